@@ -119,9 +119,9 @@ class Bundle:
     def credit(self, key: PartKey) -> tuple[str, ...]:
         """Licences and credits of a part: what its files say themselves, and the licence files of their folders."""
         part = self.parts[key]
-        said = part.document.get("attribution", ()) if isinstance(part, Features) else ()
-        said = part.attribution if isinstance(part, Picture) else said
-        texts = [text for text in said if isinstance(text, str)] if isinstance(said, list | tuple) else []
+        attribution = part.document.get("attribution", ()) if isinstance(part, Features) else ()
+        attribution = part.attribution if isinstance(part, Picture) else attribution
+        texts = [text for text in attribution if isinstance(text, str)] if isinstance(attribution, list | tuple) else []
         texts += self.credits.get(key, ())
         names, _ = self.origin.get(key, ((), ""))
         for notice, text in sorted(self.notices.items()):
@@ -167,7 +167,7 @@ def _blamed_on(name: str) -> Iterator[None]:
         raise type(error)(f"{name}: {error.detail}", places) from error
 
 
-def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: bool = False) -> Bundle:
+def read(files: Files, hints: Hints, context: Known, limits: Limits, *, inner: bool = False) -> Bundle:
     """All files of an upload (already unpacked) -> what they say together. inner: they are from one file of it.
 
     Raises BadUpload with every place that is wrong; Invalid for hints that cannot be used.
@@ -182,21 +182,21 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
         files = {name: data for name, data in files.items() if name not in _content.owned(files, content)}
     if hints.format is not None and formats.get_format(hints.format).holds:
         # A folder of other formats' maps is what any upload may be: each file is found out by its content.
-        held = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
-        if held:
+        template_files = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
+        if template_files:
             hints = dataclasses.replace(hints, format=None)
     variables = _read_variables(files, bundle)
     others = {n: d for n, d in files.items() if n not in variables}
     groups, rest = _group(others, hints) if any(others.values()) or not variables else ([], sorted(others))
     taken = _set_aside(groups, bundle)
     _check_options(groups, hints)
-    found: list[Read] = []
+    parsed_parts: list[Read] = []
     problems: list[Problem] = []
     details: list[str] = []
     errors: list[type[BadUpload]] = []
     for group in sorted(taken, key=lambda g: (-g.format.rank, g.main)):
         try:
-            found += _read_group(group, hints, known, limits, bundle)
+            parsed_parts += _read_group(group, hints, context, limits, bundle)
         except BadUpload as error:
             problems += error.problems
             details.append(error.detail)
@@ -204,7 +204,7 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
     if errors:
         raise errors[0](details[0] if len(details) == 1 else "; ".join(details), problems)
     _keep_unread({name: files[name] for name in rest}, bundle)
-    _compete(found, bundle)
+    _compete(parsed_parts, bundle)
     if hints.format is None and not any(u.format for u in bundle.files.values()) and not variables:
         lacks = {name: text for name in sorted(files) if (text := _lacking(name, files[name]))}
         known_formats = ", ".join(f.name for f in formats.all_formats().values() if f.read)
@@ -214,7 +214,7 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
         broken = next((p for p in problems if p.line is not None), None)
         detail += f"; {broken.file}, line {broken.line}: {broken.problem}" if broken else ""
         raise UnreadableFile(detail, problems)
-    _choose_datum(bundle, known)
+    _choose_datum(bundle, context)
     return bundle
 
 
@@ -238,26 +238,26 @@ def _unread(files: Files) -> set[str]:
 def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle: Bundle) -> bool:
     """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
     if dataclasses.replace(hints, format=None) != Hints() or hints.format not in (None, "environment"):
-        found: _content.Content | str = "the upload says how its maps are to be read"
+        content: _content.Content | str = "the upload says how its maps are to be read"
     else:
         try:
             with _blamed_on(main):
-                found = _content.read(files, main, limits, lambda: _unread(files))
+                content = _content.read(files, main, limits, lambda: _unread(files))
         except BadUpload:
             raise
         except (*formats.BAD_INPUT, FleetMapError, shapely.errors.ShapelyError) as error:
             reason = f"what is stored beside the maps is damaged: {formats.explain(error)[1]}; remove its folder"
             raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)]) from error
-    if isinstance(found, str):
+    if isinstance(content, str):
         for name in _content.owned(files, main):
             bundle.files[name] = Use("environment", used=False)
-        bundle.warnings.append(Problem(f"not used, the maps of the package count: {found}", main))
+        bundle.warnings.append(Problem(f"not used, the maps of the package count: {content}", main))
         return False
-    bundle.files |= {name: Use("environment", used=True) for name in files if name not in found.added}
-    _keep_unread({name: files[name] for name in sorted(found.added)}, bundle)
-    bundle.parts, bundle.datum, bundle.levels = dict(found.layers.parts), found.layers.datum, found.layers.levels
+    bundle.files |= {name: Use("environment", used=True) for name in files if name not in content.added}
+    _keep_unread({name: files[name] for name in sorted(content.added)}, bundle)
+    bundle.parts, bundle.datum, bundle.levels = dict(content.layers.parts), content.layers.datum, content.layers.levels
     bundle.origin = dict.fromkeys(bundle.parts, ((main,), "environment"))
-    bundle.credits = found.credits
+    bundle.credits = content.credits
     return True
 
 
@@ -273,8 +273,8 @@ def _unknown(name: str, data: bytes, limits: Limits) -> Problem:
         elif end in _XML_ENDS or first == b"<":
             _xml.parse(data, limits)
     except BadUpload as error:
-        told = next(iter(error.problems), Problem(error.detail))
-        return dataclasses.replace(told, file=name)
+        problem = next(iter(error.problems), Problem(error.detail))
+        return dataclasses.replace(problem, file=name)
     except formats.BAD_INPUT as error:
         line, reason = formats.explain(error)
         return Problem(f"it cannot be parsed: {reason}", name, line)
@@ -318,9 +318,9 @@ def _notice(name: str, data: bytes) -> str | None:
     lines = ["".join(c for c in line if c.isprintable()) for line in lines if line]
     if not lines:
         return None
-    told = lines[:2] if len(lines) > 1 and re.match(r"version\b", lines[1], re.IGNORECASE) else lines[:1]
-    holder = next((line for line in lines if _COPYRIGHT.match(line) and line not in told), None)
-    return f"{', '.join([*told, *filter(None, [holder])])} ({name})"
+    title_lines = lines[:2] if len(lines) > 1 and re.match(r"version\b", lines[1], re.IGNORECASE) else lines[:1]
+    holder = next((line for line in lines if _COPYRIGHT.match(line) and line not in title_lines), None)
+    return f"{', '.join([*title_lines, *filter(None, [holder])])} ({name})"
 
 
 def _group(files: Files, hints: Hints) -> tuple[list[Group], list[str]]:
@@ -328,33 +328,33 @@ def _group(files: Files, hints: Hints) -> tuple[list[Group], list[str]]:
     if not present:
         raise UnreadableFile("all files are empty", [Problem("the file is empty", name) for name in sorted(files)])
     groups, rest = formats.group(present, hints.format)
-    for known in formats.all_formats().values():
-        if hints.format in (None, known.name) and known.completing & hints.options.keys():
-            completed = _completed(known, groups, rest, present, hints.options.get("file"))
+    for fmt in formats.all_formats().values():
+        if hints.format in (None, fmt.name) and fmt.completing & hints.options.keys():
+            completed = _completed(fmt, groups, rest, present, hints.options.get("file"))
             if completed is not None:
                 groups = [*(g for g in groups if g.main not in completed.files), completed]
                 rest = sorted(set(rest) - completed.files.keys())
     return groups, sorted({*rest, *(files.keys() - present.keys())})
 
 
-def _completed(known: Format, groups: list[Group], rest: list[str], files: Files, wanted: str | None) -> Group | None:
+def _completed(fmt: Format, groups: list[Group], rest: list[str], files: Files, main_name: str | None) -> Group | None:
     """The file that options of the upload make a map, where it says too little by itself: a picture and its place."""
-    lone = {g.main for g in groups if g.format is known and known.lacking(g.main, g.files[g.main])}
-    found = sorted(n for n in {*rest, *lone} if known.lacking(n, files[n]))
-    if wanted is not None:
-        found = [n for n in found if n == wanted or n.rpartition("/")[2] == wanted]
-        if not found:
-            raise Invalid(f"no file of the upload is called {wanted!r}", [Problem("no such file", where="file")])
-    if len(found) > 1:
+    lone = {g.main for g in groups if g.format is fmt and fmt.lacking(g.main, g.files[g.main])}
+    names = sorted(n for n in {*rest, *lone} if fmt.lacking(n, files[n]))
+    if main_name is not None:
+        names = [n for n in names if n == main_name or n.rpartition("/")[2] == main_name]
+        if not names:
+            raise Invalid(f"no file of the upload is called {main_name!r}", [Problem("no such file", where="file")])
+    if len(names) > 1:
         reason = (
-            f"the options say where one picture lies, and there are several, name it with file=…: {', '.join(found)}"
+            f"the options say where one picture lies, and there are several, name it with file=…: {', '.join(names)}"
         )
         raise Invalid(reason, [Problem(reason, where="file")])
-    if not found:
+    if not names:
         return None
-    main = found[0]
-    others = [n for n in known.companions(main, files[main], sorted(files)) if n in files]
-    return Group(known, main, {n: files[n] for n in [main, *others]})
+    main = names[0]
+    others = [n for n in fmt.companions(main, files[main], sorted(files)) if n in files]
+    return Group(fmt, main, {n: files[n] for n in [main, *others]})
 
 
 def _lacking(name: str, data: bytes) -> str:
@@ -420,10 +420,10 @@ def _known_options(group: Group, hints: Hints) -> dict[str, str]:
 
 def _check_options(groups: list[Group], hints: Hints) -> None:
     """An option that no format of the upload knows is refused, not ignored."""
-    known = {f.name for g in groups for f in dataclasses.fields(g.format.read_options)}
+    option_names = {f.name for g in groups for f in dataclasses.fields(g.format.read_options)}
     for name in hints.options:
-        if name not in known:
-            accepted = ", ".join(sorted(known)) or "none"
+        if name not in option_names:
+            accepted = ", ".join(sorted(option_names)) or "none"
             detail = f"no format of this upload has an option {name!r}; accepted options: {accepted}"
             raise Invalid(detail, [Problem(f"unknown option; accepted: {accepted}", where=name)])
 
@@ -432,7 +432,7 @@ def _is_regions(name: str) -> bool:
     return "region" in PurePosixPath(name).name.lower()
 
 
-def _read_group(group: Group, hints: Hints, known: Known, limits: Limits, bundle: Bundle) -> list[Read]:
+def _read_group(group: Group, hints: Hints, upload_context: Known, limits: Limits, bundle: Bundle) -> list[Read]:
     folder = template_folder(group.main)
     layer = hints.layer
     grid = hints.grid
@@ -444,15 +444,15 @@ def _read_group(group: Group, hints: Hints, known: Known, limits: Limits, bundle
         grid = folder[1] if group.main in yamls[:1] or not yamls else None
     context = ReadContext(
         limits=limits,
-        frame=None if known.datum is None else local_frame(known.datum),
+        frame=None if upload_context.datum is None else local_frame(upload_context.datum),
         level=hints.level,
         grid=grid,
         layer=layer,
         options=formats.read_options(group.format, _known_options(group, hints)),
-        wanted=None if group.format.drawing else known.wanted,
-        cells=known.cells,
-        whole=known.whole,
-        folder=_folder_reader(hints, known, limits, bundle),
+        wanted=None if group.format.drawing else upload_context.wanted,
+        cells=upload_context.cells,
+        whole=upload_context.whole,
+        folder=_folder_reader(hints, upload_context, limits, bundle),
     )
     layers = formats.read(group, context)
     for file in group.files:
@@ -462,7 +462,7 @@ def _read_group(group: Group, hints: Hints, known: Known, limits: Limits, bundle
         bundle.fence = bundle.fence or (site.geometry[0] if len(site) else None)
     parts = dict(layers.parts)
     if group.format.drawing and layer not in (None, "objects"):
-        parts = _assign(parts, layer, hints.level, known, layers.datum, group.main, bundle)
+        parts = _assign(parts, layer, hints.level, upload_context, layers.datum, group.main, bundle)
     if layers.datum is not None:
         if bundle.datum is None:
             bundle.datum = layers.datum
@@ -472,13 +472,13 @@ def _read_group(group: Group, hints: Hints, known: Known, limits: Limits, bundle
     return [Read(key, part, group) for key, part in parts.items() if not is_empty(part)]
 
 
-def _folder_reader(hints: Hints, known: Known, limits: Limits, bundle: Bundle) -> Callable[[Files], Layers] | None:
+def _folder_reader(hints: Hints, context: Known, limits: Limits, bundle: Bundle) -> Callable[[Files], Layers] | None:
     """What reads a folder inside one file of the upload (an archive that is no ``.zip``); one deep."""
     if bundle.inner:
         return None
 
     def read_folder(files: Files) -> Layers:
-        inner = read(files, dataclasses.replace(hints, format=None), known, limits, inner=True)
+        inner = read(files, dataclasses.replace(hints, format=None), context, limits, inner=True)
         bundle.warnings += inner.warnings
         return inner.layers(None)
 
@@ -489,7 +489,7 @@ def _assign(
     parts: dict[PartKey, Part],
     layer: Layer | None,
     level: str,
-    known: Known,
+    context: Known,
     datum: Datum | None,
     file: str,
     bundle: Bundle,
@@ -503,57 +503,59 @@ def _assign(
         lines = np.isin(kinds, [1, 2, 5])
         areas = np.isin(kinds, [3, 6])
         if layer == "topology":
-            frame = local_frame(datum or known.datum) if datum or known.datum else None
+            frame = local_frame(datum or context.datum) if datum or context.datum else None
             drawn = part if lines.any() else part.take(areas)
             if not lines.any() and not areas.any():
                 bundle.warnings.append(Problem("it has no lines or polygons to make a network of", file))
                 continue
-            made = network.from_drawing(drawn, frame=frame, outlines=not lines.any())
-            out[PartKey("topology", level, NETWORK)] = made
+            drawn_network = network.from_drawing(drawn, frame=frame, outlines=not lines.any())
+            out[PartKey("topology", level, NETWORK)] = drawn_network
         elif layer == "zones":
             _move(out, key, part, areas, PartKey("zones", level, ZONES), "keepout")
         elif layer == "location":
-            fence = _own_fence(part, areas, known, bundle, file)
+            fence = _own_fence(part, areas, context, bundle, file)
             _move(out, key, part, fence, PartKey("location", level, SITE), "fence")
     return out
 
 
 def _move(
-    parts: dict[PartKey, Part], key: PartKey, part: Features, which: NDArray[np.bool_], to: PartKey, kind: str
+    parts: dict[PartKey, Part], key: PartKey, part: Features, mask: NDArray[np.bool_], to: PartKey, kind: str
 ) -> None:
     """Take these features out of the objects and into another layer; the drawing's document goes along."""
-    if not which.any():
+    if not mask.any():
         return
-    moved = part.take(which)
+    moved = part.take(mask)
     generic = ("region", "path", "poi", None)
     properties = tuple({**p, "kind": kind} if p.get("kind") in generic else p for p in moved.properties)
     parts[to] = Features(moved.ids, moved.geometry, properties, moved.local, part.document)
-    parts[key] = part.take(~which)
+    parts[key] = part.take(~mask)
 
 
-def _own_fence(part: Features, areas: NDArray[np.bool_], known: Known, bundle: Bundle, file: str) -> NDArray[np.bool_]:
+def _own_fence(
+    part: Features, areas: NDArray[np.bool_], context: Known, bundle: Bundle, file: str
+) -> NDArray[np.bool_]:
     """Which of the polygons is the environment's own fence: a mask with at most one True."""
-    where = np.flatnonzero(areas & ~part.local)
+    indices = np.flatnonzero(areas & ~part.local)
     chosen = np.zeros(len(part), bool)
-    fence = bundle.fence or known.fence
+    fence = bundle.fence or context.fence
     if fence is not None:
-        same = [k for k in where if shapely.hausdorff_distance(part.geometry[k], fence) < SAME_PLACE_DEGREES]
+        same = [k for k in indices if shapely.hausdorff_distance(part.geometry[k], fence) < SAME_PLACE_DEGREES]
         chosen[same[:1]] = True
         return chosen
-    named = [k for k in where if _FENCE.search(str(part.properties[k].get("name") or ""))]
-    if len(where) == 1 or len(named) == 1:
-        chosen[where if len(where) == 1 else named] = True
-    elif len(where):
+    named = [k for k in indices if _FENCE.search(str(part.properties[k].get("name") or ""))]
+    if len(indices) == 1 or len(named) == 1:
+        chosen[indices if len(indices) == 1 else named] = True
+    elif len(indices):
         bundle.warnings.append(
             Problem("none of its polygons is called fence, so all are kept as regions and no GNSS fence is set", file)
         )
     return chosen
 
 
-def _compete(found: list[Read], bundle: Bundle) -> None:
+def _compete(parsed_parts: list[Read], bundle: Bundle) -> None:
     """Join what belongs together; where two files tell the same network, site or grid, believe one of them."""
     by_key: dict[PartKey, list[Read]] = {}
-    for one in found:
+    for one in parsed_parts:
         by_key.setdefault(one.key, []).append(one)
     useful: set[str] = set()
     renamed: dict[str, dict[str, str]] = {}
@@ -566,14 +568,14 @@ def _compete(found: list[Read], bundle: Bundle) -> None:
                 if key.layer == "location" and _take_drawing(winners, loser):
                     useful.add(loser.group.main)
                     continue
-                what = _ONE_TELLER[key.layer].format(name=key.name)
-                reason = f"its {what} is not used: {winners[0].group.main} tells it"
+                noun = _ONE_TELLER[key.layer].format(name=key.name)
+                reason = f"its {noun} is not used: {winners[0].group.main} tells it"
                 bundle.warnings.append(Problem(reason, loser.group.main))
         useful.update(w.group.main for w in winners)
         bundle.parts[key] = _join(winners, renamed)
         names = tuple(sorted({n for w in winners for n in w.group.files}))
         bundle.origin[key] = (names, winners[0].group.format.name)
-    for one in found:
+    for one in parsed_parts:
         if one.group.main not in useful:
             for name in one.group.files:
                 bundle.files[name].used = False
@@ -609,26 +611,26 @@ def _trust(one: Read) -> tuple[object, ...]:
     return (-one.group.format.rank, name.startswith("."), "_autogen" in name, len(name), one.group.main)
 
 
-def _join(told: list[Read], renamed: dict[str, dict[str, str]]) -> Part:
+def _join(candidates: list[Read], renamed: dict[str, dict[str, str]]) -> Part:
     """Several files' parts of one key as one; ids that repeat are made distinct, and ``renamed`` remembers how."""
-    if len(told) == 1:
-        part = told[0].part
-        new = renamed.get(told[0].group.main, {})
-        if told[0].key.layer == "topology" and isinstance(part, Features) and new:
+    if len(candidates) == 1:
+        part = candidates[0].part
+        new = renamed.get(candidates[0].group.main, {})
+        if candidates[0].key.layer == "topology" and isinstance(part, Features) and new:
             properties = [
                 {**p, "drawn_from": new[i]} if isinstance(i := p.get("drawn_from"), str) and i in new else p
                 for p in part.properties
             ]
             part = Features(part.ids, part.geometry, tuple(properties), part.local, part.document)
         return part
-    if told[0].key.layer == "resources":
+    if candidates[0].key.layer == "resources":
         files: dict[str, bytes] = {}
-        for one in told:
+        for one in candidates:
             files.update(one.part.files if isinstance(one.part, Resources) else {})
         return Resources(files)
     taken: set[str] = set()
     collections = []
-    for one in told:
+    for one in candidates:
         part = one.part
         assert isinstance(part, Features)
         ids = tuple(unique_ids(part.ids, taken))
@@ -640,8 +642,8 @@ def _join(told: list[Read], renamed: dict[str, dict[str, str]]) -> Part:
     return concatenate(collections)
 
 
-def _choose_datum(bundle: Bundle, known: Known) -> None:
-    if bundle.datum is not None or known.datum is not None:
+def _choose_datum(bundle: Bundle, context: Known) -> None:
+    if bundle.datum is not None or context.datum is not None:
         return
     chosen = corner(bundle.parts)
     if chosen is not None:

@@ -403,9 +403,9 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _certificates_have_keys(self) -> Self:
-        for what in ("tls", "zenoh"):
-            if (getattr(self, f"{what}_certificate") is None) != (getattr(self, f"{what}_key") is None):
-                raise ValueError(f"{what}_certificate and {what}_key go together")
+        for prefix in ("tls", "zenoh"):
+            if (getattr(self, f"{prefix}_certificate") is None) != (getattr(self, f"{prefix}_key") is None):
+                raise ValueError(f"{prefix}_certificate and {prefix}_key go together")
         return self
 
     @model_validator(mode="after")

@@ -104,17 +104,17 @@ def check(keys: list[bytes], address: SignedAddress) -> int:
     """
     environment_id, _, code = address.signature.partition(".")
     given = code.encode("utf-8", "surrogatepass")
-    found = -1
+    match_index = -1
     for index, secret in enumerate(keys):
         expected = _code(secret, environment_id, address.path, address.query, address.expires).encode()
         if hmac.compare_digest(expected, given):
-            found = index
-    if found < 0:
+            match_index = index
+    if match_index < 0:
         raise InvalidLink(
             "the link's signature does not match its address: it was altered, its secret is no longer valid, or "
             "another server made it; use it exactly as it was given, or request a new one"
         )
-    return found
+    return match_index
 
 
 def _canonical(parameters: Mapping[str, str]) -> bytes:
@@ -186,15 +186,15 @@ class LinkSecrets:
         """Sign with a new secret from now on; the old one stays valid for ``seconds``, until its links have ended."""
         with self._exclusive():
             old = [replace(s, until=now + seconds) if s.until is None else s for s in self._read()]
-            kept = [s for s in old if s.until is not None and now < s.until]
-            self._write([_new_secret(), *kept][:MAX_SECRETS])
+            valid_secrets = [s for s in old if s.until is not None and now < s.until]
+            self._write([_new_secret(), *valid_secrets][:MAX_SECRETS])
 
     def _valid(self, now: float) -> list[_Secret]:
         """The valid secrets; those whose time is over are deleted, so that no change of the clock revives them."""
-        found = self._load()
-        if any(s.until is not None and s.until <= now for s in found):
+        stored_secrets = self._load()
+        if any(s.until is not None and s.until <= now for s in stored_secrets):
             self._change(lambda s: s if s.until is None or now < s.until else None)
-        return [s for s in found if s.until is None or now < s.until]
+        return [s for s in stored_secrets if s.until is None or now < s.until]
 
     def _change(self, change: Callable[[_Secret], _Secret | None]) -> None:
         """Change each secret in the file, or delete it. If that fails it is done when the need is seen again."""

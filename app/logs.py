@@ -36,9 +36,11 @@ def config(level: str, form: LogFormat) -> dict[str, Any]:
 
 def log_request(log: logging.Logger, level: int, fields: Mapping[str, Any]) -> None:
     """One answered request; JSON gets the fields one by one."""
-    who = f"{fields['token']} ({fields['role']})" if fields.get("role") else "no token"
+    caller = f"{fields['token']} ({fields['role']})" if fields.get("role") else "no token"
     reason = f": {fields['reason']}" if fields.get("reason") else ""
-    text = f"{fields['method']} {fields['path']} {fields['status']} {fields['ms']:.1f} ms, {who}, {fields['address']}"
+    text = (
+        f"{fields['method']} {fields['path']} {fields['status']} {fields['ms']:.1f} ms, {caller}, {fields['address']}"
+    )
     log.log(level, "%s%s", text, reason, extra={"fields": fields})
 
 

@@ -109,15 +109,15 @@ def create_app(settings: Settings) -> Server:
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Server) -> AsyncIterator[None]:
-        here = await run_in_threadpool(open_services, settings)
-        app.state.services = here
-        app.state.feed = events.Feed(here)
-        here.fleet.start()
-        threading.Thread(target=_prepare, args=(here,), daemon=True).start()
-        publishing = [p for p in (ros2_of(settings, here), relay_of(settings, here)) if p is not None]
-        app.hot = here.hot
-        scrub = scrub_of(settings, here)
-        ticker = asyncio.create_task(_tick(here))
+        services = await run_in_threadpool(open_services, settings)
+        app.state.services = services
+        app.state.feed = events.Feed(services)
+        services.fleet.start()
+        threading.Thread(target=_prepare, args=(services,), daemon=True).start()
+        publishing = [p for p in (ros2_of(settings, services), relay_of(settings, services)) if p is not None]
+        app.hot = services.hot
+        scrub = scrub_of(settings, services)
+        ticker = asyncio.create_task(_tick(services))
         try:
             yield
         finally:
@@ -129,7 +129,7 @@ def create_app(settings: Settings) -> Server:
                 await run_in_threadpool(scrub.close)
             for one in publishing:
                 await run_in_threadpool(one.close)
-            await run_in_threadpool(close_services, here)
+            await run_in_threadpool(close_services, services)
 
     app = Server(
         title="Fleet Map Server",
@@ -380,37 +380,37 @@ def provider_of(settings: Settings) -> Provider | None:
     )
 
 
-def scrub_of(settings: Settings, here: Services) -> Scrub | None:
+def scrub_of(settings: Settings, services: Services) -> Scrub | None:
     """The background check of stored data, begun; None where it is off."""
     if not settings.scrub_hours:
         return None
-    sample = partial(here.maps.cache.sample, CACHE_SHARE)
+    sample = partial(services.maps.cache.sample, CACHE_SHARE)
     rate = settings.scrub_bytes_per_second
-    scrub = Scrub(here.store, sample, every=settings.scrub_hours * 3600, rate=rate)
+    scrub = Scrub(services.store, sample, every=settings.scrub_hours * 3600, rate=rate)
     scrub.start()
     return scrub
 
 
-def relay_of(settings: Settings, here: Services) -> Relay | None:
+def relay_of(settings: Settings, services: Services) -> Relay | None:
     """Events to the fleet, begun; None where they are off."""
     if settings.zenoh_mode == "off":
         return None
     if settings.zenoh_users is not None and "tcp/" in settings.zenoh_listen:
         log.warning("users of the router come in without TLS: what is said can be read and changed on the way")
     options = _bus_options(settings)
-    made = Bus(
+    zenoh_bus = Bus(
         options,
-        ask=partial(events.ask, here, options.max_reply_bytes),
+        ask=partial(events.ask, services, options.max_reply_bytes),
         explain=problems.body_of,
-        on_status=here.fleet.heard,
-        on_alive=here.fleet.alive,
+        on_status=services.fleet.heard,
+        on_alive=services.fleet.alive,
     )
-    relay = Relay(here.store, made, settings.data_dir)
+    relay = Relay(services.store, zenoh_bus, settings.data_dir)
     relay.start()
     return relay
 
 
-def ros2_of(settings: Settings, here: Services) -> Ros2 | None:
+def ros2_of(settings: Settings, services: Services) -> Ros2 | None:
     """Topics for ROS 2, begun; None where no environment is chosen."""
     chosen = parse_chosen(settings.ros2_environments)
     if not chosen or settings.zenoh_mode == "off":
@@ -419,9 +419,9 @@ def ros2_of(settings: Settings, here: Services) -> Ros2 | None:
         Ros2Options(chosen, parse_keys(settings.ros2_keys), settings.ros2_domain_id),
         _bus_options(settings),
         settings.data_dir,
-        generation=here.store.generation,
-        look=partial(ros2.standing, here, chosen, settings.ros2_channel),
-        fetch=partial(ros2.content, here, settings.ros2_derive),
+        generation=services.store.generation,
+        look=partial(ros2.standing, services, chosen, settings.ros2_channel),
+        fetch=partial(ros2.content, services, settings.ros2_derive),
     )
     publishing.start()
     return publishing
@@ -456,24 +456,24 @@ def _bus_options(settings: Settings) -> BusOptions:
     )
 
 
-def close_services(here: Services) -> None:
+def close_services(services: Services) -> None:
     """End workers, remove the spool, close the store. Blocks."""
-    here.fleet.close()
-    here.pool.close()
-    here.spare.close()
-    here.work.close()
-    here.intake.close()
-    here.store.close()
+    services.fleet.close()
+    services.pool.close()
+    services.spare.close()
+    services.work.close()
+    services.intake.close()
+    services.store.close()
 
 
-def _prepare(here: Services) -> None:
+def _prepare(services: Services) -> None:
     """Do beside the start what the first request would wait for."""
     try:
         every_format.all_formats()  # before the workers, which import theirs meanwhile
         derive.all_derivations()
-        here.pool.start()
+        services.pool.start()
     finally:
-        here.prepared.set()
+        services.prepared.set()
 
 
 @contextlib.contextmanager
@@ -493,8 +493,8 @@ def _first_token(store: Store, settings: Settings) -> None:
         if store.find_token(text) is None:
             with contextlib.suppress(Conflict):  # a server that starts at the same time was quicker
                 store.create_token("administrator", "admin", token=text)
-    elif (made := store.create_administrator()) is not None:
-        print(f"administrator's token, shown only this once: {made}", file=sys.stdout, flush=True)
+    elif (token := store.create_administrator()) is not None:
+        print(f"administrator's token, shown only this once: {token}", file=sys.stdout, flush=True)
 
 
 def _note_time(newest: datetime) -> datetime:
@@ -508,7 +508,7 @@ def _note_time(newest: datetime) -> datetime:
     return now
 
 
-async def _tick(here: Services) -> None:
+async def _tick(services: Services) -> None:
     """Ends of tokens and overlays, planned moves and roll-outs, signs of life of jobs, and the daily clean-up."""
     beat = 0.0
     newest = datetime.now(UTC)
@@ -517,18 +517,18 @@ async def _tick(here: Services) -> None:
         await asyncio.sleep(TICK_SECONDS)
         beat += TICK_SECONDS
         try:
-            here.hot.count()
+            services.hot.count()
             newest = _note_time(newest)
-            await run_in_threadpool(here.store.end_expired_tokens)
-            await run_in_threadpool(here.store.apply_due, datetime.now(UTC))
-            await run_in_threadpool(here.store.advance_rollouts, datetime.now(UTC), decide)
-            await run_in_threadpool(here.store.end_due_overlays, datetime.now(UTC))
+            await run_in_threadpool(services.store.end_expired_tokens)
+            await run_in_threadpool(services.store.apply_due, datetime.now(UTC))
+            await run_in_threadpool(services.store.advance_rollouts, datetime.now(UTC), decide)
+            await run_in_threadpool(services.store.end_due_overlays, datetime.now(UTC))
             if beat >= BEAT_SECONDS:
                 beat = 0.0
-                await run_in_threadpool(here.work.beat)
+                await run_in_threadpool(services.work.beat)
             if datetime.now(UTC) >= collect:
                 collect = datetime.now(UTC) + COLLECT_EVERY
-                await run_in_threadpool(here.store.collect, COLLECT_GRACE)
+                await run_in_threadpool(services.store.collect, COLLECT_GRACE)
         except FleetMapError as error:
             log.warning("housekeeping waits: %s", error.detail)
         except Exception as error:  # noqa: BLE001  the ticker must outlive a database that is away for a while

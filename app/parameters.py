@@ -34,22 +34,24 @@ def parameter(
     )
 
 
-def parse(cls: type[T], values: Mapping[str, Any], what: str = "parameter") -> T:
+def parse(cls: type[T], values: Mapping[str, Any], label: str = "parameter") -> T:
     """The dataclass from texts (a query, a form, a command line) or JSON values.
 
     Invalid names every parameter that is unknown, of the wrong type or out of bounds, and says what is accepted.
     """
     hints = _hints(cls)
-    known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    fields_by_name = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     problems, out = [], {}
     for name, value in values.items():
-        if name not in known:
-            accepted = ", ".join(known) or "none"
-            problems.append(Problem(f"no such {what}{did_you_mean(name, known)}; accepted: {accepted}", where=name))
+        if name not in fields_by_name:
+            accepted = ", ".join(fields_by_name) or "none"
+            problems.append(
+                Problem(f"no such {label}{did_you_mean(name, fields_by_name)}; accepted: {accepted}", where=name)
+            )
             continue
         try:
             out[name] = _convert(hints[name], value)
-            _check_bounds(out[name], known[name].metadata)
+            _check_bounds(out[name], fields_by_name[name].metadata)
         except ValueError as error:
             problems.append(Problem(str(error), where=name))
     if problems:
@@ -113,12 +115,12 @@ def _convert(hint: Any, value: Any) -> Any:
         if isinstance(value, bool) or (isinstance(value, float) and not value.is_integer()):
             raise ValueError(f"must be a whole number, got {value!r}")
         try:
-            whole = int(_digits(value))
+            integer = int(_digits(value))
         except (TypeError, ValueError):
             raise ValueError(f"must be a whole number, got {value!r}") from None
-        if not -(2**63) <= whole < 2**63:
+        if not -(2**63) <= integer < 2**63:
             raise ValueError("must be a whole number of at most 64 bit")
-        return whole
+        return integer
     if hint is float:
         try:
             number = float(_digits(value))

@@ -37,8 +37,8 @@ class Allowed:
 
 def supported() -> int:
     """The kernel's Landlock version, 0 where there is none."""
-    found = _syscall(_CREATE, None, 0, 1)
-    return max(0, found)
+    abi_version = _syscall(_CREATE, None, 0, 1)
+    return max(0, abi_version)
 
 
 def confine(allowed: Allowed) -> bool:

@@ -64,17 +64,17 @@ class Keys:
 
     def sign(self, data: bytes) -> tuple[str, bytes]:
         """(id of the key, signature of 64 bytes)."""
-        known, private = self._load()
-        return known[0].id, private.sign(data)
+        keys, private = self._load()
+        return keys[0].id, private.sign(data)
 
     def rotate(self) -> PublicKey:
         """A new key from now on, vouched for by the old one."""
         self._load()
         with self._alone():
-            known, private = self._read()
-            made = self._create(known, private)
+            keys, private = self._read()
+            key = self._create(keys, private)
         self._known = None
-        return made
+        return key
 
     def _load(self) -> tuple[list[PublicKey], Ed25519PrivateKey]:
         with self._lock:
@@ -84,8 +84,8 @@ class Keys:
                     with self._alone():
                         if self._changed() == 0.0:
                             self._create([], None)
-                known, private = self._read()
-                self._known = (self._changed(), known, private)
+                keys, private = self._read()
+                self._known = (self._changed(), keys, private)
             return self._known[1], self._known[2]
 
     def _changed(self) -> float:
@@ -103,7 +103,7 @@ class Keys:
 
     def _read(self) -> tuple[list[PublicKey], Ed25519PrivateKey]:
         lines = json.loads((self._folder / "keys.json").read_text())
-        known = [
+        keys = [
             PublicKey(
                 line["id"],
                 base64.b64decode(line["public_key"]),
@@ -113,33 +113,33 @@ class Keys:
             )
             for line in lines
         ]
-        data = (self._folder / f"{known[0].id}.pem").read_bytes()
+        data = (self._folder / f"{keys[0].id}.pem").read_bytes()
         private = serialization.load_pem_private_key(data, None)
         if not isinstance(private, Ed25519PrivateKey):
-            raise TypeError(f"{self._folder}/{known[0].id}.pem is no Ed25519 key")
-        return known, private
+            raise TypeError(f"{self._folder}/{keys[0].id}.pem is no Ed25519 key")
+        return keys, private
 
-    def _create(self, known: list[PublicKey], old: Ed25519PrivateKey | None) -> PublicKey:
+    def _create(self, keys: list[PublicKey], old: Ed25519PrivateKey | None) -> PublicKey:
         private = Ed25519PrivateKey.generate()
         public = private.public_key().public_bytes_raw()
         endorsement = old.sign(public) if old is not None else None
-        made = PublicKey(
+        key = PublicKey(
             key_id(public),
             public,
             datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
-            known[0].id if known else None,
+            keys[0].id if keys else None,
             endorsement,
         )
         pem = private.private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
-        _write(self._folder / f"{made.id}.pem", pem)
-        kept = [made, *known][:KEPT]
-        _write(self._folder / "keys.json", json.dumps([k.as_dict() for k in kept], indent=1).encode())
+        _write(self._folder / f"{key.id}.pem", pem)
+        stored_keys = [key, *keys][:KEPT]
+        _write(self._folder / "keys.json", json.dumps([k.as_dict() for k in stored_keys], indent=1).encode())
         for path in self._folder.glob("*.pem"):
-            if path.stem != made.id:
+            if path.stem != key.id:
                 path.unlink()  # an old key never signs again
-        return made
+        return key
 
 
 def key_id(public: bytes) -> str:

@@ -34,7 +34,7 @@ class Set:
 
     def as_dict(self, name: str) -> dict[str, Any]:
         """The set as clients see it."""
-        values = {known: dict(sorted(said.items())) for known, said in sorted(self.values.items())}
+        values = {name: dict(sorted(format_values.items())) for name, format_values in sorted(self.values.items())}
         return {"name": name, "title": self.title, "formats": values}
 
 
@@ -95,41 +95,41 @@ class Resolved:
 NOTHING: Final = Resolved()
 
 
-def check_set(name: str, where: str = "set") -> str:
+def check_set(name: str, location: str = "set") -> str:
     """Invalid, with the known ones, where there is no such set."""
     if name not in SETS:
         near = did_you_mean(name, SETS)
         reason = f"there is no template set {name[:80]!r}{near}; known sets: {', '.join(SETS)}"
-        raise Invalid(reason, [Problem(reason, where=where)])
+        raise Invalid(reason, [Problem(reason, where=location)])
     return name
 
 
 def check_format(name: str) -> Format:
     """The format; NotFound where there is none, or it is not served."""
-    known = formats.get_format(name)
-    if known.write is None:
+    fmt = formats.get_format(name)
+    if fmt.write is None:
         raise NotFound(f"{name} is read and not served: it has no templates")
-    return known
+    return fmt
 
 
-def check_values(known: Format, values: Mapping[str, Any], where: str = "values") -> dict[str, Any]:
+def check_values(fmt: Format, values: Mapping[str, Any], location: str = "values") -> dict[str, Any]:
     """Values of a format's parameters, typed, as JSON has them; Invalid names each that is unknown or wrong."""
     try:
-        chosen = parameters.parse(known.write_options, values, f"parameter of {known.name}")
+        chosen = parameters.parse(fmt.write_options, values, f"parameter of {fmt.name}")
     except Invalid as error:
         raise Invalid(
-            error.detail, [dataclasses.replace(p, where=f"{where}.{p.where}") for p in error.problems]
+            error.detail, [dataclasses.replace(p, where=f"{location}.{p.where}") for p in error.problems]
         ) from None
     out = {name: _plain(getattr(chosen, name)) for name in sorted(values)}
     reason = f"a text has at most {LONGEST_TEXT} printable characters"
     texts = {name: value for name, value in out.items() if isinstance(value, str)}
     bad = [n for n, text in texts.items() if len(text) > LONGEST_TEXT or not text.isprintable()]
     if bad:
-        raise Invalid(reason, [Problem(reason, where=f"{where}.{name}") for name in bad])
+        raise Invalid(reason, [Problem(reason, where=f"{location}.{name}") for name in bad])
     return out
 
 
-def resolve(templates: Templates, known: Format) -> Resolved:
+def resolve(templates: Templates, fmt: Format) -> Resolved:
     """The values that an environment's templates give to a format.
 
     What an older or newer release has kept and this one does not know is left out, and told in ``ignored``: a robot
@@ -137,43 +137,43 @@ def resolve(templates: Templates, known: Format) -> Resolved:
     """
     if templates.set == DEFAULT_SET and not templates.formats:
         return NOTHING
-    own, chosen = templates.of(known.name), templates.chosen(known.name)
+    format_template, chosen = templates.of(fmt.name), templates.chosen(fmt.name)
     ignored = [] if chosen in SETS else [f"the template set {chosen!r} is not known to this release"]
     values: dict[str, Any] = {}
     origin: dict[str, str] = {}
-    of_set = SETS[chosen].values.get(known.name, {}) if chosen in SETS else {}
-    for source, said in ((f"set {chosen}", of_set), (ENVIRONMENT, own.values)):
-        for name, value in said.items():
+    of_set = SETS[chosen].values.get(fmt.name, {}) if chosen in SETS else {}
+    for source, source_values in ((f"set {chosen}", of_set), (ENVIRONMENT, format_template.values)):
+        for name, value in source_values.items():
             try:
-                check_values(known, {name: value})
+                check_values(fmt, {name: value})
             except Invalid as error:
-                ignored.append(f"{known.name}: {error.detail}")
+                ignored.append(f"{fmt.name}: {error.detail}")
                 continue
             values[name], origin[name] = value, source
     return Resolved(values, origin, tuple(ignored))
 
 
-def effective(templates: Templates, known: Format) -> dict[str, dict[str, Any]]:
+def effective(templates: Templates, fmt: Format) -> dict[str, dict[str, Any]]:
     """``{PARAMETER: {value, from}}`` of all parameters of a format's writer."""
-    found = resolve(templates, known)
+    resolved = resolve(templates, fmt)
     return {
         p["name"]: {
-            "value": _plain(found.values.get(p["name"], p["default"])),
-            "from": found.origin.get(p["name"], DEFAULT),
+            "value": _plain(resolved.values.get(p["name"], p["default"])),
+            "from": resolved.origin.get(p["name"], DEFAULT),
         }
-        for p in parameters.describe(known.write_options)
+        for p in parameters.describe(fmt.write_options)
     }
 
 
-def has_parameters(known: Format) -> bool:
+def has_parameters(fmt: Format) -> bool:
     """Whether there is anything that a template could say of a format."""
-    return bool(dataclasses.fields(known.write_options))
+    return bool(dataclasses.fields(fmt.write_options))
 
 
-def with_own(templates: Templates, name: str, own: Own) -> Templates:
-    """The same with something else said of one format; nothing is said of it where ``own`` is empty."""
-    others = {known: said for known, said in templates.formats.items() if known != name}
-    return Templates(templates.set, {**others, name: own} if own.as_dict() else others)
+def with_own(templates: Templates, name: str, format_template: Own) -> Templates:
+    """The same with something else said of one format; nothing is said of it where ``format_template`` is empty."""
+    others = {format_name: template for format_name, template in templates.formats.items() if format_name != name}
+    return Templates(templates.set, {**others, name: format_template} if format_template.as_dict() else others)
 
 
 def _plain(value: Any) -> Any:

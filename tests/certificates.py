@@ -26,8 +26,8 @@ class Authority:
         """A certificate for this machine and its key: the two files. days: how long it is still good."""
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-        here = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
-        certificate = self._write(name, subject, key, x509.SubjectAlternativeName(here), days)
+        names = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
+        certificate = self._write(name, subject, key, x509.SubjectAlternativeName(names), days)
         path = self.folder / f"{name}.key"
         plain = serialization.NoEncryption()
         path.write_bytes(key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, plain))
@@ -42,7 +42,7 @@ class Authority:
         days: int = 2,
     ) -> Path:
         now = datetime.now(UTC)
-        made = (
+        builder = (
             x509.CertificateBuilder()
             .subject_name(subject)
             .issuer_name(self._name)
@@ -56,9 +56,9 @@ class Authority:
             .add_extension(_usage(authority=places is None), critical=True)
         )
         if places is not None:
-            made = made.add_extension(places, critical=False)
+            builder = builder.add_extension(places, critical=False)
         path = self.folder / f"{name}.pem"
-        path.write_bytes(made.sign(self._key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+        path.write_bytes(builder.sign(self._key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
         return path
 
 

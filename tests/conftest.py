@@ -75,8 +75,8 @@ def same(shared: Path) -> Callable[[str, dict[str, bytes], dict[str, bytes]], li
 @pytest.fixture(scope="session")
 def facts_json(shared: Path) -> dict[str, Any]:
     """Facts of every real file, counted by tools that share no code with ours; key = path below data/."""
-    known: dict[str, Any] = json.loads((shared / "data" / "facts.json").read_text())["files"]
-    return known
+    facts: dict[str, Any] = json.loads((shared / "data" / "facts.json").read_text())["files"]
+    return facts
 
 
 def _tool(shared: Path, name: str) -> ModuleType:

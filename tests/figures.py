@@ -229,8 +229,8 @@ def survey(call: Callable[..., httpx.Response], number: int) -> tuple[str, dict[
     """Commit a version: its path, its files, and all that is served of it, by path."""
     network = samples.tmap2({"gate": (0.0, 0.0), "barn": (11.0, number), "field": (10.0, 8.0)})
     files = {NETWORK: network, "notes.txt": random.Random(number).randbytes(100_000)}
-    made = call("POST", "environments/farm/versions", files=parts(files)).raise_for_status().json()["version"]
-    place = f"environments/farm/versions/{made}"
+    version = call("POST", "environments/farm/versions", files=parts(files)).raise_for_status().json()["version"]
+    place = f"environments/farm/versions/{version}"
     served = {f"{place}/sources/{name}": data for name, data in files.items()}
     for name in ("tmap2", "kml", "geojson"):
         served[f"{place}/maps/{name}"] = call("GET", f"{place}/maps/{name}").raise_for_status().content

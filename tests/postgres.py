@@ -92,8 +92,8 @@ def _missing(message: str) -> None:
 
 
 def _binaries() -> Path | None:
-    found = shutil.which("initdb")
-    candidates = [*([str(Path(found).resolve().parent)] if found else []), *FOLDERS]
+    initdb = shutil.which("initdb")
+    candidates = [*([str(Path(initdb).resolve().parent)] if initdb else []), *FOLDERS]
     for folder in candidates:
         if (Path(folder) / "initdb").exists() and (Path(folder) / "pg_ctl").exists():
             return Path(folder)
@@ -154,9 +154,11 @@ def running_cluster() -> Iterator[Cluster]:
         )
 
     try:
-        made = run(str(folder / "initdb"), "-D", str(data), "-U", "fleetmap", "-A", "trust", "-E", "UTF8", "--no-sync")
-        if made.returncode:
-            pytest.fail(f"initdb failed: {made.stderr}")
+        process = run(
+            str(folder / "initdb"), "-D", str(data), "-U", "fleetmap", "-A", "trust", "-E", "UTF8", "--no-sync"
+        )
+        if process.returncode:
+            pytest.fail(f"initdb failed: {process.stderr}")
         for _ in range(5):
             cluster = Cluster(_free_port(), folder, data, run)
             started = cluster.start()
@@ -167,8 +169,8 @@ def running_cluster() -> Iterator[Cluster]:
             pytest.fail(f"PostgreSQL does not start: {started.stdout}{started.stderr}{log}")
         try:
             with cluster.connect() as connection:
-                known = connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'postgis'").fetchone()
-                if known is None:
+                row = connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'postgis'").fetchone()
+                if row is None:
                     _missing("PostGIS is not installed beside PostgreSQL")
                 connection.execute("CREATE DATABASE fleetmap_template")
             with cluster.connect("fleetmap_template") as connection:

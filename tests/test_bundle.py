@@ -57,14 +57,14 @@ def tmap2(name: str) -> bytes:
     return f"{head}nodes:\n{nodes}".encode()
 
 
-def told(files: dict[str, bytes], *, known: Known | None = None, **hints: Any) -> Bundle:
-    return read(unpack(files, LIMITS), Hints(**hints), known or Known(), LIMITS)
+def read_upload(files: dict[str, bytes], *, context: Known | None = None, **hints: Any) -> Bundle:
+    return read(unpack(files, LIMITS), Hints(**hints), context or Known(), LIMITS)
 
 
 def part(bundle: Bundle, layer: str, name: str) -> Features:
-    found = bundle.parts[PartKey(layer, "ground", name)]  # type: ignore[arg-type]
-    assert isinstance(found, Features)
-    return found
+    content = bundle.parts[PartKey(layer, "ground", name)]  # type: ignore[arg-type]
+    assert isinstance(content, Features)
+    return content
 
 
 def kinds(f: Features) -> list[Any]:
@@ -77,7 +77,7 @@ def warned(bundle: Bundle, file: str) -> str:
 
 def test_what_was_written_by_hand_wins_over_what_was_generated() -> None:
     other = DATUM.replace(b"53.26", b"10.0")
-    bundle = told({"datum.yaml": DATUM, "datum_autogen.yaml": other})
+    bundle = read_upload({"datum.yaml": DATUM, "datum_autogen.yaml": other})
     assert bundle.datum is not None
     assert bundle.datum.latitude == 53.26
     assert not bundle.files["datum_autogen.yaml"].used
@@ -86,7 +86,7 @@ def test_what_was_written_by_hand_wins_over_what_was_generated() -> None:
 
 
 def test_a_real_network_wins_over_a_drawn_one_and_regions_stay() -> None:
-    bundle = told(
+    bundle = read_upload(
         {
             "config/location/datum.yaml": DATUM,
             "config/topological/network.tmap2.yaml": tmap2("hand"),
@@ -103,23 +103,23 @@ def test_a_real_network_wins_over_a_drawn_one_and_regions_stay() -> None:
 
 
 def test_a_drawing_in_topological_alone_is_a_network_and_stays_a_drawing() -> None:
-    bundle = told({"config/topological/drawn.kml": kml(PATH)})
+    bundle = read_upload({"config/topological/drawn.kml": kml(PATH)})
     network = part(bundle, "topology", "network")
     assert kinds(network) == ["edge"] * 4 + ["node"] * 3
     assert len(part(bundle, "objects", "kml")) == 1
 
 
 def test_the_layer_says_what_a_drawing_is_meant_for() -> None:
-    assert kinds(part(told({"a.kml": kml(FIELD, PATH)}), "objects", "kml")) == ["path", "region"]
-    bundle = told({"a.kml": kml(FIELD, PATH)}, layer="zones")
+    assert kinds(part(read_upload({"a.kml": kml(FIELD, PATH)}), "objects", "kml")) == ["path", "region"]
+    bundle = read_upload({"a.kml": kml(FIELD, PATH)}, layer="zones")
     assert kinds(part(bundle, "zones", "zones")) == ["keepout"]
     assert kinds(part(bundle, "objects", "kml")) == ["path"]
-    bundle = told({"a.kml": kml(FIELD)}, layer="location")
+    bundle = read_upload({"a.kml": kml(FIELD)}, layer="location")
     assert kinds(part(bundle, "location", "site")) == ["fence"]
 
 
 def test_the_environments_own_fence_is_found_among_the_fields() -> None:
-    bundle = told({"config/location/datum.yaml": FENCED, "config/location/fields.kml": kml(FIELD, FENCE)})
+    bundle = read_upload({"config/location/datum.yaml": FENCED, "config/location/fields.kml": kml(FIELD, FENCE)})
     site = part(bundle, "location", "site")
     assert len(site) == 1
     assert site.properties[0]["name"] == "the edge"
@@ -127,16 +127,16 @@ def test_the_environments_own_fence_is_found_among_the_fields() -> None:
 
 
 def test_polygons_without_a_fence_among_them_are_regions() -> None:
-    bundle = told({"a.kml": kml(FIELD, FIELD.replace("field", "other"))}, layer="location")
+    bundle = read_upload({"a.kml": kml(FIELD, FIELD.replace("field", "other"))}, layer="location")
     assert kinds(part(bundle, "objects", "kml")) == ["region", "region"]
     assert "no GNSS fence" in warned(bundle, "a.kml")
 
 
 def test_grids_are_called_by_their_folder_in_a_template_and_by_their_file_elsewhere() -> None:
     files = {f"config/metric/{f}/map.{e}": d for f in ("map", "nogo") for e, d in (("yaml", GRID), ("pgm", PGM))}
-    assert {k.name for k in told(files).parts} == {"map", "nogo"}
-    assert {k.name for k in told({"hall.yaml": GRID, "map.pgm": PGM}).parts} == {"hall"}
-    assert {k.name for k in told({"hall.yaml": GRID, "map.pgm": PGM}, grid="keepout").parts} == {"keepout"}
+    assert {k.name for k in read_upload(files).parts} == {"map", "nogo"}
+    assert {k.name for k in read_upload({"hall.yaml": GRID, "map.pgm": PGM}).parts} == {"hall"}
+    assert {k.name for k in read_upload({"hall.yaml": GRID, "map.pgm": PGM}, grid="keepout").parts} == {"keepout"}
 
 
 def test_a_zip_of_a_folder_is_the_same_as_its_files() -> None:
@@ -145,18 +145,18 @@ def test_a_zip_of_a_folder_is_the_same_as_its_files() -> None:
     with zipfile.ZipFile(buffer, "w") as z:
         for name, data in files.items():
             z.writestr(name, data)
-    packed = told({"farm.zip": buffer.getvalue()})
-    assert packed.parts.keys() == told(files).parts.keys()
-    assert packed.datum == told(files).datum
+    packed = read_upload({"farm.zip": buffer.getvalue()})
+    assert packed.parts.keys() == read_upload(files).parts.keys()
+    assert packed.datum == read_upload(files).datum
 
 
 def test_two_drawings_with_the_same_ids_are_both_kept() -> None:
-    bundle = told({"a.kml": kml(PATH), "b.kml": kml(PATH, FIELD)})
+    bundle = read_upload({"a.kml": kml(PATH), "b.kml": kml(PATH, FIELD)})
     assert len(part(bundle, "objects", "kml")) == 3
 
 
 def test_without_a_datum_the_south_west_corner_is_taken_with_a_warning() -> None:
-    bundle = told({"a.kml": kml(PATH)})
+    bundle = read_upload({"a.kml": kml(PATH)})
     assert bundle.datum is not None
     assert (bundle.datum.latitude, bundle.datum.longitude) == (53.26, -0.52)
     assert any("south-west corner" in w.problem for w in bundle.warnings)
@@ -165,9 +165,9 @@ def test_without_a_datum_the_south_west_corner_is_taken_with_a_warning() -> None
 @pytest.mark.parametrize("latitude", [88.0, -88.0])
 def test_data_nearer_to_a_pole_than_a_datum_may_be_is_warned_of(latitude: float) -> None:
     point = b'{"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [10, %g]}}' % latitude
-    told = read({"a.geojson": point}, Hints(), Known(), Limits())
-    assert told.datum == Datum(math.copysign(85.0, latitude), 10.0)
-    assert any("no datum lies nearer to a pole" in w.problem for w in told.warnings)
+    bundle = read({"a.geojson": point}, Hints(), Known(), Limits())
+    assert bundle.datum == Datum(math.copysign(85.0, latitude), 10.0)
+    assert any("no datum lies nearer to a pole" in w.problem for w in bundle.warnings)
     with pytest.raises(BadUpload, match="must be between -85 and 85"):
         read({"datum.yaml": b"datum_latitude: %g\ndatum_longitude: 10\n" % latitude}, Hints(), Known(), Limits())
 
@@ -175,20 +175,22 @@ def test_data_nearer_to_a_pole_than_a_datum_may_be_is_warned_of(latitude: float)
 def test_the_corner_across_the_antimeridian_is_the_western_end() -> None:
     line = shapely.LineString([(179.9, -17.0), (180.0, -16.9)])
     other = shapely.LineString([(-180.0, -16.9), (-179.8, -16.8)])
-    found = corner({PartKey("objects"): features([("a", line, {}), ("b", other, {})], "wgs84")})
-    assert found is not None
-    assert (found.latitude, found.longitude) == (-17.0, 179.9)
+    datum = corner({PartKey("objects"): features([("a", line, {}), ("b", other, {})], "wgs84")})
+    assert datum is not None
+    assert (datum.latitude, datum.longitude) == (-17.0, 179.9)
 
 
 def test_variables_are_read_and_never_run() -> None:
-    bundle = told({"config/properties.sh": b"export FARM_NAME='x'\nexport BAD=$(rm -rf /)\n", "datum.yaml": DATUM})
+    bundle = read_upload(
+        {"config/properties.sh": b"export FARM_NAME='x'\nexport BAD=$(rm -rf /)\n", "datum.yaml": DATUM}
+    )
     empty = part(bundle, "objects", "environment")
     assert empty.document["environment"]["variables"] == {"FARM_NAME": "x"}
     assert warned(bundle, "config/properties.sh")
 
 
 def test_unknown_files_stay_sources_with_a_warning() -> None:
-    bundle = told({"datum.yaml": DATUM, "model.stl": b"solid", "LICENSE": b"x", "a/.placeholder": b""})
+    bundle = read_upload({"datum.yaml": DATUM, "model.stl": b"solid", "LICENSE": b"x", "a/.placeholder": b""})
     assert [w.file for w in bundle.warnings if "no format" in w.problem] == ["model.stl"]
     assert not bundle.files["model.stl"].used
 
@@ -208,12 +210,12 @@ def test_what_cannot_be_taken_is_refused_with_a_reason(
     files: dict[str, bytes], hints: dict[str, Any], error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=words):
-        told(files, **hints)
+        read_upload(files, **hints)
 
 
 def test_every_bad_file_of_an_upload_is_named() -> None:
     with pytest.raises(BadUpload) as caught:
-        told({"a.kml": b"<kml><Document>", "datum.yaml": DATUM.replace(b"53.26", b"953.26")})
+        read_upload({"a.kml": b"<kml><Document>", "datum.yaml": DATUM.replace(b"53.26", b"953.26")})
     assert {p.file for p in caught.value.problems} == {"a.kml", "datum.yaml"}
 
 
@@ -243,17 +245,17 @@ def test_template_folder(name: str, below: tuple[str, ...] | None) -> None:
 def test_real_template_folders(shared: Path, facts_json: dict[str, Any], environment: str, layers: set[str]) -> None:
     root = shared / "data" / "environment_template" / environment
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*") if p.is_file()}
-    bundle = told(files)
+    bundle = read_upload(files)
     assert bundle.layers(None).layers == layers
     for name in files:
-        known = facts_json[f"environment_template/{environment}/{name}"]
-        if known["kind"] == "tmap2" and bundle.files[name].used and "poi" not in name:
+        file_facts = facts_json[f"environment_template/{environment}/{name}"]
+        if file_facts["kind"] == "tmap2" and bundle.files[name].used and "poi" not in name:
             network = part(bundle, "topology", "network")
-            assert sum(p["kind"] == "node" for p in network.properties) == known["facts"]["nodes"]
-            assert sum(p["kind"] == "edge" for p in network.properties) == known["facts"]["edges_directed"]
-        if known["kind"] == "occupancy_map_yaml" and "metric/map/" in name:
+            assert sum(p["kind"] == "node" for p in network.properties) == file_facts["facts"]["nodes"]
+            assert sum(p["kind"] == "edge" for p in network.properties) == file_facts["facts"]["edges_directed"]
+        if file_facts["kind"] == "occupancy_map_yaml" and "metric/map/" in name:
             grid = bundle.parts[PartKey("occupancy", "ground", "map")]
-            assert grid.counts()["occupied"] == known["facts"]["cells"]["occupied_100"]  # type: ignore[union-attr]
+            assert grid.counts()["occupied"] == file_facts["facts"]["cells"]["occupied_100"]  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

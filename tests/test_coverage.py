@@ -68,15 +68,15 @@ def test_the_table_keeps_its_word(
     if kind is not None and kind in states:
         assert states[kind] == "direct", "a map is to be had as it came"
     for row in rows:
-        what = f"{env} as {row['format']}"
+        label = f"{env} as {row['format']}"
         if row["state"] == "missing":
-            assert row["missing"], f"{what}: what is to be supplied?"
-            assert any(SUPPLY.search(text) for text in row["missing"]), f"{what}: {row['missing']}"
+            assert row["missing"], f"{label}: what is to be supplied?"
+            assert any(SUPPLY.search(text) for text in row["missing"]), f"{label}: {row['missing']}"
             refused = api.get(f"environments/{env}/versions/latest/maps/{row['format']}", None)
-            assert 400 <= refused.status_code < 500, f"{what}: {refused.status_code}"
+            assert 400 <= refused.status_code < 500, f"{label}: {refused.status_code}"
             continue
-        assert row["state"] in ("direct", "derivable"), what
-        assert bool(row["chain"]) == (row["state"] == "derivable"), what
+        assert row["state"] in ("direct", "derivable"), label
+        assert bool(row["chain"]) == (row["state"] == "derivable"), label
         steps = str([step["step"] for step in row["chain"]])
         if steps in slow:
             continue  # the same derivation again for another writer, which faster samples try
@@ -85,15 +85,15 @@ def test_the_table_keeps_its_word(
         if row["chain"] and time.monotonic() - start > SLOW_SECONDS:
             slow.add(steps)
         if row.get("choose"):
-            assert answer.status_code == 409, f"{what}: {answer.status_code}"
+            assert answer.status_code == 409, f"{label}: {answer.status_code}"
             continue
         if answer.status_code == 409 and row["chain"] and "name one" in answer.json()["detail"]:
             continue  # a derivation gave several, which the table cannot know without doing it
         if answer.status_code == 422 and "too far from the datum" in answer.text:
             continue  # one item of a sample lies where no local frame reaches, which no table can know without it
-        assert answer.status_code in (200, 202), f"{what}: {answer.status_code} {answer.text[:500]}"
+        assert answer.status_code in (200, 202), f"{label}: {answer.status_code} {answer.text[:500]}"
         if answer.status_code == 202:
             job = finished(api, answer.json())
-            assert job["state"] == "done", f"{what}: {job}"
+            assert job["state"] == "done", f"{label}: {job}"
         else:
-            assert answer.content, what
+            assert answer.content, label

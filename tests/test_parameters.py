@@ -54,9 +54,9 @@ def parse(**values: Any) -> Options:
     ],
 )
 def test_taken(name: str, value: Any, expected: Any) -> None:
-    found = getattr(parse(**{name: value}), name)
-    assert found == expected
-    assert type(found) is type(expected)
+    parsed_value = getattr(parse(**{name: value}), name)
+    assert parsed_value == expected
+    assert type(parsed_value) is type(expected)
 
 
 @pytest.mark.parametrize(
@@ -121,30 +121,30 @@ def test_nothing_given_is_all_defaults() -> None:
 
 
 def test_canonical_is_what_differs_in_a_fixed_order() -> None:
-    made = parse(tags="b,a", count="3", fast="yes", band="0,1")
-    assert list(parameters.canonical(made).items()) == [("band", (0.0, 1.0)), ("fast", True), ("tags", ("b", "a"))]
+    options = parse(tags="b,a", count="3", fast="yes", band="0,1")
+    assert list(parameters.canonical(options).items()) == [("band", (0.0, 1.0)), ("fast", True), ("tags", ("b", "a"))]
 
 
 def test_described_as_json_schema() -> None:
-    said = {entry["name"]: entry for entry in parameters.describe(Options)}
-    assert list(said) == ["resolution", "count", "kind", "fast", "name", "band", "tags", "limit"]
-    assert said["resolution"] == {
+    descriptions = {entry["name"]: entry for entry in parameters.describe(Options)}
+    assert list(descriptions) == ["resolution", "count", "kind", "fast", "name", "band", "tags", "limit"]
+    assert descriptions["resolution"] == {
         "name": "resolution",
         "schema": {"type": "number", "minimum": 1e-3, "maximum": 100.0},
         "default": 0.05,
         "description": "metres a cell [m]",
     }
-    assert said["kind"]["schema"] == {"type": "string", "enum": ["pgm", "png"]}
-    assert said["fast"]["schema"] == {"type": "boolean"}
-    assert said["limit"]["schema"] == {"type": "integer"}
-    assert said["band"]["schema"]["type"] == "string"
+    assert descriptions["kind"]["schema"] == {"type": "string", "enum": ["pgm", "png"]}
+    assert descriptions["fast"]["schema"] == {"type": "boolean"}
+    assert descriptions["limit"]["schema"] == {"type": "integer"}
+    assert descriptions["band"]["schema"]["type"] == "string"
 
 
 @given(st.dictionaries(st.sampled_from(["resolution", "count", "band", "limit", "fast"]), st.text()))
 def test_any_text_is_taken_or_refused(values: dict[str, str]) -> None:
     try:
-        made = parameters.parse(Options, values)
+        options = parameters.parse(Options, values)
     except Invalid:
         return
-    assert 1e-3 <= made.resolution <= 100
-    assert 0 <= made.count <= 10
+    assert 1e-3 <= options.resolution <= 100
+    assert 0 <= options.count <= 10

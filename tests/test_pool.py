@@ -72,9 +72,9 @@ def work_unsendable() -> _Unsendable:
 
 @pytest.fixture
 def pool() -> Iterator[Pool]:
-    made = Pool(1, memory_bytes=4 * 2**30, seconds=20.0, waiting=1)
-    yield made
-    made.close()
+    new_pool = Pool(1, memory_bytes=4 * 2**30, seconds=20.0, waiting=1)
+    yield new_pool
+    new_pool.close()
 
 
 def test_a_result_comes_back(pool: Pool) -> None:
@@ -127,13 +127,13 @@ def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
 def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
     pool.run(work_double, 1)
     stops = Stop(), Stop()
-    told: list[BaseException] = []
+    errors: list[BaseException] = []
 
     def run(stop: Stop) -> None:
         try:
             pool.run(work_sleep, 60.0, stop=stop)
         except Cancelled as error:
-            told.append(error)
+            errors.append(error)
 
     threads = [threading.Thread(target=run, args=(stop,)) for stop in stops]
     for thread in threads:
@@ -143,7 +143,7 @@ def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
         stop()
         thread.join(20)
         assert not thread.is_alive()
-    assert len(told) == 2
+    assert len(errors) == 2
     with pytest.raises(Cancelled):
         pool.run(work_double, 1, stop=stops[0])
     late = Stop()
@@ -177,13 +177,13 @@ def test_no_process_to_be_had_is_told_as_for_now(pool: Pool, monkeypatch: pytest
 
 def test_who_waits_when_the_pool_closes_is_told_so(pool: Pool) -> None:
     pool.run(work_double, 1)
-    told: list[type[BaseException]] = []
+    errors: list[type[BaseException]] = []
 
     def run(*job: object) -> None:
         try:
             pool.run(*job)  # type: ignore[arg-type]
         except (Unavailable, WorkerDied) as error:
-            told.append(type(error))
+            errors.append(type(error))
 
     threads = [threading.Thread(target=run, args=job) for job in ((work_sleep, 30.0), (work_double, 1))]
     for thread in threads:
@@ -193,7 +193,7 @@ def test_who_waits_when_the_pool_closes_is_told_so(pool: Pool) -> None:
     for thread in threads:
         thread.join(10)
         assert not thread.is_alive()
-    assert told == [WorkerDied, Unavailable]
+    assert errors == [WorkerDied, Unavailable]
 
 
 def test_who_is_too_many_is_told_to_come_again(pool: Pool) -> None:
@@ -241,9 +241,9 @@ def confined(tmp_path: Path) -> Iterator[Pool]:
     (tmp_path / "scratch").mkdir()
     (tmp_path / "database").mkdir()
     (tmp_path / "database" / "a-shm").write_text("old")
-    made = Pool(1, allowed=Allowed((tmp_path / "scratch",), (tmp_path / "database",), ()))
-    yield made
-    made.close()
+    new_pool = Pool(1, allowed=Allowed((tmp_path / "scratch",), (tmp_path / "database",), ()))
+    yield new_pool
+    new_pool.close()
 
 
 needs_landlock = pytest.mark.skipif(sandbox.supported() < 4, reason="the kernel has no Landlock with network rules")

@@ -65,8 +65,8 @@ def samples() -> list[Any]:
     path = SHARED / "data" / "facts.json"
     if not path.is_file():
         return [pytest.param("", "", id="absent")]
-    known = json.loads(path.read_text())["files"]
-    maps = {n: e for n, e in known.items() if e["kind"] in KINDS and (e["kind"] != "sdf" or e["facts"]["worlds"])}
+    facts = json.loads(path.read_text())["files"]
+    maps = {n: e for n, e in facts.items() if e["kind"] in KINDS and (e["kind"] != "sdf" or e["facts"]["worlds"])}
     return [pytest.param(n, KINDS[e["kind"]], id=n) for n, e in maps.items()]
 
 
@@ -88,12 +88,12 @@ def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:
     path = data / name
     if kind == "gazebo":  # a world with all that lies below its folder, or beside the folder of the worlds
         root = path.parent.parent if path.parent.name == "worlds" else path.parent
-        found = [p for p in root.rglob("*") if p == path or (p.is_file() and p.parent != path.parent)]
-        return {p.relative_to(root).as_posix(): p.read_bytes() for p in found}
+        paths = [p for p in root.rglob("*") if p == path or (p.is_file() and p.parent != path.parent)]
+        return {p.relative_to(root).as_posix(): p.read_bytes() for p in paths}
     if kind != "occupancy_grid":
         return {path.name: path.read_bytes()}
-    found = [p for p in path.parent.rglob("*") if p == path or p.suffix.lower() in (".pgm", ".png")]
-    return {p.relative_to(path.parent).as_posix(): p.read_bytes() for p in found}
+    paths = [p for p in path.parent.rglob("*") if p == path or p.suffix.lower() in (".pgm", ".png")]
+    return {p.relative_to(path.parent).as_posix(): p.read_bytes() for p in paths}
 
 
 def served(api: Api, env: str, kind: str) -> dict[str, bytes]:
@@ -126,8 +126,8 @@ def test_every_sample_comes_back_with_the_same_information(
     sources = api.get(f"environments/{env}/versions/latest/sources").json()
     assert {s["name"] for s in sources} == set(files)
     for source in sources[:3]:
-        kept = api.get(f"environments/{env}/versions/latest/sources/{source['name']}")
-        assert kept.content == files[source["name"]], "the original is kept byte for byte"
+        response = api.get(f"environments/{env}/versions/latest/sources/{source['name']}")
+        assert response.content == files[source["name"]], "the original is kept byte for byte"
     back = served(api, env, kind)
     if name not in UNCOMPARED:
         assert same(kind, files, back) == []
@@ -147,10 +147,10 @@ def test_a_whole_template_folder_is_one_version(api: Api, shared: Path, same: Sa
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
     env = name.replace("_", "-")
     api.post("environments", {"name": env})
-    made = api.upload(env, files).json()
-    assert made["version"] == 1
-    assert {s["name"] for s in made["sources"]} == set(files)
-    used = {s["name"] for s in made["sources"] if s["used"]}
+    version = api.upload(env, files).json()
+    assert version["version"] == 1
+    assert {s["name"] for s in version["sources"]} == set(files)
+    used = {s["name"] for s in version["sources"] if s["used"]}
     for grid in {n.split("/")[2] for n in used if n.startswith("config/metric/") and n.endswith(".yaml")}:
         answer = {n: api.get(f"/maps/{env}/occupancy_grid/{n}").content for n in (f"{grid}.yaml", f"{grid}.pgm")}
         original = {n.rpartition("/")[2]: d for n, d in files.items() if f"/metric/{grid}/" in n and n in used}
@@ -174,9 +174,9 @@ def test_a_template_comes_back_as_a_package(api: Api, shared: Path, same: Same, 
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
     env = f"zip-{name.replace('_', '-')}"
     api.post("environments", {"name": env})
-    made = api.upload(env, {"site.zip": _archive.pack(files)}, format="environment").json()
+    version = api.upload(env, {"site.zip": _archive.pack(files)}, format="environment").json()
     loose = api.post("environments", {"name": f"{env}-loose"[:63]}).json()["name"]
-    assert api.upload(loose, files).json()["root"] == made["root"]
+    assert api.upload(loose, files).json()["root"] == version["root"]
     answer = api.get(f"/maps/{env}/environment")
     assert answer.headers["content-type"] == "application/zip"
     assert answer.headers["content-disposition"] == 'attachment; filename="environment.zip"'
@@ -192,22 +192,22 @@ def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[st
     """OSM's nodes in the local frame of a tmap2, against PROJ's own transverse Mercator."""
     name = "osm/urban-usa-mn-minnesota-zoo/osm.xml"
     api.post("environments", {"name": "zoo"})
-    made = api.upload("zoo", {"osm.xml": (shared / "data" / name).read_bytes()}).json()
+    version = api.upload("zoo", {"osm.xml": (shared / "data" / name).read_bytes()}).json()
     counted = facts_json[name]["facts"]
     nodes = api.get("environments/zoo/versions/1/layers/topology?crs=wgs84").json()["features"]
     local = api.get("environments/zoo/versions/1/layers/topology?crs=local").json()["features"]
     assert sum(f["properties"]["kind"] == "node" for f in nodes) == counted["distinct_nodes_used_by_highway_ways"]
     datum = api.get("environments/zoo").json()["datum"]
     assert (datum["latitude"], datum["longitude"]) == (44.7644, -93.2073), "the south-west corner of <bounds>"
-    assert any("south-west corner" in w["problem"] for w in made["warnings"])
+    assert any("south-west corner" in w["problem"] for w in version["warnings"])
     pipe = f"+proj=tmerc +lat_0={datum['latitude']} +lon_0={datum['longitude']} +k=1 +ellps=WGS84"
     proj = Transformer.from_crs("EPSG:4326", pipe, always_xy=True)
     place = {f["id"]: f for f in local}
     earth = np.array([f["geometry"]["coordinates"][:2] for f in nodes if f["properties"]["kind"] == "node"])
     metres = [place[f["id"]] for f in nodes if f["properties"]["kind"] == "node"]
-    here = np.array([(f.get("place") or f["geometry"])["coordinates"][:2] for f in metres])
+    local_xy = np.array([(f.get("place") or f["geometry"])["coordinates"][:2] for f in metres])
     truth = np.column_stack(proj.transform(earth[:, 0], earth[:, 1]))
-    assert np.abs(here - truth).max() < 1e-6
+    assert np.abs(local_xy - truth).max() < 1e-6
 
 
 @pytest.mark.parametrize("way", [["kml"], ["geojson"], ["kml", "geojson"], ["geojson", "kml"], ["kmz"]])

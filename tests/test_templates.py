@@ -21,35 +21,37 @@ TMAP2 = formats.get_format("tmap2")
 def test_every_set_says_what_writers_take(name: str) -> None:
     one = templates.SETS[name]
     assert one.title
-    for known, values in one.values.items():
-        assert values, known
-        checked = templates.check_values(formats.get_format(known), values)
-        assert checked == dict(sorted(values.items())), f"{known}: values stand as they are kept"
-        defaults = {p["name"]: p["default"] for p in parameters.describe(formats.get_format(known).write_options)}
+    for format_name, values in one.values.items():
+        assert values, format_name
+        checked = templates.check_values(formats.get_format(format_name), values)
+        assert checked == dict(sorted(values.items())), f"{format_name}: values stand as they are kept"
+        defaults = {p["name"]: p["default"] for p in parameters.describe(formats.get_format(format_name).write_options)}
         same = [key for key, value in checked.items() if value == defaults[key]]
-        assert not same, f"{known}: {same} say the format's own defaults"
+        assert not same, f"{format_name}: {same} say the format's own defaults"
 
 
 def test_no_name_stands_for_two_things() -> None:
     """``set`` stands beside formats' names and parameters' names in a version's changes."""
     assert "set" not in formats.all_formats()
-    for known in formats.all_formats().values():
-        assert "set" not in {p["name"] for p in parameters.describe(known.write_options)}
+    for fmt in formats.all_formats().values():
+        assert "set" not in {p["name"] for p in parameters.describe(fmt.write_options)}
 
 
 def test_what_holds() -> None:
     assert templates.resolve(NO_TEMPLATES, TMAP2) is templates.NOTHING
-    said = Templates("outdoor", {"tmap2": Own(None, {"xy_goal_tolerance": 0.4}), "lif": Own(None, {"creator": "x"})})
-    found = templates.resolve(said, TMAP2)
-    assert found.values["xy_goal_tolerance"] == 0.4
-    assert found.origin["xy_goal_tolerance"] == templates.ENVIRONMENT
-    assert found.origin["verts_radius"] == "set outdoor"
-    assert "action" not in found.values
-    assert found.ignored == ()
-    own = templates.with_own(said, "tmap2", Own("default"))
-    assert templates.resolve(own, TMAP2).values == {}, "the default set on purpose"
-    assert templates.with_own(own, "tmap2", Own()).formats.keys() == {"lif"}
-    assert Templates.from_dict(said.as_dict()) == said
+    environment_templates = Templates(
+        "outdoor", {"tmap2": Own(None, {"xy_goal_tolerance": 0.4}), "lif": Own(None, {"creator": "x"})}
+    )
+    resolved_template = templates.resolve(environment_templates, TMAP2)
+    assert resolved_template.values["xy_goal_tolerance"] == 0.4
+    assert resolved_template.origin["xy_goal_tolerance"] == templates.ENVIRONMENT
+    assert resolved_template.origin["verts_radius"] == "set outdoor"
+    assert "action" not in resolved_template.values
+    assert resolved_template.ignored == ()
+    updated_templates = templates.with_own(environment_templates, "tmap2", Own("default"))
+    assert templates.resolve(updated_templates, TMAP2).values == {}, "the default set on purpose"
+    assert templates.with_own(updated_templates, "tmap2", Own()).formats.keys() == {"lif"}
+    assert Templates.from_dict(environment_templates.as_dict()) == environment_templates
     assert Templates.from_dict({}) == NO_TEMPLATES
     assert Templates("default", {"tmap2": Own()}) == NO_TEMPLATES
     assert hash(Templates("default", {"tmap2": Own()})) == hash(NO_TEMPLATES)
@@ -89,10 +91,10 @@ LANE = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>lanes</na
 </Document></kml>"""
 
 
-def texts(known: formats.Format) -> dict[str, str]:
+def texts(fmt: formats.Format) -> dict[str, str]:
     """The parameters of a writer that take any text and choose no stored part."""
     choosing = {"grid", "level", "name", "picture", "world"}
-    described = parameters.describe(known.write_options)
+    described = parameters.describe(fmt.write_options)
     return {p["name"]: EVIL for p in described if p["schema"] == {"type": "string"} and p["name"] not in choosing}
 
 
@@ -101,14 +103,14 @@ SAYING = [known.name for known in formats.all_formats().values() if texts(known)
 
 @pytest.mark.parametrize("name", SAYING)
 def test_no_text_breaks_out_of_a_file(name: str) -> None:
-    known = formats.get_format(name)
-    said = templates.check_values(known, texts(known))
-    hints, here = Hints(layer="topology"), Datum(53.2686, -0.5245)
-    made = offline({"lanes.kml": LANE}, name, hints=hints, datum=here, options=said)
-    main = next(iter(made.files))
-    back = formats.read(Group(known, main, made.files), ReadContext(frame=Layers({}, here).frame))
-    whole = str([(p.ids, p.properties, p.document) for p in back.parts.values() if isinstance(p, Features)])
-    filled = {line["option"] for line in made.report["template"] if line.get("option") in said}
+    fmt = formats.get_format(name)
+    options = templates.check_values(fmt, texts(fmt))
+    hints, datum = Hints(layer="topology"), Datum(53.2686, -0.5245)
+    converted = offline({"lanes.kml": LANE}, name, hints=hints, datum=datum, options=options)
+    main = next(iter(converted.files))
+    back = formats.read(Group(fmt, main, converted.files), ReadContext(frame=Layers({}, datum).frame))
+    content = str([(p.ids, p.properties, p.document) for p in back.parts.values() if isinstance(p, Features)])
+    filled = {line["option"] for line in converted.report["template"] if line.get("option") in options}
     assert filled
-    assert {line["from"] for line in made.report["template"] if line.get("option") in filled} == {"request"}
-    assert whole.count(repr(EVIL)[1:-1]) >= 1, "it came through as a text, whole"
+    assert {line["from"] for line in converted.report["template"] if line.get("option") in filled} == {"request"}
+    assert content.count(repr(EVIL)[1:-1]) >= 1, "it came through as a text, whole"

@@ -26,9 +26,9 @@ def walls() -> bytes:
 
 def house(mesh: str | None, *models: bytes) -> dict[str, bytes]:
     """A world with the house, whose mesh file is in the upload where it is named, and further models."""
-    told = (
+    world = (
         b"<sdf version='1.7'><world name='w'><model name='house'><static>true</static><link name='l'>"
         b"<collision name='c'><geometry><mesh><uri>model://house/meshes/walls.stl</uri></mesh></geometry></collision>"
         b"</link></model>" + b"".join(models) + b"</world></sdf>"
     )
-    return {"a.world": told, **({f"models/house/meshes/{mesh}": walls()} if mesh else {})}
+    return {"a.world": world, **({f"models/house/meshes/{mesh}": walls()} if mesh else {})}

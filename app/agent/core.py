@@ -248,8 +248,8 @@ class Agent:
         woken = self._wake.wait(seconds)
         if woken and not self._stopping.is_set():
             rejoined, self._rejoined = self._rejoined, False
-            most = REJOIN_SECONDS * random.random() if rejoined else self._gather  # noqa: S311
-            self._stopping.wait(most)
+            max_seconds = REJOIN_SECONDS * random.random() if rejoined else self._gather  # noqa: S311
+            self._stopping.wait(max_seconds)
         return woken
 
     @property
@@ -302,10 +302,10 @@ class Agent:
         connect, prefix = self.options.zenoh_connect, self.options.zenoh_prefix
         if connect is None or prefix is None:
             try:
-                found = self._web.readyz().get("events", {})
-                told = found.get("connect")
-                connect = connect or (plain(str(told)) if told else None)
-                prefix = prefix or plain(str(found.get("prefix") or messages.PREFIX))
+                events = self._web.readyz().get("events", {})
+                from_server = events.get("connect")
+                connect = connect or (plain(str(from_server)) if from_server else None)
+                prefix = prefix or plain(str(events.get("prefix") or messages.PREFIX))
             except (FleetMapError, AttributeError):
                 if connect is None or self._ear.aimed:
                     return
@@ -313,8 +313,8 @@ class Agent:
         if connect is None:
             self._tell_once("polling", detail="the server tells no router: FLEETMAP_ZENOH_CONNECT can name one")
             return
-        told = self.options.zenoh_connect is None
-        if told and not all(ROUTER.fullmatch(part.strip()) for part in connect.split(",")):
+        from_server = self.options.zenoh_connect is None
+        if from_server and not all(ROUTER.fullmatch(part.strip()) for part in connect.split(",")):
             detail = f"the server tells a router by what is no plain address ({connect[:300]}): FLEETMAP_ZENOH_CONNECT"
             self._tell_once("polling", detail=f"{detail} can name it")
             return
@@ -337,8 +337,8 @@ class Agent:
         except Stopped:
             raise
         except Exception as error:  # noqa: BLE001  a mistake of ours; who ends here is of no use to a robot
-            where = traceback.extract_tb(error.__traceback__)[-1]
-            place = f"{Path(where.filename).name}:{where.lineno}"
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{Path(frame.filename).name}:{frame.lineno}"
             self._fail("failed", f"internal error in the agent ({type(error).__name__} at {place}): {error}")
             good = False
         self._status.send()
@@ -547,14 +547,14 @@ class Agent:
         if manifest.channel is None or (self._called <= manifest.sequence and seconds < LONG_SECONDS):
             return None
 
-        def here(newer: Manifest) -> bool:
+        def is_present(newer: Manifest) -> bool:
             if newer.mark == manifest.mark:
                 return False
             self._wake.set()
             return self._downloads.has_all(newer)
 
         try:
-            return self._manifests.latest(manifest.channel, here)
+            return self._manifests.latest(manifest.channel, is_present)
         except FleetMapError:
             return None  # the next look tells of it
 
@@ -604,10 +604,10 @@ class Agent:
 
         is_planned: a planned version is reported as well; this status is then sent only if it is new.
         """
-        what = (outcome.state, outcome.detail, self._folder.standing, self._mark)
-        if is_planned and what == self._reported:
+        report_key = (outcome.state, outcome.detail, self._folder.standing, self._mark)
+        if is_planned and report_key == self._reported:
             return
-        self._reported = what
+        self._reported = report_key
         if outcome.state == "active":
             self._set_status("active", self._remark())
         elif outcome.state == "failed":
@@ -631,10 +631,10 @@ class Agent:
     def _report_error(self, error: FleetMapError, *, is_planned: bool = False) -> None:
         if isinstance(error, Busy):
             self._after = error.seconds
-        what = ("failed", error.detail, self._folder.standing, self._mark)
-        if is_planned and what == self._reported:
+        report_key = ("failed", error.detail, self._folder.standing, self._mark)
+        if is_planned and report_key == self._reported:
             return
-        self._reported = what
+        self._reported = report_key
         self._fail("refused" if isinstance(error, Untrusted) else "failed", error.detail)
 
     def _set_status(self, state: RobotState, detail: str | None = None, about: Subject | None = None) -> bool:
@@ -670,14 +670,14 @@ class Agent:
         moment = datetime.fromtimestamp(self._clock(), timezone.utc)
         return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
-    def _fail(self, what: str, detail: str) -> None:
-        self._tell(what, detail=detail)
+    def _fail(self, event: str, detail: str) -> None:
+        self._tell(event, detail=detail)
         self._set_status("failed", detail, self._about)
 
-    def _tell_once(self, what: str, **members: Any) -> None:
-        if what not in self._told:
-            self._told.add(what)
-            self._tell(what, **members)
+    def _tell_once(self, event: str, **members: Any) -> None:
+        if event not in self._told:
+            self._told.add(event)
+            self._tell(event, **members)
 
 
 def _version(subject: Subject | None) -> tuple[int, str]:

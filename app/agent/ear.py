@@ -114,29 +114,29 @@ class Ear:
 
     def _run(self) -> None:
         pause = 1.0
-        there = False
-        told: str | None = None
+        was_connected = False
+        last_problem: str | None = None
         while not self._stopping.is_set():
             if self._aimed.is_set():
                 self._aimed.clear()
                 self._shut()
-                there = False
+                was_connected = False
             if self._session is None:
                 if not self._open():
-                    if self.problem is not None and self.problem != told:
+                    if self.problem is not None and self.problem != last_problem:
                         self._lost(self.problem)
-                        told = self.problem
+                        last_problem = self.problem
                     self._aimed.wait(pause * random.uniform(0.5, 1.5))  # noqa: S311  jitter is no secret
                     pause = min(MAX_PAUSE_SECONDS, pause * 2)
                     continue
                 pause = 1.0
             now = self.connected
-            if now and not there:
-                told = None
+            if now and not was_connected:
+                last_problem = None
                 self._back()
-            elif there and not now:
+            elif was_connected and not now:
                 self._lost(f"the router at {self._where[0] if self._where else ''} is gone")
-            there = now
+            was_connected = now
             self._aimed.wait(LOOK_SECONDS)
 
     def _open(self) -> bool:
@@ -148,7 +148,7 @@ class Ear:
             self.problem = no_router(connect, error, self._login)
             return False
         try:
-            held = [
+            declarations = [
                 session.liveliness().declare_token(messages.robot_key(prefix, self._robot)),
                 ext.declare_advanced_subscriber(
                     session,
@@ -164,7 +164,7 @@ class Ear:
                 _close(session)
             return False
         with self._lock:
-            self._session, self._held = session, held
+            self._session, self._held = session, declarations
         self.problem = None
         return True
 
@@ -179,11 +179,11 @@ class Ear:
 
     def _shut(self) -> None:
         with self._lock:
-            session, held = self._session, self._held
+            session, declarations = self._session, self._held
             self._session, self._held = None, []
-        for item in held:
+        for declaration in declarations:
             with contextlib.suppress(Exception):
-                item.undeclare()
+                declaration.undeclare()
         if session is not None:
             with contextlib.suppress(Exception):
                 _close(session)

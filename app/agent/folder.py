@@ -104,18 +104,18 @@ class Folder:
     def standing(self) -> str | None:
         """The name of the version that ``current`` points to."""
         try:
-            where = self.current.readlink()
+            target = self.current.readlink()
         except OSError:
             return None
-        return where.name if where == Path("versions") / where.name else None
+        return target.name if target == Path("versions") / target.name else None
 
     def manifest(self, name: str | None) -> Manifest | None:
         """The manifest of a version that is there."""
         if name is None:
             return None
-        where = self.versions / name
+        path = self.versions / name
         try:
-            return parse((where / "manifest.json").read_bytes(), (where / "manifest.sig").read_text().strip())
+            return parse((path / "manifest.json").read_bytes(), (path / "manifest.sig").read_text().strip())
         except (OSError, ValueError, Untrusted):
             return None
 
@@ -129,12 +129,12 @@ class Folder:
 
     def index(self) -> dict[str, list[Path]]:
         """SHA-256 -> files of the versions that are there, as their manifests tell; not verified yet."""
-        found: dict[str, list[Path]] = {}
+        paths: dict[str, list[Path]] = {}
         for name in self._names():
             manifest = self.manifest(name)
             for file in manifest.files if manifest else ():
-                found.setdefault(file.sha256, []).append(self.versions / name / file.path)
-        return found
+                paths.setdefault(file.sha256, []).append(self.versions / name / file.path)
+        return paths
 
     def known(self, file: File, index: Mapping[str, Sequence[Path]]) -> Path | None:
         """A file with these bytes, fetched or of a version that is there; its hash is verified now."""
@@ -150,8 +150,8 @@ class Folder:
         standing = self.standing
         if old is None or standing is None:
             return None
-        where = self.versions / standing / old.path
-        return (where, old.sha256) if _holds(where, old) else None
+        path = self.versions / standing / old.path
+        return (path, old.sha256) if _holds(path, old) else None
 
     def make_room(self, manifest: Manifest, sources: Mapping[str, Path], keep: Sequence[File] = ()) -> None:
         """See that those of a manifest's files fit that are not among ``sources``, less what was fetched of them.
@@ -159,8 +159,8 @@ class Folder:
         Where they do not: without parts of other maps, then without old versions, then without what lies ready for a
         later map (``keep``). Unavailable where that is not enough.
         """
-        wanted = {file.sha256: file for file in manifest.files if file.path not in sources}.values()
-        count = sum(file.size - min(file.size, self._fetched(file)) for file in wanted) + CHUNK
+        new_files = {file.sha256: file for file in manifest.files if file.path not in sources}.values()
+        count = sum(file.size - min(file.size, self._fetched(file)) for file in new_files) + CHUNK
         steps: Sequence[Callable[[], None]] = (
             lambda: self._forget((*manifest.files, *keep)),
             lambda: self._drop(0, sources.values()),
@@ -199,8 +199,12 @@ class Folder:
         if manifest.closures_key:
             base += f"-{manifest.closures_key[:8]}"
         for name in (n for n in self._names() if n == base or n.startswith(base + ".")):
-            there = self.manifest(name)
-            if there is not None and there.map_key == manifest.map_key and not self.damaged(name, there):
+            existing_manifest = self.manifest(name)
+            if (
+                existing_manifest is not None
+                and existing_manifest.map_key == manifest.map_key
+                and not self.damaged(name, existing_manifest)
+            ):
                 self.describe(name, manifest)
                 return name
         staging = self.versions / ".new"
@@ -254,7 +258,7 @@ class Folder:
         self._drop(0)
         self._forget(())
 
-    def _drop(self, kept: int, needed: Iterable[Path] = ()) -> None:
+    def _drop(self, keep_count: int, needed: Iterable[Path] = ()) -> None:
         """Remove versions beside the current one but so many, the last used ones, and those of needed files."""
         spared = {self.standing} | {p.relative_to(self.versions).parts[0] for p in needed if self.versions in p.parents}
         old = [name for name in self._names() if name not in spared]
@@ -267,43 +271,43 @@ class Folder:
         for name in removable:
             root = _root_name(name)
             if (
-                kept
+                keep_count
                 and root not in {_root_name(s) for s in spare}
-                and (root == standing or len(roots | {root}) <= kept)
+                and (root == standing or len(roots | {root}) <= keep_count)
             ):
                 spare.add(name)
                 roots |= {root} - {standing}
         for name in (name for name in removable if name not in spare):
-            gone = self.versions / f".{name}"
-            shutil.rmtree(gone, ignore_errors=True)
-            (self.versions / name).rename(gone)
-            shutil.rmtree(gone, ignore_errors=True)
+            trash = self.versions / f".{name}"
+            shutil.rmtree(trash, ignore_errors=True)
+            (self.versions / name).rename(trash)
+            shutil.rmtree(trash, ignore_errors=True)
 
     def _forget(self, keep: Iterable[File]) -> None:
         """Remove fetched files, and parts, but those to keep."""
-        wanted = {file.sha256 for file in keep}
+        hashes = {file.sha256 for file in keep}
         for path in self.partial.iterdir():
-            if path.name.removesuffix(".part") not in wanted:
+            if path.name.removesuffix(".part") not in hashes:
                 path.unlink(missing_ok=True)
 
     def _names(self) -> list[str]:
         """Versions that are there, the last used first."""
-        found = [p for p in self.versions.iterdir() if p.is_dir() and not p.name.startswith(".")]
-        return [p.name for p in sorted(found, key=lambda p: (-p.stat().st_mtime, p.name))]
+        folders = [p for p in self.versions.iterdir() if p.is_dir() and not p.name.startswith(".")]
+        return [p.name for p in sorted(folders, key=lambda p: (-p.stat().st_mtime, p.name))]
 
-    def _describe(self, where: Path, manifest: Manifest) -> None:
+    def _describe(self, folder: Path, manifest: Manifest) -> None:
         """Write the manifest, and what follows from it, into a version's folder."""
-        write_new(where / "manifest.sig", manifest.signature.encode() + b"\n")
-        for path, data in self._descriptions(where, manifest):
+        write_new(folder / "manifest.sig", manifest.signature.encode() + b"\n")
+        for path, data in self._descriptions(folder, manifest):
             write_new(path, data)
-        write_new(where / "manifest.json", manifest.data)
+        write_new(folder / "manifest.json", manifest.data)
 
-    def _descriptions(self, where: Path, manifest: Manifest) -> list[tuple[Path, bytes]]:
+    def _descriptions(self, folder: Path, manifest: Manifest) -> list[tuple[Path, bytes]]:
         """Return the files that describe a version to others than the agent."""
         return [
-            (where / "environment.sh", environment_sh(manifest, self.current).encode()),
-            (where / "closures.json", closures_json(manifest)),
-            (where / "levels.json", levels_json(manifest)),
+            (folder / "environment.sh", environment_sh(manifest, self.current).encode()),
+            (folder / "closures.json", closures_json(manifest)),
+            (folder / "levels.json", levels_json(manifest)),
         ]
 
 
@@ -356,21 +360,21 @@ def environment_sh(manifest: Manifest, current: Path) -> str:
     As in the template a variable is empty where its file is absent, so that sourcing it again leaves nothing stale. All
     values are literals in single quotes: whoever names a file does not run anything.
     """
-    there: dict[str, list[str]] = {}
+    names_by_format: dict[str, list[str]] = {}
     for file in manifest.files:
-        there.setdefault(file.format, []).append(file.name)
+        names_by_format.setdefault(file.format, []).append(file.name)
     values: dict[str, str] = {}
-    for variable, format_, wanted in TEMPLATE:
-        names = there.get(format_, [])
-        found = next((name for name in wanted if name in names), None)
-        if found is None and variable in ("TMAP_FILE", "GAZEBO_WORLD_FILE") and len(names) == 1:
-            found = names[0]
-        values[variable] = str(current / format_ / found) if found else ""
-    models = any(name.startswith("models/") for name in there.get("gazebo", ()))
+    for variable, format_, candidates in TEMPLATE:
+        names = names_by_format.get(format_, [])
+        file_name = next((name for name in candidates if name in names), None)
+        if file_name is None and variable in ("TMAP_FILE", "GAZEBO_WORLD_FILE") and len(names) == 1:
+            file_name = names[0]
+        values[variable] = str(current / format_ / file_name) if file_name else ""
+    models = any(name.startswith("models/") for name in names_by_format.get("gazebo", ()))
     values["GAZEBO_CUSTOM_MODELS"] = str(current / "gazebo" / "models") if models else ""
     for variable, ending in (("POI_FILE", "poi.kml"), ("PROPERTIES_FILE", "properties.sh")):
-        found = next((file.path for file in manifest.files if file.path.rpartition("/")[2] == ending), None)
-        values[variable] = str(current / found) if found else ""
+        file_name = next((file.path for file in manifest.files if file.path.rpartition("/")[2] == ending), None)
+        values[variable] = str(current / file_name) if file_name else ""
     place = {**dict.fromkeys(PLACE, ""), **manifest.variables}
     values |= {name: value for name, value in place.items() if name not in (*values, "GAZEBO_MODEL_PATH")}
     values |= _level_variables(manifest, current)
@@ -396,8 +400,8 @@ def _level_variables(manifest: Manifest, current: Path) -> dict[str, str]:
     for level in manifest.levels:
         suffix = re.sub(r"[^A-Z0-9]", "_", level.name.upper())
         names = {(f.format, f.name.rpartition("/")[2]): f.path for f in manifest.files if f.level == level.name}
-        for variable, format_, wanted in TEMPLATE:
-            path = next((names[format_, name] for name in wanted if (format_, name) in names), None)
+        for variable, format_, candidates in TEMPLATE:
+            path = next((names[format_, name] for name in candidates if (format_, name) in names), None)
             if path is not None:
                 values.setdefault(f"{variable}_{suffix}", str(current / path))
     return values

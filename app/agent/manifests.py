@@ -60,10 +60,10 @@ class Manifests:
             _, latest_etag, manifest = self._latest
             if manifest.mark == mark and manifest.expires.timestamp() > now:
                 etag, cached = latest_etag, manifest
-        found = self._web.manifest(self._options.environment, channel, self._query, etag)
-        if found is None:
+        response = self._web.manifest(self._options.environment, channel, self._query, etag)
+        if response is None:
             return cached if cached is not None and accept(cached) else None
-        manifest, key = self._verify(found[0], found[1], channel, mark)
+        manifest, key = self._verify(response[0], response[1], channel, mark)
         if self._clock.is_plausible(manifest):
             self._freshness.observe(manifest, self._clock.local)
         if not accept(manifest):
@@ -76,18 +76,18 @@ class Manifests:
             self._log("trusting", key=trust.key_id(key), detail="rotated" if state.key else "first contact")
         state = dataclasses.replace(state, key=key, newest_time=self._clock.floor)
         self._store.keep(state.marked(channel, manifest.mark))
-        self._latest = (request_key, found[2], manifest)
+        self._latest = (request_key, response[2], manifest)
         return manifest
 
     def planned(self, version: int) -> Manifest:
         """Fetch the manifest of a version that a channel is planned to move to. Raises Untrusted."""
         closures = "&closures=apply" if self.has_closures else ""
-        found = self._web.manifest(self._options.environment, str(version), self._query + closures)
-        if found is not None and not closures and trust.parse(found[0], found[1]).overlays_digest is not None:
-            found = self._web.manifest(self._options.environment, str(version), f"{self._query}&closures=apply")
-        if found is None:
+        response = self._web.manifest(self._options.environment, str(version), self._query + closures)
+        if response is not None and not closures and trust.parse(response[0], response[1]).overlays_digest is not None:
+            response = self._web.manifest(self._options.environment, str(version), f"{self._query}&closures=apply")
+        if response is None:
             raise Unavailable(f"the server did not return the manifest of version {version}")
-        manifest, _ = self._verify(found[0], found[1], None, None)
+        manifest, _ = self._verify(response[0], response[1], None, None)
         if manifest.version != version:
             raise Untrusted(f"the manifest is of version {manifest.version}, and {version} was asked for")
         return manifest

@@ -33,21 +33,21 @@ def parse_formats(text: str) -> tuple[str, ...]:
 
 def parse_requests(required: Sequence[str], optional: Sequence[str]) -> tuple[FormatRequest, ...]:
     """Parse the entries of ``--formats`` and ``--optional``. Raises Invalid if a format is invalid or named twice."""
-    found: dict[str, FormatRequest] = {}
+    requests: dict[str, FormatRequest] = {}
     for entry in (*required, *optional):
         name, _, query = entry.partition("?")
         if not _FORMAT.fullmatch(name):
             raise Invalid(
                 f"invalid format {entry[:80]!r}: write NAME or NAME?PARAMETER=VALUE, as occupancy_grid?level=L2"
             )
-        if name in found:
+        if name in requests:
             raise Invalid(f"duplicate format {name}: name each format once, in --formats or in --optional")
         try:
             parameters = tuple(parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query)))
         except ValueError:
             raise Invalid(f"invalid parameters {query[:80]!r}: write PARAMETER=VALUE, joined by &") from None
-        found[name] = FormatRequest(name, parameters)
-    return tuple(found.values())
+        requests[name] = FormatRequest(name, parameters)
+    return tuple(requests.values())
 
 
 def encode_entries(requests: Sequence[FormatRequest]) -> str:

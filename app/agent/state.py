@@ -71,7 +71,7 @@ def load(path: Path, environment: str) -> State:
         body = json.loads(path.read_bytes())
         if body["form"] not in (1, FORM):
             raise ValueError(f"it has the form {body['form']}, and this agent reads forms 1 and {FORM}")
-        found = State(
+        state = State(
             environment=str(body["environment"]),
             key=base64.b64decode(body["key"]) if body.get("key") else None,
             given=body.get("given"),
@@ -89,7 +89,7 @@ def load(path: Path, environment: str) -> State:
             working=_name(body["working"] if "working" in body else body.get("activated")),
             newest_time=float(body.get("newest_time", 0)),
         )
-        if not 0 <= found.newest_time <= MAX_TIME:
+        if not 0 <= state.newest_time <= MAX_TIME:
             raise ValueError("newest_time is not a time")
     except FileNotFoundError:
         return State(environment)
@@ -97,9 +97,9 @@ def load(path: Path, environment: str) -> State:
         raise Invalid(
             f"{path} cannot be read ({error}). Remove it to start afresh; the key is then pinned anew at first contact"
         ) from None
-    if found.environment != environment:
-        raise Invalid(f"{path.parent} holds maps of {found.environment}, not of {environment}: use a folder for each")
-    return found
+    if state.environment != environment:
+        raise Invalid(f"{path.parent} holds maps of {state.environment}, not of {environment}: use a folder for each")
+    return state
 
 
 def save(path: Path, state: State) -> None:

@@ -135,7 +135,7 @@ def parse(data: bytes, signature: str) -> Manifest:
         files = tuple(File(f["format"], f["name"], f["size"], f["sha256"], f.get("level")) for f in body["files"])
         signed_at = body.get("time")
         expires = read_time(body["expires"])
-        found = Manifest(
+        manifest = Manifest(
             body["environment"],
             body.get("channel"),
             body["sequence"],
@@ -158,20 +158,22 @@ def parse(data: bytes, signature: str) -> Manifest:
         )
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
-    whole = all(
+    valid_numbers = all(
         type(n) is int and 0 <= n < 2**63
-        for n in (found.sequence, found.version, found.epoch, *(f.size for f in files))
+        for n in (manifest.sequence, manifest.version, manifest.epoch, *(f.size for f in files))
     )
-    texts = all(isinstance(t, str) for t in (found.environment, found.channel or "", found.root))
-    hashes = texts and all(isinstance(h, str) and _HASH.fullmatch(h) for h in (found.root, *(f.sha256 for f in files)))
-    if not (whole and hashes) or expires.tzinfo is None or len(files) > MAX_FILES:
+    texts = all(isinstance(t, str) for t in (manifest.environment, manifest.channel or "", manifest.root))
+    hashes = texts and all(
+        isinstance(h, str) and _HASH.fullmatch(h) for h in (manifest.root, *(f.sha256 for f in files))
+    )
+    if not (valid_numbers and hashes) or expires.tzinfo is None or len(files) > MAX_FILES:
         raise Untrusted("the server's manifest cannot be read: a number, a hash or the time of expiry is none")
     _check_paths(files)
-    _check_variables(found.variables)
-    _check_site(found)
-    if not all(isinstance(t, str) for t in found.layers.values()) or not all(map(_LAYER.fullmatch, found.layers)):
+    _check_variables(manifest.variables)
+    _check_site(manifest)
+    if not all(isinstance(t, str) for t in manifest.layers.values()) or not all(map(_LAYER.fullmatch, manifest.layers)):
         raise Untrusted("the server's manifest cannot be read: a layer's name or hash is none")
-    return found
+    return manifest
 
 
 def read_time(text: str) -> datetime:
@@ -179,12 +181,12 @@ def read_time(text: str) -> datetime:
 
     Python 3.10's own ``fromisoformat`` reads neither ``Z`` nor a fraction of other than 3 or 6 digits.
     """
-    found = _TIME.fullmatch(text)
-    if found is None:
+    match = _TIME.fullmatch(text)
+    if match is None:
         raise ValueError(f"not an RFC 3339 time: {text[:80]!r}")
-    fraction = f".{(found['fraction'] + '000000')[:6]}" if found["fraction"] else ""
-    zone = "+00:00" if found["zone"] in ("Z", "z") else found["zone"]
-    moment = datetime.fromisoformat(f"{found['date']}T{found['clock']}{fraction}{zone}")
+    fraction = f".{(match['fraction'] + '000000')[:6]}" if match["fraction"] else ""
+    zone = "+00:00" if match["zone"] in ("Z", "z") else match["zone"]
+    moment = datetime.fromisoformat(f"{match['date']}T{match['clock']}{fraction}{zone}")
     try:
         return moment.astimezone(timezone.utc)
     except OverflowError:
@@ -249,10 +251,10 @@ def _check_paths(files: Sequence[File]) -> None:
     seen: set[str] = set()
     folders: set[str] = set()
     for file in files:
-        known = isinstance(file.format, str) and _FORMAT.fullmatch(file.format)
+        valid_format = isinstance(file.format, str) and _FORMAT.fullmatch(file.format)
         pieces = file.name.split("/") if isinstance(file.name, str) else [""]
         fine = (
-            known
+            valid_format
             and len(pieces) <= MAX_DEPTH
             and all(p not in ("", ".", "..") and len(p.encode("utf-8", "replace")) <= 255 for p in pieces)
         )
@@ -284,33 +286,35 @@ def signer(
         raise Untrusted("the server's manifest is not signed")
     if pinned is None and given is not None:
         pinned = _bytes(given) if not _KEY_ID.fullmatch(given) else None
-    known = pinned is not None and key_id(pinned) == name
-    key = pinned if pinned is not None and known else _from_server(name, pinned, given, keys())
+    is_pinned = pinned is not None and key_id(pinned) == name
+    key = pinned if pinned is not None and is_pinned else _from_server(name, pinned, given, keys())
     if not _verifies(key, signed, data):
         raise Untrusted(f"the manifest's signature is not that of the key {name}: it was changed on its way")
     return key
 
 
 def _from_server(name: str, pinned: bytes | None, given: str | None, keys: Sequence[Mapping[str, Any]]) -> bytes:
-    known: dict[str, tuple[bytes, Mapping[str, Any]]] = {}
+    server_keys: dict[str, tuple[bytes, Mapping[str, Any]]] = {}
     for line in keys:
         public = _bytes(str(line.get("public_key", "")))
         if public is not None and len(public) == 32 and line.get("id") == key_id(public):
-            known[key_id(public)] = (public, line)
-    if name not in known:
+            server_keys[key_id(public)] = (public, line)
+    if name not in server_keys:
         raise Untrusted(f"the manifest is signed with the key {name}, which the server does not tell")
     trusted = key_id(pinned) if pinned is not None else given
     if trusted is None:
-        return known[name][0]  # first contact: whoever answers is believed, and only he from now on
+        return server_keys[name][0]  # first contact: whoever answers is believed, and only he from now on
     at = name
-    for _ in range(len(known) + 1):
+    for _ in range(len(server_keys) + 1):
         if at == trusted:
-            return known[name][0]
-        if at not in known:
+            return server_keys[name][0]
+        if at not in server_keys:
             break
-        public, line = known[at]
+        public, line = server_keys[at]
         by = str(line.get("endorsed_by", ""))
-        voucher = pinned if pinned is not None and by == key_id(pinned) else known[by][0] if by in known else None
+        voucher = (
+            pinned if pinned is not None and by == key_id(pinned) else server_keys[by][0] if by in server_keys else None
+        )
         endorsement = _bytes(str(line.get("endorsement", "")))
         if voucher is None or endorsement is None or not _verifies(voucher, endorsement, public):
             break

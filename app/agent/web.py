@@ -169,15 +169,15 @@ class Web:
 
     def keys(self) -> list[Mapping[str, Any]]:
         """The keys that sign, the newest first."""
-        found = self._json(f"{API}/keys")
-        return [line for line in found if isinstance(line, dict)] if isinstance(found, list) else []
+        body = self._json(f"{API}/keys")
+        return [line for line in body if isinstance(line, dict)] if isinstance(body, list) else []
 
     def channels(self, environment: str) -> list[Mapping[str, Any]]:
         """The channels with what is planned for them, without how the fleet stands."""
-        found = self._json(f"{API}/environments/{quote(environment, safe='')}/channels?robots=false")
-        if not isinstance(found, list):
+        body = self._json(f"{API}/environments/{quote(environment, safe='')}/channels?robots=false")
+        if not isinstance(body, list):
             raise Unavailable(f"{self.server} does not answer as a Fleet Map Server: these are no channels")
-        return [line for line in found if isinstance(line, dict)]
+        return [line for line in body if isinstance(line, dict)]
 
     def manifest(
         self, environment: str, ref: str, query: str, etag: str | None = None
@@ -197,8 +197,8 @@ class Web:
                     return data, answer.headers.get(SIGNATURE, ""), answer.headers.get("etag")
                 if answer.status_code != 202:
                     raise self._refused(answer)
-                where = answer.headers.get("location", "")
-            self._wait(path, where)
+                location = answer.headers.get("location", "")
+            self._wait(path, location)
         raise Unavailable(f"{self.server} makes the maps again and again, and does not hand them out")
 
     def put_status(self, robot: str, body: Mapping[str, Any]) -> None:
@@ -239,7 +239,7 @@ class Web:
             if part.exists() and part.stat().st_size > file.size:
                 part.unlink()
             try:
-                whole = self._receive(path, part, file, old if fresh else None)
+                complete = self._receive(path, part, file, old if fresh else None)
             except UnreadableDelta:
                 self.failed_deltas += 1
                 part.unlink(missing_ok=True)
@@ -252,7 +252,7 @@ class Web:
             part.unlink(missing_ok=True)
             if overlays is not None and self._overlays not in (None, overlays):
                 raise ClosuresChanged(f"{file.path} has other closures than the manifest")
-            if fresh and whole:
+            if fresh and complete:
                 break
             old = None  # a delta, or a part of before, that did not fit: once more from the start
         raise Untrusted(f"{file.path} has other bytes than the manifest says: it was changed on its way")
@@ -351,14 +351,14 @@ class Web:
     def _wait(self, path: str, location: str) -> None:
         """Until the job is done to which ``path`` was answered; its problem where it fails."""
         try:
-            where = urljoin(path, location)
+            address = urljoin(path, location)
         except ValueError:
-            where = ""
-        if not where.startswith("/") or where.startswith("//"):
+            address = ""
+        if not address.startswith("/") or address.startswith("//"):
             raise Unavailable(f"{self.server} names a job that is not its own")
         pause, waited = 0.3, 0.0
         while True:
-            job = self._json(where)
+            job = self._json(address)
             state = job.get("state") if isinstance(job, dict) else None
             if state == "done":
                 return
@@ -386,12 +386,12 @@ class Web:
             with contextlib.closing(answer):
                 yield answer
 
-    def _note(self, event: str, told: Mapping[str, Any]) -> None:
+    def _note(self, event: str, details: Mapping[str, Any]) -> None:
         """Remember the connections, to be able to interrupt them."""
         if event in ("connection.connect_tcp.complete", "connection.start_tls.complete"):
-            made = told["return_value"].get_extra_info("socket")
-            if isinstance(made, socket.socket):
-                self._sockets = [*(s for s in self._sockets if s.fileno() != -1), made]
+            connection = details["return_value"].get_extra_info("socket")
+            if isinstance(connection, socket.socket):
+                self._sockets = [*(s for s in self._sockets if s.fileno() != -1), connection]
 
     @contextlib.contextmanager
     def _reach(self) -> Iterator[None]:
@@ -449,7 +449,7 @@ def _fits(old: int, new: int) -> bool:
 
 def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterator[bytes]:
     """The new file of a ``dcz`` body, in pieces; never much more than the manifest's size."""
-    where, sha256 = old
+    old_path, sha256 = old
     want = DCZ_MAGIC + bytes.fromhex(sha256)
     head = b""
     for chunk in chunks:
@@ -459,16 +459,16 @@ def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterato
     if head[: len(want)] != want:
         raise UnreadableDelta(f"{file.path}: the delta is not one to the file that is here")
     decoder = zstd.ZstdDecompressor(
-        zstd.ZstdDict(where.read_bytes(), is_raw=True).as_prefix,
+        zstd.ZstdDict(old_path.read_bytes(), is_raw=True).as_prefix,
         options={zstd.DecompressionParameter.window_log_max: WINDOW_LOG},
     )
-    made = 0
+    size = 0
     data: bytes | None = head[len(want) :]
     try:
         while data is not None and not decoder.eof:
             out = decoder.decompress(data, max_length=1 << 20)
-            made += len(out)
-            if made > file.size:
+            size += len(out)
+            if size > file.size:
                 raise UnreadableDelta(f"{file.path}: the delta unfolds to more bytes than the manifest says")
             if out:
                 yield out

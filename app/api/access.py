@@ -99,8 +99,8 @@ def is_open(path: str) -> bool:
 
 def environment_of(path: str) -> str | None:
     """The environment that an address speaks of."""
-    found = _ENVIRONMENT.fullmatch(path)
-    return found[1] if found else None
+    match = _ENVIRONMENT.fullmatch(path)
+    return match[1] if match else None
 
 
 class Access:
@@ -127,8 +127,8 @@ class Access:
             return NOBODY
         if header is None:
             return None
-        found = self._known.get(hashlib.sha256(header).digest())
-        return found[0] if found is not None and self._clock() < found[1] else None
+        entry = self._known.get(hashlib.sha256(header).digest())
+        return entry[0] if entry is not None and self._clock() < entry[1] else None
 
     def check(self, header: bytes | None, client: str | None) -> Principal:
         """Who sent this header. Asks the store, so call it from a thread.
@@ -137,9 +137,9 @@ class Access:
 
         Raises Unauthenticated; Throttled for a wrong token after too many from the client's address.
         """
-        known = self.known(header)
-        if known is not None:
-            return known
+        cached = self.known(header)
+        if cached is not None:
+            return cached
         if header is None:
             raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
         forgotten = self.forgotten

@@ -29,8 +29,8 @@ router = APIRouter(tags=["alignments"], route_class=Route)
 def create_alignment(
     env: EnvironmentPath,
     body: AlignmentBody,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
@@ -42,7 +42,7 @@ def create_alignment(
         reason = "give either onto or pairs"
         raise Invalid(reason, [Problem(reason, where="body.onto")])
     onto = body.onto or OntoBody.model_validate({})
-    wish = Alignment(
+    request = Alignment(
         grid=body.grid,
         level=body.level,
         layer=onto.layer,
@@ -56,8 +56,8 @@ def create_alignment(
         least=body.least,
         dry_run=body.dry_run,
     )
-    outcome = here.ingest.align(
-        env, wish, message=body.message, author=who.name, if_match=if_match, idempotency=idempotency_key
+    outcome = services.ingest.align(
+        env, request, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
     )
     version = outcome.version
     if version is None or outcome.status == "unchanged":

@@ -69,15 +69,15 @@ class Route(APIRoute):
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """FastAPI's hook."""
         handler = super().get_route_handler()
-        known = {field.alias for field in _query_fields(self.dependant)}
+        allowed_names = {field.alias for field in _query_fields(self.dependant)}
         free = bool((self.openapi_extra or {}).get("x-free-query"))
 
         async def exact(request: Request) -> Response:
             if not free:
-                unknown = sorted(set(request.query_params) - known)
+                unknown = sorted(set(request.query_params) - allowed_names)
                 if unknown:
-                    accepted = ", ".join(sorted(known)) or "none"
-                    near = did_you_mean(unknown[0], known)
+                    accepted = ", ".join(sorted(allowed_names)) or "none"
+                    near = did_you_mean(unknown[0], allowed_names)
                     raise Invalid(
                         f"unknown query parameter {unknown[0][:80]!r}{near}; accepted: {accepted}",
                         [Problem(f"unknown; accepted: {accepted}", where=name[:80]) for name in unknown[:20]],

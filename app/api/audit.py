@@ -21,7 +21,7 @@ router = APIRouter(prefix="/audit", tags=["audit"], route_class=Route)
 @router.get("", responses=told(list[AuditOut]), summary="Who changed what, from where")
 def list_audit(
     request: Request,
-    here: Here,
+    services: Here,
     _: ServerAdmin,
     environment: Annotated[str | None, Query(max_length=63, description="Only changes of this environment.")] = None,
     token_id: Annotated[str | None, Query(max_length=32, description="Only changes made with this token.")] = None,
@@ -38,7 +38,7 @@ def list_audit(
     if cursor is not None and not (cursor.isascii() and cursor.isdigit()):
         raise Invalid("cursor must be taken from the Link header of the page before")
     before = None if cursor is None else int(cursor)
-    entries = here.store.audit(environment=environment, token_id=token_id, before=before, limit=limit + 1)
+    entries = services.store.audit(environment=environment, token_id=token_id, before=before, limit=limit + 1)
     more = str(entries[limit - 1].id) if len(entries) > limit else None
     return page(request, [as_dict(entry) for entry in entries[:limit]], more)
 

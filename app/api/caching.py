@@ -30,9 +30,9 @@ def match(header: str | None, *etags: str) -> bool:
 def _tags(header: str) -> list[tuple[bool, str]]:
     """The entity tags of a list; what is not one ends it."""
     out, at = [], 0
-    while at < len(header) and (found := _TAG.match(header, at)):
-        out.append((bool(found[1]), found[2]))
-        at = found.end()
+    while at < len(header) and (tag := _TAG.match(header, at)):
+        out.append((bool(tag[1]), tag[2]))
+        at = tag.end()
     return out
 
 

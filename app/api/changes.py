@@ -42,7 +42,7 @@ def get_delta(
     env: EnvironmentPath,
     v: VersionPath,
     request: Request,
-    here: Here,
+    services: Here,
     _: Viewer,
     since: Annotated[
         str, Query(pattern=VERSION, description="What the client has: number, channel, or `latest`.", examples=["0"])
@@ -57,9 +57,9 @@ def get_delta(
     of the grid, row 0 at the bottom, `data` row by row, 0…100 and -1 for unknown. `whole`: the grid's frame is another
     one (or most of a large grid changed): fetch it. `other`: parts that have no delta: fetch what is made of them.
     """
-    new, old = here.store.version(env, number_of(v)), here.store.version(env, number_of(since))
-    wanted: Anchor = crs or ("wgs84" if new.datum else "local")
-    seed = json_bytes(["delta", old.root, new.root, old.number, new.number, wanted, env])
+    new, old = services.store.version(env, number_of(v)), services.store.version(env, number_of(since))
+    anchor: Anchor = crs or ("wgs84" if new.datum else "local")
+    seed = json_bytes(["delta", old.root, new.root, old.number, new.number, anchor, env])
     headers = {
         "etag": f'"{hashlib.sha256(seed).hexdigest()[:32]}"',
         "fleetmap-version": str(new.number),
@@ -67,26 +67,26 @@ def get_delta(
     }
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
-    delta = here.store.delta_parts(old, new)
+    delta = services.store.delta_parts(old, new)
     body = {
         "environment": env,
         "since": {"version": old.number, "root": old.root},
         "version": new.number,
         "root": new.root,
-        "crs": wanted,
+        "crs": anchor,
         "datum": {"changed": delta.datum, "value": new.datum.as_dict() if new.datum else None},
         "levels": {"changed": delta.levels, "value": [[level.name, level.elevation] for level in new.levels]},
-        "layers": _layers(here, new, delta, wanted),
-        "grids": [_grid(here, new, change) for change in delta.grids],
+        "layers": _layers(services, new, delta, anchor),
+        "grids": [_grid(services, new, change) for change in delta.grids],
         "other": [_named(key) for key in delta.other],
     }
     return answer(body, headers=headers)
 
 
-def _layers(here: Services, new: Version, delta: Delta, crs: Anchor) -> dict[str, Any]:
+def _layers(services: Services, new: Version, delta: Delta, crs: Anchor) -> dict[str, Any]:
     changes = list(delta.features)
     if delta.datum:
-        changes = _everything(here, new, changes)
+        changes = _everything(services, new, changes)
     frame = local_frame(new.datum) if new.datum else None
     puts: dict[str, list[tuple[PartKey, Features]]] = {}
     deleted: dict[str, list[dict[str, str]]] = {}
@@ -98,8 +98,8 @@ def _layers(here: Services, new: Version, delta: Delta, crs: Anchor) -> dict[str
                 "for the other crs, or give it a datum"
             )
         puts.setdefault(layer, []).append((change.key, change.put))
-        gone = [{"id": item, "level": change.key.level, "part": change.key.name} for item in change.deleted]
-        deleted.setdefault(layer, []).extend(gone)
+        removed_items = [{"id": item, "level": change.key.level, "part": change.key.name} for item in change.deleted]
+        deleted.setdefault(layer, []).extend(removed_items)
     return {
         layer: {
             "put": orjson.Fragment(feature_collection(parts, crs, frame, new, with_datum=False)),
@@ -109,24 +109,24 @@ def _layers(here: Services, new: Version, delta: Delta, crs: Anchor) -> dict[str
     }
 
 
-def _everything(here: Services, new: Version, changes: Sequence[FeatureDelta]) -> list[FeatureDelta]:
+def _everything(services: Services, new: Version, changes: Sequence[FeatureDelta]) -> list[FeatureDelta]:
     """All features are put, since in the frame that is answered in each may have moved."""
     out = {change.key: change for change in changes}
     for entry in new.parts:
         if entry.key.layer in VECTOR_LAYERS:
-            known = out.get(entry.key)
-            gone = known.deleted if known is not None else ()
-            out[entry.key] = FeatureDelta(entry.key, here.store.features(new, entry.key), gone)
+            delta = out.get(entry.key)
+            deleted = delta.deleted if delta is not None else ()
+            out[entry.key] = FeatureDelta(entry.key, services.store.features(new, entry.key), deleted)
     return [out[key] for key in sorted(out)]
 
 
-def _grid(here: Services, new: Version, change: GridDelta) -> dict[str, Any]:
+def _grid(services: Services, new: Version, change: GridDelta) -> dict[str, Any]:
     out: dict[str, Any] = {"name": change.key.name, "level": change.key.level, "deleted": change.deleted}
-    whole = change.whole or sum(r.cells.size for r in change.rectangles) > MAX_CELLS
-    out |= {"whole": whole, "frame": None, "updates": []}
+    complete = change.whole or sum(r.cells.size for r in change.rectangles) > MAX_CELLS
+    out |= {"whole": complete, "frame": None, "updates": []}
     if change.deleted:
         return out
-    part = here.store.load(new, [change.key]).parts[change.key]
+    part = services.store.load(new, [change.key]).parts[change.key]
     assert isinstance(part, OccupancyGrid)
     out["frame"] = {
         "width": part.width,
@@ -134,7 +134,7 @@ def _grid(here: Services, new: Version, change: GridDelta) -> dict[str, Any]:
         "resolution": part.resolution,
         "origin": list(part.origin),
     }
-    if not whole:
+    if not complete:
         out["updates"] = [_update(rectangle) for rectangle in change.rectangles]
     return out
 

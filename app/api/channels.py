@@ -58,15 +58,15 @@ def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> 
     return out
 
 
-def _one(here: Services, env: str, channel: Channel) -> dict[str, Any]:
-    return as_dict(channel, here.store.robots(env), datetime.now(UTC))
+def _one(services: Services, env: str, channel: Channel) -> dict[str, Any]:
+    return as_dict(channel, services.store.robots(env), datetime.now(UTC))
 
 
 @router.get("", responses=told(list[ChannelOut], 404), summary="All channels")
 async def list_channels(
     env: EnvironmentPath,
     request: Request,
-    here: Here,
+    services: Here,
     _: Viewer,
     robots: Annotated[
         bool, Query(description="`false`: without how their robots stand, which costs a look at all.")
@@ -78,26 +78,28 @@ async def list_channels(
     `failed` make up the `total`; `ready` have what is planned.
     """
     if robots:  # a look of one's own: what robots say is no commit that others' looks would be too old for
-        headers, data = await run_in_threadpool(_listed, here, env, request, robots)
+        headers, data = await run_in_threadpool(_listed, services, env, request, robots)
     else:
-        headers, data = await here.hot.shared(request, _listed, here, env, request, robots)
+        headers, data = await services.hot.shared(request, _listed, services, env, request, robots)
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
     return Response(data, 200, headers, "application/json")
 
 
-def _listed(here: Services, env: str, request: Request, robots: bool) -> tuple[dict[str, str], bytes]:
-    generation, now = here.hot.generation(), datetime.now(UTC)
-    fleet_of = here.store.robots(env) if robots else None
-    data = json_bytes([as_dict(channel, fleet_of, now) for channel in here.store.channels(env)])
+def _listed(services: Services, env: str, request: Request, robots: bool) -> tuple[dict[str, str], bytes]:
+    generation, now = services.hot.generation(), datetime.now(UTC)
+    fleet_of = services.store.robots(env) if robots else None
+    data = json_bytes([as_dict(channel, fleet_of, now) for channel in services.store.channels(env)])
     headers = {"etag": f'"{hashlib.sha256(data).hexdigest()[:40]}"', "cache-control": "no-cache"}
     if not robots:  # this is what robots ask for, all of them at once
-        here.hot.keep(request, env, headers, data, generation)
+        services.hot.keep(request, env, headers, data, generation)
     return headers, data
 
 
 @router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")
-def move_channel(env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, here: Here, who: Editor) -> Response:
+def move_channel(
+    env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, services: Here, principal: Editor
+) -> Response:
     """To a newer version or back to an older one, now or at a time to come. `latest` moves by itself.
 
     With `rollout` in two stages: robots are told (`channel.planned`), fetch the version and report `ready`; the channel
@@ -113,43 +115,43 @@ def move_channel(env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, 
         if body.activate_at <= datetime.now(UTC) - CLOCKS_DIFFER:
             raise _refused("activate_at is in the past: leave it out to move now")
     rollout = _rollout(body) if body.rollout is not None else None
-    version = here.store.version(env, body.version).number
-    moved = here.store.set_channel(
-        env, channel, version, author=who.name, activate_at=body.activate_at, rollout=rollout
+    version = services.store.version(env, body.version).number
+    moved = services.store.set_channel(
+        env, channel, version, author=principal.name, activate_at=body.activate_at, rollout=rollout
     )
-    return answer(_one(here, env, moved))
+    return answer(_one(services, env, moved))
 
 
 def _rollout(body: ChannelBody) -> Rollout:
-    wish, now = body.rollout, datetime.now(UTC)
-    assert wish is not None
-    if wish.ready is None and wish.failed is None:
+    request, now = body.rollout, datetime.now(UTC)
+    assert request is not None
+    if request.ready is None and request.failed is None:
         raise _refused("a rollout takes ready, failed, or both", "body.rollout")
-    if wish.deadline is not None:
-        where = "body.rollout.deadline"
-        if wish.ready is None:
-            raise _refused("deadline limits the waiting for robots: it needs ready", where)
-        if wish.deadline.tzinfo is None:
-            raise _refused("deadline needs a zone, like 2030-01-31T06:00:00Z", where)
-        if wish.deadline <= (body.activate_at or now):
-            raise _refused("deadline must lie in the future, and after activate_at", where)
+    if request.deadline is not None:
+        location = "body.rollout.deadline"
+        if request.ready is None:
+            raise _refused("deadline limits the waiting for robots: it needs ready", location)
+        if request.deadline.tzinfo is None:
+            raise _refused("deadline needs a zone, like 2030-01-31T06:00:00Z", location)
+        if request.deadline <= (body.activate_at or now):
+            raise _refused("deadline must lie in the future, and after activate_at", location)
     return Rollout(
         version=0,
         root="",
         started=now,
-        ready=wish.ready,
-        failed=wish.failed,
-        deadline=wish.deadline,
-        window=wish.window,
+        ready=request.ready,
+        failed=request.failed,
+        deadline=request.deadline,
+        window=request.window,
     )
 
 
-def _refused(detail: str, where: str = "body.activate_at") -> Invalid:
-    return Invalid(detail, [Problem(detail, where=where)])
+def _refused(detail: str, location: str = "body.activate_at") -> Invalid:
+    return Invalid(detail, [Problem(detail, where=location)])
 
 
 @router.delete("/{channel}/planned", status_code=204, responses=told(None, 404), summary="Cancel what is planned")
-def cancel_planned(env: EnvironmentPath, channel: ChannelPath, here: Here, who: Editor) -> Response:
+def cancel_planned(env: EnvironmentPath, channel: ChannelPath, services: Here, principal: Editor) -> Response:
     """The channel stays where it is."""
-    here.store.cancel_planned(env, channel, who.name)
+    services.store.cancel_planned(env, channel, principal.name)
     return Response(status_code=204)

@@ -86,9 +86,9 @@ class Connections:
     def open(self, connection: Connection, address: str | None) -> bool:
         """Register a new connection; others give way where need be. False: there is no place for it."""
         source = source_of(address)
-        own = self._unproven_of.get(source, {})
-        if len(own) >= self.limits.per_address and not is_loopback(source):
-            self._displace(next(iter(own)))
+        connections = self._unproven_of.get(source, {})
+        if len(connections) >= self.limits.per_address and not is_loopback(source):
+            self._displace(next(iter(connections)))
         trusted = self._trusted.get(source, -math.inf) > self._clock() or is_loopback(source)
         if not trusted and len(self._strangers) >= self.limits.total - self.limits.total // RESERVED_SHARE:
             self._displace(next(iter(self._strangers)))
@@ -126,9 +126,9 @@ class Connections:
         if source is None:
             source = self._expected.pop(connection, None)
         if source is not None:
-            own = self._unproven_of[source]
-            del own[connection]
-            if not own:
+            connections = self._unproven_of[source]
+            del connections[connection]
+            if not connections:
                 del self._unproven_of[source]
         return source
 
@@ -137,21 +137,21 @@ class Connections:
         connection.give_way()
         self._warn("the oldest connections without a token give way: there are too many")
 
-    def _warn(self, what: str) -> None:
+    def _warn(self, event: str) -> None:
         if self._clock() - self._warned >= WARN_SECONDS:
             self._warned = self._clock()
             limits = self.limits
-            log.warning("connections: %s (total=%d, per_address=%d)", what, limits.total, limits.per_address)
+            log.warning("connections: %s (total=%d, per_address=%d)", event, limits.total, limits.per_address)
 
 
 def fit_open_files(total: int) -> int:
     """Raise this process' limit of open files for so many connections; how many of them it allows."""
-    wanted = total * FILES_PER_CONNECTION + OTHER_FILES
+    required_files = total * FILES_PER_CONNECTION + OTHER_FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    if soft != resource.RLIM_INFINITY and soft < required_files:
+        soft = required_files if hard == resource.RLIM_INFINITY else min(required_files, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    if soft == resource.RLIM_INFINITY or soft >= wanted:
+    if soft == resource.RLIM_INFINITY or soft >= required_files:
         return total
     fitting = max(soft - OTHER_FILES, soft // 2) // FILES_PER_CONNECTION
     log.warning(

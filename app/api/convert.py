@@ -78,21 +78,21 @@ _BODY: dict[str, Any] = {
     summary="Convert files without storing them",
     openapi_extra=_BODY,
 )
-async def convert(request: Request, here: Here, _: Editor) -> Response:
+async def convert(request: Request, services: Here, _: Editor) -> Response:
     """The wanted format made of the files in the request. `Fleetmap-Warnings` counts what was doubtful."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media != "multipart/form-data":
         raise UnsupportedMedia("send the files as multipart/form-data")
-    async with here.intake.take(request) as form:
-        return await run_in_threadpool(_convert, here, form)
+    async with services.intake.take(request) as form:
+        return await run_in_threadpool(_convert, services, form)
 
 
-def _convert(here: Services, form: Form) -> Response:
+def _convert(services: Services, form: Form) -> Response:
     fields = dict(form.fields)
     to = format_named(fields.pop("to", ""), "to")
     if to is None:
         raise Invalid("say in the field 'to' which format is wanted", [Problem("missing", where="to")])
-    known = formats.get_format(to)
+    fmt = formats.get_format(to)
     check_names(form.files)
     layer = drawn_layer(fields.pop("layer", "") or None)
     source = format_named(fields.pop("format", ""), "format")
@@ -102,7 +102,7 @@ def _convert(here: Services, form: Form) -> Response:
     only_report = truth(fields.pop("report", ""), "report")
     grid = fields.pop("grid", "") or None
     check_grid_name(grid)
-    written = {p["name"] for p in parameters.describe(known.write_options)}
+    written = {p["name"] for p in parameters.describe(fmt.write_options)}
     read = {p["name"] for f in formats.all_formats().values() if f.read for p in parameters.describe(f.read_options)}
     for name in fields.keys() - written - read:
         accepted = ", ".join(sorted(written)) or "none"
@@ -110,12 +110,12 @@ def _convert(here: Services, form: Form) -> Response:
         raise Invalid(detail, [Problem(f"unknown; accepted: {accepted}", where=name[:80])])
     hints = Hints(source, layer, level, grid, {k: v for k, v in fields.items() if k not in written})
     values = {k: v for k, v in fields.items() if k in written}
-    done = here.maps.convert({f.name: f.path for f in form.files}, to, hints=hints, datum=datum, options=values)
+    done = services.maps.convert({f.name: f.path for f in form.files}, to, hints=hints, datum=datum, options=values)
     return _answer(done, to, only_report)
 
 
 def _answer(done: Converted, to: str, only_report: bool) -> Response:
-    known = formats.get_format(to)
+    fmt = formats.get_format(to)
     headers = {"fleetmap-warnings": str(len(done.report["warnings"]))}
     if only_report:
         files = [
@@ -125,7 +125,7 @@ def _answer(done: Converted, to: str, only_report: bool) -> Response:
         return answer({**done.report, "files": files}, headers=headers)
     if len(done.files) == 1:
         name, data = next(iter(done.files.items()))
-        kind = media_type(known, name)
+        kind = media_type(fmt, name)
     else:
         name, data, kind = f"{to}.zip", zipped(done.files), "application/zip"
     return Response(data, headers={**headers, "content-disposition": content_disposition(name)}, media_type=kind)

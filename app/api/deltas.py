@@ -53,21 +53,21 @@ class Deltas:
         before = self._cache.by_hash(key[0], MAX_BYTES)
         if before is None:
             return None  # not remembered: it may be made (again) at any moment, and anybody can ask for any hash
-        made = _smaller(before, body if isinstance(body, bytes) else body.read(), bytes.fromhex(key[0]))
+        delta = _smaller(before, body if isinstance(body, bytes) else body.read(), bytes.fromhex(key[0]))
         with self._lock:
-            self._known[key] = made
-            self._size += len(made or b"") + 200
+            self._known[key] = delta
+            self._size += len(delta or b"") + 200
             while self._size > self._room and len(self._known) > 1:
                 _, dropped = self._known.popitem(last=False)
                 self._size -= len(dropped or b"") + 200
-        return made
+        return delta
 
 
 def _smaller(before: bytes, after: bytes, digest: bytes) -> bytes | None:
     if len(before) < MIN_BYTES:
         return None
-    made = compress(before, after, digest) if after else b""
-    return made if len(made) < len(after) else None
+    delta = compress(before, after, digest) if after else b""
+    return delta if len(delta) < len(after) else None
 
 
 def compress(before: bytes, after: bytes, digest: bytes) -> bytes:
@@ -85,8 +85,8 @@ def compress(before: bytes, after: bytes, digest: bytes) -> bytes:
 
 def wanted(headers: Mapping[str, str]) -> str | None:
     """The SHA-256 (hex) of the file that a client offers as dictionary, if it takes ``dcz``."""
-    said = headers.get("available-dictionary")
-    if said is None:
+    header = headers.get("available-dictionary")
+    if header is None:
         return None
     codings = {}
     for part in headers.get("accept-encoding", "").split(","):
@@ -94,7 +94,7 @@ def wanted(headers: Mapping[str, str]) -> str | None:
         codings[name.strip().lower()] = rest.replace(" ", "")
     if "dcz" not in codings or codings["dcz"] in ("q=0", "q=0.0", "q=0.00", "q=0.000"):
         return None
-    text = said.strip()
+    text = header.strip()
     if not (text.startswith(":") and text.endswith(":") and len(text) > 2):
         return None
     try:

@@ -34,9 +34,9 @@ def as_online() -> dict[str, Any]:
 
 
 @router.get("/derivations", responses=told(list[DerivationOut]), summary="All derivations")
-def list_derivations(here: Here, _: Viewer) -> Response:
+def list_derivations(services: Here, _: Viewer) -> Response:
     """What can be computed from what. Maps use them by themselves; their parameters go into a map's query."""
-    return answer(describe_derivations() + ([as_online()] if here.ingest.provider is not None else []))
+    return answer(describe_derivations() + ([as_online()] if services.ingest.provider is not None else []))
 
 
 @router.post(
@@ -51,8 +51,8 @@ def list_derivations(here: Here, _: Viewer) -> Response:
 def create_derivation(
     env: EnvironmentPath,
     body: DerivationBody,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
@@ -62,11 +62,11 @@ def create_derivation(
     site where the operator has set up a provider (503 while that is down); it goes stale when the fence or the datum
     changes, and is still used then.
     """
-    wish = Wish(body.method, body.parameters, body.replace)
+    request = Wish(body.method, body.parameters, body.replace)
     try:
-        carry_out = here.ingest.fetch_imagery if body.method == online.METHOD else here.ingest.derive
+        carry_out = services.ingest.fetch_imagery if body.method == online.METHOD else services.ingest.derive
         outcome = carry_out(
-            env, wish, message=body.message, author=who.name, if_match=if_match, idempotency=idempotency_key
+            env, request, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
         )
     except NotFound as error:
         if body.method in derive.all_derivations():

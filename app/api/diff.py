@@ -49,7 +49,7 @@ FREED, BLOCKED, OTHER = (120, 200, 140), (225, 120, 120), (240, 205, 120)
 )
 def diff(
     env: EnvironmentPath,
-    here: Here,
+    services: Here,
     _: Viewer,
     from_: Annotated[
         str | None,
@@ -65,35 +65,38 @@ def diff(
     ] = "json",
 ) -> Response:
     """By layer: ids added, changed (with the fields) and deleted; for grids how many cells were freed and blocked."""
-    new = here.store.version(env, number_of(to or "latest"))
+    new = services.store.version(env, number_of(to or "latest"))
     if from_ is not None:
-        old = here.store.version(env, number_of(from_))
+        old = services.store.version(env, number_of(from_))
     else:
         if new.parent is None:
             raise Invalid("version 0 has no parent to compare with: say 'from'")
-        old = here.store.version(env, new.parent)
+        old = services.store.version(env, new.parent)
     if render == "png":
-        return Response(_picture(here, old, new), media_type="image/png")
-    found = here.store.diff(old, new)
-    return answer({"from": old.number, "to": new.number, "layers": found})
+        return Response(_picture(services, old, new), media_type="image/png")
+    layers = services.store.diff(old, new)
+    return answer({"from": old.number, "to": new.number, "layers": layers})
 
 
-def _picture(here: Services, old: Version, new: Version) -> bytes:
+def _picture(services: Services, old: Version, new: Version) -> bytes:
     """At most 1024 × 1024 pixels around what differs, what stayed in grey, +y (or north) on top."""
-    delta = here.store.delta_parts(old, new)
-    found: list[tuple[tuple[int, int, int], Features]] = []
+    delta = services.store.delta_parts(old, new)
+    groups: list[tuple[tuple[int, int, int], Features]] = []
     for changed in delta.features:
-        gone, was = _of(here, old, changed.key, changed.deleted), _of(here, old, changed.key, changed.put.ids)
-        known = set(was.ids)
-        moved = changed.put.take([k for k, i in enumerate(changed.put.ids) if i in known])
-        fresh = changed.put.take([k for k, i in enumerate(changed.put.ids) if i not in known])
-        found += [(DELETED, gone), (CHANGED, was), (CHANGED, moved), (ADDED, fresh)]
-    grids = [(k, *_grids(here, old, new, k)) for k in sorted({g.key for g in delta.grids})]
+        deleted, was = (
+            _of(services, old, changed.key, changed.deleted),
+            _of(services, old, changed.key, changed.put.ids),
+        )
+        old_ids = set(was.ids)
+        moved = changed.put.take([k for k, i in enumerate(changed.put.ids) if i in old_ids])
+        fresh = changed.put.take([k for k, i in enumerate(changed.put.ids) if i not in old_ids])
+        groups += [(DELETED, deleted), (CHANGED, was), (CHANGED, moved), (ADDED, fresh)]
+    grids = [(k, *_grids(services, old, new, k)) for k in sorted({g.key for g in delta.grids})]
     datum = new.datum or old.datum
     frame = local_frame(datum) if datum else None
     # Without a datum, metres and degrees have no common picture: metres where there are any.
-    degrees = frame is None and not grids and all(features.needs_datum for _, features in found if len(features))
-    drawn = [(colour, _shapes(features, frame, degrees)) for colour, features in found]
+    degrees = frame is None and not grids and all(features.needs_datum for _, features in groups if len(features))
+    drawn = [(colour, _shapes(features, frame, degrees)) for colour, features in groups]
     boxes = [shapely.total_bounds(shapes) for _, shapes in drawn if len(shapes)]
     boxes += [_changed_box(a, b) for _, a, b in grids]
     boxes = [b for b in boxes if np.isfinite(b).all()]
@@ -109,16 +112,16 @@ def _picture(here: Services, old: Version, new: Version) -> bytes:
     crs: Anchor = "wgs84" if degrees else "local"
     for changed in delta.features:
         if new.part(changed.key) is not None:
-            around = here.store.features(new, changed.key, bbox=view.box(), crs=crs)
+            around = services.store.features(new, changed.key, bbox=view.box(), crs=crs)
             view.draw(pen, SAME, _shapes(around, frame, degrees))
     for colour, shapes in drawn:
         view.draw(pen, colour, shapes)
     return _png(image)
 
 
-def _of(here: Services, version: Version, key: PartKey, ids: tuple[str, ...]) -> Features:
+def _of(services: Services, version: Version, key: PartKey, ids: tuple[str, ...]) -> Features:
     """Those of the features that the version has."""
-    return here.store.get(version, key, ids) if version.part(key) is not None else features((), "local")
+    return services.store.get(version, key, ids) if version.part(key) is not None else features((), "local")
 
 
 def _png(image: Image.Image) -> bytes:
@@ -136,11 +139,11 @@ def _shapes(features: Features, frame: LocalFrame | None, degrees: bool) -> NDAr
 
 
 def _grids(
-    here: Services, old: Version, new: Version, key: PartKey
+    services: Services, old: Version, new: Version, key: PartKey
 ) -> tuple[OccupancyGrid | None, OccupancyGrid | None]:
     out: list[OccupancyGrid | None] = []
     for version in (old, new):
-        part = here.store.load(version, [key]).parts[key] if version.part(key) else None
+        part = services.store.load(version, [key]).parts[key] if version.part(key) else None
         out.append(part if isinstance(part, OccupancyGrid) else None)
     return out[0], out[1]
 

@@ -61,7 +61,7 @@ def as_dict(environment: Environment, match: Match | None = None) -> dict[str, A
     return members if match is None else {**members, "match": match.as_dict()}
 
 
-def numbers(text: str, what: str, names: str) -> tuple[float, ...]:
+def numbers(text: str, parameter: str, names: str) -> tuple[float, ...]:
     """Numbers separated by commas; Invalid unless there is one for each of ``names`` (``LAT,LON``)."""
     count = names.count(",") + 1
     try:
@@ -69,27 +69,30 @@ def numbers(text: str, what: str, names: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if len(values) != count or not all(abs(v) <= 1e9 for v in values):
-        raise Invalid(f"{what} must be {names}: {count} numbers separated by commas", [Problem(names, where=what)])
+        raise Invalid(
+            f"{parameter} must be {names}: {count} numbers separated by commas", [Problem(names, where=parameter)]
+        )
     return values
 
 
-def box_of(text: str, what: str = "bbox") -> Box:
+def box_of(text: str, parameter: str = "bbox") -> Box:
     """West, south, east, north in degrees; west > east crosses the antimeridian."""
-    west, south, east, north = numbers(text, what, "W,S,E,N")
+    west, south, east, north = numbers(text, parameter, "W,S,E,N")
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
         raise Invalid(
-            f"{what} must be west, south, east, north in degrees, with south ≤ north", [Problem("W,S,E,N", where=what)]
+            f"{parameter} must be west, south, east, north in degrees, with south ≤ north",
+            [Problem("W,S,E,N", where=parameter)],
         )
     return west, south, east, north
 
 
-def position_of(text: str, what: str = "contains") -> tuple[float, float]:
+def position_of(text: str, parameter: str = "contains") -> tuple[float, float]:
     """Latitude and longitude in degrees."""
-    latitude, longitude = numbers(text, what, "LAT,LON")
+    latitude, longitude = numbers(text, parameter, "LAT,LON")
     if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
         raise Invalid(
-            f"{what} must be LAT,LON in degrees: the latitude comes first, within ±90",
-            [Problem("LAT,LON", where=what)],
+            f"{parameter} must be LAT,LON in degrees: the latitude comes first, within ±90",
+            [Problem("LAT,LON", where=parameter)],
         )
     return latitude, longitude
 
@@ -106,8 +109,8 @@ def _headers(environment: Environment) -> dict[str, str]:
 @router.get("", responses=told(list[EnvironmentOut]), summary="List environments")
 def list_environments(
     request: Request,
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     q: Annotated[
         str | None,
         Query(
@@ -135,12 +138,18 @@ def list_environments(
     position = None if contains is None else position_of(contains)
     box = box_of(bbox) if bbox is not None else None
     if position is not None:
-        hits, following = here.store.locate(
-            *position, q=q or None, bbox=box, limit=limit, cursor=cursor, allowed=who.environments, deleted=deleted
+        hits, following = services.store.locate(
+            *position,
+            q=q or None,
+            bbox=box,
+            limit=limit,
+            cursor=cursor,
+            allowed=principal.environments,
+            deleted=deleted,
         )
         return page(request, [as_dict(e, match) for e, match in hits], following)
-    items, following = here.store.environments(
-        q=q or None, bbox=box, limit=limit, cursor=cursor, allowed=who.environments, deleted=deleted
+    items, following = services.store.environments(
+        q=q or None, bbox=box, limit=limit, cursor=cursor, allowed=principal.environments, deleted=deleted
     )
     return page(request, [as_dict(e) for e in items], following)
 
@@ -151,89 +160,91 @@ def list_environments(
     responses=told(EnvironmentOut, 400, 409, 415, ok=201, description="Made"),
     summary="Make an environment",
 )
-def create_environment(body: EnvironmentBody, here: Here, who: Admin) -> Response:
+def create_environment(body: EnvironmentBody, services: Here, principal: Admin) -> Response:
     """Empty (version 0), with a datum (version 1), or with the content of another one (version 1)."""
-    who.enter(body.name)
+    principal.enter(body.name)
     _check_name(body.name)
     clone = None
     if body.clone is not None:
         if body.datum is not None:
             raise Invalid("a clone has the datum of what it is cloned from: give datum or clone, and PATCH it later")
-        who.enter(body.clone.environment)
-        clone = here.store.version(body.clone.environment, body.clone.version)
+        principal.enter(body.clone.environment)
+        clone = services.store.version(body.clone.environment, body.clone.version)
     about(environment=body.name, target=f"environment {body.name}")
-    made = here.store.create_environment(
+    environment = services.store.create_environment(
         body.name,
         title=body.title,
         description=body.description,
         tags=tuple(body.tags),
-        author=who.name,
+        author=principal.name,
         datum=datum_of(body.datum) if body.datum else None,
         clone=clone,
     )
-    return answer(as_dict(made), 201, {"location": path_of("environments", made.name), **_headers(made)})
+    return answer(
+        as_dict(environment), 201, {"location": path_of("environments", environment.name), **_headers(environment)}
+    )
 
 
 @router.get("/{env}", responses=told(EnvironmentOut, 404), summary="One environment")
-def get_environment(env: EnvironmentPath, here: Here, _: Viewer) -> Response:
+def get_environment(env: EnvironmentPath, services: Here, _: Viewer) -> Response:
     """The environment as it is now; its `ETag` is the head's number, for `If-Match`."""
-    found = here.store.environment(env)
-    return answer(as_dict(found), headers=_headers(found))
+    environment = services.store.environment(env)
+    return answer(as_dict(environment), headers=_headers(environment))
 
 
 @router.patch(
     "/{env}", responses=told(EnvironmentOut, 400, 404, 409, 412, 415), summary="Describe, rename, or set the datum"
 )
 def update_environment(
-    env: EnvironmentPath, body: EnvironmentPatch, here: Here, who: Editor, if_match: IfMatch = None
+    env: EnvironmentPath, body: EnvironmentPatch, services: Here, principal: Editor, if_match: IfMatch = None
 ) -> Response:
     """What is left out stays. A new datum makes a version and takes an editor; all else takes an administrator."""
     given = body.model_dump(exclude_none=True)
     if not given:
         raise Invalid("there is nothing to change: give at least one of name, title, description, tags, datum")
     if set(given) != {"datum"}:
-        who.demand("admin")
+        principal.demand("admin")
     if if_match is not None:
-        check_if_match(if_match, here.store.version(env))
+        check_if_match(if_match, services.store.version(env))
     if body.name is not None and body.name != env:
-        _check_free(here, body.name, who)
+        _check_free(services, body.name, principal)
     warnings: list[Any] = []
     if body.datum is not None:
-        outcome = here.ingest.set_datum(env, datum_of(body.datum), author=who.name, if_match=if_match)
+        outcome = services.ingest.set_datum(env, datum_of(body.datum), author=principal.name, if_match=if_match)
         warnings = outcome.body.get("warnings", []) if outcome.status == "created" else []
     if set(given) != {"datum"}:
-        found = here.store.update_environment(
+        environment = services.store.update_environment(
             env,
             new_name=body.name if body.name != env else None,
             title=body.title,
             description=body.description,
             tags=tuple(body.tags) if body.tags is not None else None,
-            author=who.name,
+            author=principal.name,
         )
     else:
-        found = here.store.environment(env)
-    headers = {**_headers(found), "content-location": path_of("environments", found.name)}
-    return answer({**as_dict(found), **({"warnings": warnings} if warnings else {})}, headers=headers)
+        environment = services.store.environment(env)
+    headers = {**_headers(environment), "content-location": path_of("environments", environment.name)}
+    return answer({**as_dict(environment), **({"warnings": warnings} if warnings else {})}, headers=headers)
 
 
 @router.delete("/{env}", status_code=204, responses=told(None, 404), summary="Delete an environment")
-def delete_environment(env: EnvironmentPath, here: Here, who: Admin) -> Response:
+def delete_environment(env: EnvironmentPath, services: Here, principal: Admin) -> Response:
     """It can be restored until it is purged; its name stays taken until then."""
-    here.store.delete_environment(env, who.name)
+    services.store.delete_environment(env, principal.name)
     return Response(status_code=204)
 
 
 @router.post("/{env}/restore", responses=told(EnvironmentOut, 404, 409), summary="Undo a deletion")
-def restore_environment(env: EnvironmentPath, here: Here, who: Admin) -> Response:
+def restore_environment(env: EnvironmentPath, services: Here, principal: Admin) -> Response:
     """A deleted environment comes back with all its versions and channels."""
-    found = here.store.restore_environment(env, who.name)
-    return answer(as_dict(found), headers=_headers(found))
+    environment = services.store.restore_environment(env, principal.name)
+    return answer(as_dict(environment), headers=_headers(environment))
 
 
 @router.post("/{env}/purge", status_code=204, responses=told(None, 404, 409), summary="Remove for good")
-def purge_environment(env: EnvironmentPath, here: Here, _: Admin) -> Response:
+def purge_environment(env: EnvironmentPath, services: Here, _: Admin) -> Response:
     """Removes a deleted environment with all its versions for good; only then its name is free again."""
-    here.store.purge_environment(env)
+    services.store.purge_environment(env)
     return Response(status_code=204)
 
 
@@ -242,12 +253,12 @@ def _check_name(name: str) -> None:
         raise Invalid(f"the name {name!r} is reserved: choose another", [Problem("reserved", where="body.name")])
 
 
-def _check_free(here: Services, name: str, who: Principal) -> None:
+def _check_free(services: Services, name: str, principal: Principal) -> None:
     """Before anything else of a PATCH is done: the new name can be had."""
-    who.enter(name)
+    principal.enter(name)
     _check_name(name)
     try:
-        here.store.environment(name, deleted=True)
+        services.store.environment(name, deleted=True)
     except Gone:
         pass
     except NotFound:

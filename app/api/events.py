@@ -64,8 +64,8 @@ class Told:
 class Feed:
     """Who listens at this moment: all wait for one look at the store."""
 
-    def __init__(self, here: Services) -> None:
-        self._here = here
+    def __init__(self, services: Services) -> None:
+        self._here = services
         self._looks: Together[tuple[str | None, int, int], list[Told]] = Together()
         self._checks: Together[tuple[bytes | None, str | None, int], Principal] = Together()
         self._changed = asyncio.Event()
@@ -130,8 +130,8 @@ class Feed:
 )
 async def stream_events(
     request: Request,
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     environment: Annotated[
         str | None, Query(description="Only of this environment; else of all that the token reaches.")
     ] = None,
@@ -144,14 +144,14 @@ async def stream_events(
 ) -> Response:
     """Server-sent events: `event` is the type, `data` the JSON, `id` what to resume from."""
     if environment is not None:
-        who.enter(environment)
+        principal.enter(environment)
     start = since
     if last_event_id is not None and last_event_id.strip():
         text = last_event_id.strip()
         if not (text.isascii() and text.isdigit() and len(text) <= 18):
             raise Invalid("Last-Event-ID is a number from an event's id", [Problem("not a number", where="id")])
         start = int(text)
-    start = await run_in_threadpool(_begin, here, environment, start)  # NotFound comes before the stream
+    start = await run_in_threadpool(_begin, services, environment, start)  # NotFound comes before the stream
     feed: Feed = request.app.state.feed
     if feed.streams >= STREAMS:
         raise Unavailable("too many streams of events are open: close some, or poll with follow=false")
@@ -161,12 +161,12 @@ async def stream_events(
         return StreamingResponse(_nothing(), media_type="text/event-stream", headers=headers)
     state[ON_STOP] = feed.end
     client = request.client.host if request.client else None
-    bearer = _Bearer(here.access, feed, who, request.headers.get("authorization"), client)
+    bearer = _Bearer(services.access, feed, principal, request.headers.get("authorization"), client)
     stream = _stream(feed, bearer, environment, start, follow=follow)
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
-def _begin(here: Services, environment: str | None, start: int | None) -> int:
+def _begin(services: Services, environment: str | None, start: int | None) -> int:
     """Where a stream begins; without a start with what happens from now on.
 
     NotFound for an environment that is not there, unless its end is still to be told. Invalid for a place that the log
@@ -174,9 +174,9 @@ def _begin(here: Services, environment: str | None, start: int | None) -> int:
     miss all that happens until then.
     """
     try:
-        newest = here.store.last_position() if environment is None else here.store.last_sequence(environment)
+        newest = services.store.last_position() if environment is None else services.store.last_sequence(environment)
     except NotFound:
-        if start is None or environment is None or not here.store.events(environment, start, 1):
+        if start is None or environment is None or not services.store.events(environment, start, 1):
             raise
         return start
     if start is not None and start > newest:
@@ -195,8 +195,10 @@ async def _nothing() -> AsyncIterator[bytes]:
 class _Bearer:
     """Whether a stream's token is still one."""
 
-    def __init__(self, access: Access, feed: Feed, who: Principal, header: str | None, client: str | None) -> None:
-        self.who = who
+    def __init__(
+        self, access: Access, feed: Feed, principal: Principal, header: str | None, client: str | None
+    ) -> None:
+        self.who = principal
         self._access, self._feed, self._client = access, feed, client
         self._header = None if header is None else header.encode("latin-1")
         self._forgotten, self._checked = access.forgotten, time.monotonic()
@@ -262,17 +264,19 @@ def _line(event: Event, number: int) -> bytes:
     return b"id: %d\nevent: %s\ndata: %s\n\n" % (number, str(event.body["type"]).encode(), orjson.dumps(event.body))
 
 
-def ask(here: Services, most: int, environment: str, rest: str, parameters: Mapping[str, str]) -> Answer | Make:
+def ask(
+    services: Services, max_bytes: int, environment: str, rest: str, parameters: Mapping[str, str]
+) -> Answer | Make:
     """What HTTP answers at ``/environments/{environment}/versions/{rest}``: ``{v}/version``, ``{v}/maps/{format}/…``;
     for a map that is not there, what makes it. ``server/where``: what ``/environments?contains=`` answers.
 
-    most: so many bytes are answered. Blocks. Raises what the calls over HTTP answer as problems.
+    max_bytes: so many bytes are answered. Blocks. Raises what the calls over HTTP answer as problems.
     """
     if (environment, rest) == messages.POSITION_QUERY:
-        return _locate(here, parameters)
+        return _locate(services, parameters)
     pieces = rest.split("/")
     if pieces[1:] == ["version"]:
-        version = here.store.version(environment, number_of(pieces[0]))
+        version = services.store.version(environment, number_of(pieces[0]))
         _no_parameters(parameters)
         return Answer(orjson.dumps(version.as_dict()), "application/json")
     if len(pieces) < 3 or pieces[1] != "maps":
@@ -282,16 +286,16 @@ def ask(here: Services, most: int, environment: str, rest: str, parameters: Mapp
     if derive not in ("true", "false"):
         raise Invalid("derive must be true or false", [Problem("true or false", where="derive")])
     mode = closure_mode(values.pop("closures", None))
-    version, _ = here.store.standing(environment, number_of(pieces[0]), mode)
+    version, _ = services.store.standing(environment, number_of(pieces[0]), mode)
     name, file = pieces[2], "/".join(pieces[3:]) or None
-    recipe = here.maps.recipe(version, name, values, derive=derive == "true", file=file)
-    made = here.maps.ready(recipe)
-    if made is not None:
-        return _answer_of(file_of(recipe, made, file), most)
-    return lambda: _answer_of(here.maps.fetch(version, name, values, derive=derive == "true", file=file), most)
+    recipe = services.maps.recipe(version, name, values, derive=derive == "true", file=file)
+    cached_map = services.maps.ready(recipe)
+    if cached_map is not None:
+        return _answer_of(file_of(recipe, cached_map, file), max_bytes)
+    return lambda: _answer_of(services.maps.fetch(version, name, values, derive=derive == "true", file=file), max_bytes)
 
 
-def _locate(here: Services, parameters: Mapping[str, str]) -> Answer:
+def _locate(services: Services, parameters: Mapping[str, str]) -> Answer:
     """The environments that a position is in, best match first, as over HTTP."""
     given = dict(parameters)
     latitude, longitude = given.pop("lat", None), given.pop("lon", None)
@@ -300,14 +304,14 @@ def _locate(here: Services, parameters: Mapping[str, str]) -> Answer:
             "a position needs lat and lon in degrees and nothing else: server/where?lat=53.2687;lon=-0.5244",
             [Problem("lat and lon", where="parameters")],
         )
-    hits, _ = here.store.locate(*position_of(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
+    hits, _ = services.store.locate(*position_of(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
     return Answer(orjson.dumps([as_dict(environment, match) for environment, match in hits]), "application/json")
 
 
-def _answer_of(found: MadeFile, most: int) -> Answer:
-    if found.size > most:
-        raise TooLarge(f"the map has {found.size} bytes, more than is sent over Zenoh ({most}): fetch it over HTTP")
-    return Answer(found.read(), found.media_type)
+def _answer_of(file: MadeFile, max_bytes: int) -> Answer:
+    if file.size > max_bytes:
+        raise TooLarge(f"the map has {file.size} bytes, more than is sent over Zenoh ({max_bytes}): fetch it over HTTP")
+    return Answer(file.read(), file.media_type)
 
 
 def _no_parameters(parameters: Mapping[str, Any]) -> None:

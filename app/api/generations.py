@@ -20,7 +20,7 @@ router = APIRouter(tags=["generations"], route_class=Route)
 @router.get("/generators", responses=told(list[GeneratorOut]), summary="All generators")
 def list_generators(_: Viewer) -> Response:
     """What can be made up, and with which parameters."""
-    return answer([known.as_dict() for known in generate.all_generators().values()])
+    return answer([generator.as_dict() for generator in generate.all_generators().values()])
 
 
 @router.post(
@@ -35,8 +35,8 @@ def list_generators(_: Viewer) -> Response:
 def create_generation(
     env: EnvironmentPath,
     body: GenerationBody,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
@@ -46,8 +46,8 @@ def create_generation(
     """
     order = Order(body.generator, body.seed, body.parameters, body.replace)
     try:
-        outcome = here.ingest.generate(
-            env, order, message=body.message, author=who.name, if_match=if_match, idempotency=idempotency_key
+        outcome = services.ingest.generate(
+            env, order, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
         )
     except NotFound as error:
         if body.generator in generate.all_generators():

@@ -70,7 +70,7 @@ class Guard:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        here: Services = scope["app"].state.services
+        services: Services = scope["app"].state.services
         started = time.perf_counter()
         head_only = scope["method"] == "HEAD"
         scope.setdefault("state", {})
@@ -82,9 +82,9 @@ class Guard:
         REQUEST_ID.set(request_id)
         answer = _Answer(send, head_only, request_id)
         reason = ""
-        body = _Body(receive, here)
+        body = _Body(receive, services)
         try:
-            await self._pass(scope, body, answer, here)
+            await self._pass(scope, body, answer, services)
         except _Disconnected:
             return
         except FleetMapError as error:
@@ -100,20 +100,20 @@ class Guard:
         finally:
             route = scope["state"].get("route") or _template(scope)
             method = scope["method"] if scope["method"] in _METHODS else "other"
-            here.metrics.requests.labels(method, route, str(answer.status)).inc()
+            services.metrics.requests.labels(method, route, str(answer.status)).inc()
             seconds = time.perf_counter() - started
-            here.metrics.seconds.labels(route).observe(seconds)
+            services.metrics.seconds.labels(route).observe(seconds)
             _log(scope, answer.status, seconds, reason)
 
-    async def _pass(self, scope: Scope, body: _Body, answer: _Answer, here: Services) -> None:
+    async def _pass(self, scope: Scope, body: _Body, answer: _Answer, services: Services) -> None:
         headers = _headers(scope)
-        if here.options.insecure_no_auth:
+        if services.options.insecure_no_auth:
             _only_from_here(headers)
         if is_open(scope["path"]):
             # Anybody can send a body: it is not read before it is known who takes it.
             await self._app(scope, body, answer)
             return
-        principal = await self._principal(scope, headers, here)
+        principal = await self._principal(scope, headers, services)
         if PROVE in scope["state"]:
             scope["state"][PROVE]()
         environment = environment_of(scope["path"])
@@ -125,18 +125,18 @@ class Guard:
             await body.preload()
         await self._app(scope, body, answer)
 
-    async def _principal(self, scope: Scope, headers: dict[bytes, bytes], here: Services) -> Principal:
+    async def _principal(self, scope: Scope, headers: dict[bytes, bytes], services: Services) -> Principal:
         """The caller: by the link that the address is, else by the token. A token beside a link counts for nothing."""
         client = scope["client"][0] if scope.get("client") else None
         link = signed_address(scope)
         if link is not None:
             scope["state"][LINK] = link
-            return await run_in_threadpool(here.links.check, link, client)
+            return await run_in_threadpool(services.links.check, link, client)
         authorization = headers.get(b"authorization")
-        principal = here.access.known(authorization)
+        principal = services.access.known(authorization)
         if principal is None:
-            key = (authorization, client, here.hot.generation())
-            principal = await self._checks.run(key, here.access.check, authorization, client)
+            key = (authorization, client, services.hot.generation())
+            principal = await self._checks.run(key, services.access.check, authorization, client)
         return principal
 
     async def _refuse(self, response: Response, scope: Scope, body: _Body, answer: _Answer) -> None:
@@ -154,12 +154,21 @@ def _template(scope: Scope) -> str:
     return path if path.startswith(API) or not scope["path"].startswith(API) else API + path
 
 
-def _caller(scope: Scope, who: Principal, environment: str | None) -> Caller | None:
+def _caller(scope: Scope, principal: Principal, environment: str | None) -> Caller | None:
     """Who stands in the audit log for what this request changes; None where it is not for there."""
     path = scope["path"]
     if scope["method"] in ("GET", "OPTIONS") or _REPORT.fullmatch(path):
         return None
-    return Caller(who.id, who.name, who.role, _address(scope), REQUEST_ID.get(), scope["method"], path, environment)
+    return Caller(
+        principal.id,
+        principal.name,
+        principal.role,
+        _address(scope),
+        REQUEST_ID.get(),
+        scope["method"],
+        path,
+        environment,
+    )
 
 
 def _address(scope: Scope) -> str:
@@ -198,15 +207,15 @@ def _log(scope: Scope, status: int, seconds: float, reason: str) -> None:
         level = logging.DEBUG
     if not log.isEnabledFor(level):
         return
-    who = scope["state"].get("principal")
+    principal = scope["state"].get("principal")
     fields = {
         "method": scope["method"],
         "path": scope["path"][:MAX_LOGGED_PATH],
         "status": status,
         "ms": round(seconds * 1000, 1),
-        "token": who.name if who else "",
-        "token_id": who.id if who else "",
-        "role": who.role if who else "",
+        "token": principal.name if principal else "",
+        "token_id": principal.id if principal else "",
+        "role": principal.role if principal else "",
         "address": _address(scope),
         "reason": reason,
     }
@@ -274,9 +283,9 @@ class _Body:
         "what",
     )
 
-    def __init__(self, receive: Receive, here: Services) -> None:
-        self._receive, self._here = receive, here
-        self._limit = here.options.max_json_bytes
+    def __init__(self, receive: Receive, services: Services) -> None:
+        self._receive, self._here = receive, services
+        self._limit = services.options.max_json_bytes
         self._received, self._begun, self._whole = 0, time.monotonic(), False
         self._declared: int | None = 0
         self._loaded: Message | None = None

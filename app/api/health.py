@@ -39,17 +39,17 @@ def router_for(advertised: str, listen: str, host: str) -> str:
     host = f"[{host}]" if ":" in host else host
     out = []
     for part in (advertised or listen).split(","):
-        found = _ENDPOINT.fullmatch(part.strip())
-        if found is None:
+        match = _ENDPOINT.fullmatch(part.strip())
+        if match is None:
             continue
-        where = found[2]
-        if where in _ANY:
+        address = match[2]
+        if address in _ANY:
             if not host:
                 continue
-            where = host
-        elif where in _LOOPBACK and not advertised and host not in _LOOPBACK:
+            address = host
+        elif address in _LOOPBACK and not advertised and host not in _LOOPBACK:
             continue
-        out.append(f"{found[1]}/{where}:{found[3]}{found[4]}")
+        out.append(f"{match[1]}/{address}:{match[3]}{match[4]}")
     return ",".join(out)
 
 
@@ -74,30 +74,30 @@ async def readyz(
     `events.prefix`); where they do not, maps are served all the same. Where maps go out to ROS 2, `ros2` tells how many
     topics there are.
     """
-    here: Services = request.app.state.services
+    services: Services = request.app.state.services
     try:
         async with asyncio.timeout(READY_SECONDS):
-            await run_in_threadpool(here.store.check)
-            refusal = await run_in_threadpool(here.writability.refusal)
+            await run_in_threadpool(services.store.check)
+            refusal = await run_in_threadpool(services.writability.refusal)
     except TimeoutError:
         raise Unavailable(f"database or file store did not answer within {READY_SECONDS:g} seconds") from None
     if refusal is not None and for_ == "writes":
         raise Unavailable(f"nothing can be stored: {refusal}")
-    if not here.prepared.is_set():
+    if not services.prepared.is_set():
         raise Unavailable("conversions are being prepared: ready in a few seconds")
-    events = state_of(here.options.data_dir, here.options.zenoh_mode)
-    if here.options.zenoh_mode != "off":
-        options = here.options
-        where = router_for(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
-        events = {**events, "prefix": options.zenoh_prefix, **({"connect": where} if where else {})}
-    topics = {"ros2": ros2.state_of(here.options.data_dir)} if here.options.ros2 else {}
+    events = state_of(services.options.data_dir, services.options.zenoh_mode)
+    if services.options.zenoh_mode != "off":
+        options = services.options
+        endpoint = router_for(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
+        events = {**events, "prefix": options.zenoh_prefix, **({"connect": endpoint} if endpoint else {})}
+    topics = {"ros2": ros2.state_of(services.options.data_dir)} if services.options.ros2 else {}
     state = {
         "status": "ready" if refusal is None else "read-only",
         "database": "ok",
         "blobs": "ok" if refusal is None else "read-only",
         "reads": "ok",
         "writes": refusal or "ok",
-        "cache": here.maps.cache.problem or "ok",
+        "cache": services.maps.cache.problem or "ok",
     }
     return answer({**state, "events": events, **topics})
 
@@ -108,9 +108,9 @@ async def readyz(
     response_class=Response,
     responses={200: {"description": "Prometheus text format", "content": {"text/plain": {}}}},
 )
-async def metrics(here: Here, _: ServerViewer) -> Response:
+async def metrics(services: Here, _: ServerViewer) -> Response:
     """Requests, conversions, cache hits, heads. Takes a token for all environments."""
-    here.hot.count()
-    response = Response(await run_in_threadpool(here.metrics.render, here.store))
+    services.hot.count()
+    response = Response(await run_in_threadpool(services.metrics.render, services.store))
     response.headers["content-type"] = CONTENT_TYPE
     return response

@@ -65,7 +65,7 @@ class Work:
         self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fleetmap-make")
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def make(self, recipe: Recipe, who: Principal, address: str) -> Made | Started:
+    async def make(self, recipe: Recipe, principal: Principal, address: str) -> Made | Started:
         """The map, or after ``seconds`` the job that will end with it. address: where the finished map is had.
 
         Raises what making raises; Unavailable where too much is being made.
@@ -81,11 +81,11 @@ class Work:
             done, _ = await asyncio.wait({running.future}, timeout=self._seconds)
             if done:
                 return running.future.result()
-            known = running.jobs.get(who.id)
-            if known is not None:
-                return Started(await run_in_threadpool(self._store.job, known))
+            job_id = running.jobs.get(principal.id)
+            if job_id is not None:
+                return Started(await run_in_threadpool(self._store.job, job_id))
             try:
-                return Started(await self._as_job(recipe, running, who, address))
+                return Started(await self._as_job(recipe, running, principal, address))
             except NoRoom:  # nowhere to note a job: the answer waits for the map
                 return await asyncio.shield(running.future)
         finally:
@@ -96,7 +96,7 @@ class Work:
         """Stop the making that a job waits for, unless others wait for it too: whether it was of this process."""
         with self._lock:
             for key, running in self._running.items():
-                owner = next((who for who, known in running.jobs.items() if known == job), None)
+                owner = next((principal_id for principal_id, job_id in running.jobs.items() if job_id == job), None)
                 if owner is None:
                     continue
                 del running.jobs[owner]
@@ -124,35 +124,35 @@ class Work:
         """Let threads end; what is being made ends with the pool."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    async def _as_job(self, recipe: Recipe, running: _Running, who: Principal, address: str) -> Job:
-        what = f"{recipe.format.name} of {recipe.version.environment}, version {recipe.version.number}"
+    async def _as_job(self, recipe: Recipe, running: _Running, principal: Principal, address: str) -> Job:
+        label = f"{recipe.format.name} of {recipe.version.environment}, version {recipe.version.number}"
 
         def begin() -> Job:
-            job = self._store.create_job(who.id, f"making {what}")
+            job = self._store.create_job(principal.id, f"making {label}")
             return self._store.update_job(job.id, state="running")
 
         job = await run_in_threadpool(begin)
-        running.jobs[who.id] = job.id
+        running.jobs[principal.id] = job.id
 
         async def follow() -> None:
             await asyncio.wait({running.future})
             if not running.future.cancelled():
-                await run_in_threadpool(self._end, job.id, running.future.exception(), what, address)
+                await run_in_threadpool(self._end, job.id, running.future.exception(), label, address)
 
         task = asyncio.create_task(follow())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return job
 
-    def _end(self, job: str, error: BaseException | None, what: str, address: str) -> None:
+    def _end(self, job: str, error: BaseException | None, label: str, address: str) -> None:
         try:
             if self._store.job(job).state == "cancelled":
                 return
             if error is None:
-                detail = f"made {what}"
+                detail = f"made {label}"
                 self._store.update_job(job, state="done", progress=1.0, detail=detail, result={"location": address})
             else:
-                self._store.update_job(job, state="failed", detail=f"could not make {what}", problem=_problem(error))
+                self._store.update_job(job, state="failed", detail=f"could not make {label}", problem=_problem(error))
         except FleetMapError as other:
             log.warning("a job's end could not be noted: %s", other.detail)
 
@@ -208,45 +208,45 @@ def started(job: Job) -> Response:
 router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=Route)
 
 
-def _mine(here: Here, who: Principal, id: str) -> Job:
+def _mine(services: Here, principal: Principal, id: str) -> Job:
     """A job that the caller may see; NotFound for all others, as if there were none."""
-    job = here.store.job(id)
-    if job.owner != who.id and not (who.can("admin") and who.environments is None):
+    job = services.store.job(id)
+    if job.owner != principal.id and not (principal.can("admin") and principal.environments is None):
         raise NotFound(f"there is no job {id[:80]!r}")
     return job
 
 
 @router.get("", responses=told(list[JobOut]), summary="List jobs")
 def list_jobs(
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
     limit: Limit = 100,
 ) -> Response:
     """List the jobs of the own token, newest first; administrators whose token is for all environments see all."""
-    every = who.role == "admin" and who.environments is None
-    mine = (job for job in reversed(here.store.jobs()) if every or job.owner == who.id)
-    found = (body for body in map(as_dict, mine) if state in (None, body["state"]))
-    return answer(list(itertools.islice(found, limit)))
+    every = principal.role == "admin" and principal.environments is None
+    visible_jobs = (job for job in reversed(services.store.jobs()) if every or job.owner == principal.id)
+    bodies = (body for body in map(as_dict, visible_jobs) if state in (None, body["state"]))
+    return answer(list(itertools.islice(bodies, limit)))
 
 
 @router.get("/{id}", responses=told(JobOut, 404), summary="How far a job is")
-def get_job(id: JobPath, here: Here, who: Viewer) -> Response:
+def get_job(id: JobPath, services: Here, principal: Viewer) -> Response:
     """A job of the own token; an administrator of all environments sees all. ``result.location`` is where a
     finished map is had.
     """
-    return answer(as_dict(_mine(here, who, id)))
+    return answer(as_dict(_mine(services, principal, id)))
 
 
 @router.delete("/{id}", status_code=204, responses=told(None, 404), summary="Cancel or forget a job")
-def delete_job(id: JobPath, here: Here, who: Viewer) -> Response:
+def delete_job(id: JobPath, services: Here, principal: Viewer) -> Response:
     """Cancels a job that runs: the work is stopped, unless somebody else waits for it too. Forgets one that has
     ended.
     """
-    job = _mine(here, who, id)
+    job = _mine(services, principal, id)
     if as_dict(job)["state"] in ("queued", "running"):
-        here.store.update_job(id, state="cancelled", detail="cancelled")
-        here.work.cancel(id)  # where another process is at it, that one notices within seconds
+        services.store.update_job(id, state="cancelled", detail="cancelled")
+        services.work.cancel(id)  # where another process is at it, that one notices within seconds
     else:
-        here.store.delete_job(id)
+        services.store.delete_job(id)
     return Response(status_code=204)

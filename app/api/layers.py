@@ -69,9 +69,9 @@ def entry_dict(entry: PartEntry) -> dict[str, Any]:
 
 
 @router.get("", responses=told(list[LayerOut], 404), summary="What a version holds")
-def list_layers(env: EnvironmentPath, v: VersionPath, here: Here, _: Viewer) -> Response:
+def list_layers(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer) -> Response:
     """Every part: layer, level and name, how much it holds, where, and where it comes from."""
-    version = here.store.version(env, number_of(v))
+    version = services.store.version(env, number_of(v))
     return answer([entry_dict(entry) for entry in version.parts if entry.key.layer != "resources"])
 
 
@@ -98,7 +98,7 @@ def get_layer(
     v: VersionPath,
     layer: LayerPath,
     request: Request,
-    here: Here,
+    services: Here,
     _: Viewer,
     level: Annotated[str | None, Query(max_length=256, description="Of this storey only.")] = None,
     name: Annotated[str | None, Query(max_length=256, description="The part's name: a grid's, a network's …")] = None,
@@ -110,7 +110,7 @@ def get_layer(
     `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`; `voxels` are JSON (`counts` in
     smallest voxels, however leaves were merged), or the `.bt` with `Accept: application/octet-stream`.
     """
-    version = here.store.version(env, number_of(v))
+    version = services.store.version(env, number_of(v))
     accept = request.headers.get("accept", "*/*")
     seed = [version.root, layer, level, name, bbox, crs, accept]
     etag = f'"{hashlib.sha256(json_bytes(seed)).hexdigest()[:32]}"'
@@ -123,23 +123,23 @@ def get_layer(
     if none_match(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     if layer in VECTOR_LAYERS:
-        wanted: Anchor = crs or ("wgs84" if version.datum else "local")
-        response = _vector(here, version, layer, level, name, _box(bbox, wanted), wanted, accept)
+        anchor: Anchor = crs or ("wgs84" if version.datum else "local")
+        response = _vector(services, version, layer, level, name, _box(bbox, anchor), anchor, accept)
     else:
         if crs == "wgs84" and version.datum is None:
             raise _no_datum(env)
         key = _one(version, layer, level, name)
         if layer == "voxels":
-            response = _voxels(here, version, key, _local_box(version, bbox, crs), accept)
+            response = _voxels(services, version, key, _local_box(version, bbox, crs), accept)
         elif layer == "occupancy":
             box = _local_box(version, bbox, crs)
-            part = here.store.load(version, [key]).parts[key]
+            part = services.store.load(version, [key]).parts[key]
             assert isinstance(part, OccupancyGrid)
             response = _grid(key, part, box, accept)
         elif bbox is not None:
             raise Invalid(f"{layer} cannot be cut to a bbox", [Problem("not for this layer", where="bbox")])
         else:
-            part = here.store.load(version, [key]).parts[key]
+            part = services.store.load(version, [key]).parts[key]
             assert isinstance(part, Picture)
             response = _picture(key, part, accept)
     for header, value in headers.items():
@@ -151,7 +151,7 @@ def get_layer(
 
 
 def _vector(
-    here: Services,
+    services: Services,
     version: Version,
     layer: Layer,
     level: str | None,
@@ -165,7 +165,7 @@ def _vector(
     if not keys and (level is not None or name is not None):
         raise _none(version, layer, level, name)
     frame = local_frame(version.datum) if version.datum else None
-    parts = [(key, here.store.features(version, key, bbox=box, crs=crs)) for key in keys]
+    parts = [(key, services.store.features(version, key, bbox=box, crs=crs)) for key in keys]
     if frame is None and any(len(part) and bool((part.local != (crs == "local")).any()) for _, part in parts):
         raise _no_datum(version.environment)
     fences = [e for e in version.parts if e.key.layer == "location" and e.count]
@@ -296,7 +296,7 @@ def png(pixels: NDArray[Any]) -> bytes:
     return out.getvalue()
 
 
-def _voxels(here: Services, version: Version, key: PartKey, box: Box | None, accept: str) -> Response:
+def _voxels(services: Services, version: Version, key: PartKey, box: Box | None, accept: str) -> Response:
     """What a voxel map holds, or its ``.bt``; a box cuts columns of full height."""
     kind = _choose(accept, "application/json", "application/octet-stream")
     column: Box3 | None = None
@@ -304,12 +304,12 @@ def _voxels(here: Services, version: Version, key: PartKey, box: Box | None, acc
         x0, y0, x1, y1 = box
         column = (x0, y0, -MAX_METRES, x1, y1, MAX_METRES)
     if kind == "application/octet-stream":
-        wanted = {"kind": "bt", "name": key.name, "level": key.level}
+        options = {"kind": "bt", "name": key.name, "level": key.level}
         if column is not None:
-            wanted["bbox"] = ",".join(map(repr, column))
-        made = here.maps.make(here.maps.recipe(version, "octomap", wanted))
-        return Response(made.whole().read(), media_type=kind)
-    part = here.store.load(version, [key]).parts[key]
+            options["bbox"] = ",".join(map(repr, column))
+        cached_map = services.maps.make(services.maps.recipe(version, "octomap", options))
+        return Response(cached_map.whole().read(), media_type=kind)
+    part = services.store.load(version, [key]).parts[key]
     assert isinstance(part, VoxelMap)
     if column is not None:
         part = cut_voxels(part, column)
@@ -378,10 +378,10 @@ def _one(version: Version, layer: Layer, level: str | None, name: str | None) ->
 
 
 def _none(version: Version, layer: Layer, level: str | None, name: str | None) -> NotFound:
-    known = [f"{e.key.name} (level {e.key.level})" for e in version.parts if e.key.layer == layer]
-    asked = " ".join(f"{k}={t!r}" for k, t in (("level", level), ("name", name)) if t is not None)
-    what = f"{layer} {asked}".strip()
-    return NotFound(f"version {version.number} has no {what}; it has: {', '.join(known) or 'none'}")
+    existing_names = [f"{e.key.name} (level {e.key.level})" for e in version.parts if e.key.layer == layer]
+    selection = " ".join(f"{k}={t!r}" for k, t in (("level", level), ("name", name)) if t is not None)
+    description = f"{layer} {selection}".strip()
+    return NotFound(f"version {version.number} has no {description}; it has: {', '.join(existing_names) or 'none'}")
 
 
 def _no_datum(environment: str) -> MissingDatum:
@@ -405,8 +405,8 @@ def _box(text: str | None, crs: Anchor) -> Box | None:
 def _local_box(version: Version, text: str | None, crs: Anchor | None) -> Box | None:
     """A box as one of the local frame: around the corners of one on earth. Grids default to the local frame."""
     if text is None or crs != "wgs84":
-        wanted: Anchor = "wgs84" if crs is None and version.datum else "local"
-        if text is None or wanted == "local":
+        anchor: Anchor = "wgs84" if crs is None and version.datum else "local"
+        if text is None or anchor == "local":
             return _box(text, "local")
     west, south, east, north = box_of(text)
     assert version.datum is not None
@@ -433,10 +433,10 @@ def _choose(accept: str, *offered: str) -> str:
 
 def _quality(accept: str, kind: str) -> float:
     family = kind.partition("/")[0] + "/*"
-    found: Mapping[str, float] = dict(_ranges(accept))
+    qualities: Mapping[str, float] = dict(_ranges(accept))
     for pattern in (kind, family, "*/*"):
-        if pattern in found:
-            return found[pattern]
+        if pattern in qualities:
+            return qualities[pattern]
     return 0.0
 
 

@@ -34,7 +34,7 @@ router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], rou
     summary="Create a signed link to a map",
 )
 async def create_link(
-    env: EnvironmentPath, v: VersionPath, body: LinkBody, request: Request, here: Here, who: Viewer
+    env: EnvironmentPath, v: VersionPath, body: LinkBody, request: Request, services: Here, principal: Viewer
 ) -> Response:
     """The `url` needs no token until it `expires`, for `GET` and `HEAD` alone.
 
@@ -42,14 +42,14 @@ async def create_link(
     the token that created it, but is not revoked with it. The map is converted first: a map that cannot be made has no
     link.
     """
-    here.links.check_life(body.seconds)
-    version = await run_in_threadpool(here.store.version, env, number_of(v))
+    services.links.check_life(body.seconds)
+    version = await run_in_threadpool(services.store.version, env, number_of(v))
     values = {name: _text(value) for name, value in body.parameters.items()}
-    linked = await link_to(here, request, who, version, body.format, body.file, values, body.seconds)
+    linked = await link_to(services, request, principal, version, body.format, body.file, values, body.seconds)
     if isinstance(linked, Started):
         return started(linked.job)
     about(target=f"link to {body.format} of version {version.number}, until {linked.expires}")
-    await run_in_threadpool(here.store.record_change)
+    await run_in_threadpool(services.store.record_change)
     out = {
         "url": linked.url,
         "expires": linked.expires,
@@ -72,9 +72,9 @@ class LinkedFile:
 
 
 async def link_to(
-    here: Services,
+    services: Services,
     request: Request,
-    who: Principal,
+    principal: Principal,
     version: Version,
     format: str,
     file: str | None,
@@ -92,25 +92,25 @@ async def link_to(
 
     Raises what converting raises; NotFound for a file that the map does not have.
     """
-    wanted = Wanted(version.environment, str(version.number), format, file)
-    outcome = await made_at(here, wanted, urlencode(sorted(values.items())).encode(), who)
+    map_request = Wanted(version.environment, str(version.number), format, file)
+    outcome = await made_at(services, map_request, urlencode(sorted(values.items())).encode(), principal)
     if isinstance(outcome, Started):
         return outcome
-    found = file_of(*outcome, file)
+    map_file = file_of(*outcome, file)
     path = f"{API}/environments/{version.environment}/versions/{version.number}/maps/{format}"
     path += "" if file is None else f"/{file}"
 
     base = str(request.base_url).rstrip("/")
     if not signed:
         query = urlencode(sorted(values.items()))
-        return LinkedFile(base + quote(path, safe="/") + (f"?{query}" if query else ""), None, found)
+        return LinkedFile(base + quote(path, safe="/") + (f"?{query}" if query else ""), None, map_file)
 
     def sign() -> Grant:
-        environment = here.store.environment(version.environment)
-        return here.links.create(environment, path, values, seconds or here.links.max_seconds, who)
+        environment = services.store.environment(version.environment)
+        return services.links.create(environment, path, values, seconds or services.links.max_seconds, principal)
 
     grant = await run_in_threadpool(sign)
-    return LinkedFile(base + grant.url, rfc3339(grant.expires), found)
+    return LinkedFile(base + grant.url, rfc3339(grant.expires), map_file)
 
 
 def _text(value: str | float | bool) -> str:

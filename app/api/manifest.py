@@ -47,27 +47,27 @@ router = APIRouter(tags=["manifest"], route_class=Route)
 
 
 @router.get("/keys", responses=told(list[KeyOut]), summary="Keys that sign manifests")
-def list_keys(here: Here, _: Viewer) -> Response:
+def list_keys(services: Here, _: Viewer) -> Response:
     """The newest first: it signs. `endorsement` is the signature of the key before it over the raw public key."""
-    return answer([key.as_dict() for key in here.keys.public()])
+    return answer([key.as_dict() for key in services.keys.public()])
 
 
 @router.post(
     "/keys", status_code=201, responses=told(KeyOut, ok=201, description="The new key"), summary="Rotate the key"
 )
-def rotate_key(here: Here, _: ServerAdmin) -> Response:
+def rotate_key(services: Here, _: ServerAdmin) -> Response:
     """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one. Takes a
     token for all environments.
 
     Signed links get a new secret as well; links that were made before stay valid until they expire.
     """
     try:
-        with here.store.changing():
-            made = here.keys.rotate()
-            here.links.rotate()
+        with services.store.changing():
+            key = services.keys.rotate()
+            services.links.rotate()
     finally:
-        here.store.generation.change()  # what was signed with the old key is in memory no longer
-    return answer(made.as_dict(), 201)
+        services.store.generation.change()  # what was signed with the old key is in memory no longer
+    return answer(key.as_dict(), 201)
 
 
 @router.get(
@@ -79,8 +79,8 @@ async def get_manifest(
     env: EnvironmentPath,
     v: VersionPath,
     request: Request,
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     formats: Annotated[
         str,
         Query(
@@ -109,24 +109,26 @@ async def get_manifest(
     `level` names a file's level.
     """
     entries = _entries(formats, optional)
-    made: dict[str, Made] = {}
+    cached_maps: dict[str, Made] = {}
     while True:
-        found = await here.hot.shared(request, _signed, here, env, v, entries, closures, request, {})
-        if isinstance(found, _Unmade) and found.recipe.key in made:  # the cache has no room for all of them at once
-            found = await run_in_threadpool(_signed, here, env, v, entries, closures, request, made)
-        if not isinstance(found, _Unmade):
+        outcome = await services.hot.shared(request, _signed, services, env, v, entries, closures, request, {})
+        if (
+            isinstance(outcome, _Unmade) and outcome.recipe.key in cached_maps
+        ):  # the cache has no room for all of them at once
+            outcome = await run_in_threadpool(_signed, services, env, v, entries, closures, request, cached_maps)
+        if not isinstance(outcome, _Unmade):
             break
         try:
-            outcome = await _made(here, found.recipe, request, who)
+            conversion = await _made(services, outcome.recipe, request, principal)
         except UNAVAILABLE as error:
-            if found.entry.required:
-                raise _named(error, found.entry) from error
+            if outcome.entry.required:
+                raise _named(error, outcome.entry) from error
             continue  # it is remembered: the next look lists it as missing
-        if isinstance(outcome, Started):
-            return started(outcome.job)
-        if outcome is not None:
-            made[found.recipe.key] = outcome
-    headers, data = found
+        if isinstance(conversion, Started):
+            return started(conversion.job)
+        if conversion is not None:
+            cached_maps[outcome.recipe.key] = conversion
+    headers, data = outcome
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
     return Response(data, 200, headers, "application/json")
@@ -153,23 +155,23 @@ class _Unmade:
 
 
 def _signed(
-    here: Services,
+    services: Services,
     env: str,
     v: str,
     entries: list[_Entry],
     mode: ClosureMode | None,
     request: Request,
-    known: Mapping[str, Made],
+    cached_maps: Mapping[str, Made],
 ) -> tuple[dict[str, str], bytes] | _Unmade:
     """The headers and the signed bytes; the first map that is to be made before that can be said.
 
-    known: maps that were made for this answer, by their recipes' keys: they may have left the cache again.
+    cached_maps: maps that were made for this answer, by their recipes' keys: they may have left the cache again.
     """
     channel = None if isinstance(number_of(v), int) else v
-    generation = here.hot.generation()
-    version, sequence = here.store.standing(env, number_of(v), mode)
+    generation = services.hot.generation()
+    version, sequence = services.store.standing(env, number_of(v), mode)
     closures = version.closures or NO_CLOSURES
-    listed = _listed(here, version, entries, known)
+    listed = _listed(services, version, entries, cached_maps)
     if isinstance(listed, _Unmade):
         return listed
     files, missing = listed
@@ -183,7 +185,7 @@ def _signed(
         "version": version.number,
         "root": version.root,
         "time": _seconds(signed),
-        "expires": _seconds(signed + here.options.manifest_seconds),
+        "expires": _seconds(signed + services.options.manifest_seconds),
         "levels": _levels(version),
         "files": files,
         "overlays_digest": closures.digest,
@@ -195,17 +197,17 @@ def _signed(
     parameters = {entry.format: entry.requested for entry in entries if entry.requested}
     body |= {"closures": shown} if shown != "apply" else {}
     body |= {"parameters": parameters} if parameters else {}
-    body |= {"epoch": epoch} if (epoch := here.store.epoch()) else {}
+    body |= {"epoch": epoch} if (epoch := services.store.epoch()) else {}
     body |= {"missing": missing} if missing else {}
     body |= {"overlays": [closure.as_dict() for closure in closures.items]} if closures.items else {}
-    variables = here.maps.variables(version)
+    variables = services.maps.variables(version)
     if variables:
         body["variables"] = variables
     data = json_bytes(body)
-    key, signature = here.keys.sign(data)
+    key, signature = services.keys.sign(data)
     header = f"{key}:{base64.b64encode(signature).decode()}"
     headers = {"etag": f'"{header[-40:-2]}"', "cache-control": "no-cache", SIGNATURE: header}
-    here.hot.keep(request, env, headers, data, generation)
+    services.hot.keep(request, env, headers, data, generation)
     return headers, data
 
 
@@ -215,16 +217,16 @@ def _seconds(moment: float) -> str:
 
 
 def _listed(
-    here: Services, version: Version, entries: list[_Entry], known: Mapping[str, Made]
+    services: Services, version: Version, entries: list[_Entry], cached_maps: Mapping[str, Made]
 ) -> tuple[list[dict[str, Any]], list[dict[str, str]]] | _Unmade:
     """The files of all formats, and the optional formats that cannot be given; or a map that is to be made first."""
     files: list[dict[str, Any]] = []
     missing: list[dict[str, str]] = []
     for entry in entries:
         try:
-            recipe = _recipe(here, version, entry)
-            made = here.maps.ready(recipe) or known.get(recipe.key)
-            failure = None if made is not None or entry.required else here.maps.failure(recipe)
+            recipe = _recipe(services, version, entry)
+            cached_map = services.maps.ready(recipe) or cached_maps.get(recipe.key)
+            failure = None if cached_map is not None or entry.required else services.maps.failure(recipe)
             if failure is not None:
                 raise failure
         except UNAVAILABLE as error:
@@ -232,21 +234,21 @@ def _listed(
                 raise _named(error, entry) from error
             missing.append({"format": entry.format, "detail": error.detail})
             continue
-        if made is None:
+        if cached_map is None:
             return _Unmade(entry, recipe)
-        for file in made.files:
+        for file in cached_map.files:
             line = {"format": entry.format, "name": file.name, "size": file.size, "sha256": file.sha256}
             files.append(line | ({"level": file.place[0]} if file.place is not None else {}))
     return sorted(files, key=lambda f: (f["format"], f["name"])), sorted(missing, key=lambda m: m["format"])
 
 
-def _recipe(here: Services, version: Version, entry: _Entry) -> Recipe:
+def _recipe(services: Services, version: Version, entry: _Entry) -> Recipe:
     """Plan the whole site in a format, or what the entry's parameters select of it."""
     values = {**site.everything(formats.get_format(entry.format)), **entry.values}
     if entry.closures is not None:
-        in_force = version.closures or here.store.closures(version.environment)
+        in_force = version.closures or services.store.closures(version.environment)
         version = replace(version, closures=in_force.in_mode(entry.closures))
-    return here.maps.recipe(version, entry.format, values, derive=entry.derive, listed=True)
+    return services.maps.recipe(version, entry.format, values, derive=entry.derive, listed=True)
 
 
 def _named(error: FleetMapError, entry: _Entry) -> FleetMapError:
@@ -289,14 +291,14 @@ def _entries(required: str, optional: str) -> list[_Entry]:
     return entries
 
 
-def _entry(text: str, where: str, *, required: bool) -> _Entry:
+def _entry(text: str, location: str, *, required: bool) -> _Entry:
     name, _, query = text.strip().partition("?")
     try:
         fmt = formats.get_format(name)
     except NotFound as error:
-        raise Invalid(error.detail, [Problem("no such format", where=where)]) from None
+        raise Invalid(error.detail, [Problem("no such format", where=location)]) from None
     if fmt.write is None:
-        raise Invalid(f"{name} is not served", [Problem("not served", where=where)])
+        raise Invalid(f"{name} is not served", [Problem("not served", where=location)])
     try:
         values, derive, closures = options_of(query)
         own_options(fmt, values)
@@ -305,12 +307,12 @@ def _entry(text: str, where: str, *, required: bool) -> _Entry:
     return _Entry(name, values, derive, closures, required, dict(parse_qsl(query, keep_blank_values=True)))
 
 
-async def _made(here: Services, recipe: Recipe, request: Request, who: Any) -> Made | Started | None:
+async def _made(services: Services, recipe: Recipe, request: Request, principal: Any) -> Made | Started | None:
     """A map that is not ready, or the job that makes it. None where it cannot be derived so: the next recipe goes
     another way, or says that there is none.
     """
     try:
-        return await here.work.make(recipe, who, address_of(request))
+        return await services.work.make(recipe, principal, address_of(request))
     except CannotDerive:
         await asyncio.sleep(0)
         return None

@@ -113,12 +113,12 @@ class Hot:
 
     def get(self, key: Key) -> Resource | None:
         """What is known to stand there at this moment."""
-        found = self._entries.get(key)
-        if found is None or found.fresh_until < time.monotonic() or found.generation != self.generation():
+        entry = self._entries.get(key)
+        if entry is None or entry.fresh_until < time.monotonic() or entry.generation != self.generation():
             return None
-        return found
+        return entry
 
-    async def find(self, request: Request, here: Services, who: Principal) -> Resource | Started:
+    async def find(self, request: Request, services: Services, principal: Principal) -> Resource | Started:
         """What stands at the request's address; made where need be, or the job that makes it."""
         key = _key(request)
         fresh = self.get(key)
@@ -126,17 +126,17 @@ class Hot:
             return fresh
         link = link_of(request)
         values, derive, closures = _options(key[1] if link is None else link.query)
-        wanted = replace(wanted_of(request), closures=closures)
+        map_request = replace(wanted_of(request), closures=closures)
         # Taken before anything is read: a commit in between makes this answer stale, never fresh.
         generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
         for attempt in itertools.count():
-            recipe = await self.shared(request, _resolve, here, wanted, values, derive)
+            recipe = await self.shared(request, _resolve, services, map_request, values, derive)
             old = self._entries.get(key)
             if old is not None and old.recipe is not None and _same(old.recipe, recipe) and old.body is not None:
                 fresh = replace(old, generation=generation, fresh_until=until)
                 self._put(key, fresh)
                 return fresh
-            empty = self._resource(wanted, recipe, values, derive, generation, until, _route(request))
+            empty = self._resource(map_request, recipe, values, derive, generation, until, _route(request))
             if link is not None:
                 empty = _by_link(empty, link)
             if _matches(request, empty.etag):
@@ -144,34 +144,34 @@ class Hot:
                 return empty
             # From here on the recipe says what is meant: who was told of a later commit has another one.
             try:
-                made: Resource | None = await self._looks.run(
-                    (key, _meant(recipe), "ready"), self._ready, here, key, empty
+                entry: Resource | None = await self._looks.run(
+                    (key, _meant(recipe), "ready"), self._ready, services, key, empty
                 )
-                if made is not None:
-                    return made
-                outcome = await here.work.make(recipe, who, address_of(request))
+                if entry is not None:
+                    return entry
+                outcome = await services.work.make(recipe, principal, address_of(request))
                 if isinstance(outcome, Started):
                     return outcome
-                made = await self._looks.run((key, _meant(recipe), "fill"), self._fill, key, empty, outcome)
+                entry = await self._looks.run((key, _meant(recipe), "fill"), self._fill, key, empty, outcome)
             except CannotDerive:
                 continue  # it is remembered: the next recipe goes another way, or says that there is none
             except LostMap:  # damaged or evicted while it was read: it is made again
                 if attempt >= LOST_ATTEMPTS:
                     raise
                 continue
-            return made
+            return entry
         raise AssertionError("unreachable")
 
-    def _ready(self, here: Services, key: Key, empty: Resource) -> Resource | None:
+    def _ready(self, services: Services, key: Key, empty: Resource) -> Resource | None:
         assert empty.recipe is not None
-        made = here.maps.ready(empty.recipe)
-        if made is None:
+        cached_map = services.maps.ready(empty.recipe)
+        if cached_map is None:
             return None
         self._metrics.disk_hits.inc()
-        return self._fill(key, empty, made)
+        return self._fill(key, empty, cached_map)
 
-    def _fill(self, key: Key, empty: Resource, made: Made) -> Resource:
-        full = _filled(empty, made)
+    def _fill(self, key: Key, empty: Resource, cached_map: Made) -> Resource:
+        full = _filled(empty, cached_map)
         self._put(key, full)
         return full
 
@@ -181,12 +181,12 @@ class Hot:
         Nobody joins a look that began before the last commit. So what it finds must depend on what commits tell of
         alone (robots' reports are not), and on nothing that was found before it, nor on who asks.
         """
-        found: T = await self._looks.run((_key(request), self.generation(), function), function, *args, **kwargs)
-        return found
+        result: T = await self._looks.run((_key(request), self.generation(), function), function, *args, **kwargs)
+        return result
 
     def _resource(
         self,
-        wanted: Wanted,
+        map_request: Wanted,
         recipe: Recipe,
         values: Mapping[str, str],
         derive: bool,
@@ -195,11 +195,11 @@ class Hot:
         route: str,
     ) -> Resource:
         version = recipe.version
-        etag = recipe.etag if wanted.file is None else _file_etag(recipe, wanted.file)
+        etag = recipe.etag if map_request.file is None else _file_etag(recipe, map_request.file)
         closures = version.closures
         more = ({} if derive else {"derive": "false"}) | ({} if closures is None else {"closures": closures.mode})
         query = urlencode({**values, **more})
-        report = path_of("environments", version.environment, "versions", version.number, "reports", wanted.format)
+        report = path_of("environments", version.environment, "versions", version.number, "reports", map_request.format)
         bare = [
             (b"etag", etag.encode()),
             (b"cache-control", b"no-cache"),
@@ -211,7 +211,9 @@ class Hot:
         link = f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()
         headers = [*bare, (b"link", link), (b"x-content-type-options", b"nosniff")]
         tally = self._tallies.setdefault(route, [0, 0])
-        return Resource(wanted, recipe, etag, etag.encode(), headers, bare, 0, None, None, "", generation, until, tally)
+        return Resource(
+            map_request, recipe, etag, etag.encode(), headers, bare, 0, None, None, "", generation, until, tally
+        )
 
     def keep(
         self, request: Request, environment: str, headers: Mapping[str, str], body: bytes, generation: int
@@ -225,11 +227,15 @@ class Hot:
         full = [*bare, (b"content-length", str(len(body)).encode()), (b"content-type", b"application/json")]
         full.append((b"x-content-type-options", b"nosniff"))
         tally = self._tallies.setdefault(request.scope["route"].path, [0, 0])
-        wanted, until, etag = Wanted(environment, None, "", None), time.monotonic() + FRESH_SECONDS, headers["etag"]
+        map_request, until, etag = (
+            Wanted(environment, None, "", None),
+            time.monotonic() + FRESH_SECONDS,
+            headers["etag"],
+        )
         self._put(
             key,
             Resource(
-                wanted, None, etag, etag.encode(), full, bare, len(body), body, None, "", generation, until, tally
+                map_request, None, etag, etag.encode(), full, bare, len(body), body, None, "", generation, until, tally
             ),
         )
 
@@ -302,20 +308,22 @@ def _matches(request: Request, etag: str) -> bool:
     return header is not None and header.strip() != "*" and none_match(header, etag)
 
 
-def _resolve(here: Services, wanted: Wanted, values: Mapping[str, str], derive: bool) -> Recipe:
-    return here.maps.recipe(version_of(here, wanted), wanted.format, values, derive=derive, file=wanted.file)
+def _resolve(services: Services, map_request: Wanted, values: Mapping[str, str], derive: bool) -> Recipe:
+    return services.maps.recipe(
+        version_of(services, map_request), map_request.format, values, derive=derive, file=map_request.file
+    )
 
 
-def version_of(here: Services, wanted: Wanted) -> Version:
+def version_of(services: Services, map_request: Wanted) -> Version:
     """The version that an address means, with the closures that its maps show: on a short one production where there is
     one, else the head.
     """
-    if wanted.version is not None:
-        return here.store.standing(wanted.environment, number_of(wanted.version), wanted.closures)[0]
+    if map_request.version is not None:
+        return services.store.standing(map_request.environment, number_of(map_request.version), map_request.closures)[0]
     try:
-        return here.store.standing(wanted.environment, PRODUCTION, wanted.closures)[0]
+        return services.store.standing(map_request.environment, PRODUCTION, map_request.closures)[0]
     except NotFound:
-        return here.store.standing(wanted.environment, LATEST, wanted.closures)[0]
+        return services.store.standing(map_request.environment, LATEST, map_request.closures)[0]
 
 
 def number_of(ref: str) -> str | int:
@@ -323,10 +331,10 @@ def number_of(ref: str) -> str | int:
     return int(ref) if ref.isascii() and ref.isdigit() and len(ref) <= 18 else ref
 
 
-def _filled(empty: Resource, made: Made) -> Resource:
+def _filled(empty: Resource, cached_map: Made) -> Resource:
     """With headers and content of the made map. NotFound where it has no such file."""
     assert empty.recipe is not None
-    file = file_of(empty.recipe, made, empty.wanted.file)
+    file = file_of(empty.recipe, cached_map, empty.wanted.file)
     headers = [
         (b"content-type", _media_type(file).encode()),
         (b"accept-ranges", b"bytes"),
@@ -341,18 +349,20 @@ def _filled(empty: Resource, made: Made) -> Resource:
     return replace(empty, headers=headers, size=len(body), body=body, sha256=file.sha256)
 
 
-def _dictionary(wanted: Wanted) -> str:
+def _dictionary(map_request: Wanted) -> str:
     """For which addresses this file is a dictionary: the same file of any version (RFC 9842, URL pattern)."""
-    env, name = quote(wanted.environment, safe=""), quote(wanted.format, safe="")
-    file = "/" + quote(wanted.file, safe="/") if wanted.file else ""
-    if wanted.version is None:
+    env, name = quote(map_request.environment, safe=""), quote(map_request.format, safe="")
+    file = "/" + quote(map_request.file, safe="/") if map_request.file else ""
+    if map_request.version is None:
         return f'match="/maps/{env}/{name}{file}"'
     return f'match="{API}/environments/{env}/versions/*/maps/{name}{file}"'
 
 
 def _media_type(file: MadeFile) -> str:
-    known = file.media_type
-    return f"{known}; charset=utf-8" if known.startswith("text/") and "charset" not in known else known
+    media_type = file.media_type
+    return (
+        f"{media_type}; charset=utf-8" if media_type.startswith("text/") and "charset" not in media_type else media_type
+    )
 
 
 _SHORT = re.compile(r"/maps/([^/]+)/([^/]+)(?:/(.+))?", re.DOTALL)
@@ -432,9 +442,9 @@ class Server(FastAPI):
         """Answer a repeated request for a map from memory, or go the long way."""
         hot = self.hot
         if hot is not None and scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
-            found = hot.get((scope.get("raw_path") or b"", scope["query_string"]))
-            if found is not None:
-                reply = _reply(hot, found, scope["headers"], scope["method"] == "HEAD")
+            entry = hot.get((scope.get("raw_path") or b"", scope["query_string"]))
+            if entry is not None:
+                reply = _reply(hot, entry, scope["headers"], scope["method"] == "HEAD")
                 if reply is not None:
                     if PROVE in scope.get("state", ()):
                         scope["state"][PROVE]()
@@ -448,7 +458,7 @@ _EMPTY = {"type": "http.response.body", "body": b""}
 
 
 def _reply(
-    hot: Hot, found: Resource, headers: list[tuple[bytes, bytes]], head_only: bool
+    hot: Hot, entry: Resource, headers: list[tuple[bytes, bytes]], head_only: bool
 ) -> tuple[dict[str, Any], dict[str, Any]] | None:
     """The two messages of an answer, or None where it takes the long way."""
     authorization = condition = None
@@ -461,77 +471,77 @@ def _reply(
             condition = value
         elif name in (b"range", b"if-match", b"available-dictionary"):
             return None
-    if found.link_expires is None:
-        who = hot.access.known(authorization)
-        if who is None or not who.may_enter(found.wanted.environment):
+    if entry.link_expires is None:
+        principal = hot.access.known(authorization)
+        if principal is None or not principal.may_enter(entry.wanted.environment):
             return None
-    elif found.link_expires <= time.time():  # the signature is part of the key: it was checked with the first request
+    elif entry.link_expires <= time.time():  # the signature is part of the key: it was checked with the first request
         return None
     if hot.access.insecure and not is_from_here(dict(headers)):
         return None
-    if condition is not None and (condition == found.raw_etag or none_match(condition.decode("latin-1"), found.etag)):
-        if found.body is None and condition.strip() == b"*":
+    if condition is not None and (condition == entry.raw_etag or none_match(condition.decode("latin-1"), entry.etag)):
+        if entry.body is None and condition.strip() == b"*":
             return None
-        found.tally[1] += 1
-        return {"type": "http.response.start", "status": 304, "headers": found.bare}, _EMPTY
-    if found.body is None:
+        entry.tally[1] += 1
+        return {"type": "http.response.start", "status": 304, "headers": entry.bare}, _EMPTY
+    if entry.body is None:
         return None
-    found.tally[0] += 1
-    body = _EMPTY if head_only else {"type": "http.response.body", "body": found.body}
-    return {"type": "http.response.start", "status": 200, "headers": found.headers}, body
+    entry.tally[0] += 1
+    body = _EMPTY if head_only else {"type": "http.response.body", "body": entry.body}
+    return {"type": "http.response.start", "status": 200, "headers": entry.headers}, body
 
 
 async def download(template: str, request: Request) -> Response:
     """A map, or one of its files: the long way."""
     request.scope["state"]["route"] = template  # for the metrics; plain routes leave none in the scope
-    here: Services = request.app.state.services
-    who: Principal = request.scope["state"]["principal"]
+    services: Services = request.app.state.services
+    principal: Principal = request.scope["state"]["principal"]
     for _ in range(LOST_ATTEMPTS):
         try:
-            return await _answer(request, here, await here.hot.find(request, here, who))
+            return await _answer(request, services, await services.hot.find(request, services, principal))
         except LostMap:  # it left the cache since it was found
-            here.hot.forget(request)
+            services.hot.forget(request)
     raise Unavailable("the map is removed from the cache faster than it is sent: try again in a few seconds")
 
 
-async def _answer(request: Request, here: Services, found: Resource | Started) -> Response:
-    if isinstance(found, Started):
+async def _answer(request: Request, services: Services, outcome: Resource | Started) -> Response:
+    if isinstance(outcome, Started):
         if link_of(request) is not None:  # its holder has no token to follow a job with
             raise Unavailable("the map is still being converted: try again in a few seconds")
-        return started(found.job)
-    if none_match(request.headers.get("if-none-match"), found.etag):
-        return _response(304, found.bare)
-    delta = await _delta(request, here, found)
+        return started(outcome.job)
+    if none_match(request.headers.get("if-none-match"), outcome.etag):
+        return _response(304, outcome.bare)
+    delta = await _delta(request, services, outcome)
     if delta is not None:
         return delta
-    if found.file is not None:
-        return await _from_disk(request, found)
-    body = found.body or b""
-    part = byte_range(request.headers.get("range"), request.headers.get("if-range"), found.etag, found.size)
+    if outcome.file is not None:
+        return await _from_disk(request, outcome)
+    body = outcome.body or b""
+    part = byte_range(request.headers.get("range"), request.headers.get("if-range"), outcome.etag, outcome.size)
     if isinstance(part, Unsatisfiable):
-        raise _unsatisfiable(found.size)
+        raise _unsatisfiable(outcome.size)
     if part is None:
-        return _response(200, found.headers, body)
-    return _response(206, _partial_headers(found, part), body[part[0] : part[1]])
+        return _response(200, outcome.headers, body)
+    return _response(206, _partial_headers(outcome, part), body[part[0] : part[1]])
 
 
-async def _delta(request: Request, here: Services, found: Resource) -> Response | None:
+async def _delta(request: Request, services: Services, entry: Resource) -> Response | None:
     """The file as a delta to the one that the client has, if it has one that is known here."""
     old = deltas.wanted(request.headers)
-    if old is None or "range" in request.headers or found.size > deltas.MAX_BYTES:
+    if old is None or "range" in request.headers or entry.size > deltas.MAX_BYTES:
         return None
-    content = found.body if found.body is not None else found.file
+    content = entry.body if entry.body is not None else entry.file
     if content is None:
         return None
-    made = await here.deltas.between(old, found.sha256, content)
-    if made is None:
+    delta = await services.deltas.between(old, entry.sha256, content)
+    if delta is None:
         return None
-    etag = f'{found.etag[:-1]}-dcz{old[:16]}"'.encode()
+    etag = f'{entry.etag[:-1]}-dcz{old[:16]}"'.encode()
     left = (b"content-length", b"etag", b"accept-ranges")
-    headers = [(n, v) for n, v in found.headers if n not in left]
-    headers = [(b"content-length", str(len(made)).encode()), (b"content-encoding", b"dcz"), (b"etag", etag), *headers]
+    headers = [(n, v) for n, v in entry.headers if n not in left]
+    headers = [(b"content-length", str(len(delta)).encode()), (b"content-encoding", b"dcz"), (b"etag", etag), *headers]
     head_only = bool(request.scope.get("state", {}).get("head"))
-    return _response(200, headers, b"" if head_only else made)
+    return _response(200, headers, b"" if head_only else delta)
 
 
 def _response(status: int, headers: Headers, body: bytes = b"") -> Response:
@@ -544,34 +554,34 @@ def _unsatisfiable(size: int) -> HTTPException:
     return HTTPException(416, f"the file has {size} bytes", {"content-range": f"bytes */{size}"})
 
 
-def _partial_headers(found: Resource, part: tuple[int, int]) -> Headers:
-    kept = [(n, v) for n, v in found.headers if n != b"content-length"]
+def _partial_headers(entry: Resource, part: tuple[int, int]) -> Headers:
+    other_headers = [(n, v) for n, v in entry.headers if n != b"content-length"]
     start, end = part
     return [
         (b"content-length", str(end - start).encode()),
-        (b"content-range", f"bytes {start}-{end - 1}/{found.size}".encode()),
-        *kept,
+        (b"content-range", f"bytes {start}-{end - 1}/{entry.size}".encode()),
+        *other_headers,
     ]
 
 
-async def _from_disk(request: Request, found: Resource) -> Response:
+async def _from_disk(request: Request, entry: Resource) -> Response:
     """A large file, in chunks. It is opened before the answer starts, so the cache may drop it meanwhile."""
-    assert found.file is not None
-    assert found.file.path is not None
-    part = byte_range(request.headers.get("range"), request.headers.get("if-range"), found.etag, found.size)
+    assert entry.file is not None
+    assert entry.file.path is not None
+    part = byte_range(request.headers.get("range"), request.headers.get("if-range"), entry.etag, entry.size)
     if isinstance(part, Unsatisfiable):
-        raise _unsatisfiable(found.size)
+        raise _unsatisfiable(entry.size)
     head_only = bool(request.scope.get("state", {}).get("head"))
-    start, end = part or (0, found.size)
-    headers = _partial_headers(found, part) if part else [(b"content-length", str(found.size).encode()), *found.headers]
+    start, end = part or (0, entry.size)
+    headers = _partial_headers(entry, part) if part else [(b"content-length", str(entry.size).encode()), *entry.headers]
     status = 206 if part else 200
     if head_only:
         return _response(status, headers)
     try:
-        file = await run_in_threadpool(found.file.path.open, "rb")
+        file = await run_in_threadpool(entry.file.path.open, "rb")
     except OSError as error:
-        raise found.file.lost(error) from error
-    return streamed(file, start, end, status, headers, None if part else found.file.check)
+        raise entry.file.lost(error) from error
+    return streamed(file, start, end, status, headers, None if part else entry.file.check)
 
 
 def streamed(
@@ -617,20 +627,22 @@ def add_routes(app: FastAPI) -> None:
         app.router.add_route(path, partial(download, path), methods=["GET"], include_in_schema=False)
 
 
-async def made_at(here: Services, wanted: Wanted, query: bytes, who: Principal) -> tuple[Recipe, Made] | Started:
+async def made_at(
+    services: Services, map_request: Wanted, query: bytes, principal: Principal
+) -> tuple[Recipe, Made] | Started:
     """The map that an address of a version's number gives, made where need be; the job that makes it if it takes long.
 
     query: the map's parameters, percent-encoded.
     """
     values, derive, closures = _options(query)
-    path = path_of("environments", wanted.environment, "versions", wanted.version, "maps", wanted.format)
+    path = path_of("environments", map_request.environment, "versions", map_request.version, "maps", map_request.format)
     address = f"{path}?{query.decode()}" if query else path
-    plan = partial(_resolve, here, replace(wanted, closures=closures), values, derive)
-    return await made_by(here, plan, address, who)
+    plan = partial(_resolve, services, replace(map_request, closures=closures), values, derive)
+    return await made_by(services, plan, address, principal)
 
 
 async def made_by(
-    here: Services, plan: Callable[[], Recipe], address: str, who: Principal
+    services: Services, plan: Callable[[], Recipe], address: str, principal: Principal
 ) -> tuple[Recipe, Made] | Started:
     """The map of a recipe, made where need be; the job that makes it for ``address`` if it takes long.
 
@@ -638,11 +650,11 @@ async def made_by(
     """
     while True:
         recipe = await run_in_threadpool(plan)
-        made = await run_in_threadpool(here.maps.ready, recipe)
-        if made is not None:
-            return recipe, made
+        cached_map = await run_in_threadpool(services.maps.ready, recipe)
+        if cached_map is not None:
+            return recipe, cached_map
         try:
-            outcome = await here.work.make(recipe, who, address)
+            outcome = await services.work.make(recipe, principal, address)
         except CannotDerive:
             continue
         return outcome if isinstance(outcome, Started) else (recipe, outcome)
@@ -652,9 +664,9 @@ router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], rou
 
 
 @router.get("/maps", responses=told(list[CoverageOut], 404), summary="Which formats can be had")
-def coverage(env: EnvironmentPath, v: VersionPath, here: Here, _: Viewer) -> Response:
+def coverage(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer) -> Response:
     """For every format: whether it can be written as it is, by deriving what lacks, or what to supply."""
-    return answer(here.maps.coverage(here.store.version(env, number_of(v))))
+    return answer(services.maps.coverage(services.store.version(env, number_of(v))))
 
 
 @router.get(
@@ -668,14 +680,14 @@ async def report(
     v: VersionPath,
     format: FormatPath,
     request: Request,
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     derive: bool = Query(True, description="Whether derived information is allowed."),
 ) -> Response:
     """Raw, derived and filled-in information of a map, what was dropped and why. Takes the map's own parameters."""
     values, allowed, mode = _options(request.scope["query_string"])
-    plan = partial(_resolve, here, Wanted(env, v, format, None, mode), values, allowed and derive)
-    outcome = await made_by(here, plan, address_of(request), who)
+    plan = partial(_resolve, services, Wanted(env, v, format, None, mode), values, allowed and derive)
+    outcome = await made_by(services, plan, address_of(request), principal)
     if isinstance(outcome, Started):
         return started(outcome.job)
-    return answer(await run_in_threadpool(here.maps.report, outcome[0]))
+    return answer(await run_in_threadpool(services.maps.report, outcome[0]))

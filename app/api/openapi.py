@@ -190,8 +190,8 @@ def _finish(path: str, method: str, operation: dict[str, Any]) -> None:
             "415": "A media type or content coding that is not taken.",
         }
     for status, text in common.items():
-        known = responses.get(status)
-        if known is None or "HTTPValidationError" in str(known):
+        response = responses.get(status)
+        if response is None or "HTTPValidationError" in str(response):
             responses[status] = {"description": text, "content": problem}
 
 
@@ -234,23 +234,23 @@ def _map_paths(paths: dict[str, Any]) -> None:
         }
         paths[path] = {"get": operation}
     short = paths["/maps/{env}/{format}"]["get"]
-    for known in formats.all_formats().values():
-        if known.write is None:
+    for fmt in formats.all_formats().values():
+        if fmt.write is None:
             continue
-        wanted = {"env", "derive", "closures", *(p["name"] for p in _header_parameters())}
-        common = [p for p in short["parameters"] if p["name"] in wanted]
-        paths[f"/maps/{{env}}/{known.name}"] = {
+        common_names = {"env", "derive", "closures", *(p["name"] for p in _header_parameters())}
+        common = [p for p in short["parameters"] if p["name"] in common_names]
+        paths[f"/maps/{{env}}/{fmt.name}"] = {
             "get": {
                 **short,
                 "tags": ["maps by format"],
-                "summary": known.title,
-                "operationId": f"get_{known.name}",
-                "parameters": [*common[:1], *_own_parameters(known), *common[1:]],
+                "summary": fmt.title,
+                "operationId": f"get_{fmt.name}",
+                "parameters": [*common[:1], *_own_parameters(fmt), *common[1:]],
             }
         }
 
 
-def _own_parameters(known: formats.Format) -> list[dict[str, Any]]:
+def _own_parameters(fmt: formats.Format) -> list[dict[str, Any]]:
     """The parameters of one format's writer."""
     return [
         {
@@ -259,7 +259,7 @@ def _own_parameters(known: formats.Format) -> list[dict[str, Any]]:
             "description": f"{option['description']} Default: {option['default']!r}.",
             "schema": dict(option["schema"]),
         }
-        for option in parameters.describe(known.write_options)
+        for option in parameters.describe(fmt.write_options)
     ]
 
 
@@ -286,7 +286,7 @@ def _path_parameter(name: str) -> dict[str, Any]:
     description, example = _EXAMPLES[name]
     schema: dict[str, Any] = {"type": "string"}
     if name == "format":
-        schema["enum"] = [known.name for known in formats.all_formats().values() if known.write]
+        schema["enum"] = [fmt.name for fmt in formats.all_formats().values() if fmt.write]
     return {
         "name": name,
         "in": "path",
@@ -303,7 +303,7 @@ def _query_parameters() -> list[dict[str, Any]]:
     One that several have is told once, with what it means for each.
     """
     out: dict[str, dict[str, Any]] = {}
-    declared = [(known.name, known.write_options) for known in formats.all_formats().values() if known.write]
+    declared = [(fmt.name, fmt.write_options) for fmt in formats.all_formats().values() if fmt.write]
     declared += [(step.name, step.parameters) for step in all_derivations().values()]
     for name, options in declared:
         for option in parameters.describe(options):

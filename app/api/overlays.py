@@ -58,7 +58,7 @@ Ref = Annotated[
 @router.get("", responses=told(list[OverlayOut], 404), summary="List overlays")
 def list_overlays(
     env: EnvironmentPath,
-    here: Here,
+    services: Here,
     _: Viewer,
     state: Annotated[
         Literal["pending", "accepted", "rejected", "expired", "ended"] | None,
@@ -68,7 +68,7 @@ def list_overlays(
     """Oldest first. `pending` waits for a decision, `accepted` is in force on every channel, `expired` was never
     decided on, `ended` is over.
     """
-    return answer([overlay.as_dict() for overlay in here.store.overlays(env, state)])
+    return answer([overlay.as_dict() for overlay in services.store.overlays(env, state)])
 
 
 @router.post(
@@ -80,22 +80,22 @@ def list_overlays(
     },
     summary="Report what is blocked",
 )
-def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Reporter) -> Response:
+def report_overlay(env: EnvironmentPath, body: OverlayBody, services: Here, principal: Reporter) -> Response:
     """Report that a polygon or an edge cannot be used until a time. With `state: "accepted"` (editors) it is in force
     at once, on every channel; otherwise an editor decides.
     """
     if (body.polygon is None) == (body.edge is None):
         raise Invalid("give polygon or edge, one of them", [Problem("one of polygon and edge", where="body")])
-    if body.state == "accepted" and who.role not in ("editor", "admin"):
+    if body.state == "accepted" and principal.role not in ("editor", "admin"):
         raise Denied("only editors can accept an overlay: report it without state, an editor decides")
-    versions = list(_shown_versions(here, env))
+    versions = list(_shown_versions(services, env))
     head = versions[0]
     now = datetime.now(UTC)
     crs = None if body.polygon is None else body.crs or ("wgs84" if head.datum else "local")
     level = body.level or GROUND
     edge = None
     if body.edge is not None:
-        key, feature = overlays.edge_of(here.store, versions, body.edge)
+        key, feature = overlays.edge_of(services.store, versions, body.edge)
         level, edge = key.level, feature.id
     reported = Overlay(
         environment=env,
@@ -105,15 +105,15 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Rep
         edge=edge,
         crs=crs,
         detail=body.detail,
-        reporter=who.robot or who.name,
+        reporter=principal.robot or principal.name,
         created=now,
         expires=_end_of(body, now),
         state=body.state,
-        decided_by=who.name if body.state == "accepted" else None,
+        decided_by=principal.name if body.state == "accepted" else None,
         decided=now if body.state == "accepted" else None,
     )
     _check_place(reported, versions)
-    overlay, new = here.store.add_overlay(reported)
+    overlay, new = services.store.add_overlay(reported)
     return answer(overlay.as_dict(), 201 if new else 200)
 
 
@@ -145,13 +145,13 @@ def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
         raise Invalid(problem, [Problem(str(problems[0]), where="polygon")])
 
 
-def _shown_versions(here: Services, env: str) -> Iterator[Version]:
+def _shown_versions(services: Services, env: str) -> Iterator[Version]:
     """The newest version, then those that channels stand on: robots report from any of them."""
-    head = here.store.version(env)
+    head = services.store.version(env)
     yield head
-    numbers = {channel.version for channel in here.store.channels(env)} - {None, head.number}
+    numbers = {channel.version for channel in services.store.channels(env)} - {None, head.number}
     for number in sorted((n for n in numbers if n is not None), reverse=True):
-        yield here.store.version(env, number)
+        yield services.store.version(env, number)
 
 
 def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -169,61 +169,65 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @router.post("/{id}/accept", responses=told(OverlayOut, 404, 409, 422, 503), summary="Accept an overlay")
-def accept_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
+def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal: Editor) -> Response:
     """Put it in force on every channel until its end: areas become keepout, edges are closed. No version changes."""
     now = datetime.now(UTC)
-    overlay = here.store.overlay(env, id)
+    overlay = services.store.overlay(env, id)
     if overlay.state == "pending" and overlay.expires <= now:
         raise Conflict(f"the overlay {id} has expired: report it again")
     if overlay.state == "pending":
-        versions = list(_shown_versions(here, env))
+        versions = list(_shown_versions(services, env))
         if overlay.edge is not None:
-            overlays.edge_of(here.store, versions, overlay.edge)
+            overlays.edge_of(services.store, versions, overlay.edge)
         _check_place(overlay, versions)
-    return answer(here.store.decide_overlay(env, id, "pending", "accepted", who.name, now).as_dict())
+    return answer(services.store.decide_overlay(env, id, "pending", "accepted", principal.name, now).as_dict())
 
 
 @router.post("/{id}/reject", responses=told(OverlayOut, 404, 409), summary="Reject an overlay")
-def reject_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
+def reject_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal: Editor) -> Response:
     """It stays in the list, and nothing changes."""
-    decided = here.store.decide_overlay(env, id, "pending", "rejected", who.name, datetime.now(UTC))
+    decided = services.store.decide_overlay(env, id, "pending", "rejected", principal.name, datetime.now(UTC))
     return answer(decided.as_dict())
 
 
 @router.post("/{id}/end", responses=told(OverlayOut, 404, 409), summary="End an accepted overlay now")
-def end_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
+def end_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal: Editor) -> Response:
     """Open the area or edge again, on every channel at once."""
-    return answer(here.store.decide_overlay(env, id, "accepted", "ended", who.name, datetime.now(UTC)).as_dict())
+    return answer(
+        services.store.decide_overlay(env, id, "accepted", "ended", principal.name, datetime.now(UTC)).as_dict()
+    )
 
 
 @router.post("/{id}/keep", responses=told(OverlayOut, 404, 409, 422, 503), summary="Make an accepted overlay permanent")
-def keep_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
+def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal: Editor) -> Response:
     """A new version holds it: an area as a keepout zone, an edge with `blocked: true`. The overlay stays in force until
     its end; promote the version before that to keep robots out for good.
     """
-    overlay = here.store.overlay(env, id)
+    overlay = services.store.overlay(env, id)
     if overlay.state != "accepted":
         raise Conflict(f"the overlay {id} is {overlay.state}: only accepted ones can be kept")
-    what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
-    outcome = here.ingest.amend(
+    obstruction = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
+    outcome = services.ingest.amend(
         env,
-        partial(overlays.permanent_edits, here.store, overlay=overlay),
-        message=f"{what} is blocked permanently (reported by {overlay.reporter})",
-        author=who.name,
+        partial(overlays.permanent_edits, services.store, overlay=overlay),
+        message=f"{obstruction} is blocked permanently (reported by {overlay.reporter})",
+        author=principal.name,
     )
     assert outcome.version is not None
-    return answer(here.store.note_kept_overlay(env, id, outcome.version.number).as_dict())
+    return answer(services.store.note_kept_overlay(env, id, outcome.version.number).as_dict())
 
 
 # --- ready-made for planners that take closures live ---
 
 
 @router.get("/nav2", responses=told(DynamicEdgesOut, 404, 409, 422), summary="Closures for Nav2's route server")
-async def nav2_edges(env: EnvironmentPath, request: Request, here: Here, who: Viewer, version: Ref = None) -> Response:
+async def nav2_edges(
+    env: EnvironmentPath, request: Request, services: Here, principal: Viewer, version: Ref = None
+) -> Response:
     """A request of `nav2_msgs/srv/DynamicEdges`: the numbers of closed edges, and of those that were closed and are
     open again, in the graph that `maps/nav2_route?closures=mark` gives.
     """
-    maps = await _marked(here, env, version, "nav2_route", request, who)
+    maps = await _marked(services, env, version, "nav2_route", request, principal)
     if isinstance(maps, Started):
         return started(maps.job)
     now, before = (live.closed_edges(files) for files in maps)
@@ -234,15 +238,15 @@ async def nav2_edges(env: EnvironmentPath, request: Request, here: Here, who: Vi
 async def rmf_lanes(
     env: EnvironmentPath,
     request: Request,
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     version: Ref = None,
     fleet: Annotated[str, Query(max_length=256, description="`fleet_name` of the messages.")] = "",
 ) -> Response:
     """Messages of `rmf_fleet_msgs/msg/LaneRequest`, one for each graph: lanes to close, and lanes that were closed and
     are open again, by their indexes in the graphs that `maps/rmf_nav_graph?closures=mark` gives.
     """
-    maps = await _marked(here, env, version, "rmf_nav_graph", request, who)
+    maps = await _marked(services, env, version, "rmf_nav_graph", request, principal)
     if isinstance(maps, Started):
         return started(maps.job)
     now, before = (live.closed_lanes(files) for files in maps)
@@ -263,7 +267,7 @@ async def rmf_lanes(
 @router.get("/vda5050", responses=told(ZoneSetsOut, 404, 409, 422), summary="Closures for VDA 5050 fleet managers")
 def vda5050_zones(
     env: EnvironmentPath,
-    here: Here,
+    services: Here,
     _: Viewer,
     version: Ref = None,
     map_id: Annotated[
@@ -274,7 +278,7 @@ def vda5050_zones(
     """Zone sets of VDA 5050 3.0 with a `BLOCKED` zone for each closed area, one set for each level, and the closed
     edges by id, for the fleet manager's own routing. A set's id changes with its content.
     """
-    shown = _shown(here, env, version)
+    shown = _shown(services, env, version)
     closures = shown.closures or Closures()
     return answer(
         {
@@ -284,32 +288,32 @@ def vda5050_zones(
     )
 
 
-def _shown(here: Services, env: str, ref: str | None) -> Version:
+def _shown(services: Services, env: str, ref: str | None) -> Version:
     """The version that planners have loaded, with the closures in force. Raises NotFound."""
     refs: list[str | int] = ["production", "latest"] if ref is None else [int(ref) if ref.isdigit() else ref]
     for name in refs[:-1]:
         try:
-            return here.store.standing(env, name, "mark")[0]
+            return services.store.standing(env, name, "mark")[0]
         except NotFound:
             continue
-    return here.store.standing(env, refs[-1], "mark")[0]
+    return services.store.standing(env, refs[-1], "mark")[0]
 
 
 async def _marked(
-    here: Services, env: str, ref: str | None, name: str, request: Request, who: Principal
+    services: Services, env: str, ref: str | None, name: str, request: Request, principal: Principal
 ) -> list[dict[str, bytes]] | Started:
     """A map's files twice, with marks: of the closures in force, and of those that ended."""
-    shown = await run_in_threadpool(_shown, here, env, ref)
-    ended = [o for o in await run_in_threadpool(here.store.overlays, env) if o.state == "ended"]
+    shown = await run_in_threadpool(_shown, services, env, ref)
+    ended = [o for o in await run_in_threadpool(services.store.overlays, env) if o.state == "ended"]
     out = []
     for closures in (shown.closures, Closures(tuple(o.closure for o in ended), "mark")):
-        plan = partial(here.maps.recipe, live.with_closures(shown, closures), name)
-        outcome = await made_by(here, plan, address_of(request), who)
+        plan = partial(services.maps.recipe, live.with_closures(shown, closures), name)
+        outcome = await made_by(services, plan, address_of(request), principal)
         if isinstance(outcome, Started):
             return outcome
         out.append(await run_in_threadpool(_files, outcome[1]))
     return out
 
 
-def _files(made: Made) -> dict[str, bytes]:
-    return {file.name: file.read() for file in made.files}
+def _files(cached_map: Made) -> dict[str, bytes]:
+    return {file.name: file.read() for file in cached_map.files}

@@ -166,8 +166,8 @@ def of_error(error: errors.FleetMapError) -> Response:
         headers["retry-after"] = str(NO_ROOM_RETRY_SECONDS)
     if isinstance(error, errors.Damaged | errors.NoRoom) and _is_news(error.detail):
         # The operator's alarm; the client learns only that it was not its fault.
-        what = "stored data is damaged" if isinstance(error, errors.Damaged) else "no room left on the server's disk"
-        log.critical("%s: %s", what, error.detail)
+        alarm = "stored data is damaged" if isinstance(error, errors.Damaged) else "no room left on the server's disk"
+        log.critical("%s: %s", alarm, error.detail)
     return problem(status, error.detail, title=title, type_=type_, problems=error.problems, headers=headers)
 
 
@@ -211,18 +211,18 @@ def of_validation(error: RequestValidationError) -> Response:
     """The answer for a request that does not fit its schema; 400 where the body is not even JSON."""
     problems = []
     for item in error.errors():
-        where = ".".join(str(part) for part in item.get("loc", ()))
+        location = ".".join(str(part) for part in item.get("loc", ()))
         if item.get("type") == "json_invalid":
             reason = str(item.get("ctx", {}).get("error", item["msg"]))
-            found = errors.Problem(f"not JSON: {reason}", where=f"character {item['loc'][-1]}")
+            parse_problem = errors.Problem(f"not JSON: {reason}", where=f"character {item['loc'][-1]}")
             return problem(
                 400,
                 "the request body is not JSON",
                 title="Malformed body",
                 type_="urn:fleetmap:problem:malformed-body",
-                problems=[found],
+                problems=[parse_problem],
             )
-        problems.append(errors.Problem(str(item["msg"]).removeprefix("Value error, "), where=where))
+        problems.append(errors.Problem(str(item["msg"]).removeprefix("Value error, "), where=location))
     detail = "; ".join(f"{p.where}: {p.problem}" for p in problems[:5])
     return problem(422, detail, title="Invalid request", type_="urn:fleetmap:problem:invalid", problems=problems)
 

@@ -56,24 +56,24 @@ def graph(maps: Maps, version: Version) -> dict[str, Any]:
         links += [{"from": f"part:{line['layer']}/{line['level']}/{line['name']}", "to": name} for line in inputs]
         if not inputs:
             links += [{"from": f"source:{source}", "to": name} for source in told_by.sources]
-    known = {part["id"] for part in parts}
-    made = []
+    part_ids = {part["id"] for part in parts}
+    map_lines = []
     for line in maps.coverage(version):
         name = f"map:{line['format']}"
-        made.append({"id": name, "format": line["format"], "state": line["state"], "chain": line["chain"]})
+        map_lines.append({"id": name, "format": line["format"], "state": line["state"], "chain": line["chain"]})
         if line["state"] == "missing":
             continue
         used = maps.parts_of(version, line["format"])
         links += [
             {"from": f"part:{k.layer}/{k.level}/{k.name}", "to": name}
             for k in used
-            if f"part:{k.layer}/{k.level}/{k.name}" in known
+            if f"part:{k.layer}/{k.level}/{k.name}" in part_ids
         ]
     named = {link["from"] for link in links if link["from"].startswith("source:")}
     sources = [{"id": f"source:{s.name}", "name": s.name, "used": s.used} for s in version.sources]
     have = {s["id"] for s in sources}
     sources += [{"id": name, "name": name.partition(":")[2], "used": True} for name in sorted(named - have)]
-    return {"sources": sources, "parts": parts, "maps": made, "links": links}
+    return {"sources": sources, "parts": parts, "maps": map_lines, "links": links}
 
 
 @dataclass(slots=True)
@@ -157,8 +157,8 @@ def _state(state: str) -> str:
     return {"direct": "raw", "derivable": "derived"}.get(state, "missing")
 
 
-def _short(text: str, most: int) -> str:
-    return text if len(text) <= most else text[: most - 1] + "…"
+def _short(text: str, limit: int) -> str:
+    return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
 @router.get(
@@ -166,11 +166,11 @@ def _short(text: str, most: int) -> str:
     responses={**told(ProvenanceOut, 404), 200: {"model": ProvenanceOut, "content": {"image/svg+xml": {}}}},
     summary="Which file made which map",
 )
-def provenance(env: EnvironmentPath, v: VersionPath, request: Request, here: Here, _: Viewer) -> Response:
+def provenance(env: EnvironmentPath, v: VersionPath, request: Request, services: Here, _: Viewer) -> Response:
     """An SVG picture, or the same as JSON with `Accept: application/json`. What is stale is marked."""
-    version = here.store.version(env, number_of(v))
-    found = graph(here.maps, version)
+    version = services.store.version(env, number_of(v))
+    lineage = graph(services.maps, version)
     if "application/json" in request.headers.get("accept", ""):
-        return answer({"environment": env, "version": version.number, **found})
-    picture = svg(found, f"{env}, version {version.number}")
+        return answer({"environment": env, "version": version.number, **lineage})
+    picture = svg(lineage, f"{env}, version {version.number}")
     return Response(picture, media_type="image/svg+xml", headers={"content-security-policy": "default-src 'none'"})

@@ -30,8 +30,8 @@ EnvironmentQuery = Annotated[
 @router.get("", responses=told(list[RobotOut], 404), summary="All robots")
 def list_robots(
     request: Request,
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     environment: EnvironmentQuery = None,
     channel: Annotated[str | None, Query(pattern=CHANNEL, description="Only on this channel.")] = None,
     limit: Limit = 100,
@@ -41,35 +41,35 @@ def list_robots(
     environment and name.
     """
     if environment is not None:
-        who.enter(environment)
-    found, following = here.store.robots_page(
-        environment, channel=channel, limit=limit, cursor=cursor, allowed=who.environments
+        principal.enter(environment)
+    robots, following = services.store.robots_page(
+        environment, channel=channel, limit=limit, cursor=cursor, allowed=principal.environments
     )
-    return page(request, _told(here, found), following)
+    return page(request, _told(services, robots), following)
 
 
 @router.get("/{robot}", responses=told(RobotDetailOut, 404), summary="One robot, with what it said before")
 def get_robot(
     robot: RobotPath,
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     environment: EnvironmentQuery = None,
     limit: Annotated[int, Query(ge=1, le=200, description="Reports in `history`.")] = 50,
 ) -> Response:
     """In the environment where it reported last, unless one is named. `history`: newest first, each time that it said
     something new; `environments`: all in which it reported.
     """
-    found = [r for r in here.store.robots(None, robot) if who.may_enter(r.environment)]
+    robots = [r for r in services.store.robots(None, robot) if principal.may_enter(r.environment)]
     if environment is not None:
-        who.enter(environment)
-    chosen = [r for r in found if environment is None or r.environment == environment]
+        principal.enter(environment)
+    chosen = [r for r in robots if environment is None or r.environment == environment]
     if not chosen:
-        where = "" if environment is None else f" in {environment}"
-        raise NotFound(f"no robot {robot[:80]!r} has reported{where}")
+        scope = "" if environment is None else f" in {environment}"
+        raise NotFound(f"no robot {robot[:80]!r} has reported{scope}")
     newest = max(chosen, key=lambda r: r.time)
-    history = here.store.robot_history(newest.environment, robot, limit)
-    body = _one(here, [newest])
-    body["environments"] = [r.environment for r in found]
+    history = services.store.robot_history(newest.environment, robot, limit)
+    body = _one(services, [newest])
+    body["environments"] = [r.environment for r in robots]
     body["history"] = [{**_report(report, time), "received": rfc3339(time)} for time, report in history]
     return answer(body)
 
@@ -82,63 +82,63 @@ def get_robot(
 async def put_status(
     robot: RobotPath,
     body: StatusBody,
-    here: Here,
-    who: Reporter,
+    services: Here,
+    principal: Reporter,
     prefer: Annotated[str | None, Header(description="`return=minimal` (RFC 7240): 204 instead of the robot.")] = None,
 ) -> Response:
     """The same as over Zenoh. A robot's token may tell of the robot that it names; editors may tell of any."""
-    may_report(who, robot)
-    who.enter(body.environment)
+    may_report(principal, robot)
+    principal.enter(body.environment)
     if body.time is not None and body.time.tzinfo is None:
         raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
     holds = None if body.holds is None else (body.holds.version, body.holds.root)
     more = (body.detail, body.sequence, body.time, body.overlays, holds)
     report = Report(body.channel, body.version, body.root, body.state, *more)
     # No thread waits for the store: a whole fleet reports at once, and others want maps meanwhile.
-    noting = here.fleet.noting(Heard(body.environment, robot, report, datetime.now(UTC)))
+    noting = services.fleet.noting(Heard(body.environment, robot, report, datetime.now(UTC)))
     await asyncio.wait({asyncio.wrap_future(noting)}, timeout=fleet.NOTE_SECONDS)
     fleet.settle(noting)
     if prefer is not None and prefer.strip().lower() == "return=minimal":
         return Response(status_code=204, headers={"preference-applied": "return=minimal"})
-    return answer(await run_in_threadpool(lambda: _one(here, here.store.robots(body.environment, robot))))
+    return answer(await run_in_threadpool(lambda: _one(services, services.store.robots(body.environment, robot))))
 
 
 @router.delete("/{robot}", status_code=204, responses=told(None, 404), summary="Forget a robot that is gone for good")
 def forget_robot(
     robot: RobotPath,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     environment: Annotated[str, Query(pattern=NAME, description="Where it is to be forgotten.", examples=["orchard"])],
 ) -> Response:
     """It no longer counts among its channel's robots. It comes back with its next report."""
-    who.enter(environment)
+    principal.enter(environment)
     about(environment=environment)
-    here.store.forget_robot(environment, robot)
+    services.store.forget_robot(environment, robot)
     return Response(status_code=204)
 
 
-def may_report(who: Principal, robot: str) -> None:
+def may_report(principal: Principal, robot: str) -> None:
     """Denied for a robot's token that names another robot, or none."""
-    if who.role != "robot" or who.robot == robot:
+    if principal.role != "robot" or principal.robot == robot:
         return
-    names = "names no robot" if who.robot is None else f"names the robot {who.robot}"
+    names = "names no robot" if principal.robot is None else f"names the robot {principal.robot}"
     raise Denied(f"your token {names}: it cannot tell the status of {robot[:128]}")
 
 
-def noted(here: Services, environment: str, robot: str, report: Report) -> dict[str, Any]:
+def noted(services: Services, environment: str, robot: str, report: Report) -> dict[str, Any]:
     """Store a report; the robot as it is now."""
-    here.fleet.note(Heard(environment, robot, report, datetime.now(UTC)))
-    return _one(here, here.store.robots(environment, robot))
+    services.fleet.note(Heard(environment, robot, report, datetime.now(UTC)))
+    return _one(services, services.store.robots(environment, robot))
 
 
-def _one(here: Services, robots: Sequence[Robot]) -> dict[str, Any]:
+def _one(services: Services, robots: Sequence[Robot]) -> dict[str, Any]:
     """The only one of them; NotFound where it, or its environment, went meanwhile."""
-    for body in _told(here, robots):
+    for body in _told(services, robots):
         return body
     raise NotFound("the robot, or its environment, is no longer there")
 
 
-def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
+def _told(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
     """As clients see them; without those whose environment is deleted meanwhile."""
     now = datetime.now(UTC)
     channels: dict[str, dict[str, Channel]] = {}
@@ -148,24 +148,24 @@ def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
         name = robot.report.channel
         try:
             if robot.environment not in channels:
-                channels[robot.environment] = {c.name: c for c in here.store.channels(robot.environment)}
+                channels[robot.environment] = {c.name: c for c in services.store.channels(robot.environment)}
             channel = channels[robot.environment].get(name)
             behind = channel is not None and (
                 robot.held is None or not robot.held.shows(channel.root, channel.closures.digest)
             )
             if behind and (robot.environment, name) not in moves:
-                moves[robot.environment, name] = here.store.moves(robot.environment, name)
+                moves[robot.environment, name] = services.store.moves(robot.environment, name)
         except NotFound:
             continue  # its environment went since
         lag = None
         if channel is not None and channel.root is not None:
             lag = fleet.lag_of(robot, channel, moves.get((robot.environment, name), [])).as_dict()
-        held = robot.held
+        active_map = robot.held
         body = {"robot": robot.robot, "environment": robot.environment, **_report(robot.report, robot.time)}
         body |= {
             "received": rfc3339(robot.time),
             "since": rfc3339(robot.since),
-            "holds": held and _held(held),
+            "holds": active_map and _held(active_map),
             "online": fleet.is_online(robot, now),
             "vouched": robot.vouched,
             "lag": lag,
@@ -174,9 +174,9 @@ def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
     return out
 
 
-def _held(held: Held) -> dict[str, Any]:
-    overlays = {} if held.overlays is None else {"overlays": held.overlays}
-    return {"version": held.version, "root": held.root, **overlays, "since": rfc3339(held.since)}
+def _held(active_map: Held) -> dict[str, Any]:
+    overlays = {} if active_map.overlays is None else {"overlays": active_map.overlays}
+    return {"version": active_map.version, "root": active_map.root, **overlays, "since": rfc3339(active_map.since)}
 
 
 def _report(report: Report, heard: datetime) -> dict[str, Any]:

@@ -21,42 +21,42 @@ PRODUCTION = "production"
 PAGE = 1000
 
 
-def standing(here: Services, chosen: tuple[Chosen, ...], channel: str) -> dict[str, Version]:
+def standing(services: Services, chosen: tuple[Chosen, ...], channel: str) -> dict[str, Version]:
     """The chosen environments that there are, each with the version and closures that the channel shows.
 
     channel: empty for production where there is one, else the latest. Where it stands nowhere, nothing goes out.
     """
     names = [entry.pattern for entry in chosen if entry.one]
     if any(not entry.one for entry in chosen):
-        names += [name for name in _all_names(here) if namespace_of(name, chosen) is not None]
+        names += [name for name in _all_names(services) if namespace_of(name, chosen) is not None]
     out = {}
     for name in dict.fromkeys(names):
         for ref in [channel] if channel else [PRODUCTION, LATEST]:
             try:
-                out[name], _ = here.store.standing(name, ref)
+                out[name], _ = services.store.standing(name, ref)
                 break
             except NotFound:
                 continue
     return out
 
 
-def _all_names(here: Services) -> list[str]:
+def _all_names(services: Services) -> list[str]:
     names: list[str] = []
     cursor: str | None = None
     while True:
-        page, cursor = here.store.environments(limit=PAGE, cursor=cursor)
+        page, cursor = services.store.environments(limit=PAGE, cursor=cursor)
         names += [environment.name for environment in page]
         if cursor is None:
             return names
 
 
-def content(here: Services, derive: bool, version: Version) -> Content:
+def content(services: Services, derive: bool, version: Version) -> Content:
     """Each level's grid, and the network. derive: also what is not stored but can be computed."""
     absent: list[str] = []
     grids: dict[str, cdr.Grid] = {}
     for values in _grids(version, derive):
         try:
-            grids[values["level"]] = _grid(here, version, values, derive)
+            grids[values["level"]] = _grid(services, version, values, derive)
         except (CannotConvert, NotFound) as error:
             absent.append(f"no grid of the level {values['level']}: {error.detail}")
     order = [GROUND, *(level.name for level in version.levels)]  # levels are sorted by elevation
@@ -64,7 +64,7 @@ def content(here: Services, derive: bool, version: Version) -> Content:
     network = None
     if derive or any(e.key.layer == "topology" and e.count for e in version.parts):
         try:
-            network = _network(here, version, derive)
+            network = _network(services, version, derive)
         except (CannotConvert, NotFound) as error:
             absent.append(f"no network: {error.detail}")
     by_level = {None if level == lowest else level: grid for level, grid in sorted(grids.items())}
@@ -82,20 +82,20 @@ def _grids(version: Version, derive: bool) -> list[dict[str, str]]:
     return [{"grid": name, "level": level} for level in sorted(levels)]
 
 
-def _grid(here: Services, version: Version, values: Mapping[str, str], derive: bool) -> cdr.Grid:
-    made = here.maps.at_once(version, "occupancy_grid", values, derive=derive)
-    files = {file.name: file.read() for file in made.files}
-    known = formats.get_format("occupancy_grid")
-    assert known.read is not None
-    read = known.read(files, ReadContext(here.options.limits, main=made.files[0].name))
+def _grid(services: Services, version: Version, values: Mapping[str, str], derive: bool) -> cdr.Grid:
+    cached_map = services.maps.at_once(version, "occupancy_grid", values, derive=derive)
+    files = {file.name: file.read() for file in cached_map.files}
+    fmt = formats.get_format("occupancy_grid")
+    assert fmt.read is not None
+    read = fmt.read(files, ReadContext(services.options.limits, main=cached_map.files[0].name))
     grid = next(iter(read.parts.values()))
     assert isinstance(grid, OccupancyGrid)
     # Unknown is 255, which is -1 in a byte with a sign.
     return cdr.Grid(grid.width, grid.height, grid.resolution, grid.origin, grid.cells.tobytes())
 
 
-def _network(here: Services, version: Version, derive: bool) -> str:
+def _network(services: Services, version: Version, derive: bool) -> str:
     """The tmap2 as JSON: topological_navigation publishes it so, and who reads YAML reads JSON."""
-    made = here.maps.at_once(version, "tmap2", {}, derive=derive)
-    document = _yaml.load(made.files[0].read(), here.options.limits)
+    cached_map = services.maps.at_once(version, "tmap2", {}, derive=derive)
+    document = _yaml.load(cached_map.files[0].read(), services.options.limits)
     return json.dumps(document, ensure_ascii=False)

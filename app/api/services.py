@@ -116,8 +116,8 @@ class Services:
 
 async def services(request: Request) -> Services:
     """The services of the application that answers this request."""
-    found: Services = request.app.state.services
-    return found
+    instance: Services = request.app.state.services
+    return instance
 
 
 Here = Annotated[Services, Depends(services)]

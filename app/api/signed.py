@@ -95,8 +95,8 @@ class SignedLinks:
         except InvalidLink:
             self._access.note_failure(client)
             raise
-        found = _MAP.fullmatch(address.path)
-        name = (found["long"] or found["short"]) if found else ""
+        match = _MAP.fullmatch(address.path)
+        name = (match["long"] or match["short"]) if match else ""
         try:
             environment = self._find(name)
         except NotFound:

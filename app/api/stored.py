@@ -34,15 +34,15 @@ def stored(
         Path(description="Uploaded files, or chunks of versions' content.", examples=["blobs"]),
     ],
     sha256: Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the bytes, in hex.")],
-    here: Here,
+    services: Here,
     _: ServerAdmin,
 ) -> Response:
     """What another server of the same data heals with. Takes an administrator's token for all environments."""
     try:
-        if kind == "blobs" and (size := here.store.blobs.size(sha256)) > IN_MEMORY:
+        if kind == "blobs" and (size := services.store.blobs.size(sha256)) > IN_MEMORY:
             headers = [(b"content-type", TYPE.encode()), (b"content-length", str(size).encode())]
-            return streamed(here.store.blobs.open(sha256), 0, size, 200, headers)
-        data = here.store.blobs.get(sha256) if kind == "blobs" else here.store.chunk(sha256)
+            return streamed(services.store.blobs.open(sha256), 0, size, 200, headers)
+        data = services.store.blobs.get(sha256) if kind == "blobs" else services.store.chunk(sha256)
     except Damaged as error:  # a chunk that was never here is the same as a lost one
         raise NotFound(f"there are no such {kind}: {sha256}") from error
     return Response(data, media_type=TYPE)

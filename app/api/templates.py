@@ -61,52 +61,52 @@ def sets() -> list[dict[str, Any]]:
 
 
 @router.get("/environments/{env}/templates", responses=told(TemplatesOut, 404), summary="An environment's templates")
-def get_templates(env: EnvironmentPath, here: Here, _: Viewer, version: Which = "latest") -> Response:
+def get_templates(env: EnvironmentPath, services: Here, _: Viewer, version: Which = "latest") -> Response:
     """The chosen set, and for each format with parameters the values of its own, what holds, and from where.
 
     A parameter of a request goes before the environment's values, these before the set's, these before the format's
     defaults.
     """
-    found = here.store.version(env, number_of(version))
-    known = [f for f in formats.all_formats().values() if f.write is not None and templates.has_parameters(f)]
+    stored_version = services.store.version(env, number_of(version))
+    fmts = [f for f in formats.all_formats().values() if f.write is not None and templates.has_parameters(f)]
     body = {
         "environment": env,
-        "version": found.number,
-        "set": found.templates.set,
+        "version": stored_version.number,
+        "set": stored_version.templates.set,
         "sets": list(templates.SETS),
-        "formats": [_line(found.templates, one) for one in known],
+        "formats": [_line(stored_version.templates, one) for one in fmts],
     }
-    return answer(body, headers=_headers(found))
+    return answer(body, headers=_headers(stored_version))
 
 
 @router.put("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Choose a template set")
 def put_templates(
     env: EnvironmentPath,
     body: TemplatesBody,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which another set holds, or other values of several formats at once. What is left out stays."""
-    own = {name: Own(said.set, said.values) for name, said in body.formats.items()}
-    wish = TemplateWish(body.set, own, dry_run=body.dry_run).checked()
-    return _said(here, env, wish, body.message, who, if_match, idempotency_key)
+    format_templates = {name: Own(template.set, template.values) for name, template in body.formats.items()}
+    update = TemplateWish(body.set, format_templates, dry_run=body.dry_run).checked()
+    return _said(services, env, update, body.message, principal, if_match, idempotency_key)
 
 
 @router.delete("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Take all templates back")
 def delete_templates(
     env: EnvironmentPath,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     message: Message = "",
     dry_run: DryRun = False,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which the formats' own defaults hold."""
-    wish = TemplateWish(clear=True, dry_run=dry_run)
-    return _said(here, env, wish, message, who, if_match, idempotency_key)
+    update = TemplateWish(clear=True, dry_run=dry_run)
+    return _said(services, env, update, message, principal, if_match, idempotency_key)
 
 
 @router.get(
@@ -115,14 +115,14 @@ def delete_templates(
     summary="An environment's templates for a format",
 )
 def get_format_templates(
-    env: EnvironmentPath, format: FormatPath, here: Here, _: Viewer, version: Which = "latest"
+    env: EnvironmentPath, format: FormatPath, services: Here, _: Viewer, version: Which = "latest"
 ) -> Response:
     """`values`: the environment's own. `effective`: each parameter's value, and `from`: `environment`, `set NAME` or
     `default`."""
-    known = templates.check_format(format)
-    found = here.store.version(env, number_of(version))
-    body = {"environment": env, "version": found.number, **_line(found.templates, known)}
-    return answer(body, headers=_headers(found))
+    fmt = templates.check_format(format)
+    stored_version = services.store.version(env, number_of(version))
+    body = {"environment": env, "version": stored_version.number, **_line(stored_version.templates, fmt)}
+    return answer(body, headers=_headers(stored_version))
 
 
 @router.put(
@@ -135,8 +135,8 @@ def put_format_templates(
     env: EnvironmentPath,
     format: FormatPath,
     body: FormatTemplatesBody,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
@@ -144,8 +144,8 @@ def put_format_templates(
 
     Maps of the new version are made with them; old versions keep answering as they did.
     """
-    wish = TemplateWish(None, {format: Own(body.set, body.values)}, dry_run=body.dry_run).checked("body")
-    return _said(here, env, wish, body.message, who, if_match, idempotency_key)
+    update = TemplateWish(None, {format: Own(body.set, body.values)}, dry_run=body.dry_run).checked("body")
+    return _said(services, env, update, body.message, principal, if_match, idempotency_key)
 
 
 @router.delete(
@@ -157,33 +157,41 @@ def put_format_templates(
 def delete_format_templates(
     env: EnvironmentPath,
     format: FormatPath,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     message: Message = "",
     dry_run: DryRun = False,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which the environment's set holds for the format again."""
-    wish = TemplateWish(None, {format: Own()}, dry_run=dry_run).checked()
-    return _said(here, env, wish, message, who, if_match, idempotency_key)
+    update = TemplateWish(None, {format: Own()}, dry_run=dry_run).checked()
+    return _said(services, env, update, message, principal, if_match, idempotency_key)
 
 
 def _said(
-    here: Services, env: str, wish: TemplateWish, message: str, who: Principal, if_match: str | None, key: str | None
+    services: Services,
+    env: str,
+    update: TemplateWish,
+    message: str,
+    principal: Principal,
+    if_match: str | None,
+    key: str | None,
 ) -> Response:
-    outcome = here.ingest.template(env, wish, message=message, author=who.name, if_match=if_match, idempotency=key)
+    outcome = services.ingest.template(
+        env, update, message=message, author=principal.name, if_match=if_match, idempotency=key
+    )
     return told_as(outcome)
 
 
-def _line(said: Templates, known: Format) -> dict[str, Any]:
+def _line(stored_templates: Templates, fmt: Format) -> dict[str, Any]:
     """One format's templates as clients see them."""
-    own, ignored = said.of(known.name), templates.resolve(said, known).ignored
+    format_template, ignored = stored_templates.of(fmt.name), templates.resolve(stored_templates, fmt).ignored
     return {
-        "format": known.name,
-        "set": own.set,
-        "values": dict(own.values),
-        "effective": templates.effective(said, known),
+        "format": fmt.name,
+        "set": format_template.set,
+        "values": dict(format_template.values),
+        "effective": templates.effective(stored_templates, fmt),
         **({"ignored": list(ignored)} if ignored else {}),
     }
 

@@ -34,9 +34,9 @@ def as_dict(token: Token) -> dict[str, Any]:
 
 
 @router.get("", responses=told(list[TokenOut]), summary="All tokens, without their secrets")
-def list_tokens(here: Here, _: ServerAdmin) -> Response:
+def list_tokens(services: Here, _: ServerAdmin) -> Response:
     """Oldest first."""
-    return answer([as_dict(token) for token in here.store.tokens()])
+    return answer([as_dict(token) for token in services.store.tokens()])
 
 
 @router.post(
@@ -45,7 +45,7 @@ def list_tokens(here: Here, _: ServerAdmin) -> Response:
     responses=told(NewTokenOut, 400, 415, ok=201, description="Made"),
     summary="Make a token",
 )
-def create_token(body: TokenBody, here: Here, _: ServerAdmin) -> Response:
+def create_token(body: TokenBody, services: Here, _: ServerAdmin) -> Response:
     """Its secret stands in this answer and nowhere else: only its hash is stored.
 
     A token with the role `robot` names its robot: `robot`, by default its own `name`.
@@ -58,7 +58,7 @@ def create_token(body: TokenBody, here: Here, _: ServerAdmin) -> Response:
     if body.robot is not None and body.role != "robot":
         raise Invalid("only a token with the role robot names a robot", [Problem("role is not robot", where="robot")])
     robot = _robot_of(body)
-    token, secret = here.store.create_token(body.name, body.role, body.environments, robot, body.expires)
+    token, secret = services.store.create_token(body.name, body.role, body.environments, robot, body.expires)
     return answer({**as_dict(token), "token": secret}, 201, {"cache-control": "no-store"})
 
 
@@ -69,24 +69,24 @@ def _robot_of(body: TokenBody) -> str | None:
     name = body.name if body.robot is None else body.robot
     if not ROBOT_NAME.fullmatch(name):
         rule = "at most 128 of A-Z, a-z, 0-9, _, . and -, starting with a letter or digit"
-        where = "name" if body.robot is None else "robot"
+        field = "name" if body.robot is None else "robot"
         raise Invalid(
             f"{name[:80]!r} is no robot's name, which must be {rule}: set 'robot' (on the command line --robot)",
-            [Problem(f"must be {rule}", where=where)],
+            [Problem(f"must be {rule}", where=field)],
         )
     return name
 
 
 @router.delete("/{id}", status_code=204, responses=told(None, 404, 409), summary="Revoke a token")
-def delete_token(id: TokenPath, here: Here, _: ServerAdmin) -> Response:
+def delete_token(id: TokenPath, services: Here, _: ServerAdmin) -> Response:
     """It is refused from now on (within a second by other worker processes). The last administrator's stays."""
-    known = {token.id: token for token in here.store.tokens()}
-    if id not in known:
+    tokens = {token.id: token for token in services.store.tokens()}
+    if id not in tokens:
         raise NotFound("there is no token with this id")
-    if _rules_all(known[id]) and not any(_rules_all(t) for t in known.values() if t.id != id):
+    if _rules_all(tokens[id]) and not any(_rules_all(t) for t in tokens.values() if t.id != id):
         raise Conflict("this is the last administrator's token: make another one first")
-    here.store.delete_token(id)
-    here.access.forget()
+    services.store.delete_token(id)
+    services.access.forget()
     return Response(status_code=204)
 
 

@@ -24,14 +24,14 @@ router = APIRouter(prefix="/environments/{env}", tags=["transform"], route_class
 FAR = "the place is too far from the datum for the local frame"
 
 
-def _refused(where: str, detail: str) -> Invalid:
-    return Invalid(detail, [Problem(detail, where=where)])
+def _refused(location: str, detail: str) -> Invalid:
+    return Invalid(detail, [Problem(detail, where=location)])
 
 
 @router.get("/transform", responses=told(TransformOut, 404), summary="Between earth and local frame")
 def transform(
     env: EnvironmentPath,
-    here: Here,
+    services: Here,
     _: Viewer,
     latlon: Annotated[
         str | None, Query(description="`LAT,LON` in degrees (WGS 84).", examples=["52.4206,5.6134"])
@@ -42,7 +42,7 @@ def transform(
     """Give ``latlon`` or ``xy``; the answer has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
     if (latlon is None) == (xy is None):
         raise Invalid("give either latlon=LAT,LON or xy=X,Y", [Problem("one of latlon and xy", where="query")])
-    datum = here.store.version(env, number_of(version)).datum
+    datum = services.store.version(env, number_of(version)).datum
     if datum is None:
         raise MissingDatum(f'{env} has no datum: PATCH it with {{"datum": {{…}}}} or upload a datum.yaml')
     frame = local_frame(datum)

@@ -266,12 +266,12 @@ class _Receiver:
         self._ended = True
 
 
-def _text(data: bytes, what: str) -> str:
+def _text(data: bytes, label: str) -> str:
     """UTF-8 without a NUL; Invalid says which part of the form is not."""
     try:
         text = data.decode()
     except UnicodeDecodeError:
-        raise Invalid(f"a {what} of the form is not UTF-8") from None
+        raise Invalid(f"a {label} of the form is not UTF-8") from None
     if "\0" in text:
-        raise Invalid(f"a {what} of the form has a NUL character")
+        raise Invalid(f"a {label} of the form has a NUL character")
     return text

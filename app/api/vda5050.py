@@ -45,8 +45,8 @@ async def get_actions(
     env: EnvironmentPath,
     v: VersionPath,
     request: Request,
-    here: Here,
-    who: Viewer,
+    services: Here,
+    principal: Viewer,
     map_id: Annotated[
         str | None,
         Query(
@@ -85,18 +85,20 @@ async def get_actions(
     version's number, and the link names it, so that its bytes stay the same whatever is promoted later. Each answer
     has new action ids.
     """
-    own = {"mapId", "format", "level", "signed", "seconds"}
-    values = {name: text for name, text in request.query_params.multi_items() if name not in own}
-    version = await run_in_threadpool(here.store.version, env, number_of(v))
+    reserved_names = {"mapId", "format", "level", "signed", "seconds"}
+    values = {name: text for name, text in request.query_params.multi_items() if name not in reserved_names}
+    version = await run_in_threadpool(services.store.version, env, number_of(v))
     _check_format(format, by_level=level is not None)
-    here.links.check_life(seconds)
+    services.links.check_life(seconds)
     maps: list[dict[str, Any]] = []
     missing: list[dict[str, str]] = []
     site = map_id or env
     for name in _levels(version, level):
-        wanted = values if level is None else {**values, "level": name}
+        options = values if level is None else {**values, "level": name}
         try:
-            outcome = await link_to(here, request, who, version, format, None, wanted, seconds, signed=signed)
+            outcome = await link_to(
+                services, request, principal, version, format, None, options, seconds, signed=signed
+            )
         except (NotFound, CannotConvert) as error:
             if level != "*":
                 raise
@@ -174,8 +176,8 @@ def _actions(version: Version, map_id: str, level: str | None, link: LinkedFile)
 def post_state(
     robot: RobotPath,
     message: Annotated[dict[str, Any], Body(openapi_examples={"state": {"value": STATE}})],
-    here: Here,
-    who: Reporter,
+    services: Here,
+    principal: Reporter,
     environment: Annotated[
         str | None, Query(pattern=NAME, description="Environment of the maps. Default: the `mapId` before `/`.")
     ] = None,
@@ -197,7 +199,7 @@ def post_state(
     each floor in the message, and `active` with the oldest that is enabled on any. `ignored`: what is not known here,
     and why.
     """
-    may_report(who, robot)
+    may_report(principal, robot)
     out: dict[str, list[dict[str, Any]]] = {"robots": [], "ignored": []}
     sites: dict[str, list[vda5050.Maps]] = {}
     for maps in vda5050.read_state(message):
@@ -207,13 +209,13 @@ def post_state(
         names = ", ".join(list(sites)[:20])
         raise Invalid(f"the state tells of several maps: say which is {environment}'s, mapId being one of {names}")
     for site, floors in sites.items():
-        _take(here, who, robot, floors, environment or site, channel, out)
+        _take(services, principal, robot, floors, environment or site, channel, out)
     return answer(out)
 
 
 def _take(
-    here: Services,
-    who: Principal,
+    services: Services,
+    principal: Principal,
     robot: str,
     floors: list[vda5050.Maps],
     env: str,
@@ -221,34 +223,39 @@ def _take(
     out: dict[str, list[dict[str, Any]]],
 ) -> None:
     try:
-        if not who.may_enter(env):
+        if not principal.may_enter(env):
             raise NotFound("your token does not reach it, or it is none of this server's environments")
-        known = next(iter(here.store.robots(env, robot)), None)
-        channels = {c.name: c for c in here.store.channels(env)}
+        stored_robot = next(iter(services.store.robots(env, robot)), None)
+        channels = {c.name: c for c in services.store.channels(env)}
     except NotFound as error:
         out["ignored"] += [{"mapId": floor.map_id, "why": error.detail} for floor in floors]
         return
     maps = vda5050.whole_site(floors)
-    usual = known.report.channel if known else "production" if "production" in channels else "latest"
+    usual = stored_robot.report.channel if stored_robot else "production" if "production" in channels else "latest"
     follows = channels.get(channel or usual)
     reports = [report for state, text, detail in _states(maps, follows) for report in _report(
-        here, env, maps.map_id, channel or usual, state, text, detail, out)]  # fmt: skip
+        services, env, maps.map_id, channel or usual, state, text, detail, out)]  # fmt: skip
     # What it drives on is told only where it is news: else every message would be a change there and back.
-    if len(reports) > 1 and known is not None and known.held is not None and known.held.root == reports[0].root:
+    if (
+        len(reports) > 1
+        and stored_robot is not None
+        and stored_robot.held is not None
+        and stored_robot.held.root == reports[0].root
+    ):
         reports = reports[1:]
     for report in reports:
-        told = noted(here, env, robot, report)
+        body = noted(services, env, robot, report)
     if reports:
-        out["robots"].append(told)
+        out["robots"].append(body)
 
 
 def _states(maps: vda5050.Maps, channel: Channel | None) -> list[tuple[RobotState, str, str | None]]:
     """What a vehicle is told to have said: (state, version, detail), what it drives on first."""
     planned = None if channel is None or channel.planned is None else str(channel.planned.version)
-    wanted = {planned, None if channel is None or channel.version is None else str(channel.version)} - {None}
+    targets = {planned, None if channel is None or channel.version is None else str(channel.version)} - {None}
     out: list[tuple[RobotState, str, str | None]] = [("active", text, None) for text in maps.enabled]
-    failed = [(text, why) for text, why in maps.failed if text in wanted and text not in maps.enabled]
-    loaded = [text for text in maps.disabled if text in wanted]
+    failed = [(text, why) for text, why in maps.failed if text in targets and text not in maps.enabled]
+    loaded = [text for text in maps.disabled if text in targets]
     if failed:
         out.append(("failed", *failed[-1]))
     elif loaded:
@@ -259,7 +266,7 @@ def _states(maps: vda5050.Maps, channel: Channel | None) -> list[tuple[RobotStat
 
 
 def _report(
-    here: Services,
+    services: Services,
     env: str,
     map_id: str,
     channel: str,
@@ -271,7 +278,7 @@ def _report(
     try:
         if not (text.isascii() and text.isdigit() and len(text) < 10):
             raise NotFound("its mapVersion is no version's number")
-        version = here.store.version(env, int(text))
+        version = services.store.version(env, int(text))
     except NotFound as error:
         out["ignored"].append({"mapId": map_id, "mapVersion": text, "why": error.detail})
         return []

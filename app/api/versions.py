@@ -92,15 +92,15 @@ UPLOAD_BODY: dict[str, Any] = {
 
 @router.get("/versions", responses=told(list[VersionOut], 404), summary="History, newest first")
 def list_versions(
-    env: EnvironmentPath, request: Request, here: Here, _: Viewer, limit: Limit = 100, cursor: Cursor = None
+    env: EnvironmentPath, request: Request, services: Here, _: Viewer, limit: Limit = 100, cursor: Cursor = None
 ) -> Response:
     """All versions of an environment."""
     if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) <= 18):
         raise Invalid("the cursor is not one that a page's Link header gave", [Problem("unknown", where="cursor")])
     before = int(cursor) if cursor is not None else None
-    found = here.store.versions(env, limit=limit + 1, before=before)
-    following = str(found[limit - 1].number) if len(found) > limit else None
-    return page(request, [version.as_dict() for version in found[:limit]], following)
+    versions = services.store.versions(env, limit=limit + 1, before=before)
+    following = str(versions[limit - 1].number) if len(versions) > limit else None
+    return page(request, [version.as_dict() for version in versions[:limit]], following)
 
 
 @router.post(
@@ -116,23 +116,23 @@ def list_versions(
 async def create_version(
     env: EnvironmentPath,
     request: Request,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """One upload is one version, all or nothing. Files are taken as they are; what is doubtful comes as warnings."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media == "multipart/form-data":
-        async with here.intake.take(request) as form:
+        async with services.intake.take(request) as form:
             upload = _upload(form, request)
             outcome = await run_in_threadpool(
-                _counted, here, here.ingest.upload, env, upload, who, if_match, idempotency_key
+                _counted, services, services.ingest.upload, env, upload, principal, if_match, idempotency_key
             )
     elif media == "application/json" or media.endswith("+json"):
         _no_query(request)
         outcome = await run_in_threadpool(
-            _revert, here, env, await _revert_body(request), who, if_match, idempotency_key
+            _revert, services, env, await _revert_body(request), principal, if_match, idempotency_key
         )
     else:
         raise UnsupportedMedia("send multipart/form-data with files, or application/json with revert_to")
@@ -151,17 +151,17 @@ async def create_version(
 def create_edit(
     env: EnvironmentPath,
     body: EditsBody,
-    here: Here,
-    who: Editor,
+    services: Here,
+    principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """Some features put or deleted, some cells set: one version, or none. Edges that would dangle are refused."""
     changes = [change.model_dump(exclude_none=True) for change in body.changes]
-    _count = here.metrics.uploads.labels
+    _count = services.metrics.uploads.labels
     try:
-        outcome = here.ingest.edit(
-            env, changes, message=body.message, author=who.name, if_match=if_match, idempotency=idempotency_key
+        outcome = services.ingest.edit(
+            env, changes, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
         )
     except FleetMapError:
         _count("refused").inc()
@@ -171,17 +171,17 @@ def create_edit(
 
 
 @router.get("/versions/{v}", responses=told(VersionOut, 404), summary="One version")
-def get_version(env: EnvironmentPath, v: VersionPath, here: Here, _: Viewer) -> Response:
+def get_version(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer) -> Response:
     """A version by number, by channel, or the newest."""
-    found = here.store.version(env, number_of(v))
-    headers = {"etag": f'"{found.number}"', "fleetmap-version": str(found.number), "fleetmap-root": found.root}
-    return answer(found.as_dict(), headers=headers)
+    version = services.store.version(env, number_of(v))
+    headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
+    return answer(version.as_dict(), headers=headers)
 
 
 @router.get("/versions/{v}/sources", tags=["sources"], responses=told(list[SourceOut], 404), summary="Uploaded files")
-def list_sources(env: EnvironmentPath, v: VersionPath, here: Here, _: Viewer) -> Response:
+def list_sources(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer) -> Response:
     """The files that made a version, also those that were not used."""
-    return answer([source.as_dict() for source in here.store.version(env, number_of(v)).sources])
+    return answer([source.as_dict() for source in services.store.version(env, number_of(v)).sources])
 
 
 @router.get(
@@ -203,14 +203,14 @@ def get_source(
         str, Path(max_length=1024, description="The file's name, with its folders.", examples=["datum.yaml"])
     ],
     request: Request,
-    here: Here,
+    services: Here,
     _: Viewer,
     sha256: Annotated[
         str | None, Query(pattern=r"^[0-9a-f]{64}$", description="Which one, where several have this name.")
     ] = None,
 ) -> Response:
     """Always as an attachment, never to be shown by a browser as what it says it is."""
-    source = _source(here.store.version(env, number_of(v)).sources, name, sha256)
+    source = _source(services.store.version(env, number_of(v)).sources, name, sha256)
     etag = f'"{source.sha256}"'
     headers = [
         (b"content-type", b"application/octet-stream"),
@@ -235,8 +235,8 @@ def get_source(
         headers.insert(1, (b"content-range", f"bytes {start}-{end - 1}/{source.size}".encode()))
     status = 206 if part else 200
     if source.size > IN_MEMORY:
-        return streamed(here.store.blobs.open(source.sha256), start, end, status, headers)
-    response = Response(here.store.blobs.get(source.sha256)[start:end], status)
+        return streamed(services.store.blobs.open(source.sha256), start, end, status, headers)
+    response = Response(services.store.blobs.get(source.sha256)[start:end], status)
     response.raw_headers = headers
     return response
 
@@ -288,14 +288,14 @@ def _upload(form: Form, request: Request) -> Upload:
     )
 
 
-def format_named(text: str, where: str) -> str | None:
+def format_named(text: str, location: str) -> str | None:
     """A format's id as a form says it; empty is none. Invalid, with those there are, where it is not known."""
     if not text:
         return None
     try:
         return formats.get_format(text).name
     except NotFound as error:
-        raise Invalid(error.detail, [Problem("no such format", where=where)]) from None
+        raise Invalid(error.detail, [Problem("no such format", where=location)]) from None
 
 
 def check_names(files: list[SpooledFile]) -> None:
@@ -311,31 +311,33 @@ def check_names(files: list[SpooledFile]) -> None:
         seen.add(file.name)
 
 
-def truth(text: str, what: str) -> bool:
+def truth(text: str, parameter: str) -> bool:
     """A form's yes or no; empty is no."""
-    known = {"": False, "false": False, "0": False, "no": False, "true": True, "1": True, "yes": True}
-    if text.lower() not in known:
-        raise Invalid(f"{what} must be true or false, got {text[:80]!r}", [Problem("true or false", where=what)])
-    return known[text.lower()]
+    values = {"": False, "false": False, "0": False, "no": False, "true": True, "1": True, "yes": True}
+    if text.lower() not in values:
+        raise Invalid(
+            f"{parameter} must be true or false, got {text[:80]!r}", [Problem("true or false", where=parameter)]
+        )
+    return values[text.lower()]
 
 
 def _counted(
-    here: Services, take: Any, env: str, upload: Upload, who: Principal, if_match: str | None, key: str | None
+    services: Services, take: Any, env: str, upload: Upload, principal: Principal, if_match: str | None, key: str | None
 ) -> Outcome:
     try:
-        outcome: Outcome = take(env, upload, author=who.name, if_match=if_match, idempotency=key)
+        outcome: Outcome = take(env, upload, author=principal.name, if_match=if_match, idempotency=key)
     except FleetMapError:
-        here.metrics.uploads.labels("refused").inc()
+        services.metrics.uploads.labels("refused").inc()
         raise
-    here.metrics.uploads.labels(outcome.status).inc()
+    services.metrics.uploads.labels(outcome.status).inc()
     return outcome
 
 
 def _revert(
-    here: Services, env: str, body: RevertBody, who: Principal, if_match: str | None, key: str | None
+    services: Services, env: str, body: RevertBody, principal: Principal, if_match: str | None, key: str | None
 ) -> Outcome:
-    return here.ingest.revert(
-        env, body.revert_to, message=body.message, author=who.name, if_match=if_match, idempotency=key
+    return services.ingest.revert(
+        env, body.revert_to, message=body.message, author=principal.name, if_match=if_match, idempotency=key
     )
 
 

@@ -74,30 +74,30 @@ def align(
         target: dict[str, Any] = {"layer": layer, "level": onto_level or level, "parameters": options.pairs(option)}
         body["onto"] = target if layer != "occupancy" else {**target, "name": onto}
     with Client(server, token) as client, output.progress_bar("aligning"):
-        made = client.post(path_of("environments", environment, "alignments"), body, repeat=True)
+        result = client.post(path_of("environments", environment, "alignments"), body, repeat=True)
     if as_json:
-        output.show_json(made)
+        output.show_json(result)
         return
-    _show(environment, made)
+    _show(environment, result)
 
 
-def _show(environment: str, made: Mapping[str, Any]) -> None:
-    found, version = made.get("alignment") or {}, made.get("version")
-    if found:
-        where = found.get("grid") or {}
-        turn = math.degrees(float(found["yaw"]))
-        moved = f"turned by {turn:.3f}°, moved by {float(found['x']):.3f}, {float(found['y']):.3f} m"
-        output.show(f"{environment}: {where.get('level')}/{where.get('name')} {moved}")
-        shares = [f"residual {float(found['residual']):.3f} m", f"agreement {float(found['agreement']):.1%}"]
-        if found.get("overlap") is not None:
-            shares.append(f"overlap {float(found['overlap']):.1%}")
+def _show(environment: str, result: Mapping[str, Any]) -> None:
+    fit, version = result.get("alignment") or {}, result.get("version")
+    if fit:
+        grid = fit.get("grid") or {}
+        turn = math.degrees(float(fit["yaw"]))
+        moved = f"turned by {turn:.3f}°, moved by {float(fit['x']):.3f}, {float(fit['y']):.3f} m"
+        output.show(f"{environment}: {grid.get('level')}/{grid.get('name')} {moved}")
+        shares = [f"residual {float(fit['residual']):.3f} m", f"agreement {float(fit['agreement']):.1%}"]
+        if fit.get("overlap") is not None:
+            shares.append(f"overlap {float(fit['overlap']):.1%}")
         output.show(f"  {', '.join(shares)}")
-        output.show(f"  origin {_place(found['before'])} → {_place(found['origin'])}")
-        for other in found.get("others") or ():
+        output.show(f"  origin {_place(fit['before'])} → {_place(fit['origin'])}")
+        for other in fit.get("others") or ():
             turn = math.degrees(float(other["yaw"]))
             output.show(f"  also possible: {turn:.3f}°, {other['x']:.3f}, {other['y']:.3f} m: {other['agreement']:.1%}")
     output.show(f"  version {version['version']}" if version else "  nothing is stored")
-    output.show_warnings(made.get("warnings") or ())
+    output.show_warnings(result.get("warnings") or ())
 
 
 def _place(origin: Any) -> str:

@@ -66,27 +66,27 @@ def show(
     """
     with Client(server, token) as client:
         rows = client.get(path_of("environments", environment, "channels"))
-    found = next((row for row in rows if row["channel"] == channel), None)
-    if found is None:
+    row = next((row for row in rows if row["channel"] == channel), None)
+    if row is None:
         names = [row["channel"] for row in rows]
         detail = f"{environment} has no channel {channel!r}{did_you_mean(channel, names)}; it has: {', '.join(names)}"
         raise Refused({"title": "Not found", "detail": detail}, status=404)
     if as_json:
-        output.show_json(found)
+        output.show_json(row)
         return
-    robots, rollout = found["robots"], found.get("rollout") or {}
+    robots, rollout = row["robots"], row.get("rollout") or {}
     output.show_members(
         {
-            "channel": found["channel"],
-            "version": "none" if found["version"] is None else str(found["version"]),
-            "since (UTC)": output.minute(found.get("time")),
-            "author": found.get("author"),
-            "planned": planned(found),
+            "channel": row["channel"],
+            "version": "none" if row["version"] is None else str(row["version"]),
+            "since (UTC)": output.minute(row.get("time")),
+            "author": row.get("author"),
+            "planned": planned(row),
             "roll-out": ", ".join(f"{name} {value}" for name, value in rollout.items() if value is not None),
             "robots": f"{robots['holding']} of {robots['total']} have it, {robots['lagging']} are behind, "
             f"{robots['failed']} failed, {robots['ready']} are ready for the plan",
-            "closures": f"{found['overlays']['count']} in force",
-            "root hash": found.get("root"),
+            "closures": f"{row['overlays']['count']} in force",
+            "root hash": row.get("root"),
         }
     )
 

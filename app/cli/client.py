@@ -175,9 +175,9 @@ class Client:
 
     def pages(self, path: str, params: Mapping[str, Any], *, limit: int | None = None) -> Iterator[Any]:
         """All items of a list, or the first ``limit``; a page names the next one in ``Link: <…>; rel="next"``."""
-        count, where, query = 0, path, _present(params)
+        count, address, query = 0, path, _present(params)
         while True:
-            answer = self._send("GET", where, params=query, repeat=True)
+            answer = self._send("GET", address, params=query, repeat=True)
             for item in self._json(answer):
                 if limit is not None and count >= limit:
                     return
@@ -185,7 +185,7 @@ class Client:
                 count += 1
             if "next" not in answer.links:
                 return
-            where, query = urljoin(str(answer.url), answer.links["next"]["url"]), {}
+            address, query = urljoin(str(answer.url), answer.links["next"]["url"]), {}
 
     def stream(self, path: str, params: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         """Yield server-sent events as ``{id, type, data}`` until the server ends the stream."""
@@ -302,11 +302,15 @@ class Client:
 
     def _other_environments(self, url: httpx.URL) -> str:
         """Return the environment that a mistyped one probably means; only those that the token may see."""
-        wanted = unquote(url.params.get("environment") or url.path.removeprefix(f"{API}/environments/").split("/")[0])
+        environment = unquote(
+            url.params.get("environment") or url.path.removeprefix(f"{API}/environments/").split("/")[0]
+        )
         near = ""
         if url.path != f"{API}/environments":
             with suppress(Refused):
-                near = did_you_mean(wanted, (row["name"] for row in self.pages("/environments", {}, limit=MAX_NAMES)))
+                near = did_you_mean(
+                    environment, (row["name"] for row in self.pages("/environments", {}, limit=MAX_NAMES))
+                )
         question = near.strip(" ()").capitalize()
         return f"{question} `fleetmap environment list` lists all.".strip()
 
@@ -328,14 +332,14 @@ class Client:
 
     def _wait(self, answer: httpx.Response) -> dict[str, Any]:
         """Follow a job to its end with a bar; Refused with the job's problem where it fails."""
-        where = answer.headers.get("Location")
-        if answer.status_code != httpx.codes.ACCEPTED or not where:
+        location = answer.headers.get("Location")
+        if answer.status_code != httpx.codes.ACCEPTED or not location:
             detail = f"unexpected answer {answer.status_code} of {answer.url}"
             raise Refused({"title": "Unexpected answer", "detail": detail}, status=answer.status_code)
-        where, pause = urljoin(str(answer.url), where), POLL_SECONDS
+        location, pause = urljoin(str(answer.url), location), POLL_SECONDS
         with progress_bar("waiting", total=1.0) as bar:
             while True:
-                job: dict[str, Any] = self.get(where)
+                job: dict[str, Any] = self.get(location)
                 bar.update(
                     completed=float(job.get("progress") or 0), description=str(job.get("detail") or job["state"])
                 )

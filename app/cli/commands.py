@@ -132,15 +132,15 @@ def build(only: str | None = None) -> typer.Typer:
         places = {only: places[only]}
     for name, place in places.items():
         module, _, member = place.partition(":")
-        found = getattr(importlib.import_module(f"app.cli.{module}"), member)
+        command = getattr(importlib.import_module(f"app.cli.{module}"), member)
         shown: dict[str, Any] = {"rich_help_panel": panels.get(name), "hidden": name in ALIASES}
-        if isinstance(found, typer.Typer):
-            app.add_typer(found, name=name, **shown)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name, **shown)
             continue
         if name == "serve":
-            found = sys.modules["app.cli.serving"].with_flags(found) if only == "serve" else _serve_without_flags
+            command = sys.modules["app.cli.serving"].with_flags(command) if only == "serve" else _serve_without_flags
         settings = {"ignore_unknown_options": True} if name in NEGATIVE_ARGUMENTS else None
-        app.command(name, context_settings=settings, **shown)(found)
+        app.command(name, context_settings=settings, **shown)(command)
     return app
 
 
@@ -148,7 +148,7 @@ def _serve_without_flags() -> None:
     """Start the server, with a demo if you like."""
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(flag: bool) -> None:
+    if flag:
         sys.stdout.write(f"fleetmap {__version__}\n")
         raise typer.Exit

@@ -39,15 +39,15 @@ def _companions(main: str, beside: _Beside) -> list[str]:
     """The files that a map names, of those beside and below it; none if it is no map."""
     from app import formats
 
-    known = formats.detect(main, beside[main])
-    if known is None:
+    fmt = formats.detect(main, beside[main])
+    if fmt is None:
         return []
-    if known.sort is not None:
-        wanted = known.sort(beside, [main]).get(main, ())
+    if fmt.sort is not None:
+        companion_names = fmt.sort(beside, [main]).get(main, ())
     else:
         names = list(beside)
-        wanted = [*known.companions(main, beside[main], names), *known.looks_at(main, names)]
-    return [name for name in wanted if name in beside and name != main]
+        companion_names = [*fmt.companions(main, beside[main], names), *fmt.looks_at(main, names)]
+    return [name for name in companion_names if name in beside and name != main]
 
 
 class _Beside(Mapping[str, bytes]):
@@ -56,8 +56,8 @@ class _Beside(Mapping[str, bytes]):
     def __init__(self, path: Path) -> None:
         folder = path.resolve().parent
         self._paths = {path.name: path}
-        for found in walk(folder, MAX_LISTED):
-            self._paths.setdefault(found.relative_to(folder).as_posix(), found)
+        for file in walk(folder, MAX_LISTED):
+            self._paths.setdefault(file.relative_to(folder).as_posix(), file)
         self._read: dict[str, bytes] = {}
 
     def path(self, name: str) -> Path:

@@ -37,9 +37,9 @@ def ensured(
 
     Yields whether the environment was created now. Raises Refused or Invalid if it must not be created.
     """
-    wanted = datum.as_dict() if datum else None
+    datum_values = datum.as_dict() if datum else None
     try:
-        known = client.get(path_of("environments", name))
+        environment = client.get(path_of("environments", name))
     except Refused as refused:
         if refused.status != 404 or str(refused.problem.get("type")).endswith(":gone"):
             raise
@@ -47,15 +47,17 @@ def ensured(
             detail = f"there is no environment {name} yet, and a dry run does not create it"
             raise Refused({"title": "No such environment", "detail": detail}, status=404, hint=refused.hint) from None
         _check_new(client, name, create, refused)
-        made = client.post("/environments", {"name": name, "title": title, "datum": wanted})
-        with _undone(lambda: _remove(client, made), f"The environment {name}, created for this, could not be removed"):
+        new_environment = client.post("/environments", {"name": name, "title": title, "datum": datum_values})
+        with _undone(
+            lambda: _remove(client, new_environment), f"The environment {name}, created for this, could not be removed"
+        ):
             yield True
         return
-    if wanted is None or (known.get("datum") or {}) == wanted or dry_run:
+    if datum_values is None or (environment.get("datum") or {}) == datum_values or dry_run:
         yield False
         return
-    client.patch(path_of("environments", name), {"datum": wanted})
-    with _undone(lambda: _take_back(client, known), f"The new datum of {name} could not be taken back"):
+    client.patch(path_of("environments", name), {"datum": datum_values})
+    with _undone(lambda: _take_back(client, environment), f"The new datum of {name} could not be taken back"):
         yield False
 
 
@@ -83,20 +85,20 @@ def _undone(undo: Any, failure: str) -> Iterator[None]:
         raise
 
 
-def _remove(client: Client, made: Mapping[str, Any]) -> None:
+def _remove(client: Client, environment: Mapping[str, Any]) -> None:
     """Remove an environment permanently, unless another client has changed it since."""
-    place = path_of("environments", made["name"])
-    if client.get(place)["version"] == made["version"]:
+    place = path_of("environments", environment["name"])
+    if client.get(place)["version"] == environment["version"]:
         client.delete(place)
         client.post(f"{place}/purge", {})
 
 
-def _take_back(client: Client, known: Mapping[str, Any]) -> None:
+def _take_back(client: Client, environment: Mapping[str, Any]) -> None:
     """Return to the version before the datum was set, unless another client has made a version since."""
-    place = path_of("environments", known["name"])
-    if client.get(place)["version"] == known["version"] + 1:
+    place = path_of("environments", environment["name"])
+    if client.get(place)["version"] == environment["version"] + 1:
         message = "take back the datum: the import it was for failed"
-        client.post(f"{place}/versions", {"revert_to": known["version"], "message": message}, repeat=True)
+        client.post(f"{place}/versions", {"revert_to": environment["version"], "message": message}, repeat=True)
 
 
 def slip(name: str, existing: Iterable[str]) -> str | None:

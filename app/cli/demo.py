@@ -37,8 +37,8 @@ def install(client: Client) -> dict[str, Any]:
     head = client.get(path_of("environments", NAME, "versions", "latest"))
     if any(kind != "missing" for kind in (head.get("information") or {}).values()):
         return {"environment": NAME, "version": head["version"], "created": False}
-    made = client.post(path_of("environments", NAME, "generations"), SITE)
-    return {"environment": NAME, "version": made["version"], "created": True}
+    version = client.post(path_of("environments", NAME, "generations"), SITE)
+    return {"environment": NAME, "version": version["version"], "created": True}
 
 
 def curl_lines(server: str, token: str | None) -> list[str]:

@@ -59,25 +59,25 @@ def show(
     Example: `fleetmap environment show farm`
     """
     with Client(server, token) as client:
-        found = client.get(path_of("environments", environment))
+        details = client.get(path_of("environments", environment))
         channels = client.get(path_of("environments", environment, "channels"), {"robots": "false"})
     if as_json:
-        output.show_json(found)
+        output.show_json(details)
         return
-    west_south_east_north = found.get("bounds")
+    west_south_east_north = details.get("bounds")
     output.show_members(
         {
-            "environment": found["name"],
-            "title": found.get("title"),
-            "description": found.get("description"),
-            "tags": ", ".join(found.get("tags") or ()),
-            "newest version": str(found["version"]),
+            "environment": details["name"],
+            "title": details.get("title"),
+            "description": details.get("description"),
+            "tags": ", ".join(details.get("tags") or ()),
+            "newest version": str(details["version"]),
             "channels": ", ".join(f"{c['channel']} → {c['version']}" for c in channels if c["version"] is not None),
-            "datum": output.datum(found.get("datum")),
+            "datum": output.datum(details.get("datum")),
             "bounds (west, south, east, north)": ", ".join(f"{n:.6f}" for n in west_south_east_north or ()),
-            "created (UTC)": output.minute(found.get("created")),
-            "changed (UTC)": output.minute(found.get("updated")),
-            "root hash": found.get("root"),
+            "created (UTC)": output.minute(details.get("created")),
+            "changed (UTC)": output.minute(details.get("updated")),
+            "root hash": details.get("root"),
         }
     )
 
@@ -107,15 +107,15 @@ def create(
     Example: `fleetmap environment create farm --datum 53.2686,-0.5245 --title 'North farm'`
     """
     check_name(environment)
-    where = options.datum(datum)
+    new_datum = options.datum(datum)
     body: dict[str, Any] = {"name": environment, "title": title, "description": description, "tags": tag}
-    body["datum"] = where.as_dict() if where else None
+    body["datum"] = new_datum.as_dict() if new_datum else None
     if clone is not None:
         name, _, version = clone.partition("@")
         body["clone"] = {"environment": name, "version": version or "latest"}
     with Client(server, token) as client:
-        made = client.post("/environments", body)
-    _show_result(made, f"{made['name']}: created, version {made['version']}", as_json=as_json)
+        result = client.post("/environments", body)
+    _show_result(result, f"{result['name']}: created, version {result['version']}", as_json=as_json)
 
 
 @commands.command("rename")
@@ -142,8 +142,8 @@ def rename(
         check_name(name)
     with Client(server, token) as client:
         changed = client.patch(path_of("environments", environment), body)
-    what = f"is now called {changed['name']}" if name not in (None, environment) else "changed"
-    _show_result(changed, f"{environment}: {what}", as_json=as_json)
+    change = f"is now called {changed['name']}" if name not in (None, environment) else "changed"
+    _show_result(changed, f"{environment}: {change}", as_json=as_json)
 
 
 @commands.command("datum")
@@ -166,16 +166,16 @@ def set_datum(
 
     Example: `fleetmap environment datum farm 53.2686,-0.5245,12.5`
     """
-    where = options.datum(datum)
+    new_datum = options.datum(datum)
     with Client(server, token) as client:
         place = path_of("environments", environment)
-        found = client.get(place) if where is None else client.patch(place, {"datum": where.as_dict()})
+        result = client.get(place) if new_datum is None else client.patch(place, {"datum": new_datum.as_dict()})
     if as_json:
-        output.show_json(found["datum"] if where is None else found)
+        output.show_json(result["datum"] if new_datum is None else result)
         return
-    version = "" if where is None else f", version {found['version']}"
-    output.show(f"{environment}: datum {output.datum(found.get('datum'))}{version}")
-    output.show_warnings(found.get("warnings") or ())
+    version = "" if new_datum is None else f", version {result['version']}"
+    output.show(f"{environment}: datum {output.datum(result.get('datum'))}{version}")
+    output.show_warnings(result.get("warnings") or ())
 
 
 @commands.command("delete")
@@ -209,8 +209,8 @@ def restore(
     Example: `fleetmap environment restore farm`
     """
     with Client(server, token) as client:
-        found = client.post(path_of("environments", environment, "restore"), {})
-    _show_result(found, f"{environment}: restored, version {found['version']}", as_json=as_json)
+        result = client.post(path_of("environments", environment, "restore"), {})
+    _show_result(result, f"{environment}: restored, version {result['version']}", as_json=as_json)
 
 
 @commands.command("purge")
@@ -237,5 +237,5 @@ def purge(
         output.show(f"{environment}: removed permanently")
 
 
-def _show_result(found: Any, line: str, *, as_json: bool) -> None:
-    output.show_json(found) if as_json else output.show(line)
+def _show_result(result: Any, line: str, *, as_json: bool) -> None:
+    output.show_json(result) if as_json else output.show(line)

@@ -80,8 +80,8 @@ def _show(event: Mapping[str, Any], *, as_json: bool) -> None:
         sys.stdout.flush()
         return
     data = event["data"]
-    known = ("environment", "type", "time", "sequence", "epoch", "root")
-    rest = [f"{name} {value}" for name, value in data.items() if name not in known and _is_short(value)]
+    standard_names = ("environment", "type", "time", "sequence", "epoch", "root")
+    rest = [f"{name} {value}" for name, value in data.items() if name not in standard_names and _is_short(value)]
     moment = str(data.get("time") or "")[:19].replace("T", " ")
     output.show(f"{event['id']}  {moment}  {data.get('environment', '')}  {event['type']}  {', '.join(rest)}".rstrip())
 

@@ -49,14 +49,14 @@ def collect(folder: Path) -> Folder:
     Invalid where there is nothing to upload.
     """
     folder = folder.resolve()
-    root, wanted = _template(folder)
+    root, template_paths = _template(folder)
     notes: list[str] = []
-    files = [_local(path, root) for path in _walk(wanted or root, root, notes)]
-    if wanted is not None:
+    files = [_local(path, root) for path in _walk(template_paths or root, root, notes)]
+    if template_paths is not None:
         files += [_local(root / name, root) for name in SCRIPTS if (root / name).is_file()]
     if not files:
         raise Invalid(f"{folder} has no files to upload")
-    return Folder(root, tuple(sorted(files, key=lambda f: f.name)), wanted is not None, tuple(notes))
+    return Folder(root, tuple(sorted(files, key=lambda f: f.name)), template_paths is not None, tuple(notes))
 
 
 def environment_name(text: str) -> str:
@@ -103,9 +103,9 @@ def walk(folder: Path, limit: int) -> Iterator[Path]:
     that cannot be listed are passed over."""
     waiting, count = [folder], 0
     while waiting and count < limit:
-        here = waiting.pop(0)
+        directory = waiting.pop(0)
         try:
-            entries = sorted(entry for entry in here.iterdir() if entry.name not in SKIPPED)
+            entries = sorted(entry for entry in directory.iterdir() if entry.name not in SKIPPED)
         except OSError:
             continue
         for entry in entries:

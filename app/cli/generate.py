@@ -88,8 +88,8 @@ def generate(
             output.progress_bar(f"generating {site}"),
             ensured(client, name, datum=place, create=create if environment else True),
         ):
-            made = client.post(path_of("environments", name, "generations"), body, repeat=True)
-        show_made(name, made, as_json=as_json)
+            result = client.post(path_of("environments", name, "generations"), body, repeat=True)
+        show_made(name, result, as_json=as_json)
         return
     if out is None:
         raise typer.BadParameter("--to needs -o: a file, a folder, or - for standard output")
@@ -104,9 +104,9 @@ def _list(*, as_json: bool) -> None:
     local.require_server_python("generate")
     from app.generate import all_generators
 
-    known = [one.as_dict() for one in all_generators().values()]
+    generators = [one.as_dict() for one in all_generators().values()]
     if as_json:
-        output.show_json(known)
+        output.show_json(generators)
         return
     output.show_table(
         ("generator", "what it makes", "works on", "gives", "parameters"),
@@ -118,7 +118,7 @@ def _list(*, as_json: bool) -> None:
                 ", ".join(one["gives"]),
                 ", ".join(p["name"] for p in one["parameters"]),
             )
-            for one in known
+            for one in generators
         ],
     )
 
@@ -127,22 +127,22 @@ def _describe(site: str, *, as_json: bool) -> None:
     local.require_server_python("generate")
     from app.generate import get_generator
 
-    known = get_generator(site).as_dict()
+    details = get_generator(site).as_dict()
     if as_json:
-        output.show_json(known)
+        output.show_json(details)
         return
     output.show_members(
         {
-            "generator": f"{known['id']}: {known['title']}",
-            "works on": _worked_on(known),
-            "gives": ", ".join(known["gives"]),
+            "generator": f"{details['id']}: {details['title']}",
+            "works on": _worked_on(details),
+            "gives": ", ".join(details["gives"]),
         }
     )
-    show_parameters(known["parameters"], "Parameters")
+    show_parameters(details["parameters"], "Parameters")
 
 
-def _worked_on(known: Mapping[str, Any]) -> str:
-    return ", ".join(known["needs"]) or " or ".join(known["changes"]) or "nothing"
+def _worked_on(details: Mapping[str, Any]) -> str:
+    return ", ".join(details["needs"]) or " or ".join(details["changes"]) or "nothing"
 
 
 def _check_names(site: str, ours: set[str], to: str, values: Mapping[str, str]) -> None:
@@ -167,21 +167,21 @@ def _write(
     from app.model.layers import Layers
     from app.store.values import Provenance
 
-    known = generate.get_generator(site)
+    generator = generate.get_generator(site)
     formats.get_format(to)
-    if known.works_on:
+    if generator.works_on:
         raise Invalid(
-            f"{site} works on {', '.join(sorted(known.works_on))} of an environment: name one with --environment"
+            f"{site} works on {', '.join(sorted(generator.works_on))} of an environment: name one with --environment"
         )
-    ours = {p["name"] for p in parameters.describe(known.parameters)}
+    ours = {p["name"] for p in parameters.describe(generator.parameters)}
     _check_names(site, ours, to, values)
-    own = {n: v for n, v in values.items() if n in ours}
+    generator_values = {n: v for n, v in values.items() if n in ours}
     notes = Notes()
     with output.progress_bar(f"generating {site}"):
-        made = generate.run(site, seed, own, Layers(datum=datum), notes)
-        how = generate.step(site, seed, own, {}, made.datum if datum is None else None)
+        layers = generate.run(site, seed, generator_values, Layers(datum=datum), notes)
+        how = generate.step(site, seed, generator_values, {}, layers.datum if datum is None else None)
         came = Provenance("generated", steps=(how,))
-        result = written(made, to, {n: v for n, v in values.items() if n not in ours}, came)
+        result = written(layers, to, {n: v for n, v in values.items() if n not in ours}, came)
     report: dict[str, Any] = {**result.report}
     report["warnings"] = [w.as_dict() for w in notes.warnings] + report["warnings"]
     report["dropped"] = notes.dropped + report["dropped"]

@@ -75,16 +75,16 @@ def diff(
     Example: `fleetmap diff farm production latest`
     """
     with Client(server, token) as client:
-        told = client.get(path_of("environments", environment, "diff"), {"from": old, "to": new})
+        differences = client.get(path_of("environments", environment, "diff"), {"from": old, "to": new})
     if as_json:
-        output.show_json(told)
+        output.show_json(differences)
         return
-    old, new = str(told.get("from", old)), str(told.get("to", new))
-    lines = [line for layer, change in (told.get("layers") or {}).items() for line in _lines(layer, change)]
+    old, new = str(differences.get("from", old)), str(differences.get("to", new))
+    lines = [line for layer, change in (differences.get("layers") or {}).items() for line in _lines(layer, change)]
     if not lines:
         output.show(f"versions {old} and {new} have the same content")
         return
-    parts = filter(None, (_summary(layer, change) for layer, change in told["layers"].items()))
+    parts = filter(None, (_summary(layer, change) for layer, change in differences["layers"].items()))
     output.show(f"versions {old} → {new}: {'; '.join(parts)}")
     for line in lines:
         output.show(line)
@@ -155,8 +155,8 @@ def promote(
             if at is not None or rollout:
                 raise typer.BadParameter("--cancel plans nothing: leave the other options out")
             client.delete(f"{path}/planned")
-            found = client.get(path_of("environments", environment, "channels"), {"robots": "false"})
-            moved: Any = next((c for c in found if c["channel"] == channel), {"channel": channel, "version": None})
+            channels = client.get(path_of("environments", environment, "channels"), {"robots": "false"})
+            moved: Any = next((c for c in channels if c["channel"] == channel), {"channel": channel, "version": None})
         else:
             number = resolve(client, environment, version)
             moved = client.put(path, {"version": number, "activate_at": at, "rollout": rollout or None})
@@ -194,11 +194,11 @@ def revert(
     with Client(server, token) as client:
         number = resolve(client, environment, version)
         body = {"revert_to": number, "message": message or f"revert to version {number}"}
-        made = client.post(path_of("environments", environment, "versions"), body, repeat=True)
+        result = client.post(path_of("environments", environment, "versions"), body, repeat=True)
     if as_json:
-        output.show_json(made)
+        output.show_json(result)
     else:
-        output.show(f"{environment}: version {made['version']} holds what version {number} holds")
+        output.show(f"{environment}: version {result['version']} holds what version {number} holds")
 
 
 def resolve(client: Client, environment: str, version: str) -> int:
@@ -211,10 +211,10 @@ def resolve(client: Client, environment: str, version: str) -> int:
 
 def channels_by_version(client: Client, environment: str) -> dict[int, list[str]]:
     """Which channels stand on which version."""
-    told: dict[int, list[str]] = {}
+    channels: dict[int, list[str]] = {}
     for row in channel_rows(client, environment):
-        told.setdefault(row["version"], []).append(str(row["channel"]))
-    return told
+        channels.setdefault(row["version"], []).append(str(row["channel"]))
+    return channels
 
 
 def channel_rows(client: Client, environment: str) -> list[dict[str, Any]]:
@@ -225,19 +225,19 @@ def channel_rows(client: Client, environment: str) -> list[dict[str, Any]]:
 
 def summary(changes: Mapping[str, Any]) -> str:
     """A version's changes in a few words."""
-    return "; ".join(change_line(what, change) for what, change in changes.items())
+    return "; ".join(change_line(subject, change) for subject, change in changes.items())
 
 
-def change_line(what: str, change: Any) -> str:
+def change_line(subject: str, change: Any) -> str:
     """What changed and how: ``topology: 2 added``, ``datum: none → 53.25, -0.5``."""
-    if what == "datum" and isinstance(change, Mapping):
+    if subject == "datum" and isinstance(change, Mapping):
         return f"datum: {output.datum(change.get('from'))} → {output.datum(change.get('to'))}"
-    if what == "templates" and isinstance(change, Mapping):
+    if subject == "templates" and isinstance(change, Mapping):
         return f"templates: {', '.join(_template_changes(change))}"
-    if what == "renewed" and isinstance(change, list):
+    if subject == "renewed" and isinstance(change, list):
         parts = ", ".join(f"{part['layer']} {part['level']}/{part['name']}" for part in change)
         return f"derived anew with the same content: {parts}"
-    return f"{what}: {counts(change)}"
+    return f"{subject}: {counts(change)}"
 
 
 def counts(change: Any) -> str:
@@ -277,11 +277,11 @@ def _lines(layer: str, change: Mapping[str, Any]) -> list[str]:
 def _template_changes(change: Mapping[str, Any]) -> list[str]:
     """``tmap2 action: none → NavigateToPose``, for each value that differs."""
     out = []
-    for name, said in change.items():
+    for name, format_changes in change.items():
         if name == "set":
-            out.append(f"set: {said.get('from')} → {said.get('to')}")
+            out.append(f"set: {format_changes.get('from')} → {format_changes.get('to')}")
             continue
-        for parameter, values in said.items():
+        for parameter, values in format_changes.items():
             old, new = ("none" if values.get(end) is None else values[end] for end in ("from", "to"))
             out.append(f"{name} {parameter}: {old} → {new}")
     return out
@@ -332,15 +332,15 @@ def derive(
     Example: `fleetmap derive farm occupancy_to_topology -O robot_radius=0.3`
     """
     if environment is None:
-        known = _derivations(server, token)
+        derivations = _derivations(server, token)
         if as_json:
-            output.show_json(known)
+            output.show_json(derivations)
             return
         output.show_table(
             ("derivation", "what it does", "from", "to", "parameters"),
             [
                 (d["id"], d["title"], ", ".join(d["needs"]), d["gives"], ", ".join(p["name"] for p in d["parameters"]))
-                for d in known
+                for d in derivations
             ],
         )
         return
@@ -348,14 +348,14 @@ def derive(
         raise typer.BadParameter("name the derivation; `fleetmap derive` lists them")
     body = {"method": method, "parameters": options.pairs(option), "message": message, "replace": replace}
     with Client(server, token) as client, output.progress_bar(f"deriving by {method}"):
-        made = client.post(path_of("environments", environment, "derivations"), body, repeat=True)
-    show_made(environment, made, as_json=as_json)
+        result = client.post(path_of("environments", environment, "derivations"), body, repeat=True)
+    show_made(environment, result, as_json=as_json)
 
 
-def show_made(environment: str, made: Mapping[str, Any], *, as_json: bool) -> None:
+def show_made(environment: str, result: Mapping[str, Any], *, as_json: bool) -> None:
     """A version that a derivation or a generator has made, or that is as it was."""
     if as_json:
-        output.show_json(made)
+        output.show_json(result)
         return
-    output.show(f"{environment}: version {made['version']}: {summary(made.get('changes') or {}) or 'nothing new'}")
-    output.show_warnings(made.get("warnings") or ())
+    output.show(f"{environment}: version {result['version']}: {summary(result.get('changes') or {}) or 'nothing new'}")
+    output.show_warnings(result.get("warnings") or ())

@@ -63,20 +63,20 @@ def show(
     Example: `fleetmap jobs show 7f3a…`
     """
     with Client(server, token) as client:
-        found = client.get(path_of("jobs", job))
+        details = client.get(path_of("jobs", job))
     if as_json:
-        output.show_json(found)
+        output.show_json(details)
         return
     output.show_members(
         {
-            "job": found["id"],
-            "state": found["state"],
-            "progress": f"{found['progress']:.0%}",
-            "detail": found["detail"],
-            "problem": (found.get("problem") or {}).get("detail"),
-            "result": (found.get("result") or {}).get("location"),
-            "started (UTC)": output.minute(found["created"]),
-            "changed (UTC)": output.minute(found["updated"]),
+            "job": details["id"],
+            "state": details["state"],
+            "progress": f"{details['progress']:.0%}",
+            "detail": details["detail"],
+            "problem": (details.get("problem") or {}).get("detail"),
+            "result": (details.get("result") or {}).get("location"),
+            "started (UTC)": output.minute(details["created"]),
+            "changed (UTC)": output.minute(details["updated"]),
         }
     )
 

@@ -51,11 +51,11 @@ def show(
     """
     with Client(server, token) as client:
         rows = client.get("/keys")
-    found = next((row for row in rows if key in (None, row["id"])), None)
-    if found is None:
+    row = next((row for row in rows if key in (None, row["id"])), None)
+    if row is None:
         near = did_you_mean(key or "", [row["id"] for row in rows])
         raise Refused({"title": "Not found", "detail": f"the server has no key {key!r}{near}"}, status=404)
-    output.show_json(found) if as_json else output.show(found["public_key"])
+    output.show_json(row) if as_json else output.show(row["public_key"])
 
 
 @commands.command("rotate")
@@ -74,8 +74,8 @@ def rotate(
     if not yes:
         typer.confirm("Sign with a new key from now on? This cannot be undone.", abort=True, err=True)
     with Client(server, token) as client:
-        made = client.post("/keys", {})
+        result = client.post("/keys", {})
     if as_json:
-        output.show_json(made)
+        output.show_json(result)
     else:
-        output.show(f"key {made['id']} signs from now on: {made['public_key']}")
+        output.show(f"key {result['id']} signs from now on: {result['public_key']}")

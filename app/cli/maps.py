@@ -56,7 +56,7 @@ def import_maps(
 
     Example: `fleetmap import network.kml --environment farm --layer topology -m 'drawn by hand'`
     """
-    where = options.datum(datum)
+    new_datum = options.datum(datum)
     extra = options.pairs(option)
     if environment is not None:
         folders.check_name(environment)
@@ -72,18 +72,18 @@ def import_maps(
         with ensured(
             client,
             name,
-            datum=where,
+            datum=new_datum,
             title=title if title != name else None,
             create=create if environment else True,
             dry_run=dry_run,
-        ) as made:
+        ) as is_new:
             status, body = client.upload(path_of("environments", name, "versions"), files, fields)
     if as_json:
         output.show_json(body)
         return
     for note in notes:
         output.say(f"left out: {note}", style="yellow")
-    _show_import(name, status, body, dry_run=dry_run, made=made)
+    _show_import(name, status, body, dry_run=dry_run, is_new=is_new)
 
 
 def export_map(
@@ -152,12 +152,12 @@ def link(
     body: dict[str, Any] = {"format": format, "file": file, "parameters": parameters, "seconds": seconds}
     with Client(server, token) as client:
         chosen = version or _preferred(client, environment)
-        made = client.post_until_done(path_of("environments", environment, "versions", chosen, "links"), body)
+        result = client.post_until_done(path_of("environments", environment, "versions", chosen, "links"), body)
     if as_json:
-        output.show_json(made)
+        output.show_json(result)
         return
-    output.say(f"{made['name']} of version {made['version']}, without a token until {made['expires']}:")
-    output.show(made["url"])
+    output.say(f"{result['name']} of version {result['version']}, without a token until {result['expires']}:")
+    output.show(result["url"])
 
 
 def convert(
@@ -193,27 +193,29 @@ def convert(
 
     if out == "-" and as_json:
         raise typer.BadParameter("--json and -o - both want standard output")
-    known = formats.get_format(to)
-    ours = {p["name"] for p in parameters.describe(known.write_options)}
+    fmt = formats.get_format(to)
+    ours = {p["name"] for p in parameters.describe(fmt.write_options)}
     ours |= {name for step in all_derivations() for name in takes(step)}
     values = options.pairs(option)
     files, _, notes = _collect(paths)
     files = with_companions(files)
     hints = Hints(format, drawn_layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
-    wanted = {k: v for k, v in values.items() if k in ours}
+    format_options = {k: v for k, v in values.items() if k in ours}
     with output.progress_bar(f"converting to {to}"):
         data = {f.name: f.path.read_bytes() for f in files}
-        made = offline(data, to, hints=hints, datum=options.datum(datum), options=wanted, derived=derive)
-    as_folder = write.wants_folder(out) or (len(made.files) > 1 and out != "-" and not out.lower().endswith(".zip"))
-    names = write.bundle(made.files, Path(out), folder=as_folder)
+        converted = offline(data, to, hints=hints, datum=options.datum(datum), options=format_options, derived=derive)
+    as_folder = write.wants_folder(out) or (
+        len(converted.files) > 1 and out != "-" and not out.lower().endswith(".zip")
+    )
+    names = write.bundle(converted.files, Path(out), folder=as_folder)
     if as_json:
-        output.show_json({"files": names, "report": made.report})
+        output.show_json({"files": names, "report": converted.report})
         return
     for note in notes:
         output.say(f"left out: {note}", style="yellow")
     for name in names if as_folder else [out] if out != "-" else []:
         output.say(f"wrote {Path(out) / name if as_folder else name}")
-    show_report(made.report)
+    show_report(converted.report)
 
 
 def check(
@@ -235,23 +237,23 @@ def check(
     collected = with_companions(collected)
     files = bundle.unpack({f.name: f.path.read_bytes() for f in collected}, formats.Limits())
     groups, rest = formats.group({name: data for name, data in files.items() if data}, format)
-    told: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
     for group in groups:
-        found = [p.as_dict() for p in formats.check(group.format, group.files)]
-        level = found[0]["level"] if found else "fine" if group.format.check else "unchecked"
-        told.append({"format": group.format.name, "file": group.main, "result": level, "findings": found})
-    if not told:
+        findings = [p.as_dict() for p in formats.check(group.format, group.files)]
+        level = findings[0]["level"] if findings else "fine" if group.format.check else "unchecked"
+        results.append({"format": group.format.name, "file": group.main, "result": level, "findings": findings})
+    if not results:
         raise Invalid("none of the files is a map that is known here: name the format with --format")
     if as_json:
-        output.show_json({"maps": told, "unknown": rest})
+        output.show_json({"maps": results, "unknown": rest})
     else:
         for note in notes:
             output.say(f"left out: {note}", style="yellow")
-        for line in told:
+        for line in results:
             _show_check(line)
         for name in rest:
             output.say(f"not checked: {name}: no format reads this file")
-    if any(line["result"] == "error" for line in told):
+    if any(line["result"] == "error" for line in results):
         raise typer.Exit(1)
 
 
@@ -276,13 +278,13 @@ def list_formats(
     from app import catalogue, formats
 
     if format is not None:
-        found = formats.get_format(format)
-        described = catalogue.describe_format(found)
-        output.show_json(described) if as_json else _show_format(found, described)
+        fmt = formats.get_format(format)
+        described = catalogue.describe_format(fmt)
+        output.show_json(described) if as_json else _show_format(fmt, described)
         return
-    known = catalogue.describe_formats()
+    descriptions = catalogue.describe_formats()
     if as_json:
-        output.show_json(known)
+        output.show_json(descriptions)
         return
     rows = [
         (
@@ -293,27 +295,27 @@ def list_formats(
             ", ".join(layer for layer, how in f["information"].items() if how == "raw"),
             ", ".join(p["name"] for p in f["options"] if p["for"] == "write") or "-",
         )
-        for f in known
+        for f in descriptions
     ]
     output.show_table(("format", "what it is", "read", "served as", "layers", "options"), rows)
 
 
-def _show_format(known: Format, described: Mapping[str, Any]) -> None:
+def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
     """Describe a format: files, the layers that it keeps and drops, what a map of it needs, and its parameters."""
-    kept = [layer for layer in described["information"] if layer in known.carries]
-    dropped = [layer for layer in described["information"] if layer not in known.carries]
-    dropped += ["blocked edges"] if "topology" in known.carries and not known.marks_blocked else []
+    carried_layers = [layer for layer in described["information"] if layer in fmt.carries]
+    dropped = [layer for layer in described["information"] if layer not in fmt.carries]
+    dropped += ["blocked edges"] if "topology" in fmt.carries and not fmt.marks_blocked else []
     derived = [layer for layer, how in described["information"].items() if how == "derived"]
     output.show_members(
         {
-            "format": f"{known.name}: {known.title}",
-            "uploads": "yes, detected from the content" if known.read else "not read",
-            "maps": ", ".join(known.files) if known.write else "not written",
-            "media types": ", ".join(dict.fromkeys(known.media_types)) if known.write else "",
-            "a map needs": _needed(known.needs) if known.write else "",
-            "keeps": ", ".join(kept),
-            "derived from it": ", ".join(derived) if known.read else "",
-            "has no place for": ", ".join(dropped) if known.write else "",
+            "format": f"{fmt.name}: {fmt.title}",
+            "uploads": "yes, detected from the content" if fmt.read else "not read",
+            "maps": ", ".join(fmt.files) if fmt.write else "not written",
+            "media types": ", ".join(dict.fromkeys(fmt.media_types)) if fmt.write else "",
+            "a map needs": _needed(fmt.needs) if fmt.write else "",
+            "keeps": ", ".join(carried_layers),
+            "derived from it": ", ".join(derived) if fmt.read else "",
+            "has no place for": ", ".join(dropped) if fmt.write else "",
         }
     )
     for use, title in (("write", "Parameters of a map"), ("read", "Parameters of an upload")):
@@ -380,13 +382,13 @@ def coverage(
     if as_json:
         output.show_json(rows)
         return
-    told = []
+    lines = []
     for row in rows:
         steps = [_step(step) for step in row.get("chain") or ()]
         how = ", then ".join(steps) or "; ".join(row.get("missing") or ()) or "-"
         how += f"; {row['choose']}" if row.get("choose") else ""
-        told.append((row["format"], row["state"], how.removeprefix("-; ")))
-    output.show_table(("format", "state", "how, or what to supply"), told)
+        lines.append((row["format"], row["state"], how.removeprefix("-; ")))
+    output.show_table(("format", "state", "how, or what to supply"), lines)
 
 
 def show_report(report: Mapping[str, Any]) -> None:
@@ -409,21 +411,21 @@ def _collect(paths: Sequence[Path]) -> tuple[list[LocalFile], str | None, tuple[
         if not path.exists():
             raise NotFound(f"{path} does not exist")
     if len(paths) == 1 and paths[0].is_dir():
-        found = folders.collect(paths[0])
-        inner = found.root if found.is_template else paths[0].resolve()
+        upload_folder = folders.collect(paths[0])
+        inner = upload_folder.root if upload_folder.is_template else paths[0].resolve()
         try:
             name = folders.environment_name(inner.name)
         except Invalid:
             name = None
-        return list(found.files), name, found.notes
+        return list(upload_folder.files), name, upload_folder.notes
     files: list[LocalFile] = []
     notes: list[str] = []
     for path in paths:
         if path.is_dir():
-            found = folders.collect(path)
-            notes += found.notes
-            prefix = "" if found.is_template else f"{path.resolve().name}/"
-            files += [LocalFile(prefix + f.name, f.path, f.size) for f in found.files]
+            upload_folder = folders.collect(path)
+            notes += upload_folder.notes
+            prefix = "" if upload_folder.is_template else f"{path.resolve().name}/"
+            files += [LocalFile(prefix + f.name, f.path, f.size) for f in upload_folder.files]
         else:
             files.append(folders.single(path))
     names = [f.name for f in files]
@@ -438,16 +440,16 @@ def _default_message(paths: Sequence[Path]) -> str:
     return f"import {', '.join(names[:3])}{' …' if len(names) > 3 else ''}"
 
 
-def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bool, made: bool) -> None:
+def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bool, is_new: bool) -> None:
     if dry_run:
         output.show(f"{name}: this would make a version")
     elif status == 201:
-        output.show(f"{name}: version {body['version']}{' of the new environment' if made else ''}")
+        output.show(f"{name}: version {body['version']}{' of the new environment' if is_new else ''}")
     else:
         output.show(f"{name}: nothing changed, version {body['version']} stays")
     if dry_run or status == 201:  # else they are those of the version that stays
-        for what, change in (body.get("changes") or {}).items():
-            output.show(f"  {change_line(what, change)}")
+        for subject, change in (body.get("changes") or {}).items():
+            output.show(f"  {change_line(subject, change)}")
     kinds = [f"{layer} {kind}" for layer, kind in (body.get("information") or {}).items() if kind != "missing"]
     if kinds:
         output.show(f"  holds: {', '.join(kinds)}")
@@ -497,8 +499,8 @@ _RESULTS: Mapping[str, str] = {
 
 def _show_check(line: Mapping[str, Any]) -> None:
     output.show(f"{line['file']} ({line['format']}): {_RESULTS[line['result']]}")
-    for found in line["findings"]:
-        output.show(f"  {found['level']}: {output.place(found)}")
+    for finding in line["findings"]:
+        output.show(f"  {finding['level']}: {output.place(finding)}")
 
 
 def _step(step: Any) -> str:

@@ -136,15 +136,15 @@ def show_warnings(warnings: Sequence[Mapping[str, Any]], *, limit: int = 20) -> 
     for number, warning in enumerate(warnings):
         whole_file = warning.get("file") and warning.get("line") is None and not warning.get("where")
         lines.setdefault((warning.get("problem"),) if whole_file else (number,), []).append(warning)
-    told = list(lines.values())
-    for alike in told[:limit]:
+    groups = list(lines.values())
+    for alike in groups[:limit]:
         names = ", ".join(str(w["file"]) for w in alike[:NAMED]) if len(alike) > 1 else ""
         more = f" and {len(alike) - NAMED} more" if len(alike) > NAMED else ""
         line = f"{len(alike)} files: {alike[0].get('problem')}: {names}{more}" if names else place(alike[0])
         severe = alike[0].get("level") == "error"
         say(f"{'would be refused' if severe else 'warning'}: {line}", style="red" if severe else "yellow")
-    if len(told) > limit:
-        say(f"… and {sum(map(len, told[limit:]))} more warnings (--json shows all)", style="yellow")
+    if len(groups) > limit:
+        say(f"… and {sum(map(len, groups[limit:]))} more warnings (--json shows all)", style="yellow")
 
 
 def show_problem(problem: Mapping[str, Any], *, hint: str = "", as_json: bool = False, limit: int = 50) -> None:

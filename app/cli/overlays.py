@@ -53,7 +53,7 @@ def list_overlays(
             (
                 row["id"],
                 row["state"],
-                what(row),
+                describe_obstruction(row),
                 row["level"],
                 output.minute(row["expires"]),
                 row["reporter"],
@@ -78,28 +78,28 @@ def show(
     """
     with Client(server, token) as client:
         rows = client.get(path_of("environments", environment, "overlays"))
-    found = next((row for row in rows if row["id"] == overlay), None)
-    if found is None:
+    row = next((row for row in rows if row["id"] == overlay), None)
+    if row is None:
         near = did_you_mean(overlay, [row["id"] for row in rows])
         raise Invalid(f"{environment} has no overlay {overlay!r} of the last 30 days{near}")
     if as_json:
-        output.show_json(found)
+        output.show_json(row)
         return
-    polygon = found.get("polygon")
+    polygon = row.get("polygon")
     output.show_members(
         {
-            "overlay": found["id"],
-            "state": found["state"],
-            "what": what(found),
-            "polygon": f"{json.dumps(polygon)} ({found['crs']})" if polygon else None,
-            "level": found["level"],
-            "detail": found.get("detail"),
-            "reporter": found["reporter"],
-            "reported (UTC)": output.minute(found["created"]),
-            "until (UTC)": output.minute(found["expires"]),
-            "decided by": found.get("decided_by"),
-            "decided (UTC)": output.minute(found.get("decided")),
-            "kept in version": found.get("version"),
+            "overlay": row["id"],
+            "state": row["state"],
+            "what": describe_obstruction(row),
+            "polygon": f"{json.dumps(polygon)} ({row['crs']})" if polygon else None,
+            "level": row["level"],
+            "detail": row.get("detail"),
+            "reporter": row["reporter"],
+            "reported (UTC)": output.minute(row["created"]),
+            "until (UTC)": output.minute(row["expires"]),
+            "decided by": row.get("decided_by"),
+            "decided (UTC)": output.minute(row.get("decided")),
+            "kept in version": row.get("version"),
         }
     )
 
@@ -145,8 +145,8 @@ def create(
     body |= {"detail": detail, "polygon": _polygon(polygon) if polygon else None}
     body["state"] = "accepted" if accept else None
     with Client(server, token) as client:
-        made = client.post(path_of("environments", environment, "overlays"), body)
-    _show_decided(environment, made, as_json=as_json)
+        result = client.post(path_of("environments", environment, "overlays"), body)
+    _show_decided(environment, result, as_json=as_json)
 
 
 def _decision(name: str, help: str) -> Callable[..., None]:
@@ -160,8 +160,8 @@ def _decision(name: str, help: str) -> Callable[..., None]:
         as_json: options.Json = False,
     ) -> None:
         with Client(server, token) as client:
-            made = client.post(path_of("environments", environment, "overlays", overlay, name), {})
-        _show_decided(environment, made, as_json=as_json)
+            result = client.post(path_of("environments", environment, "overlays", overlay, name), {})
+        _show_decided(environment, result, as_json=as_json)
 
     commands.command(name, help=f"{help}\n\nExample: `fleetmap overlays {name} farm 4f1c…`")(decide)
     return decide
@@ -173,35 +173,35 @@ end = _decision("end", "End an accepted overlay now: robots may use the edge or 
 keep = _decision("keep", "Make an accepted overlay permanent in a new version (as editor). Promote that version then.")
 
 
-def what(row: Mapping[str, Any]) -> str:
+def describe_obstruction(row: Mapping[str, Any]) -> str:
     """Name what an overlay blocks: ``edge A_B``, ``area``."""
     return f"edge {row['edge']}" if row.get("edge") else "area"
 
 
-def _show_decided(environment: str, made: Mapping[str, Any], *, as_json: bool) -> None:
+def _show_decided(environment: str, overlay: Mapping[str, Any], *, as_json: bool) -> None:
     if as_json:
-        output.show_json(made)
+        output.show_json(overlay)
         return
-    kept = f"; version {made['version']} keeps it blocked" if made.get("version") is not None else ""
-    until = f" until {output.minute(made['expires'])} UTC" if made["state"] in ("pending", "accepted") else ""
+    permanence = f"; version {overlay['version']} keeps it blocked" if overlay.get("version") is not None else ""
+    until = f" until {output.minute(overlay['expires'])} UTC" if overlay["state"] in ("pending", "accepted") else ""
     state = {"pending": "waits for a decision", "accepted": "is in force", "ended": "has ended"}
-    became = state.get(made["state"], f"is {made['state']}")
-    output.show(f"{environment}: overlay {made['id']} ({what(made)}) {became}{until}{kept}")
+    became = state.get(overlay["state"], f"is {overlay['state']}")
+    output.show(f"{environment}: overlay {overlay['id']} ({describe_obstruction(overlay)}) {became}{until}{permanence}")
 
 
 def _polygon(path: Path) -> Any:
     """Read the one polygon of a GeoJSON file: a geometry, a feature, or a collection of one. Raises Invalid."""
     try:
-        found = json.loads(path.read_bytes())
+        geometry = json.loads(path.read_bytes())
     except ValueError as error:
         raise Invalid(f"{path} is not JSON: {error}") from error
-    features = found.get("features") if isinstance(found, dict) else None
+    features = geometry.get("features") if isinstance(geometry, dict) else None
     if isinstance(features, list):
         if len(features) != 1:
             raise Invalid(f"{path} has {len(features)} features: give a file with one polygon")
-        found = features[0]
-    if isinstance(found, dict) and found.get("type") == "Feature":
-        found = found.get("geometry")
-    if not isinstance(found, dict) or found.get("type") not in ("Polygon", "MultiPolygon"):
+        geometry = features[0]
+    if isinstance(geometry, dict) and geometry.get("type") == "Feature":
+        geometry = geometry.get("geometry")
+    if not isinstance(geometry, dict) or geometry.get("type") not in ("Polygon", "MultiPolygon"):
         raise Invalid(f"{path} has no polygon: give a GeoJSON Polygon or MultiPolygon")
-    return found
+    return geometry

@@ -47,6 +47,6 @@ def problem_of(error: Exception) -> tuple[dict[str, Any] | None, str]:
         detail = f"this command needs the server's packages ({error.name} is not installed)"
         return {"title": "Not installed", "detail": detail}, 'pip install "fleet-map-server[server]"'
     if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        return {"title": "Input or output failed", "detail": f"{where}{error.strerror or error}"}, ""
+        prefix = f"{error.filename}: " if error.filename else ""
+        return {"title": "Input or output failed", "detail": f"{prefix}{error.strerror or error}"}, ""
     return None, ""

@@ -74,29 +74,29 @@ def show(
     Example: `fleetmap robots show mower-3`
     """
     with Client(server, token) as client:
-        found = client.get(path_of("robots", robot), {"environment": environment, "limit": limit})
+        details = client.get(path_of("robots", robot), {"environment": environment, "limit": limit})
     if as_json:
-        output.show_json(found)
+        output.show_json(details)
         return
     output.show_members(
         {
-            "robot": found["robot"],
-            "environment": found["environment"],
-            "channel": found["channel"],
-            "runs version": runs(found),
-            "state": found["state"],
-            "detail": found.get("detail"),
-            "online": "yes" if found["online"] else "no",
-            "behind": behind(found),
-            "last report (UTC)": output.minute(found["received"]),
-            "also in": ", ".join(name for name in found["environments"] if name != found["environment"]),
+            "robot": details["robot"],
+            "environment": details["environment"],
+            "channel": details["channel"],
+            "runs version": runs(details),
+            "state": details["state"],
+            "detail": details.get("detail"),
+            "online": "yes" if details["online"] else "no",
+            "behind": behind(details),
+            "last report (UTC)": output.minute(details["received"]),
+            "also in": ", ".join(name for name in details["environments"] if name != details["environment"]),
         }
     )
     output.show_table(
         ("received (UTC)", "channel", "version", "state", "detail"),
         (
             (output.minute(one["received"]), one["channel"], one["version"], one["state"], one.get("detail"))
-            for one in found["history"]
+            for one in details["history"]
         ),
     )
 
@@ -128,8 +128,8 @@ def forget(
 
 def runs(row: Mapping[str, Any]) -> str:
     """Return the version that a robot runs."""
-    held = row.get("holds")
-    return str(held["version"]) if held else "none"
+    active_map = row.get("holds")
+    return str(active_map["version"]) if active_map else "none"
 
 
 def behind(row: Mapping[str, Any]) -> str:

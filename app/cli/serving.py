@@ -103,11 +103,11 @@ def _compile(folder: Path) -> None:
     """
     from app.derive import _native
 
-    where = os.environ.setdefault(_native.FOLDER, str(folder.resolve()))
-    if _native.is_filled(Path(where)):
+    cache_path = os.environ.setdefault(_native.FOLDER, str(folder.resolve()))
+    if _native.is_filled(Path(cache_path)):
         return
     process = multiprocessing.get_context("spawn").Process(
-        target=_native.fill_quietly, args=(Path(where),), daemon=True
+        target=_native.fill_quietly, args=(Path(cache_path),), daemon=True
     )
     process.start()
 
@@ -147,12 +147,14 @@ def demo(server: options.Server = None, token: options.Token = None, as_json: op
     from app.cli.client import Client
 
     with Client(server, token) as client:
-        made = orchard.install(client)
+        result = orchard.install(client)
         lines = orchard.curl_lines(client.server, client.token)
     if as_json:
-        output.show_json(made)
+        output.show_json(result)
         return
-    output.show(f"{made['environment']}: version {made['version']}{'' if made['created'] else ' was there already'}")
+    output.show(
+        f"{result['environment']}: version {result['version']}{'' if result['created'] else ' was there already'}"
+    )
     for line in lines:
         output.show(f"  {line}")
 
@@ -162,11 +164,11 @@ def application() -> Any:
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    made = _main().create_app(load_settings({}, warn=False))  # the process that started it has warned
+    server_app = _main().create_app(load_settings({}, warn=False))  # the process that started it has warned
     gc.freeze()
     gc.unfreeze()  # all of it counts as old now, without a look at any of it
     gc.enable()
-    return made
+    return server_app
 
 
 def load_settings(values: Mapping[str, Any], *, warn: bool = True) -> Settings:
@@ -205,9 +207,9 @@ def _warn_unknown(settings: Iterable[str], file: Path) -> None:
     names = dict.fromkeys(name.upper() for name in os.environ if name.upper().startswith(variables.PREFIX))
     if file.is_file():
         lines = file.read_text(errors="replace").splitlines()
-        names |= dict.fromkeys(found[1].upper() for line in lines if (found := _ASSIGNED.match(line)))
-    known = {f"{variables.PREFIX}{name.upper()}" for name in settings} | {SECRETS_DIR}
-    for warning in variables.unknown(names, known):
+        names |= dict.fromkeys(match[1].upper() for line in lines if (match := _ASSIGNED.match(line)))
+    setting_names = {f"{variables.PREFIX}{name.upper()}" for name in settings} | {SECRETS_DIR}
+    for warning in variables.unknown(names, setting_names):
         output.say(f"warning: {warning}", style="yellow")
 
 
@@ -313,11 +315,11 @@ def with_demo_token(settings: Settings) -> Settings:
     if settings.admin_token is not None or settings.insecure_no_auth:
         return settings
     settings.data_dir.mkdir(parents=True, exist_ok=True)
-    kept = settings.data_dir / DEMO_TOKEN
-    if not kept.is_file() or not kept.read_text().strip():
-        with open(os.open(kept, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as stream:  # noqa: PTH123  its mode
+    token_file = settings.data_dir / DEMO_TOKEN
+    if not token_file.is_file() or not token_file.read_text().strip():
+        with open(os.open(token_file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as stream:  # noqa: PTH123  its mode
             stream.write(secrets.token_urlsafe(32) + "\n")
-    return settings.model_copy(update={"admin_token": SecretStr(kept.read_text().strip())})
+    return settings.model_copy(update={"admin_token": SecretStr(token_file.read_text().strip())})
 
 
 def _store(settings: Settings) -> Any:
@@ -381,11 +383,11 @@ def _bring_demo(address: str, token: str | None) -> None:
     try:
         wait_ready(address)
         with Client(address, token) as client:
-            made = orchard.install(client)
+            result = orchard.install(client)
     except (FleetMapError, Refused, OSError) as error:
         output.say(f"the demo could not be installed: {error}", style="yellow")
         return
-    output.show(f"demo environment: {made['environment']}, version {made['version']}")
+    output.show(f"demo environment: {result['environment']}, version {result['version']}")
     if token:
         output.show(f"administrator's token: {token}")
     output.show("try:")

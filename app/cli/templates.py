@@ -55,45 +55,45 @@ def template(
     place = path_of("environments", environment, "templates", *([format] if format else []))
     with Client(server, token) as client:
         if not (chosen or option or unset):
-            told = client.get(place, {"version": version})
-            output.show_json(told) if as_json else _show(told)
+            details = client.get(place, {"version": version})
+            output.show_json(details) if as_json else _show(details)
             return
-        known = client.get(place)
+        stored_template = client.get(place)
         common = {"message": message, "dry_run": dry_run}
         key = {"Idempotency-Key": secrets.token_hex(16)}
         if unset and not option:
-            made = client.delete(place, {"message": message, "dry_run": str(dry_run).lower()}, key)
+            result = client.delete(place, {"message": message, "dry_run": str(dry_run).lower()}, key)
         elif format is None:
-            made = client.put(place, {"set": chosen, **common}, key)
+            result = client.put(place, {"set": chosen, **common}, key)
         else:
-            body = _said(known, chosen, option or [], unset=unset)
-            made = client.put(place, {**body, **common}, {**key, "If-Match": f'"{known["version"]}"'})
+            body = _said(stored_template, chosen, option or [], unset=unset)
+            result = client.put(place, {**body, **common}, {**key, "If-Match": f'"{stored_template["version"]}"'})
     if as_json:
-        output.show_json(made)
+        output.show_json(result)
     else:
-        _show_made(environment, made, before=known["version"])
+        _show_made(environment, result, before=stored_template["version"])
 
 
-def _said(known: Mapping[str, Any], chosen: str | None, texts: list[str], *, unset: bool) -> dict[str, Any]:
+def _said(stored_template: Mapping[str, Any], chosen: str | None, texts: list[str], *, unset: bool) -> dict[str, Any]:
     """What is said of a format from now on: as before, with these options or without them."""
-    values = dict(known.get("values") or {})
+    values = dict(stored_template.get("values") or {})
     if unset:
         for text in texts:
             values.pop(text.partition("=")[0].strip(), None)
     else:
         values |= options.pairs(texts)
-    return {"set": chosen or known.get("set"), "values": values}
+    return {"set": chosen or stored_template.get("set"), "values": values}
 
 
-def _show_made(environment: str, made: Mapping[str, Any], *, before: int) -> None:
-    changes = made.get("changes") or {}
-    if made["version"] is None:
+def _show_made(environment: str, result: Mapping[str, Any], *, before: int) -> None:
+    changes = result.get("changes") or {}
+    if result["version"] is None:
         output.show(f"{environment}: {'this would make a version' if changes else 'nothing would change'}")
-    elif made["version"] == before:
+    elif result["version"] == before:
         output.show(f"{environment}: nothing changed, version {before} stays")
         return  # its changes are those that made it
     else:
-        output.show(f"{environment}: version {made['version']}")
+        output.show(f"{environment}: version {result['version']}")
     if "templates" in changes:
         output.show(f"  {change_line('templates', changes['templates'])}")
 
@@ -102,19 +102,21 @@ def _sets(*, as_json: bool) -> None:
     local.require_server_python("template")
     from app import templates
 
-    known = [one.as_dict(name) for name, one in templates.SETS.items()]
+    template_sets = [one.as_dict(name) for name, one in templates.SETS.items()]
     if as_json:
-        output.show_json(known)
+        output.show_json(template_sets)
         return
-    rows = ((s["name"], s["title"], "; ".join(f"{f}: {_values(v)}" for f, v in s["formats"].items())) for s in known)
+    rows = (
+        (s["name"], s["title"], "; ".join(f"{f}: {_values(v)}" for f, v in s["formats"].items())) for s in template_sets
+    )
     output.show_table(("set", "what it is for", "values"), rows)
 
 
-def _show(told: Mapping[str, Any]) -> None:
-    lines = told.get("formats")
+def _show(details: Mapping[str, Any]) -> None:
+    lines = details.get("formats")
     if lines is None:
-        shown = [(name, one["value"], one["from"]) for name, one in told["effective"].items()]
-        output.show_table(("parameter", "value", "from"), shown, title=_title(told))
+        shown = [(name, one["value"], one["from"]) for name, one in details["effective"].items()]
+        output.show_table(("parameter", "value", "from"), shown, title=_title(details))
         return
     rows = [
         (line["format"], name, one["value"], one["from"])
@@ -122,14 +124,14 @@ def _show(told: Mapping[str, Any]) -> None:
         for name, one in line["effective"].items()
         if one["from"] != "default"
     ]
-    output.show(f"{told['environment']}, version {told['version']}: the set {told['set']}")
+    output.show(f"{details['environment']}, version {details['version']}: the set {details['set']}")
     if rows:
         output.show_table(("format", "parameter", "value", "from"), rows)
 
 
-def _title(told: Mapping[str, Any]) -> str:
-    own = f", the set {told['set']}" if told.get("set") else ""
-    return f"{told['environment']}, version {told['version']}: {told['format']}{own}"
+def _title(details: Mapping[str, Any]) -> str:
+    set_note = f", the set {details['set']}" if details.get("set") else ""
+    return f"{details['environment']}, version {details['version']}: {details['format']}{set_note}"
 
 
 def _values(values: Mapping[str, Any]) -> str:

@@ -44,13 +44,13 @@ def create(
     options.check_choice("--role", role, ROLES)
     body = {"name": name, "role": role, "environments": environments, "robot": robot, "expires": expires}
     with Client(server, token) as client:
-        made = client.post("/tokens", body)
+        result = client.post("/tokens", body)
     if as_json:
-        output.show_json(made)
+        output.show_json(result)
         return
-    scope = f"{role}, sets the status of the robot {made['robot']}" if made.get("robot") else role
-    output.say(f"token {made['id']} for {name} ({scope}), shown only this once:")
-    output.show(made["token"])
+    scope = f"{role}, sets the status of the robot {result['robot']}" if result.get("robot") else role
+    output.say(f"token {result['id']} for {name} ({scope}), shown only this once:")
+    output.show(result["token"])
 
 
 @commands.command("list")

@@ -33,12 +33,12 @@ SURE = 0.8
 
 def unknown(names: Iterable[str], settings: Iterable[str]) -> list[str]:
     """Return a warning for each variable that neither a setting nor a client, the agent or its hooks read."""
-    known = {*settings, *CLIENT, *AGENT, *COMPOSE}
+    setting_names = {*settings, *CLIENT, *AGENT, *COMPOSE}
     hooks = tuple(f"{PREFIX}{start}" for start in HOOKS)
     return [
-        f"unknown setting {name}{did_you_mean(name, known)}; it has no effect"
+        f"unknown setting {name}{did_you_mean(name, setting_names)}; it has no effect"
         for name in sorted(names)
-        if name not in known and not name.startswith(hooks)
+        if name not in setting_names and not name.startswith(hooks)
     ]
 
 

@@ -71,8 +71,8 @@ def verify(
         raise Invalid(f"{settings.blob_dir}: no folder of stored files is there: name the server's by --data-dir")
     with ExitStack() as stack:
         store = stack.enter_context(closing(_open(settings, readonly=not repair)))
-        found = latest = _check(store)
-        left, healed = found.findings, dict[tuple[str, str], str]()
+        verification = latest = _check(store)
+        left, healed = verification.findings, dict[tuple[str, str], str]()
         for _ in range(MAX_ROUNDS if repair else 0):
             if not left:
                 break
@@ -85,15 +85,15 @@ def verify(
             healed |= fresh
             latest = _check(store)  # what lay below a lost chunk is found only now
             left = latest.findings
-            known = {(f.kind, f.name) for f in found.findings}
-            found.findings += [f for f in left if (f.kind, f.name) not in known]
+            finding_keys = {(f.kind, f.name) for f in verification.findings}
+            verification.findings += [f for f in left if (f.kind, f.name) not in finding_keys]
     for f in left:  # what a failing disk spoils again counts as damaged
         healed.pop((f.kind, f.name), None)
     cache = _check_cache(Cache(settings.cache_dir, settings.cache_bytes)) if settings.cache_dir.is_dir() else (0, 0)
     if as_json:
-        output.show_json(_as_dict(found, healed, cache, ok=not left))
+        output.show_json(_as_dict(verification, healed, cache, ok=not left))
     else:
-        _show(found, healed, cache, repaired=repair)
+        _show(verification, healed, cache, repaired=repair)
     if left:
         raise typer.Exit(1)
 
@@ -136,7 +136,7 @@ def _repair(
 class FolderDonor:
     """Original files, below any names: what counts is their hash."""
 
-    def __init__(self, place: Path, wanted: set[str]) -> None:
+    def __init__(self, place: Path, hashes: set[str]) -> None:
         import hashlib
 
         self.name = str(place)
@@ -146,7 +146,7 @@ class FolderDonor:
             with path.open("rb") as file:
                 while block := file.read(2**20):
                     sha256.update(block)
-            if sha256.hexdigest() in wanted:
+            if sha256.hexdigest() in hashes:
                 self._files[sha256.hexdigest()] = path
 
     def blob(self, sha256: str) -> bytes | None:
@@ -197,8 +197,8 @@ class ServerDonor:
 
     def _get(self, kind: str, sha256: str) -> bytes | None:
         try:
-            with self._client.download(f"/stored/{kind}/{sha256}") as found:
-                return found.path.read_bytes()
+            with self._client.download(f"/stored/{kind}/{sha256}") as download:
+                return download.path.read_bytes()
         except Refused as refused:
             if refused.problem.get("status") == 404:
                 return None
@@ -228,35 +228,37 @@ def _files(place: Path) -> Iterator[Path]:
 
 
 def _as_dict(
-    found: Verified, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, ok: bool
+    verification: Verified, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, ok: bool
 ) -> dict[str, Any]:
-    findings = [{**f.as_dict(), "repaired_from": healed.get((f.kind, f.name))} for f in found.findings]
+    findings = [{**f.as_dict(), "repaired_from": healed.get((f.kind, f.name))} for f in verification.findings]
     return {
         "ok": ok,
-        "checked": {**found.checked, "cache": cache[0]},
-        "bytes": found.size,
+        "checked": {**verification.checked, "cache": cache[0]},
+        "bytes": verification.size,
         "findings": findings,
         "cache_removed": cache[1],
     }
 
 
-def _show(found: Verified, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, repaired: bool) -> None:
-    counts = ", ".join(f"{count} {kind}s" for kind, count in found.checked.items() if kind != "database")
+def _show(
+    verification: Verified, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, repaired: bool
+) -> None:
+    counts = ", ".join(f"{count} {kind}s" for kind, count in verification.checked.items() if kind != "database")
     output.show(f"checked: {counts}, {cache[0]} cached maps")
     if cache[1]:
         output.show(f"{cache[1]} damaged cached maps were removed; they are made again when they are requested")
-    if not found.findings:
+    if not verification.findings:
         output.show("nothing is damaged")
         return
     rows = []
-    for f in found.findings:
+    for f in verification.findings:
         versions = [f"{environment} {number}" for environment, number in f.versions]
         more = f" and {len(versions) - MAX_VERSIONS} more" if len(versions) > MAX_VERSIONS else ""
-        where = ", ".join(versions[:MAX_VERSIONS]) + more or "of no version"
+        version_names = ", ".join(versions[:MAX_VERSIONS]) + more or "of no version"
         source = healed.get((f.kind, f.name))
-        rows.append((f"{f.kind} {f.name[:16]}", f.problem, where, f"repaired from {source}" if source else ""))
+        rows.append((f"{f.kind} {f.name[:16]}", f.problem, version_names, f"repaired from {source}" if source else ""))
     output.show_table(("what", "problem", "versions", "repair"), rows)
-    left = sum((f.kind, f.name) not in healed for f in found.findings)
+    left = sum((f.kind, f.name) not in healed for f in verification.findings)
     if not left:
         output.show("everything was repaired")
     elif repaired:

@@ -84,9 +84,9 @@ def bundle(files: Mapping[str, bytes], output: Path, *, folder: bool) -> list[st
         for name, data in files.items():
             to_file(targets[name], io.BytesIO(data))
         return list(files)
-    whole = next(iter(files.values())) if len(files) == 1 else pack(files, next(iter(files)))
+    content = next(iter(files.values())) if len(files) == 1 else pack(files, next(iter(files)))
     if output == STDOUT:
-        to_stdout(io.BytesIO(whole))
+        to_stdout(io.BytesIO(content))
     else:
-        to_file(output, io.BytesIO(whole))
+        to_file(output, io.BytesIO(content))
     return list(files)

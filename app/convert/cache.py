@@ -163,9 +163,9 @@ class Cache:
 
     def get(self, key: str) -> Made | None:
         """The map, if it is made and intact."""
-        found = self._stored(key)
-        if found is not None:
-            return found
+        cached_map = self._stored(key)
+        if cached_map is not None:
+            return cached_map
         with self._guard:
             return self._spare.get(key)
 
@@ -174,12 +174,12 @@ class Cache:
         entry = self._read_entry(key)
         if entry is None:
             return None
-        made, stamp = entry
+        cached_map, stamp = entry
         with self._guard:
             checked = self._checked.get(key) == stamp
         if not checked:
             try:
-                _check_files(made)
+                _check_files(cached_map)
             except LostMap:
                 return None
             self._note_checked(key, stamp)
@@ -187,7 +187,7 @@ class Cache:
             folder = self._path(key)
             if time.time() - folder.stat().st_mtime > FRESH_SECONDS:
                 os.utime(folder)
-        return made
+        return cached_map
 
     def _read_entry(self, key: str) -> tuple[Made, tuple[int, int, int]] | None:
         """What ``map.json`` describes; None where it is absent, cannot be read at the moment, or is not intact.
@@ -210,9 +210,9 @@ class Cache:
         damaged = partial(self.discard, key)
         files = tuple(_described(folder, f, damaged) for f in described["files"])
         archive = _described(folder, described["archive"], damaged) if described["archive"] else None
-        made = Made(files, archive, described["report"])
-        times = [status.st_mtime_ns, *(_written(file) for file in made.every())]
-        return made, (status.st_ino, min(times), max(times))
+        cached_map = Made(files, archive, described["report"])
+        times = [status.st_mtime_ns, *(_written(file) for file in cached_map.every())]
+        return cached_map, (status.st_ino, min(times), max(times))
 
     def _note_checked(self, key: str, stamp: tuple[int, int, int]) -> None:
         with self._guard:
@@ -247,13 +247,13 @@ class Cache:
         entry = self._read_entry(key)
         if entry is None:
             return 0, self.damaged == before
-        made, stamp = entry
+        cached_map, stamp = entry
         try:
-            _check_files(made)
+            _check_files(cached_map)
         except LostMap:
             return 0, self.damaged == before
         self._note_checked(key, stamp)
-        return sum(f.size for f in made.every()), True
+        return sum(f.size for f in cached_map.every()), True
 
     def sample(self, share: float) -> Iterator[tuple[str, int, bool]]:
         """Hash some of the entries, chosen at random: (key, bytes, whether it was intact)."""
@@ -263,15 +263,15 @@ class Cache:
 
     def get_or_make(self, key: str, maker: Callable[[], Product]) -> Made:
         """The map; made now if nobody has, and then by one caller only."""
-        found = self.get(key)
-        if found is not None:
+        cached_map = self.get(key)
+        if cached_map is not None:
             self.hits += 1
-            return found
+            return cached_map
         with self._only(key):
-            found = self.get(key)
-            if found is not None:
+            cached_map = self.get(key)
+            if cached_map is not None:
                 self.hits += 1
-                return found
+                return cached_map
             self.misses += 1
             return replace(self._store(key, maker()), fresh=True)
 
@@ -290,10 +290,10 @@ class Cache:
             self._note_problem(reason_of(error))
             folder = None
 
-        def hold(made: Made) -> Made:
+        def hold(cached_map: Made) -> Made:
             nonlocal count
             files = []
-            for file in made.files:
+            for file in cached_map.files:
                 count += 1
                 if file.path is None:
                     files.append(file)
@@ -307,7 +307,7 @@ class Cache:
                         raise file.lost(error) from error
                     except OSError:  # no room for a name
                         files.append(replace(file, path=None, data=file.read()))
-            return replace(made, files=tuple(files), archive=None)
+            return replace(cached_map, files=tuple(files), archive=None)
 
         try:
             yield hold
@@ -317,19 +317,19 @@ class Cache:
 
     def _store(self, key: str, product: Product) -> Made:
         try:
-            made = self._write(key, product)
+            cached_map = self._write(key, product)
         except OSError as error:
             self._note_problem(reason_of(error))
             return self._keep_spare(key, product)
         self._note_problem(None)
-        if made is None:
+        if cached_map is None:
             return self._keep_spare(key, product)
-        for file in made.every():
+        for file in cached_map.every():
             self._note_hash(file)
-        self._total += sum(f.size for f in made.every())
+        self._total += sum(f.size for f in cached_map.every())
         if self._total > self._limit:
             self._make_room()
-        return made
+        return cached_map
 
     def _write(self, key: str, product: Product) -> Made | None:
         """The entry on disk; None where it is removed or cannot be read as soon as it is there.
@@ -359,10 +359,10 @@ class Cache:
         entry = self._read_entry(key)
         if entry is None:  # another process needed the room, or it does not match its hash, which is reported
             return None
-        made, stamp = entry
+        cached_map, stamp = entry
         self._note_checked(key, stamp)  # the hashes are of the bytes as they were made, not as the disk has them
         self._sync_later(key)
-        return made
+        return cached_map
 
     def _sync_later(self, key: str) -> None:
         with self._guard:
@@ -391,12 +391,12 @@ class Cache:
 
         files = tuple(described(name, *content) for name, content in product.files.items())
         archive = described(*product.archive, "application/zip") if product.archive else None
-        made = Made(files, archive, product.report)
+        cached_map = Made(files, archive, product.report)
         with self._guard:
-            self._spare[key] = made
+            self._spare[key] = cached_map
             while len(self._spare) > 1 and sum(m.size for m in self._spare.values()) > SPARE_BYTES:
                 self._spare.popitem(last=False)
-        return made
+        return cached_map
 
     def _note_problem(self, reason: str | None) -> None:
         """Log that the disk refuses, or works again: once each."""
@@ -410,11 +410,11 @@ class Cache:
             with self._guard:
                 self._spare.clear()
 
-    def by_hash(self, sha256: str, most: int) -> bytes | None:
+    def by_hash(self, sha256: str, max_bytes: int) -> bytes | None:
         """The content of a made file that is still here, by its SHA-256; None where it is gone or larger."""
         try:
             path = self._folder / self._hash_path(sha256).read_text()
-            if path.stat().st_size > most:
+            if path.stat().st_size > max_bytes:
                 return None
             data = path.read_bytes()
         except OSError:
@@ -524,9 +524,9 @@ def _hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _check_files(made: Made) -> None:
+def _check_files(cached_map: Made) -> None:
     """LostMap unless all files of an entry match their hashes; what is wrong is reported as damage."""
-    for file in made.every():
+    for file in cached_map.every():
         assert file.path is not None
         try:
             digest = _hash(file.path)

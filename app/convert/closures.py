@@ -90,12 +90,12 @@ def _without_timed_marks(part: Features) -> Features:
     timed = [UNTIL in p or ("overlay" in p and "expires" in p) for p in part.properties]
     if not any(timed):
         return part
-    kept = part.take([k for k, p in enumerate(part.properties) if not ("overlay" in p and "expires" in p)])
+    remaining = part.take([k for k, p in enumerate(part.properties) if not ("overlay" in p and "expires" in p)])
     properties = tuple(
         {name: value for name, value in p.items() if name not in (BLOCKED, UNTIL)} if UNTIL in p else p
-        for p in kept.properties
+        for p in remaining.properties
     )
-    return replace(kept, properties=properties)
+    return replace(remaining, properties=properties)
 
 
 def ingredients(version: Version, fmt: Format, keys: Collection[PartKey]) -> dict[str, Any]:
@@ -143,13 +143,13 @@ def _areas(version: Version) -> dict[PartKey, list[Closure]]:
     closures = version.closures
     if closures is None or not closures.items:
         return {}
-    wanted = (closures.digest, version.levels, version.datum)
+    cache_key = (closures.digest, version.levels, version.datum)
     with _placed_lock:
-        chosen = _placed.get(wanted)
+        chosen = _placed.get(cache_key)
     if chosen is None:
         chosen = [c for c in closures.items if c.polygon is not None and place_problem(c, version) is None]
         with _placed_lock:
-            _placed[wanted] = chosen
+            _placed[cache_key] = chosen
             while len(_placed) > MAX_PLACED:
                 _placed.popitem(last=False)
     taken = {entry.key for entry in version.parts if not _is_area_part(entry)}
@@ -238,11 +238,11 @@ def close(
             parts[key] = _close_edges(key, part, items, layers.frame, mark=mark, effects=effects, report=report)
         elif isinstance(part, OccupancyGrid) and key.name == KEEPOUT:
             areas = [c for c in items if c.polygon is not None and c.level == key.level]
-            whole = True
+            complete = True
             if key not in drawn and areas:
-                parts[key], whole = _burn(part, areas, layers.frame)
+                parts[key], complete = _burn(part, areas, layers.frame)
             for area in areas:
-                effects[area.id].cells = "keepout cells" if whole else "keepout cells (cut off at the mask's edge)"
+                effects[area.id].cells = "keepout cells" if complete else "keepout cells (cut off at the mask's edge)"
         elif isinstance(part, Features) and key.layer == "zones":
             for overlay_id in (zones[i] for i in part.ids if i in zones):
                 effects[overlay_id].zone = True
@@ -353,9 +353,9 @@ def _closed(
     if not areas and not named:
         return
     edges = np.array([p.get("kind") == "edge" for p in part.properties], bool)
-    where = part.index() if named else {}
+    positions = part.index() if named else {}
     for closure in named:
-        k = where.get(closure.edge or "")
+        k = positions.get(closure.edge or "")
         if k is not None and edges[k]:
             yield closure, [k]
     if areas and edges.any():
@@ -406,8 +406,8 @@ def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | Non
     if not fits:
         before = after = (0, 0)
     cells = np.pad(grid.cells, ((before[0], after[0]), (before[1], after[1])), constant_values=FREE)
-    here = Affine.translation(-before[1], -before[0])
-    rasterize([(shape, OCCUPIED) for shape in shapes], out=cells, transform=here, all_touched=True)
+    transform = Affine.translation(-before[1], -before[0])
+    rasterize([(shape, OCCUPIED) for shape in shapes], out=cells, transform=transform, all_touched=True)
     dx, dy = -before[1] * size, -before[0] * size
     origin = (round(x + dx * cosine - dy * sine, 9), round(y + dx * sine + dy * cosine, 9), yaw)
     return replace(grid, cells=cells, origin=origin), fits

@@ -58,39 +58,41 @@ def _offline(
     derived: bool,
 ) -> Converted:
     """``offline`` of files that are loaded when they are read, and not held while the map is made."""
-    known = formats.get_format(to)
-    asked = dict(options)
-    recipes.own_options(known, asked)
-    needed: frozenset[Layer] = known.carries | known.needs.also.union(*known.needs.one_of)
-    if "topology" in known.carries:
+    fmt = formats.get_format(to)
+    option_values = dict(options)
+    recipes.own_options(fmt, option_values)
+    needed: frozenset[Layer] = fmt.carries | fmt.needs.also.union(*fmt.needs.one_of)
+    if "topology" in fmt.carries:
         needed |= {"occupancy"}  # edges may lead through what it shows
-    wanted = None if "objects" in needed else needed  # whatever can be read can be an object
-    if site.asks_for_all(known, asked):
-        wanted = None  # further parts may be derived from any layer
-    cells = bool(asked) or not known.outlines  # an option may ask for the images, too
-    complete = wanted is None and cells
-    knowing = Known(datum, None, wanted, cells, known.drawing or known.holds)
-    told = bundle.read(bundle.unpack(load(), limits), hints, knowing, limits)
+    required_layers = None if "objects" in needed else needed  # whatever can be read can be an object
+    if site.asks_for_all(fmt, option_values):
+        required_layers = None  # further parts may be derived from any layer
+    cells = bool(option_values) or not fmt.outlines  # an option may ask for the images, too
+    complete = required_layers is None and cells
+    knowing = Known(datum, None, required_layers, cells, fmt.drawing or fmt.holds)
+    upload_bundle = bundle.read(bundle.unpack(load(), limits), hints, knowing, limits)
     try:
-        written = _made(known, told, datum, asked, derived=derived and complete)
+        written = _made(fmt, upload_bundle, datum, option_values, derived=derived and complete)
     except (CannotConvert, Invalid, NotFound):
         if complete:
             raise
         # Nothing is ever derived from layers that were read in part: a world without its meshes has no walls.
-        told = bundle.read(bundle.unpack(load(), limits), hints, replace(knowing, wanted=None, cells=True), limits)
-        written = _made(known, told, datum, asked, derived=derived)
-    filled = making.labelled(written.report["template"], dict.fromkeys(asked, REQUEST))
+        upload_bundle = bundle.read(
+            bundle.unpack(load(), limits), hints, replace(knowing, wanted=None, cells=True), limits
+        )
+        written = _made(fmt, upload_bundle, datum, option_values, derived=derived)
+    filled = making.labelled(written.report["template"], dict.fromkeys(option_values, REQUEST))
     report = {**written.report, "template": filled}
-    report |= {"warnings": [p.as_dict() for p in told.warnings] + written.report["warnings"]}
-    return Converted(written.files, report, told.warnings)
+    report |= {"warnings": [p.as_dict() for p in upload_bundle.warnings] + written.report["warnings"]}
+    return Converted(written.files, report, upload_bundle.warnings)
 
 
 def _made(
-    known: Format, told: bundle.Bundle, datum: Datum | None, asked: Mapping[str, Any], *, derived: bool
+    fmt: Format, upload_bundle: bundle.Bundle, datum: Datum | None, option_values: Mapping[str, Any], *, derived: bool
 ) -> making.Written:
-    credit = {key: told.credit(key) for key in told.parts}
-    layers = told.layers(datum)
-    return making.from_layers(known, layers, asked, derived=derived, origin=told.origin, credit=credit)
+    credit = {key: upload_bundle.credit(key) for key in upload_bundle.parts}
+    layers = upload_bundle.layers(datum)
+    return making.from_layers(fmt, layers, option_values, derived=derived, origin=upload_bundle.origin, credit=credit)
 
 
 def written(layers: Layers, to: str, options: Mapping[str, str], came: Provenance) -> Converted:
@@ -98,13 +100,15 @@ def written(layers: Layers, to: str, options: Mapping[str, str], came: Provenanc
 
     options: the format's, and those of derivations on the way. came: how the layers came, for the report.
     """
-    known = formats.get_format(to)
-    recipes.own_options(known, options)
+    fmt = formats.get_format(to)
+    recipes.own_options(fmt, options)
     entries = {key: PartEntry(key, "", 1, {}, came) for key in layers.parts}
-    made = making.from_layers(known, layers, options, derived=True, entries=entries)
-    left = making.not_carried(known, None, layers)
-    filled = making.labelled(made.report["template"], dict.fromkeys(options, REQUEST))
-    return Converted(made.files, {**made.report, "template": filled, "dropped": made.report["dropped"] + left})
+    written_map = making.from_layers(fmt, layers, options, derived=True, entries=entries)
+    left = making.not_carried(fmt, None, layers)
+    filled = making.labelled(written_map.report["template"], dict.fromkeys(options, REQUEST))
+    return Converted(
+        written_map.files, {**written_map.report, "template": filled, "dropped": written_map.report["dropped"] + left}
+    )
 
 
 def offline_paths(

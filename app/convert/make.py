@@ -55,26 +55,26 @@ def make(
     version: Version,
     name: str,
     values: Mapping[str, Any],
-    way: Chain,
+    chain: Chain,
     spread: Spread | None = None,
 ) -> Written:
     """In a worker: a stored version's map. The parts are addressed by content, so no later change can mix in."""
     store = open_store(database_url, blob_dir)
-    known = formats.get_format(name)
-    layers = applied_closures.load(store, version, way.keys)
+    fmt = formats.get_format(name)
+    layers = applied_closures.load(store, version, chain.keys)
     entries = {e.key: e for e in version.parts}
     templates, closures = version.templates, version.closures
     title = version.environment
     return write(
-        known, layers, values, way, entries, templates=templates, closures=closures, spread=spread, title=title
+        fmt, layers, values, chain, entries, templates=templates, closures=closures, spread=spread, title=title
     )
 
 
-def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> Hindrance | None:
+def hindrance(database_url: str, blob_dir: str, version: Version, chain: Chain) -> Hindrance | None:
     """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
-    layers = applied_closures.load(open_store(database_url, blob_dir), version, way.keys)
+    layers = applied_closures.load(open_store(database_url, blob_dir), version, chain.keys)
     try:
-        derive.attempt(way.steps, layers)
+        derive.attempt(chain.steps, layers)
     except CannotDerive as error:
         return Hindrance(error.step, error.detail, error.choose)
     except FleetMapError as error:
@@ -86,31 +86,31 @@ def stored_crossings(
     database_url: str, blob_dir: str, version: Version, name: str, keys: Sequence[PartKey]
 ) -> list[Problem]:
     """In a worker: warn of stored edges that lead through the version's obstacles. keys: the parts of the map."""
-    known = formats.get_format(name)
+    fmt = formats.get_format(name)
     seen = [e.key for e in version.parts if e.key.layer in ("occupancy", "objects") and e.key not in keys]
     layers = applied_closures.load(open_store(database_url, blob_dir), version, [*keys, *seen])
-    chosen = known.choose(sorted(k for k in keys if k.layer in known.carries), formats.write_options(known, {}))
+    chosen = fmt.choose(sorted(k for k in keys if k.layer in fmt.carries), formats.write_options(fmt, {}))
     used = replace(layers, parts={k: layers.parts[k] for k in chosen})
-    return crossing_edges(known, applied_closures.close(known, used, version.closures)[0], layers)
+    return crossing_edges(fmt, applied_closures.close(fmt, used, version.closures)[0], layers)
 
 
-def lacking(database_url: str, blob_dir: str, version: Version, name: str, way: Chain) -> Hindrance | None:
+def lacking(database_url: str, blob_dir: str, version: Version, name: str, chain: Chain) -> Hindrance | None:
     """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
-    known = formats.get_format(name)
-    layers = applied_closures.load(open_store(database_url, blob_dir), version, way.keys)
+    fmt = formats.get_format(name)
+    layers = applied_closures.load(open_store(database_url, blob_dir), version, chain.keys)
     try:
-        made = derive.run(way.steps, layers)
+        derived_layers = derive.run(chain.steps, layers)
     except FleetMapError as error:
         return Hindrance("", error.detail)
-    reason = known.lacks(made) if known.lacks is not None else None
+    reason = fmt.lacks(derived_layers) if fmt.lacks is not None else None
     return None if reason is None else Hindrance("", f"{name}: {reason}")
 
 
 def write(
-    known: Format,
+    fmt: Format,
     layers: Layers,
     values: Mapping[str, Any],
-    way: Chain,
+    chain: Chain,
     entries: Mapping[PartKey, PartEntry] | None = None,
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
     credit: Mapping[PartKey, Sequence[str]] | None = None,
@@ -126,21 +126,21 @@ def write(
     environment's name, for formats with a place for one.
     """
     notes = derive.Notes()
-    options = recipes.own_options(known, values)
+    options = recipes.own_options(fmt, values)
     if entries is None:  # of files; what is stored was loaded without them
         layers = applied_closures.without_timed_marks(layers)
-    source = _Source(layers, way, entries, origin, credit, templates, closures, around or Layers(), title)
+    source = _Source(layers, chain, entries, origin, credit, templates, closures, around or Layers(), title)
     if spread is None:
-        return _written(known, derive.run(way.steps, layers, notes), options, source, notes)
+        return _written(fmt, derive.run(chain.steps, layers, notes), options, source, notes)
     try:
-        made = derive.run(way.steps, layers, notes)
+        derived_layers = derive.run(chain.steps, layers, notes)
     except CannotDerive as error:
         if not spread.optional:
             raise
         if isinstance(error.__cause__, MissingLayer):
-            return Written({}, empty_report(known))
+            return Written({}, empty_report(fmt))
         raise CannotConvert(error.detail, error.problems) from error
-    return _written_each(known, made, options, source, notes, spread)
+    return _written_each(fmt, derived_layers, options, source, notes, spread)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,13 +159,17 @@ class _Source:
 
 
 def _written_each(
-    known: Format, made: Layers, options: Any, source: _Source, notes: derive.Notes, spread: Spread
+    fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.Notes, spread: Spread
 ) -> Written:
     """One map of every part that was derived, each written as it would be by itself."""
-    parts = known.parts
+    parts = fmt.parts
     if parts is None:
-        raise AssertionError(f"{known.name} declares no parts")
-    keys = [k for k in made.of(parts.layer) if k not in source.layers.parts and (k.level, k.name) not in spread.stored]
+        raise AssertionError(f"{fmt.name} declares no parts")
+    keys = [
+        k
+        for k in derived_layers.of(parts.layer)
+        if k not in source.layers.parts and (k.level, k.name) not in spread.stored
+    ]
     keys = [k for k in keys if not spread.names or k.name in spread.names]
     files: dict[str, bytes] = {}
     places: dict[str, tuple[str, str]] = {}
@@ -174,85 +178,87 @@ def _written_each(
         names = [k.name for k in keys if k.level == key.level]
         usual = not spread.names and key.name == site.default_name(parts, names)
         chosen = replace(options, **{parts.level: key.level, parts.name: None if usual else key.name})
-        one = _written(known, made, chosen, source, notes)
+        one = _written(fmt, derived_layers, chosen, source, notes)
         folder = "" if key.level == spread.default else site.folder_of(key.level) + "/"
         reports.append((folder, one.report))
         for name, data in one.files.items():
             files.setdefault(folder + name, data)
             places.setdefault(folder + name, (key.level, key.name))
-    return Written(files, site.merged_report(reports) if reports else empty_report(known), places)
+    return Written(files, site.merged_report(reports) if reports else empty_report(fmt), places)
 
 
-def empty_report(known: Format) -> dict[str, Any]:
+def empty_report(fmt: Format) -> dict[str, Any]:
     """Build the report of a map without files."""
     members = ("layers", "attribution", "template", "dropped", "warnings", "closures")
     empty: dict[str, Any] = {member: [] for member in members}
-    return {"format": known.name, **empty}
+    return {"format": fmt.name, **empty}
 
 
-def _written(known: Format, made: Layers, options: Any, source: _Source, notes: derive.Notes) -> Written:
+def _written(fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.Notes) -> Written:
     """One map of what was derived and what was there."""
-    layers, way, entries, origin = source.layers, source.way, source.entries, source.origin
+    layers, chain, entries, origin = source.layers, source.way, source.entries, source.origin
     credit, closures = source.credit, source.closures
     noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
     context = WriteContext(source.title, options, stored=None if closures is not None and closures.items else noted)
     inner: list[dict[str, Any]] = []
     inner_closures: list[list[dict[str, Any]]] = []
-    if known.holds:
+    if fmt.holds:
         context.make = partial(_inner, source, inner, inner_closures)
-    chosen = known.choose(sorted(k for k in made.parts if k.layer in known.carries), context.options)
-    used = Layers({k: made.parts[k] for k in chosen}, made.datum, made.levels)
+    chosen = fmt.choose(sorted(k for k in derived_layers.parts if k.layer in fmt.carries), context.options)
+    used = Layers({k: derived_layers.parts[k] for k in chosen}, derived_layers.datum, derived_layers.levels)
     closed = applied_closures.ClosureReport()
-    if not known.holds:  # a folder's inner maps apply closures themselves
-        drawn = made.parts.keys() - layers.parts.keys()
-        applied, closed = applied_closures.close(known, used, closures, drawn)
-        if closed.emptied and _lacks_edges(known, applied):
-            applied, closed = applied_closures.close(known, used, closures, drawn, mark=True)
+    if not fmt.holds:  # a folder's inner maps apply closures themselves
+        drawn = derived_layers.parts.keys() - layers.parts.keys()
+        applied, closed = applied_closures.close(fmt, used, closures, drawn)
+        if closed.emptied and _lacks_edges(fmt, applied):
+            applied, closed = applied_closures.close(fmt, used, closures, drawn, mark=True)
         used = applied
-    lines = _told(used, layers, way, entries or {}, origin or {}, noted)
+    lines = _told(used, layers, chain, entries or {}, origin or {}, noted)
     context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
-    files = formats.write(known, used, context)
-    _report_blocked(known, closed, context)
-    if not known.holds:  # as above
-        context.warnings += crossing_edges(known, used, replace(made, parts={**source.around.parts, **made.parts}))
+    files = formats.write(fmt, used, context)
+    _report_blocked(fmt, closed, context)
+    if not fmt.holds:  # as above
+        context.warnings += crossing_edges(
+            fmt, used, replace(derived_layers, parts={**source.around.parts, **derived_layers.parts})
+        )
     known_lines = {(line["layer"], line["level"], line["name"]) for line in lines}
     lines += [line for line in inner if (line["layer"], line["level"], line["name"]) not in known_lines]
     report = {
-        "format": known.name,
+        "format": fmt.name,
         "layers": lines,
         "attribution": credits_of(lines),
         "template": notes.template + context.template,
         # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
-        "dropped": notes.dropped + context.dropped + (not_carried(known, None, layers) if entries is None else []),
+        "dropped": notes.dropped + context.dropped + (not_carried(fmt, None, layers) if entries is None else []),
         "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
         "closures": applied_closures.merged_lines([closed.lines, *inner_closures]),
     }
     return Written(files, report)
 
 
-def crossing_edges(known: Format, written: Layers, around: Layers) -> list[Problem]:
+def crossing_edges(fmt: Format, written: Layers, around: Layers) -> list[Problem]:
     """Warn of edges that lead through obstacles in a map of these layers. around: layers with grids and objects."""
-    return crossings(written, around, shape_of=known.name if known.bends == "foreign" else None)
+    return crossings(written, around, shape_of=fmt.name if fmt.bends == "foreign" else None)
 
 
-def _lacks_edges(known: Format, layers: Layers) -> bool:
+def _lacks_edges(fmt: Format, layers: Layers) -> bool:
     """Whether the format cannot be written without an edge."""
-    return known.lacks is not None and known.lacks(layers) is not None
+    return fmt.lacks is not None and fmt.lacks(layers) is not None
 
 
-def _report_blocked(known: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
+def _report_blocked(fmt: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
     """Report edges that nobody may use: those left out, and those that stay open to who plans on this map."""
-    context.drop("blocked edges", closed.left_out, f"{known.name} cannot mark an edge as blocked for its planners")
+    context.drop("blocked edges", closed.left_out, f"{fmt.name} cannot mark an edge as blocked for its planners")
     if closed.kept:
         edges = "1 blocked edge stays" if closed.kept == 1 else f"{closed.kept} blocked edges stay"
         why = "it was requested with closures=mark, or no edge would be left"
-        context.warn(f"{edges} in this map ({why}): planners of {known.name} use them unless closed otherwise")
+        context.warn(f"{edges} in this map ({why}): planners of {fmt.name} use them unless closed otherwise")
 
 
 def from_layers(
-    known: Format,
+    fmt: Format,
     layers: Layers,
-    asked: Mapping[str, Any],
+    option_values: Mapping[str, Any],
     *,
     derived: bool,
     entries: Mapping[PartKey, PartEntry] | None = None,
@@ -266,22 +272,31 @@ def from_layers(
 
     around: the layers in which edges may meet obstacles, if there are more than these.
     """
-    if site.asks_for_all(known, asked):
-        return _every_part(known, layers, asked, derived=derived, entries=entries, origin=origin, credit=credit)
-    own = recipes.own_options(known, asked)
+    if site.asks_for_all(fmt, option_values):
+        return _every_part(fmt, layers, option_values, derived=derived, entries=entries, origin=origin, credit=credit)
+    writer_options = recipes.own_options(fmt, option_values)
     without: frozenset[str] = frozenset()
     failed: list[Hindrance] = []
     stock = recipes.stock_of(layers)
     while True:
         try:
-            way = recipes.chain(known, stock, own, derived=derived, values=asked, without=without)
+            chain = recipes.chain(fmt, stock, writer_options, derived=derived, values=option_values, without=without)
         except MissingLayer as error:
             raise recipes.exhausted(error, failed) from error
-        kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
+        chain_layers = Layers({k: layers.parts[k] for k in chain.keys}, layers.datum, layers.levels)
         try:
             beside = around or layers
             written = write(
-                known, kept, asked, way, entries, origin, credit, closures=closures, around=beside, title=title
+                fmt,
+                chain_layers,
+                option_values,
+                chain,
+                entries,
+                origin,
+                credit,
+                closures=closures,
+                around=beside,
+                title=title,
             )
             warnings = [*recipes.detours(failed), *written.report["warnings"]]
             return replace(written, report={**written.report, "warnings": warnings})
@@ -291,9 +306,9 @@ def from_layers(
 
 
 def _every_part(
-    known: Format,
+    fmt: Format,
     layers: Layers,
-    asked: Mapping[str, Any],
+    option_values: Mapping[str, Any],
     *,
     derived: bool,
     entries: Mapping[PartKey, PartEntry] | None,
@@ -306,7 +321,7 @@ def _every_part(
     failed: list[Hindrance] = []
     while True:
         try:
-            recipe = site.recipe(version, known, asked, derived=derived, without=without, archive=False)
+            recipe = site.recipe(version, fmt, option_values, derived=derived, without=without, archive=False)
         except MissingLayer as error:
             raise recipes.exhausted(error, failed) from error
         files: dict[str, bytes] = {}
@@ -314,10 +329,10 @@ def _every_part(
         reports: list[tuple[str, Mapping[str, Any]]] = []
         try:
             for member in recipe.members:
-                way, spread = member.recipe.chain, member.recipe.spread
-                kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
+                chain, spread = member.recipe.chain, member.recipe.spread
+                chain_layers = Layers({k: layers.parts[k] for k in chain.keys}, layers.datum, layers.levels)
                 values = parameters.canonical(member.recipe.options)
-                one = write(known, kept, values, way, entries, origin, credit, spread=spread)
+                one = write(fmt, chain_layers, values, chain, entries, origin, credit, spread=spread)
                 reports.append((member.folder, one.report))
                 for file in site.select([_Placed(name, one.places.get(name)) for name in one.files], member):
                     files.setdefault(member.folder + file.name, one.files[file.name])
@@ -360,12 +375,12 @@ def _inner(
     derived: bool,
 ) -> Inner:
     """What ``WriteContext.make`` does; layers that were derived on the way are noted in ``derivations``."""
-    known = formats.get_format(name)
-    asked = {**resolve(source.templates, known).values, **values}
-    made = from_layers(
-        known,
+    fmt = formats.get_format(name)
+    option_values = {**resolve(source.templates, fmt).values, **values}
+    written_map = from_layers(
+        fmt,
         layers,
-        asked,
+        option_values,
         derived=derived,
         entries=source.entries,
         origin=source.origin,
@@ -374,22 +389,22 @@ def _inner(
         around=source.layers,
         title=source.title,
     )
-    report = made.report
+    report = written_map.report
     derivations += [line for line in report["layers"] if line["information"] == "derived"]
     closed.append(report["closures"])
     return Inner(
-        made.files,
+        written_map.files,
         tuple(report["layers"]),
         tuple(report["dropped"]),
-        tuple({**line, "format": known.name} for line in report["template"]),
+        tuple({**line, "format": fmt.name} for line in report["template"]),
         tuple(warnings_of(report)),
     )
 
 
-def media_type(known: Format, name: str) -> str:
+def media_type(fmt: Format, name: str) -> str:
     """The media type of one of a format's files, by its ending."""
     end = name.rpartition(".")[2]
-    for pattern, declared in zip(known.files, known.media_types, strict=False):
+    for pattern, declared in zip(fmt.files, fmt.media_types, strict=False):
         if pattern.rpartition(".")[2] == end:
             return declared
     return mimetypes.guess_type(name)[0] or "application/octet-stream"
@@ -403,26 +418,26 @@ def zipped(files: Mapping[str, bytes]) -> bytes:
 def _told(
     used: Layers,
     before: Layers,
-    way: Chain,
+    chain: Chain,
     entries: Mapping[PartKey, PartEntry],
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]],
     noted: Mapping[PartKey, Sequence[str]],
 ) -> list[dict[str, Any]]:
     """For each part in the map: raw, derived or template, by which steps, from which sources."""
     out = []
-    steps = {step.gives: step for step in way.steps}
+    steps = {step.gives: step for step in chain.steps}
     for key in sorted(used.parts):
         part = used.parts[key]
         if isinstance(part, Features) and not len(part):
             continue
         line: dict[str, Any] = {"layer": key.layer, "level": key.level, "name": key.name}
         if key not in before.parts and key.layer in steps:
-            way_here, roots = _ancestry(key.layer, steps)
+            part_steps, roots = _ancestry(key.layer, steps)
             sources = sorted({s for k, e in entries.items() if k.layer in roots for s in e.provenance.sources})
             sources = sources or sorted({s for k, (n, _) in origin.items() if k.layer in roots for s in n})
             needed = [k for k in before.parts if k.layer in roots]
             credit = list(dict.fromkeys(text for k in needed for text in noted.get(k, ())))
-            done = [step.as_dict() for step in way.steps if step in way_here]
+            done = [step.as_dict() for step in chain.steps if step in part_steps]
             line |= {"information": "derived", "steps": done, "sources": sources, "attribution": credit}
         elif key in entries:
             p = entries[key].provenance
@@ -467,24 +482,24 @@ def labelled(
     out = []
     for line in lines:
         inside = line.get("format")
-        said = origin if inside is None else resolve(templates, formats.get_format(str(inside))).origin
-        out.append({**line, "from": said.get(str(line.get("option")), DEFAULT)})
+        origins = origin if inside is None else resolve(templates, formats.get_format(str(inside))).origin
+        out.append({**line, "from": origins.get(str(line.get("option")), DEFAULT)})
     return out
 
 
-def not_carried(known: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> list[dict[str, Any]]:
+def not_carried(fmt: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> list[dict[str, Any]]:
     """Stored layers that this format has no words for."""
     counts: dict[str, int] = {}
     if entries is not None:
         for key, entry in entries.items():
-            if key.layer not in known.carries and entry.count:
+            if key.layer not in fmt.carries and entry.count:
                 items = entry.count if key.layer in VECTOR_LAYERS else 1  # grids and pictures, not their cells
                 counts[key.layer] = counts.get(key.layer, 0) + items
     else:
         for key, part in layers.parts.items():
-            if key.layer not in known.carries:
+            if key.layer not in fmt.carries:
                 counts[key.layer] = counts.get(key.layer, 0) + (len(part) if isinstance(part, Features) else 1)
-    why = f"{known.name} has no place for it"
+    why = f"{fmt.name} has no place for it"
     return [{"what": layer, "count": counts[layer], "why": why} for layer in LAYERS if counts.get(layer)]
 
 

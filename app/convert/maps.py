@@ -98,24 +98,24 @@ class Maps:
         listed: as in a manifest: files are named as those of the whole site, and no zip of them is made.
         """
         version = applied_closures.with_areas(version)
-        known = formats.get_format(name)
+        fmt = formats.get_format(name)
         values = values or {}
-        filled = templates.resolve(version.templates, known)
-        hints = known.by_file(file.rpartition("/")[2]) if file is not None else {}
+        filled = templates.resolve(version.templates, fmt)
+        hints = fmt.by_file(file.rpartition("/")[2]) if file is not None else {}
 
         def plan(without: frozenset[str]) -> Recipe:
-            if known.parts is not None:
+            if fmt.parts is not None:
                 if file is not None:
-                    by_name = {known.parts.level, known.parts.name, *hints}  # the file's name overrides templates
-                    asked = {**{n: v for n, v in filled.values.items() if n not in by_name}, **values}
-                    found = site.file_recipe(version, known, asked, file, derived=derive, without=without)
-                    if found is not None:
-                        return found
-                elif listed or site.asks_for_all(known, values):
-                    asked = {**filled.values, **values}
-                    return site.recipe(version, known, asked, derived=derive, without=without, archive=not listed)
-            asked = {**filled.values, **hints, **site.one_of(known, values)}
-            return recipes.recipe(version, name, asked, derived=derive, without=without)
+                    by_name = {fmt.parts.level, fmt.parts.name, *hints}  # the file's name overrides templates
+                    option_values = {**{n: v for n, v in filled.values.items() if n not in by_name}, **values}
+                    recipe = site.file_recipe(version, fmt, option_values, file, derived=derive, without=without)
+                    if recipe is not None:
+                        return recipe
+                elif listed or site.asks_for_all(fmt, values):
+                    option_values = {**filled.values, **values}
+                    return site.recipe(version, fmt, option_values, derived=derive, without=without, archive=not listed)
+            option_values = {**filled.values, **hints, **site.one_of(fmt, values)}
+            return recipes.recipe(version, name, option_values, derived=derive, without=without)
 
         origin = {**filled.origin, **dict.fromkeys({**hints, **values}, templates.REQUEST)}
         return self._planned(version, plan, origin)
@@ -126,12 +126,12 @@ class Maps:
         failed: list[Hindrance] = []
         while True:
             try:
-                found = plan(without)
+                recipe = plan(without)
             except MissingLayer as error:
                 raise recipes.exhausted(error, failed) from error
-            tried = self._hindered(version, found)
+            tried = self._hindered(version, recipe)
             if tried is None:
-                return replace(_with_origin(found, origin), failed=tuple(failed))
+                return replace(_with_origin(recipe, origin), failed=tuple(failed))
             without |= {tried.step}
             failed.append(tried)
 
@@ -161,9 +161,9 @@ class Maps:
             return self.cache.get_or_make(recipe.key, lambda: self._made(recipe, stop))
         except CannotDerive as error:
             if not recipe.members:  # else it is the member's
-                found = Hindrance(error.step, error.detail, error.choose)
+                failure = Hindrance(error.step, error.detail, error.choose)
                 key = _trial_key(recipe.version, recipe.chain)
-                self._trials.add(key, found, lasting=_is_lasting(recipe.chain))
+                self._trials.add(key, failure, lasting=_is_lasting(recipe.chain))
             raise
         except (CannotConvert, NotFound, Invalid) as error:
             self._note_failure(recipe.key, error)
@@ -187,8 +187,8 @@ class Maps:
         for _ in range(HOLD_ATTEMPTS):
             # A member whose file turns out to be damaged leaves the cache, and is made again.
             with contextlib.suppress(LostMap), self.cache.holding() as hold:
-                held = [self._held(member.recipe, hold, stop) for member in recipe.members]
-                return self.cache.get_or_make(recipe.key, partial(joined, recipe, held))
+                cached_maps = [self._held(member.recipe, hold, stop) for member in recipe.members]
+                return self.cache.get_or_make(recipe.key, partial(joined, recipe, cached_maps))
         raise Unavailable("cached maps are damaged repeatedly: check the disk of the cache")
 
     def _held(self, recipe: Recipe, hold: Callable[[Made], Made], stop: Stop | None) -> Made:
@@ -241,24 +241,24 @@ class Maps:
             clashes = {**making.empty_report(recipe.format), "dropped": self.make(recipe).report["dropped"]}
             members = [(member.folder, self.report(member.recipe)) for member in recipe.members]
             return site.merged_report([*members, ("", clashes)])
-        told = self.make(recipe).report
+        map_report = self.make(recipe).report
         entries = {(e.key.layer, e.key.level, e.key.name): e.provenance for e in recipe.version.parts}
         anew = {step.gives for step in recipe.steps}
         lines = []
-        for line in told["layers"]:
+        for line in map_report["layers"]:
             # Equal content may have come from other files in another version: sources are this version's own. What a
             # step on the way has made anew beside a stored part of that name came from the step's own sources.
-            known = entries.get((line["layer"], line.get("level"), line["name"]))
-            if known is not None and line["layer"] not in anew:
+            entry = entries.get((line["layer"], line.get("level"), line["name"]))
+            if entry is not None and line["layer"] not in anew:
                 line = {  # noqa: PLW2901
                     **line,
-                    "information": known.information,
-                    "sources": list(known.sources),
-                    "attribution": list(known.attribution),
+                    "information": entry.information,
+                    "sources": list(entry.sources),
+                    "attribution": list(entry.attribution),
                 }
             lines.append(line)
         stored = {e.key: e for e in recipe.version.parts}
-        dropped = told["dropped"] + making.not_carried(recipe.format, stored, Layers())
+        dropped = map_report["dropped"] + making.not_carried(recipe.format, stored, Layers())
         version, credit = recipe.version.number, making.credits_of(lines)
         stored_version = applied_closures.without_areas(recipe.version)
         used = {k: why for k, why in stored_version.stale.items() if k in recipe.chain.keys}
@@ -270,40 +270,40 @@ class Maps:
             for k, why in used.items()
         ]
         ignored = [{"problem": reason} for reason in self._ignored(recipe)]
-        warnings = [*recipes.detours(recipe.failed), *told["warnings"], *stale, *ignored]
+        warnings = [*recipes.detours(recipe.failed), *map_report["warnings"], *stale, *ignored]
         texts = {line["problem"] for line in warnings}
         warnings += [p.as_dict() for p in self._crossings(recipe) if p.problem not in texts]
-        filled = making.labelled(told["template"], recipe.origin, recipe.version.templates)
+        filled = making.labelled(map_report["template"], recipe.origin, recipe.version.templates)
         more = {"layers": lines, "attribution": credit, "template": filled, "dropped": dropped, "warnings": warnings}
-        closures = applied_closures.report_lines(recipe.version, told["closures"])
-        return {**told, "version": version, "closures": closures, **more}
+        closures = applied_closures.report_lines(recipe.version, map_report["closures"])
+        return {**map_report, "version": version, "closures": closures, **more}
 
     def _crossings(self, recipe: Recipe) -> list[Problem]:
         """Warnings of edges that lead through obstacles which the map itself does not hold."""
-        version, known, keys = recipe.version, recipe.format, recipe.chain.keys
+        version, fmt, keys = recipe.version, recipe.format, recipe.chain.keys
         network = [k for k in keys if k.layer == "topology"]
-        if recipe.steps or known.holds or not network or "topology" not in known.carries:
+        if recipe.steps or fmt.holds or not network or "topology" not in fmt.carries:
             return []
         beside = [(e.key, e.hash) for e in version.parts if e.key.layer in ("occupancy", "objects")]
         key = ("crossings", recipe.key, version.datum, tuple(beside))
         with self._guard:
-            found = self._crossed.get(key)
-        if found is None:
-            where = (self._store.database_url, str(self._store.blob_dir))
+            problems = self._crossed.get(key)
+        if problems is None:
+            store_location = (self._store.database_url, str(self._store.blob_dir))
             try:
-                found = self._run(making.stored_crossings, *where, version, known.name, network)
+                problems = self._run(making.stored_crossings, *store_location, version, fmt.name, network)
             except (FleetMapError, WorkerDied) as error:
-                found = [Problem(f"edges were not checked against obstacles: {error.detail}")]
+                problems = [Problem(f"edges were not checked against obstacles: {error.detail}")]
             with self._guard:
-                self._crossed[key] = found
+                self._crossed[key] = problems
                 while len(self._crossed) > REMEMBERED:
                     self._crossed.pop(next(iter(self._crossed)))
-        return found
+        return problems
 
     def _ignored(self, recipe: Recipe) -> list[str]:
         """What the environment's templates say and this release cannot use."""
         used = formats.all_formats().values() if recipe.format.holds else [recipe.format]
-        reasons = [reason for known in used for reason in templates.resolve(recipe.version.templates, known).ignored]
+        reasons = [reason for fmt in used for reason in templates.resolve(recipe.version.templates, fmt).ignored]
         return list(dict.fromkeys(reasons))
 
     def variables(self, version: Version) -> dict[str, str]:
@@ -319,20 +319,20 @@ class Maps:
         """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""
         available = recipes.stock(version)
         out = []
-        for known in formats.all_formats().values():
-            if known.write is None:
+        for fmt in formats.all_formats().values():
+            if fmt.write is None:
                 continue
-            line: dict[str, Any] = {"format": known.name, "state": "missing", "chain": [], "missing": []}
+            line: dict[str, Any] = {"format": fmt.name, "state": "missing", "chain": [], "missing": []}
             try:
-                way, choose = self._way(version, known, available)
+                chain, choose = self._way(version, fmt, available)
             except Ambiguous as error:  # it can be made, once the caller says which one
                 line |= {"state": "direct", "choose": error.detail}
             except FleetMapError as error:
-                line["missing"] = [*recipes.missing(known, available), *(p.problem for p in error.problems)]
+                line["missing"] = [*recipes.missing(fmt, available), *(p.problem for p in error.problems)]
                 line["missing"] = line["missing"] or [error.detail]
             else:
-                line["state"] = "derivable" if way.steps else "direct"
-                line["chain"] = [step.as_dict() for step in way.steps]
+                line["state"] = "derivable" if chain.steps else "direct"
+                line["chain"] = [step.as_dict() for step in chain.steps]
                 line |= {"choose": choose} if choose else {}
             out.append(line)
         return out
@@ -344,9 +344,7 @@ class Maps:
         except FleetMapError:
             return ()
 
-    def _way(
-        self, version: Version, known: formats.Format, available: recipes.Stock
-    ) -> tuple[recipes.Chain, str | None]:
+    def _way(self, version: Version, fmt: formats.Format, available: recipes.Stock) -> tuple[recipes.Chain, str | None]:
         """The cheapest chain whose derivations work on what is stored, found by doing them once for each content; and
         what the caller has to name for it, where it works only so."""
         without: frozenset[str] = frozenset()
@@ -354,51 +352,51 @@ class Maps:
         unnamed: tuple[recipes.Chain, str | None] | None = None
         while True:
             try:
-                said = templates.resolve(version.templates, known).values
-                options = formats.write_options(known, said)
-                way = recipes.chain(known, available, options, values=said, without=without)
+                template_values = templates.resolve(version.templates, fmt).values
+                options = formats.write_options(fmt, template_values)
+                chain = recipes.chain(fmt, available, options, values=template_values, without=without)
             except MissingLayer as error:
                 if unnamed is not None:
                     return unnamed
                 raise MissingLayer(error.detail, failed) from error
-            hindrance = self._hindrance(version, way) if way.steps else None
+            hindrance = self._hindrance(version, chain) if chain.steps else None
             if hindrance is None:
-                self._check_content(version, known, way)
-                return way, None
+                self._check_content(version, fmt, chain)
+                return chain, None
             failed.append(Problem(hindrance.reason))
             if not hindrance.step and unnamed is not None:
                 return unnamed
             if not hindrance.step:
                 raise CannotConvert(hindrance.reason, failed)
             if hindrance.choose:
-                unnamed = unnamed or (way, hindrance.reason)
+                unnamed = unnamed or (chain, hindrance.reason)
             without |= {hindrance.step}
 
-    def _check_content(self, version: Version, known: formats.Format, way: recipes.Chain) -> None:
+    def _check_content(self, version: Version, fmt: formats.Format, chain: recipes.Chain) -> None:
         """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
-        if known.lacks is None:
+        if fmt.lacks is None:
             return
-        found = self._try(_trial_key(version, way, known), way, making.lacking, version, known.name, way)
-        if found is not None:
-            raise CannotConvert(found.reason, [Problem(found.reason)])
+        failure = self._try(_trial_key(version, chain, fmt), chain, making.lacking, version, fmt.name, chain)
+        if failure is not None:
+            raise CannotConvert(failure.reason, [Problem(failure.reason)])
 
-    def _hindrance(self, version: Version, way: recipes.Chain) -> Hindrance | None:
+    def _hindrance(self, version: Version, chain: recipes.Chain) -> Hindrance | None:
         """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""
-        way = recipes.needed(way)
-        return self._try(_trial_key(version, way), way, making.hindrance, version, way)
+        chain = recipes.needed(chain)
+        return self._try(_trial_key(version, chain), chain, making.hindrance, version, chain)
 
-    def _try(self, key: str, way: recipes.Chain, function: Callable[..., Any], *args: Any) -> Hindrance | None:
+    def _try(self, key: str, chain: recipes.Chain, function: Callable[..., Any], *args: Any) -> Hindrance | None:
         """What a worker finds in the way, if it was not found before."""
         with contextlib.suppress(KeyError):
             return self._trials[key]
-        where = (self._store.database_url, str(self._store.blob_dir))
+        store_location = (self._store.database_url, str(self._store.blob_dir))
         try:
-            found: Hindrance | None = self._run_trial(function, *where, *args)
-            lasting = _is_lasting(way)
+            failure: Hindrance | None = self._run_trial(function, *store_location, *args)
+            lasting = _is_lasting(chain)
         except WorkerDied as error:
-            found, lasting = Hindrance("", error.detail), False
-        self._trials.add(key, found, lasting=lasting)
-        return found
+            failure, lasting = Hindrance("", error.detail), False
+        self._trials.add(key, failure, lasting=lasting)
+        return failure
 
     def convert(
         self,
@@ -420,11 +418,18 @@ class Maps:
 
     def _made(self, recipe: Recipe, stop: Stop | None) -> Product:
         values = parameters.canonical(recipe.options)
-        where = (self._store.database_url, str(self._store.blob_dir))
-        wanted = {} if stop is None else {"stop": stop}
+        store_location = (self._store.database_url, str(self._store.blob_dir))
+        cancel_arguments = {} if stop is None else {"stop": stop}
         try:
             written: making.Written = self._run(
-                making.make, *where, recipe.version, recipe.format.name, values, recipe.chain, recipe.spread, **wanted
+                making.make,
+                *store_location,
+                recipe.version,
+                recipe.format.name,
+                values,
+                recipe.chain,
+                recipe.spread,
+                **cancel_arguments,
             )
         except WorkerDied as error:
             raise CannotConvert(f"{recipe.format.name} could not be made: {error.detail}") from error
@@ -437,29 +442,29 @@ class Maps:
         return Product(typed, archive, written.report, written.places)
 
 
-def file_of(recipe: Recipe, made: Made, file: str | None) -> MadeFile:
+def file_of(recipe: Recipe, cached_map: Made, file: str | None) -> MadeFile:
     """The wanted file of a made map, or the zip of all. file: as the request names it. NotFound where it has none."""
     if file is None:
-        return made.whole()
-    wanted = recipe.file or file
-    found = made.file(wanted)
-    if found is None and recipe.spread is not None and "/" not in wanted:
-        others = [f for f in made.files if f.name.rpartition("/")[2] == wanted]
-        found = others[0] if len(others) == 1 else None  # on the only level that has it
-    if found is None:
-        names = [f.name for f in made.files]
+        return cached_map.whole()
+    file_name = recipe.file or file
+    cached_file = cached_map.file(file_name)
+    if cached_file is None and recipe.spread is not None and "/" not in file_name:
+        others = [f for f in cached_map.files if f.name.rpartition("/")[2] == file_name]
+        cached_file = others[0] if len(others) == 1 else None  # on the only level that has it
+    if cached_file is None:
+        names = [f.name for f in cached_map.files]
         near = did_you_mean(file, names)
         raise NotFound(f"this map has no file {file!r}{near}; its files are: {', '.join(names[:20]) or 'none'}")
-    return found
+    return cached_file
 
 
-def joined(recipe: Recipe, held: Sequence[Made]) -> Product:
+def joined(recipe: Recipe, cached_maps: Sequence[Made]) -> Product:
     """The files of all members, each at its place; of two of one name the first stays, and the report says so."""
     files: dict[str, tuple[bytes | MadeFile, str]] = {}
     places: dict[str, tuple[str, str]] = {}
     clashes: list[dict[str, Any]] = []
-    for member, made in zip(recipe.members, held, strict=True):
-        for file in site.select(made.files, member):
+    for member, cached_map in zip(recipe.members, cached_maps, strict=True):
+        for file in site.select(cached_map.files, member):
             name = member.folder + file.name
             place = file.place or member.place
             if name in files:
@@ -474,7 +479,9 @@ def joined(recipe: Recipe, held: Sequence[Made]) -> Product:
     archive = None
     if recipe.archive and len(files) > 1:
         archive = (f"{recipe.format.name}.zip", making.zipped(_Contents({n: p for n, (p, _) in files.items()})))
-    report = site.merged_report([(m.folder, made.report) for m, made in zip(recipe.members, held, strict=True)])
+    report = site.merged_report(
+        [(m.folder, cached_map.report) for m, cached_map in zip(recipe.members, cached_maps, strict=True)]
+    )
     return Product(files, archive, {**report, "dropped": [*report["dropped"], *clashes]}, places)
 
 
@@ -485,8 +492,8 @@ class _Contents(Mapping[str, bytes]):
         self._files = files
 
     def __getitem__(self, name: str) -> bytes:
-        found = self._files[name]
-        return found if isinstance(found, bytes) else found.read()
+        content = self._files[name]
+        return content if isinstance(content, bytes) else content.read()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._files)
@@ -500,14 +507,14 @@ def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:
     return replace(recipe, origin=origin, members=members)
 
 
-def _trial_key(version: Version, way: recipes.Chain, known: formats.Format | None = None) -> str:
-    """The hash of what the outcome of a trial depends on: a chain's steps and, with ``known``, what a format lacks."""
-    keys = recipes.needed(way).keys if known is None else way.keys
+def _trial_key(version: Version, chain: recipes.Chain, fmt: formats.Format | None = None) -> str:
+    """The hash of what the outcome of a trial depends on: a chain's steps and, with ``fmt``, what a format lacks."""
+    keys = recipes.needed(chain).keys if fmt is None else chain.keys
     entries = {e.key: e.hash for e in version.parts}
     ingredients = {
         "server": __version__,
-        "format": None if known is None else [known.name, known.version],
-        "steps": [[s.name, s.version, s.given] for s in way.steps],
+        "format": None if fmt is None else [fmt.name, fmt.version],
+        "steps": [[s.name, s.version, s.given] for s in chain.steps],
         "parts": [[k.layer, k.level, k.name, entries[k]] for k in keys],
         "datum": version.datum.as_dict() if version.datum else None,
         "levels": [[level.name, level.elevation] for level in version.levels],
@@ -515,6 +522,6 @@ def _trial_key(version: Version, way: recipes.Chain, known: formats.Format | Non
     return hashlib.sha256(orjson.dumps(ingredients)).hexdigest()
 
 
-def _is_lasting(way: recipes.Chain) -> bool:
+def _is_lasting(chain: recipes.Chain) -> bool:
     """Whether a trial of these steps comes out the same at any time: a model may be supplied or removed."""
-    return not any(dict(step.given).get("model") for step in way.steps)
+    return not any(dict(step.given).get("model") for step in chain.steps)

@@ -56,12 +56,14 @@ class Stock:
     pinned: Mapping[Layer, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
     drawn: frozenset[PartKey] = frozenset()
 
-    def seen_by(self, known: Format) -> Stock:
+    def seen_by(self, fmt: Format) -> Stock:
         """The same with the blank parts that came from this format; a folder of maps holds all of them."""
-        if known.holds:
+        if fmt.holds:
             return replace(self, keys=self.keys | self.blank, blank=frozenset())
-        own = {k for k in self.blank if k.name == known.family or (k.layer == "voxels" and k.layer in known.carries)}
-        return replace(self, keys=self.keys | own, blank=frozenset()) if own else self
+        format_keys = {
+            k for k in self.blank if k.name == fmt.family or (k.layer == "voxels" and k.layer in fmt.carries)
+        }
+        return replace(self, keys=self.keys | format_keys, blank=frozenset()) if format_keys else self
 
     @property
     def layers(self) -> frozenset[Layer]:
@@ -180,20 +182,20 @@ def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mappi
     is stale).
     """
     stale = version.stale
-    known = derive.all_derivations()
+    derivations = derive.all_derivations()
     out: dict[Layer, Mapping[str, Mapping[str, Any]]] = {}
     for layer in {key.layer for key in stale}:
         parts = [e for e in entries if e.key.layer == layer]
         if all(e.key in stale and e.provenance.information == "derived" and not e.provenance.edited for e in parts):
             steps = [step for e in parts for step in e.provenance.steps]
-            if any(step.get("step") not in known for step in steps):
+            if any(step.get("step") not in derivations for step in steps):
                 continue  # fetched from the net: no map does that by itself
             out[layer] = {str(s["step"]): dict(s.get("parameters") or {}) for s in steps if "step" in s}
     return out
 
 
 def chain(
-    known: Format,
+    fmt: Format,
     available: Stock,
     options: Any,
     *,
@@ -207,49 +209,49 @@ def chain(
     step of the cheapest way has it, the layer is made anew by a step that has (a slice of a world beside a stored
     grid). without: derivations that are known to find nothing to use.
     """
-    asked = dict(values or {})
-    available = available.seen_by(known)
+    option_values = dict(values or {})
+    available = available.seen_by(fmt)
     for layer, before in available.pinned.items():
         rivals = {n for n, d in derive.all_derivations().items() if d.gives == layer and n not in before}
         if not without & before.keys():  # else what made it finds nothing any more: any other way will do
             without |= rivals
-    if known.needs.datum and not available.datum:
-        raise MissingDatum(f"{known.name} needs {SUPPLY['location']}")
-    named = _named(known, available, options, asked, without) if derived else None
+    if fmt.needs.datum and not available.datum:
+        raise MissingDatum(f"{fmt.name} needs {SUPPLY['location']}")
+    named = _named(fmt, available, options, option_values, without) if derived else None
     if named is not None:
         return named
-    best = _best(known, available, without, derived=derived)
-    rest = asked.keys() - {f.name for f in dataclasses.fields(known.write_options)}
+    best = _best(fmt, available, without, derived=derived)
+    rest = option_values.keys() - {f.name for f in dataclasses.fields(fmt.write_options)}
     if rest and (best is None or not rest <= _taken(best)):
-        available, best = _forced(known, available, without, frozenset(rest), derived=derived)
+        available, best = _forced(fmt, available, without, frozenset(rest), derived=derived)
     if best is None:
-        raise MissingLayer(f"{known.name} cannot be made: supply {' or '.join(missing(known, available))}")
-    carried = known.carries | {layer for step in best.steps for layer in step.reads}
+        raise MissingLayer(f"{fmt.name} cannot be made: supply {' or '.join(missing(fmt, available))}")
+    carried = fmt.carries | {layer for step in best.steps for layer in step.reads}
     keys = sorted(k for k in available.keys if k.layer in carried)
-    chosen: Sequence[PartKey] = [k for k in keys if k.layer in known.carries]
-    if not any(step.gives in known.carries for step in best.steps):  # else it is chosen once all parts are there
-        chosen = known.choose(chosen, options)
+    chosen: Sequence[PartKey] = [k for k in keys if k.layer in fmt.carries]
+    if not any(step.gives in fmt.carries for step in best.steps):  # else it is chosen once all parts are there
+        chosen = fmt.choose(chosen, options)
     needed = {layer for step in best.steps for layer in step.needs}
-    if not _is_whole(known, available):
-        _check_anchor(known, available, sorted({*chosen, *(k for k in keys if k.layer in needed)}))
+    if not _is_whole(fmt, available):
+        _check_anchor(fmt, available, sorted({*chosen, *(k for k in keys if k.layer in needed)}))
     read = {layer for step in best.steps for layer in step.reads}
     keys = sorted({*chosen, *(k for k in keys if k.layer in read and k not in available.drawn)})
     remembered = {name: value for steps in available.pinned.values() for name, value in steps.items()}
-    steps = [derive.with_values([s], {**remembered.get(s.name, {}), **asked})[0] for s in best.steps]
+    steps = [derive.with_values([s], {**remembered.get(s.name, {}), **option_values})[0] for s in best.steps]
     return Chain(tuple(steps), tuple(keys))
 
 
 def _named(
-    known: Format, available: Stock, options: Any, asked: Mapping[str, str], without: frozenset[str]
+    fmt: Format, available: Stock, options: Any, option_values: Mapping[str, str], without: frozenset[str]
 ) -> Chain | None:
     """The way to a part that is asked for by name and not stored, where a derivation makes parts of that name."""
-    parts = known.parts
+    parts = fmt.parts
     if parts is None or (name := getattr(options, parts.name)) is None:
         return None
     layer, level = parts.layer, getattr(options, parts.level)
     if any((k.layer, k.name) == (layer, name) and level in (None, k.level) for k in available.keys):
         return None
-    further = asked.keys() - {f.name for f in dataclasses.fields(known.write_options)}
+    further = option_values.keys() - {f.name for f in dataclasses.fields(fmt.write_options)}
     for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name)):
         if (
             d.gives != layer
@@ -263,80 +265,82 @@ def _named(
         if further <= derive.takes(d.name):
             keys = sorted(k for k in available.keys if k.layer in d.needs or (k.layer, k.name) == (layer, MAP))
             before = available.pinned.get(layer, {}).get(d.name, {})
-            return Chain(derive.with_values([d.step()], {**before, **asked}), tuple(keys))
+            return Chain(derive.with_values([d.step()], {**before, **option_values}), tuple(keys))
     return None
 
 
-def _best(known: Format, available: Stock, without: frozenset[str], *, derived: bool = True) -> derive.Plan | None:
-    best: derive.Plan | None = derive.Plan((), 0.0) if _is_whole(known, available) else None
-    for wanted in known.needs.one_of:
-        found = derive.plan(available.layers, wanted, without, available.dead)
-        if found is not None and (derived or not found.steps) and (best is None or found.cost < best.cost):
-            best = found
+def _best(fmt: Format, available: Stock, without: frozenset[str], *, derived: bool = True) -> derive.Plan | None:
+    best: derive.Plan | None = derive.Plan((), 0.0) if _is_whole(fmt, available) else None
+    for required in fmt.needs.one_of:
+        plan = derive.plan(available.layers, required, without, available.dead)
+        if plan is not None and (derived or not plan.steps) and (best is None or plan.cost < best.cost):
+            best = plan
     return best
 
 
-def _is_whole(known: Format, available: Stock) -> bool:
+def _is_whole(fmt: Format, available: Stock) -> bool:
     """Whether a map of this very format is stored, so that nothing else is needed."""
-    return known.needs.own and any(k.layer == "objects" and k.name == known.family for k in available.keys)
+    return fmt.needs.own and any(k.layer == "objects" and k.name == fmt.family for k in available.keys)
 
 
-def _taken(way: derive.Plan) -> frozenset[str]:
+def _taken(plan: derive.Plan) -> frozenset[str]:
     """The names of all parameters on a way."""
-    return frozenset().union(*(derive.takes(step.name) for step in way.steps))
+    return frozenset().union(*(derive.takes(step.name) for step in plan.steps))
 
 
 def _forced(
-    known: Format, available: Stock, without: frozenset[str], names: frozenset[str], *, derived: bool
+    fmt: Format, available: Stock, without: frozenset[str], names: frozenset[str], *, derived: bool
 ) -> tuple[Stock, derive.Plan]:
     """A way with a step that knows all these parameters, and the stock without what that step makes anew."""
-    useful = frozenset().union(*known.needs.one_of)
+    useful = frozenset().union(*fmt.needs.one_of)
     everything = derive.all_derivations()
-    found: list[tuple[float, str, Stock, derive.Plan]] = []
+    candidates: list[tuple[float, str, Stock, derive.Plan]] = []
     for name, step in everything.items() if derived else ():
         if not names <= derive.takes(name) or step.gives not in useful or name in without:
             continue
-        kept = frozenset(k for k in available.keys if k.layer != step.gives)
-        less = replace(available, keys=kept, drawn=available.drawn & kept)
+        remaining_keys = frozenset(k for k in available.keys if k.layer != step.gives)
+        less = replace(available, keys=remaining_keys, drawn=available.drawn & remaining_keys)
         rivals = frozenset(n for n, d in everything.items() if d.gives == step.gives and n != name)
         # Only by what the step gives: a format that a grid alone is enough for would do without its objects.
-        wishes = [wanted for wanted in known.needs.one_of if step.gives in wanted]
-        ways = [
-            way
-            for wanted in wishes
-            if (way := derive.plan(less.layers, wanted, without | rivals, less.dead)) is not None
+        alternatives = [required for required in fmt.needs.one_of if step.gives in required]
+        plans = [
+            plan
+            for required in alternatives
+            if (plan := derive.plan(less.layers, required, without | rivals, less.dead)) is not None
         ]
-        ways = [way for way in ways if any(s.name == name for s in way.steps)]
-        if ways:
-            way = min(ways, key=lambda one: one.cost)
-            found.append((way.cost, name, less, way))
-    if found:
-        _, _, less, way = min(found, key=lambda f: f[:2])
-        return less, way
+        plans = [plan for plan in plans if any(s.name == name for s in plan.steps)]
+        if plans:
+            plan = min(plans, key=lambda one: one.cost)
+            candidates.append((plan.cost, name, less, plan))
+    if candidates:
+        _, _, less, plan = min(candidates, key=lambda f: f[:2])
+        return less, plan
     if any(names <= derive.takes(name) for name in without):
-        lacking = " or ".join(missing(known, available)) or "other layers"
-        raise MissingLayer(f"{known.name} cannot be made with {', '.join(sorted(names))}: supply {lacking}")
-    told = sorted({n for d, step in everything.items() if step.gives in useful for n in derive.takes(d)})
-    own = [p["name"] for p in parameters.describe(known.write_options)]
-    accepted = ", ".join(own) or "none"
-    further = f"; where a layer is derived, also {', '.join(told)}" if told else ""
+        lacking = " or ".join(missing(fmt, available)) or "other layers"
+        raise MissingLayer(f"{fmt.name} cannot be made with {', '.join(sorted(names))}: supply {lacking}")
+    derivation_parameters = sorted(
+        {n for d, step in everything.items() if step.gives in useful for n in derive.takes(d)}
+    )
+    format_parameters = [p["name"] for p in parameters.describe(fmt.write_options)]
+    accepted = ", ".join(format_parameters) or "none"
+    further = f"; where a layer is derived, also {', '.join(derivation_parameters)}" if derivation_parameters else ""
     wrong = sorted(names)
-    near = did_you_mean(wrong[0], [*own, *told])
-    problem = f"no such parameter of {known.name} here{near}; accepted: {accepted}{further}"
+    near = did_you_mean(wrong[0], [*format_parameters, *derivation_parameters])
+    problem = f"no such parameter of {fmt.name} here{near}; accepted: {accepted}{further}"
     raise Invalid(f"{', '.join(wrong)}: {problem}", [Problem(problem, where=name) for name in wrong])
 
 
-def needed(way: Chain) -> Chain:
+def needed(chain: Chain) -> Chain:
     """The same with only those parts that its steps read."""
-    read = {layer for step in way.steps for layer in step.reads}
-    return replace(way, keys=tuple(k for k in way.keys if k.layer in read))
+    read = {layer for step in chain.steps for layer in step.reads}
+    return replace(chain, keys=tuple(k for k in chain.keys if k.layer in read))
 
 
-def missing(known: Format, available: Stock) -> list[str]:
+def missing(fmt: Format, available: Stock) -> list[str]:
     """What to supply for a format, one text for each alternative."""
     out = []
-    for wanted in known.needs.one_of:
-        lacking = [SUPPLY[layer] for layer in LAYERS if layer in wanted - available.layers]
+    for required in fmt.needs.one_of:
+        lacking = [SUPPLY[layer] for layer in LAYERS if layer in required - available.layers]
         out.append(" and ".join(lacking))
     return [text for text in dict.fromkeys(out) if text]
 
@@ -379,73 +383,75 @@ def recipe(
 
     values: the format's options and the parameters of derivations on the way, as texts. without: see ``chain``.
     """
-    known = formats.get_format(name)
-    options = own_options(known, values)
-    way = chain(known, stock(version), options, derived=derived, values=values, without=without)
-    return of_chain(version, known, options, way)
+    fmt = formats.get_format(name)
+    options = own_options(fmt, values)
+    derivation_chain = chain(fmt, stock(version), options, derived=derived, values=values, without=without)
+    return of_chain(version, fmt, options, derivation_chain)
 
 
-def of_chain(version: Version, known: Format, options: Any, way: Chain, spread: Spread | None = None) -> Recipe:
+def of_chain(version: Version, fmt: Format, options: Any, chain: Chain, spread: Spread | None = None) -> Recipe:
     """The recipe of a map by this chain. spread: see ``Recipe``."""
     entries = {e.key: e for e in version.parts}
-    return Recipe(version, known, options, way, _key(version, known, options, way, entries, spread), spread=spread)
+    return Recipe(version, fmt, options, chain, _key(version, fmt, options, chain, entries, spread), spread=spread)
 
 
-def own_options(known: Format, values: Mapping[str, str]) -> Any:
+def own_options(fmt: Format, values: Mapping[str, str]) -> Any:
     """The format's own options among what was asked for; Invalid for a name that nothing on any way could mean."""
-    own = {f.name for f in dataclasses.fields(known.write_options)}
+    option_names = {f.name for f in dataclasses.fields(fmt.write_options)}
     steps = frozenset().union(*(derive.takes(name) for name in derive.all_derivations()))
-    return formats.write_options(known, {n: v for n, v in values.items() if n in own or n not in steps})
+    return formats.write_options(fmt, {n: v for n, v in values.items() if n in option_names or n not in steps})
 
 
-def defaults(said: Templates, known: Format) -> Any:
+def defaults(stored_templates: Templates, fmt: Format) -> Any:
     """The options of a format's writer as an environment's templates give them."""
-    return formats.write_options(known, templates.resolve(said, known).values)
+    return formats.write_options(fmt, templates.resolve(stored_templates, fmt).values)
 
 
 def _key(
     version: Version,
-    known: Format,
+    fmt: Format,
     options: Any,
-    way: Chain,
+    chain: Chain,
     entries: Mapping[PartKey, PartEntry],
     spread: Spread | None,
 ) -> str:
     ingredients: dict[str, Any] = {
         "server": __version__,
-        "format": [known.name, known.version],
+        "format": [fmt.name, fmt.version],
         "options": parameters.canonical(options),
-        "steps": [[s.name, s.version, s.given] for s in way.steps],
-        "parts": [[k.layer, k.level, k.name, entries[k].hash] for k in way.keys],
-        "attribution": sorted({text for k in way.keys for text in entries[k].provenance.attribution}),
+        "steps": [[s.name, s.version, s.given] for s in chain.steps],
+        "parts": [[k.layer, k.level, k.name, entries[k].hash] for k in chain.keys],
+        "attribution": sorted({text for k in chain.keys for text in entries[k].provenance.attribution}),
         "datum": version.datum.as_dict() if version.datum else None,
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
-    ingredients |= applied_closures.ingredients(version, known, way.keys)
-    if known.titled or known.holds:
+    ingredients |= applied_closures.ingredients(version, fmt, chain.keys)
+    if fmt.titled or fmt.holds:
         ingredients["title"] = version.environment
     if spread is not None:
         ingredients["spread"] = dataclasses.asdict(spread)
-    if known.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations
+    if fmt.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations
         ingredients["formats"] = [[f.name, f.version] for f in formats.all_formats().values()]
         ingredients["derivations"] = [[d.name, d.version] for d in derive.all_derivations().values()]
-        said = {f.name: defaults(version.templates, f) for f in formats.all_formats().values() if f is not known}
-        said = {name: parameters.canonical(chosen) for name, chosen in said.items()}
-        if any(said.values()):
-            ingredients["templates"] = {name: values for name, values in said.items() if values}
+        format_defaults = {
+            f.name: defaults(version.templates, f) for f in formats.all_formats().values() if f is not fmt
+        }
+        format_defaults = {name: parameters.canonical(chosen) for name, chosen in format_defaults.items()}
+        if any(format_defaults.values()):
+            ingredients["templates"] = {name: values for name, values in format_defaults.items() if values}
     return hashlib.sha256(orjson.dumps(ingredients, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
 
-def _check_anchor(known: Format, available: Stock, keys: list[PartKey]) -> None:
+def _check_anchor(fmt: Format, available: Stock, keys: list[PartKey]) -> None:
     """Refuse early what would fail on the way for want of a datum."""
-    if known.needs.anchor is None or available.datum:
+    if fmt.needs.anchor is None or available.datum:
         return
-    other = "wgs84" if known.needs.anchor == "local" else "local"
-    grids_only = known.needs.anchor == "wgs84"
+    other = "wgs84" if fmt.needs.anchor == "local" else "local"
+    grids_only = fmt.needs.anchor == "wgs84"
     for key in keys:
         if other in available.anchors.get(key, ()) or (grids_only and key.layer == "occupancy"):
-            here = "places on earth" if other == "wgs84" else "local metres"
-            there = "local metres" if other == "wgs84" else "places on earth"
+            part_frame = "places on earth" if other == "wgs84" else "local metres"
+            fmt_frame = "local metres" if other == "wgs84" else "places on earth"
             raise MissingDatum(
-                f"the {key.layer} are {here} and {known.name} speaks of {there}: supply {SUPPLY['location']}"
+                f"the {key.layer} are {part_frame} and {fmt.name} speaks of {fmt_frame}: supply {SUPPLY['location']}"
             )

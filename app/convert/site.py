@@ -133,11 +133,11 @@ def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: 
         for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name))
         if derived and d.makes and d.gives == fmt.parts.layer and d.needs <= available.layers
     )
-    own = {f.name for f in dataclasses.fields(fmt.write_options)}
-    only_makers = frozenset().union(*(derive.takes(d.name) for d in makers)) - own
+    option_names = {f.name for f in dataclasses.fields(fmt.write_options)}
+    only_makers = frozenset().union(*(derive.takes(d.name) for d in makers)) - option_names
     own_values = {name: value for name, value in values.items() if name not in only_makers}
     main, lacking = None, None
-    if not stored or own_values.keys() - own:  # not stored, or to be derived with these parameters
+    if not stored or own_values.keys() - option_names:  # not stored, or to be derived with these parameters
         options = recipes.own_options(fmt, own_values)
         try:
             main = recipes.chain(fmt, available, options, derived=derived, values=own_values, without=without)
@@ -205,20 +205,20 @@ def _stored_members(site: _Site, levels: frozenset[str] | None, name: str | None
     for level in sorted({key.level for key in site.stored}, key=lambda one: (one != site.default, one)):
         if levels is not None and level not in levels:
             continue
-        here = [key.name for key in site.stored if key.level == level]
-        here.sort(key=lambda one: (site.parts.stem(one) != one, one))  # of two with equal file names the first is kept
-        wanted: list[str | None] = [None]
+        names = [key.name for key in site.stored if key.level == level]
+        names.sort(key=lambda one: (site.parts.stem(one) != one, one))  # of two with equal file names the first is kept
+        selection: list[str | None] = [None]
         if name == EVERY:
-            usual = default_name(site.parts, here)
-            wanted = [None if one == usual else one for one in here]
+            default = default_name(site.parts, names)
+            selection = [None if one == default else one for one in names]
         elif name is not None:
-            wanted = [one for one in here if one == name]
-        for one in wanted:
+            selection = [one for one in names if one == name]
+        for one in selection:
             selected = {site.parts.level: level} | ({} if one is None else {site.parts.name: one})
             values = {**site.own_values, **selected}
-            made = recipes.recipe(site.version, site.format.name, values, derived=derived)
-            part = one or default_name(site.parts, here) or MAP
-            yield Member(made, site.prefix(level), (level, part))
+            member_recipe = recipes.recipe(site.version, site.format.name, values, derived=derived)
+            part = one or default_name(site.parts, names) or MAP
+            yield Member(member_recipe, site.prefix(level), (level, part))
 
 
 def default_name(parts: Parts, names: Sequence[str]) -> str | None:
@@ -230,7 +230,7 @@ def default_name(parts: Parts, names: Sequence[str]) -> str | None:
 
 def _spread(
     site: _Site,
-    way: Chain,
+    chain: Chain,
     levels: frozenset[str] | None,
     names: frozenset[str] | None,
     *,
@@ -239,13 +239,15 @@ def _spread(
 ) -> Member:
     """All that the last step of a chain gives, as one map; a member may select some of its files."""
     makes = () if maker is None else tuple(sorted(maker.makes))
-    kept = tuple(sorted((k.level, k.name) for k in site.stored if k.name in makes))
-    spread = Spread(site.default, makes, kept, optional=maker is not None)
+    stored_parts = tuple(sorted((k.level, k.name) for k in site.stored if k.name in makes))
+    spread = Spread(site.default, makes, stored_parts, optional=maker is not None)
     values = site.own_values if maker is None else site.values
-    own = {f.name for f in dataclasses.fields(site.format.write_options)}
-    options = recipes.own_options(site.format, {option: value for option, value in values.items() if option in own})
+    option_names = {f.name for f in dataclasses.fields(site.format.write_options)}
+    options = recipes.own_options(
+        site.format, {option: value for option, value in values.items() if option in option_names}
+    )
     return Member(
-        recipes.of_chain(site.version, site.format, options, way, spread), "", None, levels, names, only_default
+        recipes.of_chain(site.version, site.format, options, chain, spread), "", None, levels, names, only_default
     )
 
 
@@ -262,10 +264,11 @@ def _made_by(site: _Site, maker: Derivation, levels: frozenset[str] | None, name
 
 def _may_add(site: _Site, maker: Derivation, levels: frozenset[str] | None) -> bool:
     """Whether a level that has what the derivation needs lacks one of the parts that it makes."""
-    known = {(key.level, key.name) for key in site.stored}
+    stored_parts = {(key.level, key.name) for key in site.stored}
     able = {key.level for key in site.available.keys if key.layer in maker.needs}
     return any(
-        (levels is None or level in levels) and any((level, n) not in known for n in maker.makes) for level in able
+        (levels is None or level in levels) and any((level, n) not in stored_parts for n in maker.makes)
+        for level in able
     )
 
 
@@ -332,17 +335,17 @@ def file_recipe(
     if not folder and not _is_at_top(site, name):
         return None
     selected: dict[str, Any] = {parts.level: of_file} | ({} if name is None else {parts.name: name})
-    found = recipes.recipe(
+    part_recipe = recipes.recipe(
         version, fmt.name, {**hints, **site.own_values, **selected}, derived=derived, without=without
     )
-    return replace(found, file=base)
+    return replace(part_recipe, file=base)
 
 
 def _default_kinds(fmt: Format) -> dict[str, str]:
     """Collect the options that the names of the format's default files imply, where they agree: PGM is the default."""
     hints = [dict(fmt.by_file(name)) for name in fmt.files]
     values = {option: {one[option] for one in hints if option in one} for one in hints for option in one}
-    return {option: next(iter(found)) for option, found in values.items() if len(found) == 1}
+    return {option: next(iter(choices)) for option, choices in values.items() if len(choices) == 1}
 
 
 def _named_like(site: _Site, level: str, stem: str) -> str:
@@ -360,17 +363,17 @@ def _is_at_top(site: _Site, name: str | None) -> bool:
     return any(key.level == site.default and name in (None, key.name) for key in site.stored)
 
 
-def select(made: Iterable[Any], member: Member) -> list[Any]:
+def select(files: Iterable[Any], member: Member) -> list[Any]:
     """The files of a member's map that belong to the site. made: with ``place``, the level and the name of the part."""
-    files = [f for f in made if member.place is not None or _fits(f.place, member)]
+    candidates = [f for f in files if member.place is not None or _fits(f.place, member)]
     if not member.only_default:
-        return files
+        return candidates
     out = []
-    for level in dict.fromkeys(f.place[0] for f in files):
-        here = [f for f in files if f.place[0] == level]
+    for level in dict.fromkeys(f.place[0] for f in candidates):
+        level_files = [f for f in candidates if f.place[0] == level]
         assert member.recipe.format.parts is not None
-        usual = default_name(member.recipe.format.parts, list(dict.fromkeys(f.place[1] for f in here)))
-        out += [f for f in here if f.place[1] == usual]
+        default = default_name(member.recipe.format.parts, list(dict.fromkeys(f.place[1] for f in level_files)))
+        out += [f for f in level_files if f.place[1] == default]
     return out
 
 

@@ -30,18 +30,18 @@ class Trials:
         self._guard = threading.Lock()
         self._found: dict[str, Hindrance | None] = {}
         self._lines = 0
-        for key, found in self._read():
-            self._put(key, found)
+        for key, failure in self._read():
+            self._put(key, failure)
 
     def __getitem__(self, key: str) -> Hindrance | None:
         """KeyError where it was not tried."""
         with self._guard:
             return self._found[key]
 
-    def add(self, key: str, found: Hindrance | None, *, lasting: bool) -> None:
+    def add(self, key: str, failure: Hindrance | None, *, lasting: bool) -> None:
         """Remember an outcome. lasting: also for the next start."""
         with self._guard:
-            self._put(key, found)
+            self._put(key, failure)
             if not lasting:
                 return
             self._lines += 1
@@ -50,11 +50,11 @@ class Trials:
                     self._rewrite()
                 else:
                     with self._path.open("ab", buffering=0) as file:  # one write: whole lines, whoever else writes
-                        file.write(_line(key, found))
+                        file.write(_line(key, failure))
 
-    def _put(self, key: str, found: Hindrance | None) -> None:
+    def _put(self, key: str, failure: Hindrance | None) -> None:
         self._found.pop(key, None)  # the latest last: the oldest goes first
-        self._found[key] = found
+        self._found[key] = failure
         while len(self._found) > MOST:
             self._found.pop(next(iter(self._found)))
 
@@ -69,21 +69,21 @@ class Trials:
             if digest != _digest(text):
                 continue
             with contextlib.suppress(TypeError, ValueError):  # of a release that knows other fields
-                key, found = orjson.loads(text)
-                yield key, None if found is None else Hindrance(**found)
+                key, failure = orjson.loads(text)
+                yield key, None if failure is None else Hindrance(**failure)
 
     def _rewrite(self) -> None:
         temporary = self._path.with_suffix(f".{uuid4().hex}")
         try:
-            temporary.write_bytes(b"".join(_line(key, found) for key, found in self._found.items()))
+            temporary.write_bytes(b"".join(_line(key, failure) for key, failure in self._found.items()))
             temporary.replace(self._path)
         finally:
             temporary.unlink(missing_ok=True)
         self._lines = len(self._found)
 
 
-def _line(key: str, found: Hindrance | None) -> bytes:
-    text = orjson.dumps([key, None if found is None else asdict(found)])
+def _line(key: str, failure: Hindrance | None) -> bytes:
+    text = orjson.dumps([key, None if failure is None else asdict(failure)])
     return _digest(text) + b" " + text + b"\n"
 
 

@@ -37,15 +37,15 @@ class Notes:
         """The layer was made, but whoever uses it should know this."""
         self.warnings.append(Problem(problem, where=where))
 
-    def drop(self, what: str, count: int, why: str) -> None:
+    def drop(self, subject: str, count: int, why: str) -> None:
         """This much of the source had no part in the result."""
         if count:
-            self.dropped.append({"what": what, "count": count, "why": why})
+            self.dropped.append({"what": subject, "count": count, "why": why})
 
-    def fill(self, what: str, value: Any, why: str, option: str | None = None) -> None:
+    def fill(self, subject: str, value: Any, why: str, option: str | None = None) -> None:
         """No source says this: a default was taken. option: the parameter that says it."""
-        said = {} if option is None else {"option": option}
-        self.template.append({"what": what, "value": value, "why": why, **said})
+        option_entry = {} if option is None else {"option": option}
+        self.template.append({"what": subject, "value": value, "why": why, **option_entry})
 
 
 Function = Callable[[Layers, Any, Notes], Layers]
@@ -138,8 +138,8 @@ def derives(
         if name in _registry:
             raise ValueError(f"derivation {name} is declared twice")
         title = (function.__doc__ or name).strip().splitlines()[0]
-        known = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes, last, trial)
-        _registry[name] = Derivation(name, *known)
+        fields = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes, last, trial)
+        _registry[name] = Derivation(name, *fields)
         return function
 
     return declare
@@ -160,13 +160,13 @@ def all_derivations() -> Mapping[str, Derivation]:
 
 def is_drawn(steps: Iterable[Mapping[str, Any]]) -> bool:
     """Whether one of these steps, as provenance tells them, is the last one that a map may take (see ``last``)."""
-    known = all_derivations()
-    return any(name in known and known[name].last for name in (str(step.get("step")) for step in steps))
+    derivations = all_derivations()
+    return any(name in derivations and derivations[name].last for name in (str(step.get("step")) for step in steps))
 
 
 def plan(
     available: frozenset[Layer],
-    wanted: frozenset[Layer],
+    required: frozenset[Layer],
     without: frozenset[str] = frozenset(),
     dead: frozenset[Layer] = frozenset(),
 ) -> Plan | None:
@@ -179,7 +179,7 @@ def plan(
     pushed = 0
     while queue:
         cost, _, have, steps = heapq.heappop(queue)
-        if wanted <= have:
+        if required <= have:
             return Plan(steps, cost)
         if have in done:
             continue
@@ -203,8 +203,8 @@ def with_values(steps: Iterable[Step], values: Mapping[str, Any]) -> tuple[Step,
     """The steps, each with those of the values that it knows. Invalid names what is wrong with one."""
     out = []
     for step in steps:
-        own = {name: value for name, value in values.items() if name in takes(step.name)}
-        chosen = parameters.parse(all_derivations()[step.name].parameters, own, f"parameter of {step.name}")
+        step_values = {name: value for name, value in values.items() if name in takes(step.name)}
+        chosen = parameters.parse(all_derivations()[step.name].parameters, step_values, f"parameter of {step.name}")
         out.append(replace(step, given=tuple(parameters.canonical(chosen).items())))
     return tuple(out)
 
@@ -221,14 +221,18 @@ def run(steps: Iterable[Step], layers: Layers, notes: Notes | None = None) -> La
     """Carry out a plan: the layers with what each step adds. CannotDerive names the step that found nothing to use."""
     notes = notes or Notes()
     for step in steps:
-        known = all_derivations()[step.name]
+        derivation = all_derivations()[step.name]
         with _blaming(step):
-            made = known.function(layers, known.parameters(**dict(step.given)), notes)
-        if not known.makes and not known.last and all(map(_says_nothing, made.of(step.gives).values())):
+            derived_layers = derivation.function(layers, derivation.parameters(**dict(step.given)), notes)
+        if (
+            not derivation.makes
+            and not derivation.last
+            and all(map(_says_nothing, derived_layers.of(step.gives).values()))
+        ):
             needs = " and ".join(step.needs)
             reason = f"{step.name} finds nothing in the stored {needs} to make {step.gives} of: supply {step.gives}"
             raise CannotDerive(f"{reason}, or {needs} with more in it", [Problem(reason)], step=step.name)
-        layers = Layers({**layers.parts, **made.parts}, layers.datum or made.datum, layers.levels)
+        layers = Layers({**layers.parts, **derived_layers.parts}, layers.datum or derived_layers.datum, layers.levels)
     return layers
 
 

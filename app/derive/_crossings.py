@@ -112,8 +112,8 @@ def _segments(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
 
 def _obstacle_grid(grids: Mapping[PartKey, OccupancyGrid]) -> PartKey | None:
     """A level's grid of obstacles: ``map``, else the only one that is no costmap filter mask."""
-    found = [k for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties]
-    return next((k for k in found if k.name == MAP), found[0] if len(found) == 1 else None)
+    keys = [k for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties]
+    return next((k for k in keys if k.name == MAP), keys[0] if len(keys) == 1 else None)
 
 
 def _in_grid(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -99,7 +99,7 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: Sizes) -> F
     if pieces(mask) > PIECES:
         raise CannotConvert(f"this is noise: it has more than {PIECES} pieces and holes")
     contours, tree = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    found = Found([], [], [], [], 0)
+    shapes = Found([], [], [], [], 0)
     specks = 0
     rest = np.zeros(mask.shape, np.uint8)
     links = np.empty((0, 4), np.int64) if tree is None else np.asarray(tree[0], np.int64)
@@ -122,16 +122,16 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: Sizes) -> F
         room = small and any(_holds(contours[c], free) for c in inner)
         disc = None if room else _disc(points, sides, sizes)
         if disc is not None:
-            found.discs.append(disc)
+            shapes.discs.append(disc)
         elif not room and share >= FULL and box.width <= sizes.wall and box.length >= 2 * box.width:
-            found.walls.append(box)
+            shapes.walls.append(box)
         elif not room and share >= FULL and box.length <= sizes.box:
-            found.boxes.append(box)
+            shapes.boxes.append(box)
         else:
             cv2.drawContours(rest, [contours[k], *(contours[c] for c in inner)], -1, 1, cv2.FILLED)
     if rest.any():
-        _others(rest & mask, sizes, found)
-    return Found(found.discs, found.boxes, found.walls, found.areas, specks)
+        _others(rest & mask, sizes, shapes)
+    return Found(shapes.discs, shapes.boxes, shapes.walls, shapes.areas, specks)
 
 
 def _holds(contour: Any, free: NDArray[np.bool_]) -> bool:
@@ -150,13 +150,13 @@ def pieces(mask: NDArray[np.uint8]) -> int:
     height, width = mask.shape
     count = 0
     for start in range(0, height, ROWS):
-        here = np.zeros((min(ROWS, height - start) + 1, width + 2), bool)
+        band = np.zeros((min(ROWS, height - start) + 1, width + 2), bool)
         low = max(0, start - 1)
         rows = mask[low : start + ROWS]
-        here[-len(rows) :, 1:-1] = rows == 1
-        before = here[1:, :-2]
-        count += int((here[1:, 1:-1] & ~(before | here[:-1, :-2] | here[:-1, 1:-1] | here[:-1, 2:])).sum())
-        count += int((~here[1:, 1:-1] & before & here[:-1, 1:-1]).sum())
+        band[-len(rows) :, 1:-1] = rows == 1
+        before = band[1:, :-2]
+        count += int((band[1:, 1:-1] & ~(before | band[:-1, :-2] | band[:-1, 1:-1] | band[:-1, 2:])).sum())
+        count += int((~band[1:, 1:-1] & before & band[:-1, 1:-1]).sum())
     return count
 
 
@@ -207,7 +207,7 @@ def _disc(points: NDArray[Any], sides: tuple[float, float], sizes: Sizes) -> Dis
     return Disc(x + 0.5, y + 0.5, math.sqrt(area / math.pi) if round_ else radius)
 
 
-def _others(rest: NDArray[np.uint8], sizes: Sizes, found: Found) -> None:
+def _others(rest: NDArray[np.uint8], sizes: Sizes, shapes: Found) -> None:
     """Figures that are neither: their thin parts are walls, the others rectangles or areas."""
     from app.derive import _skeleton
 
@@ -217,20 +217,20 @@ def _others(rest: NDArray[np.uint8], sizes: Sizes, found: Found) -> None:
     at = np.array([left - 1.0, top - 1.0])
     thick = _opened(mask, sizes.wall / 2)
     if thick.any():
-        found.areas.extend(_areas(thick, sizes, found, at))
+        shapes.areas.extend(_areas(thick, sizes, shapes, at))
     thin = mask & (1 - thick)
     if not thin.any():
         return
-    where = _skeleton.space(thin.copy(), 0, 0, 0.0)
+    free_space = _skeleton.space(thin.copy(), 0, 0, 0.0)
     # Ends that reach less than their width out of a wall are its roughness.
-    graph, _ = _skeleton.skeleton(where, merge=2.0, spur=sizes.speck, tolerance=sizes.tolerance, island=0.0)
+    graph, _ = _skeleton.skeleton(free_space, merge=2.0, spur=sizes.speck, tolerance=sizes.tolerance, island=0.0)
     if len(graph.edges) > MOST:
         raise CannotConvert(f"this is no place with walls: thin pieces have more than {MOST} edges")
     ends = straightened(graph.nodes[:, ::-1].astype(np.float64), graph.edges, sizes.tolerance)
     for a, b in ends:
         wall = _wall(thin, a + 0.5, b + 0.5, sizes.wall)
         if wall.length >= sizes.speck:
-            found.walls.append(Box(wall.x + at[0], wall.y + at[1], wall.length, wall.width, wall.yaw))
+            shapes.walls.append(Box(wall.x + at[0], wall.y + at[1], wall.length, wall.width, wall.yaw))
 
 
 def _opened(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
@@ -248,7 +248,7 @@ def _opened(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
     return np.asarray(mask & (1 - far), np.uint8)
 
 
-def _areas(thick: NDArray[np.uint8], sizes: Sizes, found: Found, at: NDArray[np.float64]) -> list[Any]:
+def _areas(thick: NDArray[np.uint8], sizes: Sizes, mask_shapes: Found, at: NDArray[np.float64]) -> list[Any]:
     """Rectangles among the thick figures go to the boxes; the others' outlines, in order of their rows."""
     import cv2
     import shapely
@@ -273,7 +273,7 @@ def _areas(thick: NDArray[np.uint8], sizes: Sizes, found: Found, at: NDArray[np.
                 yaw = (math.atan2(step[1], step[0]) + math.pi / 2) % math.pi - math.pi / 2
                 middle = corners[:4].mean(axis=0)
                 x, y = (float(v) for v in middle)
-                found.boxes.append(Box(x, y, float(sides[long]), float(sides[1 - long]), yaw))
+                mask_shapes.boxes.append(Box(x, y, float(sides[long]), float(sides[1 - long]), yaw))
                 continue
         out.append(area)
     return out
@@ -294,9 +294,9 @@ def straightened(
     for node in sorted(at):
         while len(at[node]) > 1:
             best: tuple[float, int, int, list[int]] | None = None
-            here = sorted(at[node])
-            for i, one in enumerate(here):
-                for other in here[i + 1 :]:
+            neighbours = sorted(at[node])
+            for i, one in enumerate(neighbours):
+                for other in neighbours[i + 1 :]:
                     joined = _joined(lines[one], lines[other], node)
                     away = _away(nodes[joined], tolerance)
                     if away is not None and (best is None or away < best[0]):
@@ -323,14 +323,14 @@ def _joined(one: list[int], other: list[int], node: int) -> list[int]:
 
 def _away(line: NDArray[np.float64], tolerance: float) -> float | None:
     """How far the straight line between the ends is from the corners; None if too far, or if the line turns back."""
-    whole = line[-1] - line[0]
-    length = float(np.hypot(*whole))
+    chord = line[-1] - line[0]
+    length = float(np.hypot(*chord))
     if length == 0.0:
         return None
-    along = (line - line[0]) @ whole / length
+    along = (line - line[0]) @ chord / length
     if (np.diff(along) <= 0).any():
         return None
-    away = np.abs((line - line[0]) @ np.array([-whole[1], whole[0]])) / length
+    away = np.abs((line - line[0]) @ np.array([-chord[1], chord[0]])) / length
     worst = float(away.max())
     return worst if worst <= tolerance else None
 
@@ -354,10 +354,10 @@ def _wall(thin: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.float64
 
 
 def _reach(
-    mask: NDArray[np.uint8], places: NDArray[np.float64], direction: NDArray[np.float64], most: float
+    mask: NDArray[np.uint8], places: NDArray[np.float64], direction: NDArray[np.float64], max_distance: float
 ) -> NDArray[np.float64]:
-    """How far cells of the mask go on from places in a direction, ``most`` cells at most."""
-    steps = np.arange(0.0, most + 1.0, STEP) + STEP / 2
+    """How far cells of the mask go on from places in a direction, ``max_distance`` cells at most."""
+    steps = np.arange(0.0, max_distance + 1.0, STEP) + STEP / 2
     at = np.floor(places[:, None, :] + direction * steps[:, None]).astype(np.int64)
     x = np.clip(at[..., 0], 0, mask.shape[1] - 1)
     y = np.clip(at[..., 1], 0, mask.shape[0] - 1)

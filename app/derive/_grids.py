@@ -13,17 +13,17 @@ from app.model.grid import OccupancyGrid, as_seen, unknown_grey
 from app.model.layers import MAP, Layers, PartKey
 
 
-def chosen(layers: Layers, name: str | None, what: str) -> dict[PartKey, OccupancyGrid]:
+def chosen(layers: Layers, name: str | None, label: str) -> dict[PartKey, OccupancyGrid]:
     """One grid for each level: the named one, else ``map``, else the only one that is no costmap filter mask.
 
-    what: what masks do not tell, for the error. Raises NotFound, MissingLayer where there are masks alone, Ambiguous.
+    label: what masks do not tell, for the error. Raises NotFound, MissingLayer where there are masks alone, Ambiguous.
     """
     grids = layers.grids()
     if name is not None:
         return named(grids, name, "occupancy grid")
     maps = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
     if not maps:
-        raise MissingLayer(f"costmap filter masks alone tell no {what}: upload an occupancy grid of what stands there")
+        raise MissingLayer(f"costmap filter masks alone tell no {label}: upload an occupancy grid of what stands there")
     return one_each(maps, MAP, "occupancy grid", "grid")
 
 

@@ -42,20 +42,20 @@ def spanner(count: int, edges: I64, length: F64, wanted: I64, straight: F64, det
         touched[0], seen = a, 1
         queue[0], first, last = a, 0, 1
         while first != last:
-            here = queue[first]
+            current = queue[first]
             first = first + 1 if first < count else 0
-            queued[here] = 0
-            link = head[here]
+            queued[current] = 0
+            link = head[current]
             while link >= 0:
-                there, far = to[link], distance[here] + weight[link]
-                if far <= bound and far < distance[there]:
-                    if distance[there] == np.inf:
-                        touched[seen] = there
+                neighbour, far = to[link], distance[current] + weight[link]
+                if far <= bound and far < distance[neighbour]:
+                    if distance[neighbour] == np.inf:
+                        touched[seen] = neighbour
                         seen += 1
-                    distance[there] = far
-                    if not queued[there]:
-                        queued[there] = 1
-                        queue[last] = there
+                    distance[neighbour] = far
+                    if not queued[neighbour]:
+                        queued[neighbour] = 1
+                        queue[last] = neighbour
                         last = last + 1 if last < count else 0
                 link = following[link]
             if distance[b] < np.inf:
@@ -63,10 +63,10 @@ def spanner(count: int, edges: I64, length: F64, wanted: I64, straight: F64, det
         while first != last:
             queued[queue[first]] = 0
             first = first + 1 if first < count else 0
-        found = distance[b] < np.inf
+        reached = distance[b] < np.inf
         for i in range(seen):
             distance[touched[i]] = np.inf
-        if not found:
+        if not reached:
             out[k] = 1
             _link(head, following, to, weight, used, a, b, straight[k])
             _link(head, following, to, weight, used + 1, b, a, straight[k])

@@ -116,7 +116,7 @@ def thin(mask: U8) -> int:
                     edge += 1
     size = max(1024, edge * 2)
     first, second = np.empty(size, np.int32), np.empty(size, np.int32)
-    gone = np.empty(size, np.int32)
+    removed = np.empty(size, np.int32)
     n1 = n2 = 0
     # Cells whose only missing neighbours are diagonal cannot be deleted yet: they have seven.
     for y in range(1, height - 1):
@@ -140,11 +140,11 @@ def thin(mask: U8) -> int:
             for k in range(8):
                 code |= (flat[cell + step[k]] & 1) << k
             if _PASSES[code] & bit and not (code == _BLOCK and _lone_block(mask, cell // width, cell % width)):
-                gone[deleted] = cell
+                removed[deleted] = cell
                 deleted += 1
         n1 = 0
         for i in range(deleted):
-            flat[gone[i]] &= 6
+            flat[removed[i]] &= 6
         count -= deleted
         need = max(n2, 0) + 8 * deleted
         if need > len(second):
@@ -152,7 +152,7 @@ def thin(mask: U8) -> int:
         if 8 * deleted > len(first):
             first = _grown(first, 0, 8 * deleted)
         for i in range(deleted):
-            cell = gone[i]
+            cell = removed[i]
             for k in range(8):
                 other = cell + step[k]
                 value = flat[other]
@@ -166,8 +166,8 @@ def thin(mask: U8) -> int:
                     flat[other] = 7
         first, second = second, first
         n1, n2 = n2, n1
-        if n1 > len(gone):
-            gone = np.empty(len(first), np.int32)
+        if n1 > len(removed):
+            removed = np.empty(len(first), np.int32)
         bit = 3 - bit
     # What is left of corners.
     left = np.empty(count, np.int32)
@@ -271,20 +271,20 @@ def trace(mask: U8, cells: I32, rows: I64) -> Graph:
                 begin[edges] = used
                 path[used] = k
                 used += 1
-                previous, here = k, q
-                while node[here] < 0:
-                    done[here] = 1
-                    path[used] = here
+                previous, current = k, q
+                while node[current] < 0:
+                    done[current] = 1
+                    path[used] = current
                     used += 1
-                    _neighbours(mask, cells, rows, here, other)
+                    _neighbours(mask, cells, rows, current, other)
                     following = other[0] if other[0] != previous else other[1]
-                    previous, here = here, following
-                path[used] = here
+                    previous, current = current, following
+                path[used] = current
                 used += 1
-                if here == k and used - begin[edges] < 5:
+                if current == k and used - begin[edges] < 5:
                     used = begin[edges]  # two cells beside a junction, around nothing
                     continue
-                start[edges], end[edges] = node[k], node[here]
+                start[edges], end[edges] = node[k], node[current]
                 edges += 1
     begin[edges] = used
     return nodes[:count].copy(), start[:edges].copy(), end[:edges].copy(), begin[: edges + 1].copy(), path[:used].copy()
@@ -349,24 +349,24 @@ def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
         queue[0] = v
         size, i = 1, 0
         while i < size and first[v + 1] - first[v] > 2:
-            here = queue[i]
+            current = queue[i]
             i += 1
-            for k in range(first[here], first[here + 1]):
+            for k in range(first[current], first[current + 1]):
                 e = at[k]
-                u = end[e] if start[e] == here else start[e]
-                far = away[here] + length[e]
+                u = end[e] if start[e] == current else start[e]
+                far = away[current] + length[e]
                 if head[u] < 0 and far <= radius and first[u + 1] - first[u] > 2:
                     head[u], via[u], away[u] = v, e, far
                     queue[size] = u
                     size += 1
-    kept = np.zeros(edges, np.uint8)
+    remaining = np.zeros(edges, np.uint8)
     room = m = 0
     for e in range(edges):
         a, b = start[e], end[e]
         tree = via[a] == e or via[b] == e
         if tree or (head[a] == head[b] and length[e] + away[a] + away[b] <= 4.0 * radius):
             continue
-        kept[e] = 1
+        remaining[e] = 1
         m += 1
         room += begin[e + 1] - begin[e]
         for v0 in (a, b):
@@ -386,7 +386,7 @@ def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
     new_path = np.empty(room, np.int64)
     used = m = 0
     for e in range(edges):
-        if not kept[e]:
+        if not remaining[e]:
             continue
         a, b = start[e], end[e]
         new_start[m], new_end[m], new_begin[m] = place[head[a]], place[head[b]], used
@@ -441,32 +441,32 @@ def prune(graph: Graph, gap: U16, cells: I32, spur: float) -> U8:
         for tip in range(count):
             if first[tip + 1] - first[tip] != 1:
                 continue
-            here, e, far = tip, at[first[tip]], 0.0
+            current, e, far = tip, at[first[tip]], 0.0
             while True:
                 far += length[e]
-                here = end[e] if start[e] == here else start[e]
-                if first[here + 1] - first[here] != 2:
+                current = end[e] if start[e] == current else start[e]
+                if first[current + 1] - first[current] != 2:
                     break
-                e = at[first[here]] if at[first[here]] != e else at[first[here] + 1]
-            if first[here + 1] - first[here] < 3:
+                e = at[first[current]] if at[first[current]] != e else at[first[current] + 1]
+            if first[current + 1] - first[current] < 3:
                 continue
-            beyond = far - max(0.0, clearance[here] - clearance[tip])
-            if beyond < spur and (beyond < best[here] or (beyond == best[here] and tip < leaf[here])):
-                best[here], leaf[here] = beyond, tip
-        found = False
+            beyond = far - max(0.0, clearance[current] - clearance[tip])
+            if beyond < spur and (beyond < best[current] or (beyond == best[current] and tip < leaf[current])):
+                best[current], leaf[current] = beyond, tip
+        pruned = False
         for junction in range(count):
             tip = leaf[junction]
             if tip < 0:
                 continue
-            found = True
-            here, e = tip, at[first[tip]]
+            pruned = True
+            current, e = tip, at[first[tip]]
             while True:
                 alive[e] = 0
-                here = end[e] if start[e] == here else start[e]
-                if here == junction:
+                current = end[e] if start[e] == current else start[e]
+                if current == junction:
                     break
-                e = at[first[here]] if at[first[here]] != e else at[first[here] + 1]
-        if not found:
+                e = at[first[current]] if at[first[current]] != e else at[first[current] + 1]
+        if not pruned:
             return alive
 
 
@@ -501,20 +501,20 @@ def chains(graph: Graph, alive: U8) -> tuple[I64, I64, I64]:
                     continue
                 out_begin[lines] = used
                 lines += 1
-                here = v
+                current = v
                 out[used] = nodes[v]
                 used += 1
                 while True:
                     done[e] = 1
                     low, high = begin[e], begin[e + 1] - 1
-                    forward = start[e] == here
+                    forward = start[e] == current
                     for i in range(1, high - low + 1):
                         out[used] = path[low + i] if forward else path[high - i]
                         used += 1
-                    here = end[e] if forward else start[e]
-                    if first[here + 1] - first[here] != 2 or here == v:
+                    current = end[e] if forward else start[e]
+                    if first[current + 1] - first[current] != 2 or current == v:
                         break
-                    e = at[first[here]] if at[first[here]] != e else at[first[here] + 1]
+                    e = at[first[current]] if at[first[current]] != e else at[first[current] + 1]
     out_begin[lines] = used
     return lone[:alone].copy(), out_begin[: lines + 1].copy(), out[:used].copy()
 
@@ -541,7 +541,7 @@ def simplify(mask: U8, cells: I32, begin: I64, path: I64, tolerance: float, keep
             y1, x1 = np.int64(cells[path[j], 0]), np.int64(cells[path[j], 1])
             dy, dx = y1 - y0, x1 - x0
             along = dy * dy + dx * dx
-            worst, where = -1.0, (i + j) // 2
+            worst, farthest = -1.0, (i + j) // 2
             for k in range(i + 1, j):
                 v, u = cells[path[k], 0] - y0, cells[path[k], 1] - x0
                 t = 0.0
@@ -549,12 +549,12 @@ def simplify(mask: U8, cells: I32, begin: I64, path: I64, tolerance: float, keep
                     t = min(1.0, max(0.0, (v * dy + u * dx) / along))
                 away = (v - t * dy) ** 2 + (u - t * dx) ** 2
                 if away > worst:
-                    worst, where = away, k
+                    worst, farthest = away, k
             if along > 0 and worst <= tolerance * tolerance and clear(mask, y0, x0, y1, x1):
                 continue
-            keep[where] = 1
-            stack[size, 0], stack[size, 1] = i, where
-            stack[size + 1, 0], stack[size + 1, 1] = where, j
+            keep[farthest] = 1
+            stack[size, 0], stack[size, 1] = i, farthest
+            stack[size + 1, 0], stack[size + 1, 1] = farthest, j
             size += 2
 
 

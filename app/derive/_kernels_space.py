@@ -129,9 +129,9 @@ def narrowest(gap: U16, y0: int, x0: int, y1: int, x1: int) -> int:
             j += 1
         slack -= 1.5  # more than a step to a diagonal neighbour
         if slack < 0.0:
-            here = distance2(gap, y, x)
-            best = min(best, here)
-            slack = np.sqrt(here) - np.sqrt(best)
+            current = distance2(gap, y, x)
+            best = min(best, current)
+            slack = np.sqrt(current) - np.sqrt(best)
     return best
 
 

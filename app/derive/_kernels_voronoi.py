@@ -67,13 +67,13 @@ def farthest(mask: U8, gap: U16) -> int:
     height, width = gap.shape
     at, until = np.empty(width, np.int64), np.empty(width + 1, np.float64)
     far, column = np.empty(width, np.int64), np.empty(width, np.int64)
-    most = np.int64(0)
+    maximum = np.int64(0)
     for y in range(height):
         envelope(gap, y, at, until, far, column)
         for x in range(width):
-            if mask[y, x] and far[x] > most:
-                most = far[x]
-    return most
+            if mask[y, x] and far[x] > maximum:
+                maximum = far[x]
+    return maximum
 
 
 @native
@@ -98,18 +98,18 @@ def anchors(mask: U8, gap: U16, scale: float, rank: U16) -> int:
     envelope(gap, 1, at, until, far[1], column[1])
     count = 0
     for y in range(1, height - 1):
-        here, below = y % 2, (y + 1) % 2
+        current, below = y % 2, (y + 1) % 2
         envelope(gap, y + 1, at, until, far[below], column[below])
         for x in range(width):
-            rank[y, x] = np.uint16(np.sqrt(np.float32(far[here, x])) * factor)
+            rank[y, x] = np.uint16(np.sqrt(np.float32(far[current, x])) * factor)
         for x in range(1, width - 1):
             if mask[y, x] == 0:
                 continue
-            ax = column[here, x]
+            ax = column[current, x]
             ay = np.int64(_row(gap, y, ax))
             # In the middle of an odd number of cells: the same distance to both sides.
-            g = np.int64(np.sqrt(far[here, x]))
-            if g * g == far[here, x] and (
+            g = np.int64(np.sqrt(far[current, x]))
+            if g * g == far[current, x] and (
                 (y >= g and y + g < height and gap[y - g, x] == 0 and gap[y + g, x] == 0)
                 or (x >= g and x + g < width and gap[y, x - g] == 0 and gap[y, x + g] == 0)
             ):
@@ -119,13 +119,13 @@ def anchors(mask: U8, gap: U16, scale: float, rank: U16) -> int:
                 v, u = y + d, x + 1 - d
                 if mask[v, u] == 0:
                     continue
-                other = below if d else here
+                other = below if d else current
                 bx = column[other, u]
                 by = np.int64(_row(gap, v, bx))
                 apart = np.sqrt((ax - bx) * (ax - bx) + (ay - by) * (ay - by))
                 # Neighbours see obstacles that are a cell farther apart, because they are at different places.
-                if apart - 1.0 >= OPPOSITE * (np.sqrt(far[here, x]) + np.sqrt(far[other, u])) / 2.0:
-                    if far[other, u] > far[here, x]:
+                if apart - 1.0 >= OPPOSITE * (np.sqrt(far[current, x]) + np.sqrt(far[other, u])) / 2.0:
+                    if far[other, u] > far[current, x]:
                         count += 1 if mask[v, u] & 2 == 0 else 0
                         mask[v, u] |= 2
                     else:

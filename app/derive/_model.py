@@ -16,12 +16,12 @@ def segments(ground: Ground, how: Segmentation, notes: Notes, name: str) -> Segm
     Invalid for parameters that belong to another family.
     """
     supplied = _onnx.supplied(how.model or "")
-    least = 1.0 if how.minimum_area is None else how.minimum_area
+    min_area = 1.0 if how.minimum_area is None else how.minimum_area
     if len(supplied.files) == 2:
         model = _sam.model_of(supplied)
         sure = _sam.SURE if how.confidence is None else how.confidence
         stable = _sam.STABLE if how.stability is None else how.stability
-        return _sam.segments(ground, model, sure, stable, how.points or _sam.POINTS, least, notes, name)
+        return _sam.segments(ground, model, sure, stable, how.points or _sam.POINTS, min_area, notes, name)
     problems = [
         Problem(f"belongs to models of the Segment-Anything family, and {how.model} is none", where=word)
         for word in ("points", "stability")
@@ -33,7 +33,7 @@ def segments(ground: Ground, how: Segmentation, notes: Notes, name: str) -> Segm
     ranks = [len(shape) for _, shape in file.outputs.values()]
     if ranks and ranks[0] == 4 and 3 not in ranks:
         sure = _pixels.SURE if how.confidence is None else how.confidence
-        return _pixels.segments(ground, _pixels.model_of(supplied, file), sure, least, notes, name)
+        return _pixels.segments(ground, _pixels.model_of(supplied, file), sure, min_area, notes, name)
     if 3 not in ranks:
         raise CannotConvert(
             f"the model {supplied.name} is of no family that is known: of one file [1, 3, h, w] -> boxes [1, values, "
@@ -41,4 +41,4 @@ def segments(ground: Ground, how: Segmentation, notes: Notes, name: str) -> Segm
             f"{supplied.name}.encoder.onnx and {supplied.name}.decoder.onnx; it is {file.signature()}"
         )
     sure = _yolo.SURE if how.confidence is None else how.confidence
-    return _yolo.segments(ground, _yolo.model_of(supplied, file), sure, least, notes, name)
+    return _yolo.segments(ground, _yolo.model_of(supplied, file), sure, min_area, notes, name)

@@ -40,8 +40,8 @@ _PARENT_DEATH_SIGNAL = 1
 
 def folder() -> Path:
     """Where compiled code of this release, machine and user is kept; it need not exist."""
-    said = os.environ.get(FOLDER)
-    base = Path(said) if said else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fleetmap"
+    setting = os.environ.get(FOLDER)
+    base = Path(setting) if setting else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fleetmap"
     return base / _key()
 
 
@@ -55,38 +55,38 @@ def native(function: F) -> F:
     return cast(F, compiled)
 
 
-def is_filled(where: Path) -> bool:
+def is_filled(directory: Path) -> bool:
     """Whether ``fill`` has nothing to do."""
-    return (where / _key()).is_dir()
+    return (directory / _key()).is_dir()
 
 
-def fill(where: Path) -> None:
-    """Compile all kernels into ``where`` (what ``NUMBA_CACHE_DIR`` names), unless this was done before.
+def fill(directory: Path) -> None:
+    """Compile all kernels into ``directory`` (what ``NUMBA_CACHE_DIR`` names), unless this was done before.
 
     It never reads what stands there, and the new folder appears in one step: nothing half-written is ever loaded.
     """
-    if is_filled(where):
+    if is_filled(directory):
         return
-    where.mkdir(parents=True, exist_ok=True)
-    for old in where.glob(f"{_PREFIX}*"):  # of other releases
+    directory.mkdir(parents=True, exist_ok=True)
+    for old in directory.glob(f"{_PREFIX}*"):  # of other releases
         shutil.rmtree(old, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=where, prefix=f"{_PREFIX}part-") as scratch:
+    with tempfile.TemporaryDirectory(dir=directory, prefix=f"{_PREFIX}part-") as scratch:
         os.environ[FOLDER] = scratch
         for module in _modules():
             importlib.import_module(module).compile_all()
-        made = Path(scratch) / _key()
-        if made.is_dir():
+        build = Path(scratch) / _key()
+        if build.is_dir():
             with contextlib.suppress(OSError):  # another process was quicker
-                made.rename(where / _key())
+                build.rename(directory / _key())
 
 
-def fill_quietly(where: Path) -> None:
+def fill_quietly(directory: Path) -> None:
     """``fill`` for a process of its own: politely, and without a word where it cannot be done."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
     with contextlib.suppress(Exception):
         ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)  # it ends with the server, however that ends
         os.nice(19)
-        fill(where)
+        fill(directory)
 
 
 def _modules() -> list[str]:
@@ -126,9 +126,9 @@ def _cache(function: Callable[..., Any]) -> Any:
 
         @classmethod
         def from_function(cls, py_func: Any, py_file: str) -> Any:
-            made = cls(py_func, py_file)
-            made.ensure_cache_path()
-            return made
+            locator = cls(py_func, py_file)
+            locator.ensure_cache_path()
+            return locator
 
     class Stored(caching.CompileResultCacheImpl):
         _locator_classes: ClassVar[Any] = [Locator]  # type: ignore[misc]

@@ -82,10 +82,10 @@ class Site:
         if not len(self.triangles):
             return np.zeros(0, bool)
         owners, index = np.unique(self.owner, return_inverse=True)
-        least, most = np.full(len(owners), np.inf), np.full(len(owners), -np.inf)
-        np.minimum.at(least, index, self.triangles[:, :, 2].min(axis=1))
-        np.maximum.at(most, index, self.triangles[:, :, 2].max(axis=1))
-        return np.asarray(((least <= height) & (most > height))[index])
+        lowest, highest = np.full(len(owners), np.inf), np.full(len(owners), -np.inf)
+        np.minimum.at(lowest, index, self.triangles[:, :, 2].min(axis=1))
+        np.maximum.at(highest, index, self.triangles[:, :, 2].max(axis=1))
+        return np.asarray(((lowest <= height) & (highest > height))[index])
 
     def draw(self, cells: NDArray[np.uint8], frame: _raster.Frame, low: float, high: float) -> None:
         """Occupy every cell that is touched between two heights by what ``cut`` has given for them."""
@@ -129,9 +129,9 @@ def sites(
     surroundings: metres around a solid that cannot be read. unknown_radius: metres around an object of unknown extent.
     Raises MissingDatum where objects are places on earth without one, Invalid where there is no such world.
     """
-    known = solids.Solids(layers.resources(), visuals=visuals)
+    solid_reader = solids.Solids(layers.resources(), visuals=visuals)
     out: dict[str, Site] = {}
-    reader = _Reader(layers, notes, known, doors_closed, surroundings, unknown_radius)
+    reader = _Reader(layers, notes, solid_reader, doors_closed, surroundings, unknown_radius)
     parts = {key: part for key, part in layers.vector("objects").items() if len(part)}
     if world is not None and not any(worlds.names(part) for part in parts.values()):
         raise Invalid("no world is stored", [Problem("no world is stored", where="world")])
@@ -167,11 +167,11 @@ def fences(layers: Layers, notes: Notes) -> dict[str, Any]:
     return out
 
 
-def unreadable_error(reasons: Iterable[str], what: str) -> MissingLayer:
+def unreadable_error(reasons: Iterable[str], summary: str) -> MissingLayer:
     """The error for a map that would be a guess, since solids cannot be read. what: what is therefore not known."""
     named = list(dict.fromkeys(reasons))
     more = f"; and {len(named) - 3} more" if len(named) > 3 else ""
-    detail = f"{what}, since solids of the objects cannot be read: {'; '.join(named[:3])}{more}"
+    detail = f"{summary}, since solids of the objects cannot be read: {'; '.join(named[:3])}{more}"
     return MissingLayer(detail, [Problem(reason) for reason in named[:100]])
 
 
@@ -187,14 +187,14 @@ class _Reader:
         self,
         layers: Layers,
         notes: Notes,
-        known: solids.Solids,
+        solid_reader: solids.Solids,
         doors_closed: bool,
         surroundings: float,
         unknown_radius: float,
     ) -> None:
-        self.layers, self.notes, self.known, self.doors_closed = layers, notes, known, doors_closed
+        self.layers, self.notes, self.known, self.doors_closed = layers, notes, solid_reader, doors_closed
         self.surroundings, self.unknown_radius = surroundings, unknown_radius
-        self.seen = replace(known, planes=True, visuals=True)
+        self.seen = replace(solid_reader, planes=True, visuals=True)
         self.found: dict[int, list[Array]] = {}
         self.left: Counter[str] = Counter()
         self.shapeless: Counter[str] = Counter()
@@ -290,7 +290,7 @@ class _Reader:
     def _solids(self, part: Features, k: int, site: Site, level: str) -> None:
         p = part.properties[k]
         try:
-            made, unreadable = self.known.read(p)
+            triangles, unreadable = self.known.read(p)
         except (Invalid, TooLarge) as error:
             self._surround(_name(part, k), p, self._all_of(part, k), [error.detail], site)
             return
@@ -298,13 +298,13 @@ class _Reader:
             origins = shapely.MultiPoint([one.at for one in unreadable])
             ground = obstacles.surroundings_of({**p, "pose": None}, origins, self.surroundings)
             self._surround(_name(part, k), p, ground, [one.error.detail for one in unreadable], site)
-        self.triangles += len(made)
+        self.triangles += len(triangles)
         if self.triangles > MOST_TRIANGLES:
             raise CannotConvert(f"the solids of the objects have more than {MOST_TRIANGLES} triangles")
-        if unreadable and not len(made):
+        if unreadable and not len(triangles):
             return
-        if len(made):
-            self.found.setdefault(id(site), []).append(made - np.array([0.0, 0.0, self.layers.elevation(level)]))
+        if len(triangles):
+            self.found.setdefault(id(site), []).append(triangles - np.array([0.0, 0.0, self.layers.elevation(level)]))
         else:
             self.left["with planes or pictures only"] += 1
 
@@ -334,10 +334,10 @@ class _Reader:
 
     def finished(self, site: Site, level: str) -> Site:  # noqa: ARG002
         """The site with its solids' triangles."""
-        found = self.found.get(id(site), [])
-        if found:
-            site.triangles = np.concatenate(found)
-            site.owner = np.repeat(np.arange(len(found)), [len(one) for one in found])
+        pieces = self.found.get(id(site), [])
+        if pieces:
+            site.triangles = np.concatenate(pieces)
+            site.owner = np.repeat(np.arange(len(pieces)), [len(one) for one in pieces])
         return site
 
     def report(self) -> None:
@@ -361,11 +361,11 @@ class _Reader:
             why = "metres around objects of unknown extent"
             self.notes.fill("unknown_radius", self.unknown_radius, why, "unknown_radius")
 
-    def _warn(self, names: Sequence[str], what: str, consequence: str) -> None:
-        known = list(dict.fromkeys(names))
-        called = ", ".join(name[:80] for name in known[:5]) + (" …" if len(known) > 5 else "")
+    def _warn(self, names: Sequence[str], fault: str, consequence: str) -> None:
+        distinct_names = list(dict.fromkeys(names))
+        called = ", ".join(name[:80] for name in distinct_names[:5]) + (" …" if len(distinct_names) > 5 else "")
         objects = f"{len(names)} objects have" if len(names) > 1 else "1 object has"
-        self.notes.warn(f"{objects} {what} ({called}): {consequence}", where=names[0][:80])
+        self.notes.warn(f"{objects} {fault} ({called}): {consequence}", where=names[0][:80])
 
 
 def _name(part: Features, k: int) -> str:

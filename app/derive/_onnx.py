@@ -83,10 +83,10 @@ class Loaded:
     def signature(self) -> str:
         """Its inputs and outputs, for people."""
 
-        def said(of: Mapping[str, tuple[str, Shape]]) -> str:
+        def describe(of: Mapping[str, tuple[str, Shape]]) -> str:
             return ", ".join(f"{n[:60]} [{', '.join(str(s)[:20] for s in shape)}]" for n, (_, shape) in of.items())
 
-        return f"({said(self.inputs)}) → ({said(self.outputs)})"[:600]
+        return f"({describe(self.inputs)}) → ({describe(self.outputs)})"[:600]
 
 
 def supplied(name: str) -> Supplied:
@@ -97,16 +97,18 @@ def supplied(name: str) -> Supplied:
             f"there are no models: the operator sets {FOLDER} to a folder with {name[:100]}.onnx, or "
             f"{name[:100]}.encoder.onnx and {name[:100]}.decoder.onnx"
         )
-    known = _known(Path(folder))
-    if not _NAME.fullmatch(name) or name not in known:
-        near = did_you_mean(name, known)
-        raise NotFound(f"there is no model {name[:100]!r}{near}; there are: {', '.join(known) or 'none'}")
-    files = known[name]
-    most = int(os.environ.get(LARGEST) or MOST_BYTES)
+    models = _known(Path(folder))
+    if not _NAME.fullmatch(name) or name not in models:
+        near = did_you_mean(name, models)
+        raise NotFound(f"there is no model {name[:100]!r}{near}; there are: {', '.join(models) or 'none'}")
+    files = models[name]
+    max_bytes = int(os.environ.get(LARGEST) or MOST_BYTES)
     stems = {file.stem for file in files}
     beside = (f for f in Path(folder).iterdir() if f.is_file() and any(f.name.startswith(stem) for stem in stems))
-    if sum(f.stat().st_size for f in beside) > most:
-        raise TooLarge(f"the files of the model {name} are larger than {most} bytes: the operator may set {LARGEST}")
+    if sum(f.stat().st_size for f in beside) > max_bytes:
+        raise TooLarge(
+            f"the files of the model {name} are larger than {max_bytes} bytes: the operator may set {LARGEST}"
+        )
     return Supplied(name, files)
 
 
@@ -148,37 +150,37 @@ def classes(model: Supplied, session: Any) -> tuple[tuple[str | None, ...], Mapp
     metadata (as Ultralytics writes them) count.
     """
     file, name = model.words, model.name
-    said: Any
+    metadata: Any
     more: Mapping[str, Any] = {}
     try:
         if file.is_file():
-            said = json.loads(file.read_text("utf-8"))
-            if isinstance(said, dict) and "classes" in said:
-                more = {key: value for key, value in said.items() if key != "classes"}
-                said = said["classes"]
+            metadata = json.loads(file.read_text("utf-8"))
+            if isinstance(metadata, dict) and "classes" in metadata:
+                more = {key: value for key, value in metadata.items() if key != "classes"}
+                metadata = metadata["classes"]
         else:
-            said = ast.literal_eval(session.get_modelmeta().custom_metadata_map.get("names", "None"))
-        if isinstance(said, dict):
-            said = [said[key] for key in sorted(said, key=int)]
+            metadata = ast.literal_eval(session.get_modelmeta().custom_metadata_map.get("names", "None"))
+        if isinstance(metadata, dict):
+            metadata = [metadata[key] for key in sorted(metadata, key=int)]
     except (OSError, ValueError, SyntaxError, TypeError) as error:
         raise CannotConvert(f"the classes of the model {name} cannot be read: {error}") from error
-    if not isinstance(said, list) or not said:
+    if not isinstance(metadata, list) or not metadata:
         raise CannotConvert(f"the model {name} does not say its classes: put {name}.json beside it, a list of kinds")
-    if file.is_file() and not all(kind is None or kind in KINDS for kind in said):
+    if file.is_file() and not all(kind is None or kind in KINDS for kind in metadata):
         raise CannotConvert(f"{file.name}: each class must be null or one of {', '.join(KINDS)}")
-    kinds = tuple(kind if kind in KINDS else None for kind in said)
+    kinds = tuple(kind if kind in KINDS else None for kind in metadata)
     if not any(kinds):
         raise CannotConvert(f"no class of the model {name} is one of {', '.join(KINDS)}: put {name}.json beside it")
     return kinds, more
 
 
-def one_picture(model: Supplied, file: Loaded, told: str, usual: int) -> int:
+def one_picture(model: Supplied, file: Loaded, reason: str, usual: int) -> int:
     """The side of the one picture [1, 3, h, w] that a model takes. told: of a model that takes something else, for the
     error. CannotConvert says what it should take."""
     (kind, shape), *more = file.inputs.values()
     if more or kind != "tensor(float)" or len(shape) != 4 or shape[1] not in (3, "3"):
         raise CannotConvert(
-            f"the model {model.name} {told}: its input is not one picture [1, 3, h, w] of floats; it is "
+            f"the model {model.name} {reason}: its input is not one picture [1, 3, h, w] of floats; it is "
             f"{file.signature()}"
         )
     return square(shape[2:], model.name, usual)

@@ -101,13 +101,13 @@ def ground(picture: Picture, frame: LocalFrame | None, resolution: float | None,
         raise CannotConvert(f"{name}: {error.detail}", error.problems) from error
     shown = displayed(seen)
     bands = shown.shape[2]
-    known = shown[..., -1] >= OPAQUE if bands in (2, 4) else np.ones(shown.shape[:2], bool)
+    valid = shown[..., -1] >= OPAQUE if bands in (2, 4) else np.ones(shown.shape[:2], bool)
     grey = bands < 3
     rgb = np.repeat(shown[..., :1], 3, axis=2) if grey else np.ascontiguousarray(shown[..., :3])
-    if not known.any():
+    if not valid.any():
         raise CannotConvert(f"{name} shows nothing: all of it is transparent or without data")
     _, _, left, _, _, top = seen.transform
-    return Ground(rgb, known, seen.transform[0], left, top, seen.pixels, frame, grey, on_earth)
+    return Ground(rgb, valid, seen.transform[0], left, top, seen.pixels, frame, grey, on_earth)
 
 
 def infrared(picture: Picture, number: int | None, name: str) -> int | None:
@@ -119,8 +119,8 @@ def infrared(picture: Picture, number: int | None, name: str) -> int | None:
         if picture.colours[number - 1] in CLEAR:
             raise CannotConvert(f"band {number} of {name} is its {picture.colours[number - 1]}: correct near_infrared")
         return number - 1
-    said = picture.properties.get("bands")
-    for k, band in enumerate(said if isinstance(said, list | tuple) else ()):
+    bands = picture.properties.get("bands")
+    for k, band in enumerate(bands if isinstance(bands, list | tuple) else ()):
         if isinstance(band, Mapping):
             words = [str(band.get(word, "")).strip().lower() for word in ("colour", "description")]
             if any(word in INFRARED for word in words):

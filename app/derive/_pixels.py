@@ -48,16 +48,16 @@ class Model:
 def model_of(supplied: Supplied, file: Loaded) -> Model:
     """A loaded file as a model that tells pixels. CannotConvert says what it should take."""
     side = one_picture(supplied, file, "tells no pixels", SIDE)
-    kinds, said = classes(supplied, file.session)
-    mean, deviation = (_three(said, word, usual, supplied) for word, usual in (("mean", MEAN), ("std", DEVIATION)))
+    kinds, metadata = classes(supplied, file.session)
+    mean, deviation = (_three(metadata, word, usual, supplied) for word, usual in (("mean", MEAN), ("std", DEVIATION)))
     if (deviation <= 0).any():
         raise CannotConvert(f"{supplied.words.name}: std must be above 0")
     return Model(file, supplied.name, kinds, side, mean, deviation)
 
 
-def _three(said: Mapping[str, Any], word: str, usual: tuple[float, ...], supplied: Supplied) -> Array:
+def _three(metadata: Mapping[str, Any], word: str, usual: tuple[float, ...], supplied: Supplied) -> Array:
     try:
-        values = np.array([float(v) for v in said.get(word, usual)], np.float32)
+        values = np.array([float(v) for v in metadata.get(word, usual)], np.float32)
     except (TypeError, ValueError):
         values = np.empty(0, np.float32)
     if values.shape != (3,) or not np.isfinite(values).all():
@@ -65,12 +65,14 @@ def _three(said: Mapping[str, Any], word: str, usual: tuple[float, ...], supplie
     return values
 
 
-def segments(ground: Ground, model: Model, sure: float, least: float, notes: Notes, name: str) -> Segments:
+def segments(ground: Ground, model: Model, sure: float, min_area: float, notes: Notes, name: str) -> Segments:
     """What a model tells of each pixel. least: square metres."""
     import cv2
 
     height, width = ground.known.shape
-    told = np.zeros((height, width), np.uint8 if len(model.classes) < 255 else np.uint16)  # 0: nothing, k: class k - 1
+    labels = np.zeros(
+        (height, width), np.uint8 if len(model.classes) < 255 else np.uint16
+    )  # 0: nothing, k: class k - 1
     chance = np.zeros((height, width), np.float16)
     rows, columns = starts(height, model.side), starts(width, model.side)
     for (i, row), (j, column) in itertools.product(enumerate(rows), enumerate(columns)):
@@ -79,18 +81,18 @@ def segments(ground: Ground, model: Model, sure: float, least: float, notes: Not
         top, left = (_half(starts_, k, model.side) for starts_, k in ((rows, i), (columns, j)))
         inner = (slice(top, None), slice(left, None))
         at = (slice(row + top, row + best.shape[0]), slice(column + left, column + best.shape[1]))
-        told[at], chance[at] = best[inner] + 1, score[inner]
-    told[(chance < sure) | ~ground.known] = 0
+        labels[at], chance[at] = best[inner] + 1, score[inner]
+    labels[(chance < sure) | ~ground.known] = 0
     label = np.zeros((height, width), np.int32)
     regions: list[Region] = []
     other = small = 0
     for k, kind in enumerate(model.classes, 1):
-        mask = told == k
+        mask = labels == k
         if kind is None:
             other += int(mask.sum())
             continue
         count, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
-        large = stats[:, cv2.CC_STAT_AREA] * ground.resolution**2 >= max(least, ground.resolution**2)
+        large = stats[:, cv2.CC_STAT_AREA] * ground.resolution**2 >= max(min_area, ground.resolution**2)
         small += int(count - 1 - large[1:].sum())
         if len(regions) + int(large[1:].sum()) > MOST:
             raise CannotConvert(f"{name}: the model {model.name} tells more than {MOST} things: give minimum_area")
@@ -98,16 +100,16 @@ def segments(ground: Ground, model: Model, sure: float, least: float, notes: Not
             x, y, w, h, area = (int(v) for v in stats[piece])
             at = (slice(y, y + h), slice(x, x + w))
             inside = pieces[at] == piece
-            said = {"area": round(area * ground.resolution**2, 2), "model": model.name}
-            said |= way(kind, inside, ground.resolution)
+            attributes = {"area": round(area * ground.resolution**2, 2), "model": model.name}
+            attributes |= way(kind, inside, ground.resolution)
             mean = round(float(chance[at][inside].mean(dtype=np.float64)), 3)
-            regions.append(Region(kind, min(mean, 1.0), said))  # type: ignore[arg-type]
+            regions.append(Region(kind, min(mean, 1.0), attributes))  # type: ignore[arg-type]
             label[at][inside] = len(regions)
     if not regions:
         raise CannotConvert(f"{name}: the model {model.name} finds nothing of a confidence of {sure:g}")
     area = round(other * ground.resolution**2)
     notes.drop("m² of ground", area, f"{name}: of classes that the model's operator gave no kind")
-    notes.drop("spots", small, f"{name}: smaller than minimum_area={least:g} m²")
+    notes.drop("spots", small, f"{name}: smaller than minimum_area={min_area:g} m²")
     return Segments(label, regions, np.zeros(label.shape, bool))
 
 

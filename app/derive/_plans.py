@@ -53,11 +53,11 @@ class Plan:
     outside_free: bool
 
 
-def looks_like(rgb: NDArray[np.uint8], known: NDArray[np.bool_]) -> bool:
+def looks_like(rgb: NDArray[np.uint8], valid: NDArray[np.bool_]) -> bool:
     """Whether a picture is ink on paper: hardly any colour, and one bright shade on much of it."""
-    if not known.any():
+    if not valid.any():
         return False
-    pixels = rgb[known]
+    pixels = rgb[valid]
     chroma = pixels.max(axis=1).astype(np.int16) - pixels.min(axis=1)
     if float((chroma > CHROMA).mean()) > COLOURFUL:
         return False
@@ -115,8 +115,8 @@ def grid_of(picture: Picture, how: Plan, notes: Notes, name: str) -> OccupancyGr
     paper, shaded = _looked_up(~unknown, picture, frame)
     walls, specks = _without_specks(walls, how.speck / resolution**2)
     notes.drop("marks", specks, f"{name}: ink of less than {how.speck:g} m² is dirt or writing")
-    told = bool(unknown.any())
-    if told:
+    has_unknown = bool(unknown.any())
+    if has_unknown:
         inside = (walls == 0) & paper & ~shaded
     else:
         outside = _outside(walls, how.gap / 2 / resolution)
@@ -131,7 +131,7 @@ def grid_of(picture: Picture, how: Plan, notes: Notes, name: str) -> OccupancyGr
         cells[paper & ~shaded] = FREE
     cells[inside] = FREE
     near = walls == 1
-    if inside.any() and not told and not how.outside_free:
+    if inside.any() and not has_unknown and not how.outside_free:
         away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         far = near & (away > REACH / resolution)
         notes.drop("cells of ink", int(far.sum()), f"{name}: more than {REACH:g} m from any room")
@@ -148,9 +148,10 @@ def _shades(grey: NDArray[np.uint8], level: int, notes: Notes, name: str) -> NDA
     shades = [k for k in range(level + 1, max(paper, brightest) - SAME) if counts[k] >= SHADE * grey.size]
     if not shades:
         return np.zeros(grey.shape, bool)
-    told = ", ".join(map(str, shades))
+    listing = ", ".join(map(str, shades))
     notes.warn(
-        f"{name}: the even grey {told} is taken as unknown, as in the maps of ROS: gap is not needed", where="imagery"
+        f"{name}: the even grey {listing} is taken as unknown, as in the maps of ROS: gap is not needed",
+        where="imagery",
     )
     return np.asarray(np.isin(grey, shades))
 
@@ -166,8 +167,8 @@ def _walls(ink: NDArray[np.bool_], picture: Picture, frame: Frame, size: float) 
             at = placed(picture.transform, u, v)
             x, y = np.floor(frame.of(at)).astype(np.int64).T
             walls[np.clip(y, 0, frame.height - 1), np.clip(x, 0, frame.width - 1)] = 1
-    _, there = _looked_up(~ink, picture, frame)
-    walls[there] = 1
+    _, mask = _looked_up(~ink, picture, frame)
+    walls[mask] = 1
     return walls
 
 
@@ -193,26 +194,26 @@ def _looked_up(
     return inside, dark
 
 
-def _without_specks(walls: NDArray[np.uint8], least: float) -> tuple[NDArray[np.uint8], int]:
+def _without_specks(walls: NDArray[np.uint8], min_area: float) -> tuple[NDArray[np.uint8], int]:
     """Without pieces of ink that cover fewer cells than that, and how many they were."""
     import cv2
 
-    if least <= 1:
+    if min_area <= 1:
         return walls, 0
     _, labels, stats, _ = cv2.connectedComponentsWithStats(walls, connectivity=8)
-    small = stats[:, cv2.CC_STAT_WIDTH].astype(np.int64) * stats[:, cv2.CC_STAT_HEIGHT] < least
+    small = stats[:, cv2.CC_STAT_WIDTH].astype(np.int64) * stats[:, cv2.CC_STAT_HEIGHT] < min_area
     small[0] = False
     if not small.any():
         return walls, 0
     return np.where(small[labels], 0, walls).astype(np.uint8), int(small[1:].sum())
 
 
-def _rooms(inside: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+def _rooms(inside: NDArray[np.bool_], min_area: float) -> NDArray[np.bool_]:
     """Without pieces of fewer cells than that."""
     import cv2
 
     _, labels, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8), connectivity=4)
-    large = stats[:, cv2.CC_STAT_AREA] >= least
+    large = stats[:, cv2.CC_STAT_AREA] >= min_area
     large[0] = False
     return np.asarray(large[labels])
 

@@ -107,11 +107,11 @@ def _clipped(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np
     within = (a[..., 2] >= low[:, None]) & (a[..., 2] <= high[:, None])
     enter = np.where(level, np.where(within, 0.0, 2.0), np.clip(np.minimum(t0, t1), 0.0, None))
     leave = np.where(level, 1.0, np.clip(np.maximum(t0, t1), None, 1.0))
-    there = enter <= leave
+    mask = enter <= leave
     p = a[..., :2] + (b[..., :2] - a[..., :2]) * enter[..., None]
     q = a[..., :2] + (b[..., :2] - a[..., :2]) * leave[..., None]
-    parts = [np.stack([p, q], axis=2)[there]]
-    owners = [owner[there]]
+    parts = [np.stack([p, q], axis=2)[mask]]
+    owners = [owner[mask]]
     # Where the heights cut through, two edges meet the cut: the line between these points closes the piece.
     for z in (low, high):
         side = a[..., 2] > z[:, None]
@@ -146,13 +146,13 @@ def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], f
     of_piece = np.add.reduceat(count, starts)
     bound = np.append(starts, len(owner))
     for pieces in _portions(of_piece):
-        wanted = np.concatenate([np.arange(bound[pieces[0]], bound[pieces[-1] + 1])])
-        times = count[wanted]
-        which = np.repeat(wanted, times)
-        if not len(which):
+        indices = np.concatenate([np.arange(bound[pieces[0]], bound[pieces[-1] + 1])])
+        times = count[indices]
+        edge_index = np.repeat(indices, times)
+        if not len(edge_index):
             continue
-        row = np.repeat(low[wanted], times) + _within(times)
-        (x0, y0), (x1, y1) = edges[which, 0].T, edges[which, 1].T
+        row = np.repeat(low[indices], times) + _within(times)
+        (x0, y0), (x1, y1) = edges[edge_index, 0].T, edges[edge_index, 1].T
         run = y1 - y0
         with np.errstate(all="ignore"):
             at0, at1 = (row - y0) / run, (row + 1 - y0) / run
@@ -160,16 +160,16 @@ def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], f
         t0 = np.where(flat, 0.0, np.clip(np.minimum(at0, at1), 0.0, 1.0))
         t1 = np.where(flat, 1.0, np.clip(np.maximum(at0, at1), 0.0, 1.0))
         left, right = x0 + (x1 - x0) * t0, x0 + (x1 - x0) * t1
-        key = owner[which] * frame.height + row
+        key = owner[edge_index] * frame.height + row
         order = np.argsort(key, kind="stable")
         begin = np.flatnonzero(np.diff(key[order], prepend=-1))
-        least = np.minimum.reduceat(np.minimum(left, right)[order], begin)
-        most = np.maximum.reduceat(np.maximum(left, right)[order], begin)
-        least, most = _shorter(least, most, end)
-        c0 = np.clip(np.floor(least), 0, frame.width).astype(np.int64)
-        c1 = np.clip(np.floor(most) + 1, 0, frame.width).astype(np.int64)
-        here = order[begin]
-        spans = np.column_stack([layer[owner[which[here]]], row[here], c0, c1])
+        leftmost = np.minimum.reduceat(np.minimum(left, right)[order], begin)
+        rightmost = np.maximum.reduceat(np.maximum(left, right)[order], begin)
+        leftmost, rightmost = _shorter(leftmost, rightmost, end)
+        c0 = np.clip(np.floor(leftmost), 0, frame.width).astype(np.int64)
+        c1 = np.clip(np.floor(rightmost) + 1, 0, frame.width).astype(np.int64)
+        first = order[begin]
+        spans = np.column_stack([layer[owner[edge_index[first]]], row[first], c0, c1])
         yield spans[c1 > c0]
 
 
@@ -197,10 +197,10 @@ def insides(triangles: Array, owner: NDArray[np.int64], frame: Frame, heights: A
     order = np.argsort(of_solid, kind="stable")
     bound = np.append(0, np.cumsum(np.bincount(of_solid, minlength=len(solids))))
     for chosen in _portions(load):
-        which = order[bound[chosen[0]] : bound[chosen[-1] + 1]]
-        times = count[which]
-        index = np.repeat(which, times)
-        layer = np.repeat(first[which], times) + _within(times)
+        indices = order[bound[chosen[0]] : bound[chosen[-1] + 1]]
+        times = count[indices]
+        index = np.repeat(indices, times)
+        layer = np.repeat(first[indices], times) + _within(times)
         if len(index):
             a = triangles[index]
             ends, through = _crossings(a, heights[layer])
@@ -235,12 +235,12 @@ def _enclosed(edges: Array, group: NDArray[np.int64], layers: int, frame: Frame)
     order = np.argsort(of_group, kind="stable")
     bound = np.append(0, np.cumsum(np.bincount(of_group, minlength=len(groups))))
     for chosen in _portions(load):
-        which = order[bound[chosen[0]] : bound[chosen[-1] + 1]]
-        times = count[which]
-        index = np.repeat(which, times)
+        indices = order[bound[chosen[0]] : bound[chosen[-1] + 1]]
+        times = count[indices]
+        index = np.repeat(indices, times)
         if not len(index):
             continue
-        row = np.repeat(low[which], times) + _within(times)
+        row = np.repeat(low[indices], times) + _within(times)
         (ax, ay), (bx, by) = edges[index, 0].T, edges[index, 1].T
         x = ax + (bx - ax) * ((row + 0.5 - ay) / (by - ay))
         sign = np.where(by > ay, 1, -1)
@@ -299,8 +299,8 @@ def lines(edges: Array, frame: Frame) -> Iterator[Spans]:
     if len(edges):
         xy = frame.of(edges)
         aside = (xy.max(axis=1) < 0).any(axis=1) | (xy.min(axis=1) > [frame.width, frame.height]).any(axis=1)
-        there = np.flatnonzero(~aside)
-        yield from _touched(xy[there], np.arange(len(there)), there, frame)
+        indices = np.flatnonzero(~aside)
+        yield from _touched(xy[indices], np.arange(len(indices)), indices, frame)
 
 
 def _edges(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
@@ -323,14 +323,14 @@ def paint(cells: NDArray[np.uint8], spans: Iterable[Spans], value: int) -> None:
         ordered = part[np.argsort(part[:, 1], kind="stable")]
         for low in range(int(ordered[0, 1]) // rows * rows, int(ordered[-1, 1]) + 1, rows):
             a, b = np.searchsorted(ordered[:, 1], (low, low + rows))
-            here = ordered[a:b]
-            if not len(here):
+            band_spans = ordered[a:b]
+            if not len(band_spans):
                 continue
-            low_row, high_row = int(here[0, 1]), int(here[-1, 1]) + 1
-            left, right = int(here[:, 2].min()), int(here[:, 3].max())
+            low_row, high_row = int(band_spans[0, 1]), int(band_spans[-1, 1]) + 1
+            left, right = int(band_spans[:, 2].min()), int(band_spans[:, 3].max())
             depth = np.zeros((high_row - low_row, right - left + 1), np.int32)
-            np.add.at(depth, (here[:, 1] - low_row, here[:, 2] - left), 1)
-            np.add.at(depth, (here[:, 1] - low_row, here[:, 3] - left), -1)
+            np.add.at(depth, (band_spans[:, 1] - low_row, band_spans[:, 2] - left), 1)
+            np.add.at(depth, (band_spans[:, 1] - low_row, band_spans[:, 3] - left), -1)
             np.cumsum(depth, axis=1, out=depth)
             cells[low_row:high_row, left:right][depth[:, :-1] > 0] = value
 
@@ -367,20 +367,20 @@ def grown(cells: NDArray[np.uint8], value: int, distance: float) -> None:
     source = cells.copy()
     for low in range(0, height, rows):
         top, end = max(0, low - margin), min(height, low + rows + margin)
-        there = source[top:end] == value
-        if there.any():
-            away = cv2.distanceTransform((~there).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            here = away[low - top : low - top + rows] <= distance + 1e-4
-            cells[low : low + rows][here] = value
+        mask = source[top:end] == value
+        if mask.any():
+            away = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            near = away[low - top : low - top + rows] <= distance + 1e-4
+            cells[low : low + rows][near] = value
 
 
-def limited(frame: Frame, most: int, longest: int) -> Frame:
-    """The frame; CannotConvert where it has more cells than ``most`` or a side longer than ``longest`` cells."""
-    if frame.cells > most or max(frame.width, frame.height) > longest:
+def limited(frame: Frame, cap: int, longest: int) -> Frame:
+    """The frame; CannotConvert where it has more cells than ``cap`` or a side longer than ``longest`` cells."""
+    if frame.cells > cap or max(frame.width, frame.height) > longest:
         side = max(frame.width, frame.height) * frame.resolution
-        needed = max(math.sqrt(frame.cells * frame.resolution**2 / most), side / longest)
+        needed = max(math.sqrt(frame.cells * frame.resolution**2 / cap), side / longest)
         raise CannotConvert(
-            f"{frame.width} × {frame.height} cells of {frame.resolution:g} m are needed; the limit is {most} cells and "
+            f"{frame.width} × {frame.height} cells of {frame.resolution:g} m are needed; the limit is {cap} cells and "
             f"{longest} along a side: ask for a resolution of at least {needed:.3g} m, or supply a smaller fence"
         )
     return frame

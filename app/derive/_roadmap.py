@@ -12,7 +12,7 @@ NEAR = 16
 
 
 def roadmap(
-    where: Space, skeleton: Graph, *, samples: int, neighbours: int, max_edge: float, seed: int
+    free_space: Space, skeleton: Graph, *, samples: int, neighbours: int, max_edge: float, seed: int
 ) -> tuple[Graph, int]:
     """Seeded samples joined to their nearest neighbours by collision-free straight lines. Lengths are in cells.
 
@@ -24,18 +24,18 @@ def roadmap(
     from scipy.spatial import cKDTree
 
     random = np.random.default_rng(seed)
-    middle = _along(skeleton, where, samples // 2, random)
-    cells = np.unique(np.concatenate([middle, _anywhere(where, samples - len(middle), random)]), axis=0)
+    middle = _along(skeleton, free_space, samples // 2, random)
+    cells = np.unique(np.concatenate([middle, _anywhere(free_space, samples - len(middle), random)]), axis=0)
     n = len(cells)
     _, near = cKDTree(cells).query(cells, k=min(neighbours + 1, n), distance_upper_bound=max_edge)
     near = near.reshape(n, -1)
     a, b = np.repeat(np.arange(n), near.shape[1]), near.ravel()
     pairs = np.stack([a, b], axis=1)[(b < n) & (a != b)]
-    edges = clear_only(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64), cells, where)
-    return _joined(Graph(cells, edges), skeleton, where)
+    edges = clear_only(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64), cells, free_space)
+    return _joined(Graph(cells, edges), skeleton, free_space)
 
 
-def _along(skeleton: Graph, where: Space, count: int, random: np.random.Generator) -> NDArray[np.int64]:
+def _along(skeleton: Graph, free_space: Space, count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Cells on the skeleton's edges, evenly by length."""
     if not len(skeleton.edges):
         return np.empty((0, 2), np.int64)
@@ -43,23 +43,23 @@ def _along(skeleton: Graph, where: Space, count: int, random: np.random.Generato
     edge = random.choice(len(length), size=count, p=length / length.sum())
     a, b = skeleton.nodes[skeleton.edges[edge, 0]], skeleton.nodes[skeleton.edges[edge, 1]]
     cells = np.rint(a + (b - a) * random.random((count, 1))).astype(np.int64)
-    return np.asarray(cells[where.mask[cells[:, 0], cells[:, 1]] == 1])
+    return np.asarray(cells[free_space.mask[cells[:, 0], cells[:, 1]] == 1])
 
 
-def _anywhere(where: Space, count: int, random: np.random.Generator) -> NDArray[np.int64]:
+def _anywhere(free_space: Space, count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Different cells of the space, evenly."""
-    before = np.concatenate([[0], np.cumsum(where.mask.sum(axis=1, dtype=np.int64))])
+    before = np.concatenate([[0], np.cumsum(free_space.mask.sum(axis=1, dtype=np.int64))])
     chosen = np.sort(random.choice(int(before[-1]), size=min(count, int(before[-1])), replace=False))
     rows = np.searchsorted(before, chosen, side="right") - 1
     out = np.empty((len(chosen), 2), np.int64)
     out[:, 0] = rows
     for row in np.unique(rows):
-        here = rows == row if len(chosen) < 64 else slice(*np.searchsorted(rows, [row, row + 1]))
-        out[here, 1] = np.flatnonzero(where.mask[row])[chosen[here] - before[row]]
+        selection = rows == row if len(chosen) < 64 else slice(*np.searchsorted(rows, [row, row + 1]))
+        out[selection, 1] = np.flatnonzero(free_space.mask[row])[chosen[selection] - before[row]]
     return out
 
 
-def _joined(graph: Graph, skeleton: Graph, where: Space) -> tuple[Graph, int]:
+def _joined(graph: Graph, skeleton: Graph, free_space: Space) -> tuple[Graph, int]:
     """The roadmap with what of the skeleton is needed to join its pieces, without what nothing can join."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
@@ -70,10 +70,10 @@ def _joined(graph: Graph, skeleton: Graph, where: Space) -> tuple[Graph, int]:
     k = min(NEAR, more)
     _, near = cKDTree(skeleton.nodes).query(graph.nodes, k=k)
     pairs = np.stack([np.repeat(np.arange(n), k), near.reshape(-1) + n], axis=1).astype(np.int64)
-    ways = np.concatenate([clear_only(pairs, nodes, where), skeleton.edges + n])
-    links = np.concatenate([graph.edges, ways])
+    fallback_edges = np.concatenate([clear_only(pairs, nodes, free_space), skeleton.edges + n])
+    links = np.concatenate([graph.edges, fallback_edges])
     # A tree that prefers the roadmap's own edges, then short ways; a weight of 0 would mean no edge to scipy.
-    weight = np.concatenate([np.full(len(graph.edges), 1e-6), np.maximum(lengths(nodes, ways), 0.0) + 1e-3])
+    weight = np.concatenate([np.full(len(graph.edges), 1e-6), np.maximum(lengths(nodes, fallback_edges), 0.0) + 1e-3])
     size = n + more
     tree = minimum_spanning_tree(coo_array((weight, (links[:, 0], links[:, 1])), (size, size)).tocsr()).tocoo()
     added = np.stack([tree.row, tree.col], axis=1).astype(np.int64)[(tree.row >= n) | (tree.col >= n)]
@@ -86,12 +86,12 @@ def _joined(graph: Graph, skeleton: Graph, where: Space) -> tuple[Graph, int]:
             break
         added = added[stays]
     full = Graph(nodes, np.concatenate([graph.edges, added]))
-    kept = np.ones(size, bool)
-    kept[n:] = False
-    kept[added.ravel()] = True
+    remaining = np.ones(size, bool)
+    remaining[n:] = False
+    remaining[added.ravel()] = True
     count, piece = pieces(Graph(nodes, links))  # with all of the skeleton: which pieces belong to it
-    known = np.zeros(count, bool)
-    known[piece[n:]] = True
-    kept &= known[piece]
-    full = only(full, kept)
-    return tidy(full.nodes, full.edges), n - int(kept[:n].sum())
+    connected = np.zeros(count, bool)
+    connected[piece[n:]] = True
+    remaining &= connected[piece]
+    full = only(full, remaining)
+    return tidy(full.nodes, full.edges), n - int(remaining[:n].sum())

@@ -140,7 +140,7 @@ def _answers(decoder: Loaded) -> bool:
 
 
 def segments(
-    ground: Ground, model: Model, sure: float, stable: float, points: int, least: float, notes: Notes, name: str
+    ground: Ground, model: Model, sure: float, stable: float, points: int, min_area: float, notes: Notes, name: str
 ) -> Segments:
     """What a model sees as a thing of its own, the smaller ones above the larger ones. least: square metres.
 
@@ -150,23 +150,23 @@ def segments(
     height, width = ground.known.shape
     tiles = list(_tiles(height, width, model.side))
     prompts = [_grid(tile, points, ground.known) for tile in tiles]
-    asked = sum(len(p) for p in prompts)
-    if len(tiles) > MOST_TILES or asked > MOST_PROMPTS:
+    prompt_count = sum(len(p) for p in prompts)
+    if len(tiles) > MOST_TILES or prompt_count > MOST_PROMPTS:
         raise CannotConvert(
-            f"{name}: the model {model.name} would be asked {asked} times in {len(tiles)} tiles of {model.side} "
+            f"{name}: the model {model.name} would be asked {prompt_count} times in {len(tiles)} tiles of {model.side} "
             f"pixels, at most {MOST_PROMPTS} in {MOST_TILES} are done: give a coarser resolution than "
             f"{ground.resolution:g} m, or fewer points than {points}"
         )
-    found: list[Mask] = []
+    masks: list[Mask] = []
     for tile, places in zip(tiles, prompts, strict=True):
         if len(places):
-            found += _without_twice(_seen(ground, tile, places, model, sure, stable))
-    kept = _without_twice(found)
-    if not kept:
+            masks += _without_twice(_seen(ground, tile, places, model, sure, stable))
+    best_masks = _without_twice(masks)
+    if not best_masks:
         raise CannotConvert(
             f"{name}: the model {model.name} finds nothing of a confidence of {sure:g} and a stability of {stable:g}"
         )
-    return _told(ground, kept, model, least, notes, name)
+    return _told(ground, best_masks, model, min_area, notes, name)
 
 
 def _tiles(height: int, width: int, side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -177,7 +177,7 @@ def _tiles(height: int, width: int, side: int) -> Iterator[tuple[int, int, int, 
             yield row, column, min(side, height - row), min(side, width - column)
 
 
-def _grid(tile: tuple[int, int, int, int], points: int, known: NDArray[np.bool_]) -> Array:
+def _grid(tile: tuple[int, int, int, int], points: int, valid: NDArray[np.bool_]) -> Array:
     """The points (x, y) of a tile that it is asked at, in its pixels: as dense both ways, where there is a picture."""
     row, column, rows, columns = tile
     step = max(rows, columns) / points
@@ -185,8 +185,8 @@ def _grid(tile: tuple[int, int, int, int], points: int, known: NDArray[np.bool_]
     y = (np.arange(down) + 0.5) * rows / down
     x = (np.arange(across) + 0.5) * columns / across
     at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    there = known[row + at[:, 1].astype(np.int64), column + at[:, 0].astype(np.int64)]
-    return at[there].astype(np.float32)
+    mask = valid[row + at[:, 1].astype(np.int64), column + at[:, 0].astype(np.int64)]
+    return at[mask].astype(np.float32)
 
 
 def _seen(
@@ -270,7 +270,11 @@ def _stability(logits: Array) -> float:
 
 
 def _mask(
-    full: NDArray[np.bool_], tile: tuple[int, int, int, int], whole: tuple[int, ...], score: float, stability: float
+    full: NDArray[np.bool_],
+    tile: tuple[int, int, int, int],
+    full_shape: tuple[int, ...],
+    score: float,
+    stability: float,
 ) -> Mask | None:
     """A mask in its place; None where it is empty, or goes on beyond its tile."""
     row, column, rows, columns = tile
@@ -281,37 +285,37 @@ def _mask(
     near = EDGE * max(rows, columns)
     if (row > 0 and y0 < near) or (column > 0 and x0 < near):
         return None
-    if (row + rows < whole[0] and rows - y1 < near) or (column + columns < whole[1] and columns - x1 < near):
+    if (row + rows < full_shape[0] and rows - y1 < near) or (column + columns < full_shape[1] and columns - x1 < near):
         return None
     inside = full[y0:y1, x0:x1]
     box = (column + x0, row + y0, column + x1, row + y1)
     return Mask(box, np.packbits(inside), int(inside.sum()), float(score), stability, rows * columns)
 
 
-def _without_twice(found: list[Mask]) -> list[Mask]:
+def _without_twice(masks: list[Mask]) -> list[Mask]:
     """Non-maximum suppression by boxes: what is seen in a finer tile goes first, then the surest."""
     import cv2
 
-    if not found:
+    if not masks:
         return []
-    found = sorted(found, key=lambda m: (m.tile, -m.score, -m.stability, m.box))
-    boxes = [(m.box[0], m.box[1], m.box[2] - m.box[0], m.box[3] - m.box[1]) for m in found]
-    rank = np.linspace(1.0, 0.5, len(found)).tolist()
-    kept = cv2.dnn.NMSBoxes(boxes, rank, 0.0, SAME)
-    return [found[k] for k in sorted(int(i) for i in np.asarray(kept).ravel())]
+    masks = sorted(masks, key=lambda m: (m.tile, -m.score, -m.stability, m.box))
+    boxes = [(m.box[0], m.box[1], m.box[2] - m.box[0], m.box[3] - m.box[1]) for m in masks]
+    rank = np.linspace(1.0, 0.5, len(masks)).tolist()
+    indices = cv2.dnn.NMSBoxes(boxes, rank, 0.0, SAME)
+    return [masks[k] for k in sorted(int(i) for i in np.asarray(indices).ravel())]
 
 
-def _told(ground: Ground, kept: list[Mask], model: Model, least: float, notes: Notes, name: str) -> Segments:
+def _told(ground: Ground, masks: list[Mask], model: Model, min_area: float, notes: Notes, name: str) -> Segments:
     """The masks as regions, by their colours and shapes."""
     label = np.zeros(ground.known.shape, np.int32)
-    pixels = max(least / ground.resolution**2, 1.0)
-    kept.sort(key=lambda m: (-m.size, m.score, m.box))
-    clean = [(mask, cleaned) for mask in kept if (cleaned := _cleaned(mask.pixels(), pixels)) is not None]
+    pixels = max(min_area / ground.resolution**2, 1.0)
+    masks.sort(key=lambda m: (-m.size, m.score, m.box))
+    clean = [(mask, cleaned) for mask in masks if (cleaned := _cleaned(mask.pixels(), pixels)) is not None]
     for k, (mask, cleaned) in enumerate(clean, 1):
         x0, y0, x1, y1 = mask.box
         label[y0:y1, x0:x1][cleaned & ground.known[y0:y1, x0:x1]] = k
     seen = np.bincount(label.ravel(), minlength=len(clean) + 1)
-    colours = Colours(ground, least)
+    colours = Colours(ground, min_area)
     regions: list[Region] = []
     numbers = np.zeros(len(clean) + 1, np.int32)
     unsure = 0
@@ -320,9 +324,9 @@ def _told(ground: Ground, kept: list[Mask], model: Model, least: float, notes: N
             continue
         x0, y0, x1, y1 = mask.box
         at = (slice(y0, y1), slice(x0, x1))
-        mine = label[at] == k
-        rest = _without_small(mine, pixels)  # what others leave of it
-        label[at][mine & ~rest] = 0
+        region_mask = label[at] == k
+        rest = _without_small(region_mask, pixels)  # what others leave of it
+        label[at][region_mask & ~rest] = 0
         if not rest.any():
             continue
         region = colours.kind(rest, at)
@@ -332,9 +336,11 @@ def _told(ground: Ground, kept: list[Mask], model: Model, least: float, notes: N
         regions.append(region)
         numbers[k] = len(regions)
     if not regions:
-        raise CannotConvert(f"{name}: all that the model {model.name} finds is smaller than minimum_area={least:g} m²")
+        raise CannotConvert(
+            f"{name}: all that the model {model.name} finds is smaller than minimum_area={min_area:g} m²"
+        )
     notes.drop(
-        "masks", len(kept) - len(regions), f"{name}: smaller than minimum_area={least:g} m², or hidden by others"
+        "masks", len(masks) - len(regions), f"{name}: smaller than minimum_area={min_area:g} m², or hidden by others"
     )
     notes.warn(
         f"{name}: the model {model.name} finds things and does not say what they are: {len(regions) - unsure} are told "
@@ -343,18 +349,18 @@ def _told(ground: Ground, kept: list[Mask], model: Model, least: float, notes: N
     return Segments(numbers[label], regions, np.zeros(label.shape, bool))
 
 
-def _cleaned(mask: NDArray[np.bool_], least: float) -> NDArray[np.bool_] | None:
+def _cleaned(mask: NDArray[np.bool_], min_pixels: float) -> NDArray[np.bool_] | None:
     """A mask without pieces and holes that are too small; None where nothing is left."""
-    filled = ~_without_small(np.pad(~mask, 1, constant_values=True), least)[1:-1, 1:-1]
-    inside = _without_small(filled, least)
+    filled = ~_without_small(np.pad(~mask, 1, constant_values=True), min_pixels)[1:-1, 1:-1]
+    inside = _without_small(filled, min_pixels)
     return inside if inside.any() else None
 
 
-def _without_small(mask: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+def _without_small(mask: NDArray[np.bool_], min_pixels: float) -> NDArray[np.bool_]:
     """A mask without its connected pieces of fewer pixels."""
     import cv2
 
     count, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= least
+    large = stats[:, cv2.CC_STAT_AREA] >= min_pixels
     large[0] = False
     return mask if large[1:].all() or count == 1 else np.asarray(large[pieces])

@@ -25,8 +25,8 @@ def method_of(picture: Picture, how: Segmentation) -> str:
         few = Picture(picture.pixels[::step, ::step].copy(), picture.transform, picture.crs, picture.properties)
         shown = displayed(few)
         bands = shown.shape[2]
-        known = shown[..., -1] >= 128 if bands in (2, 4) else shown[..., 0] >= 0
-        method = "plan" if _plans.looks_like(shown[..., : 1 if bands < 3 else 3], known) else "colour"
+        valid = shown[..., -1] >= 128 if bands in (2, 4) else shown[..., 0] >= 0
+        method = "plan" if _plans.looks_like(shown[..., : 1 if bands < 3 else 3], valid) else "colour"
         if how.near_infrared is not None:
             method = "index"
     changed = [f.name for f in fields(how) if getattr(how, f.name) != f.default]

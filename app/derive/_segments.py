@@ -174,8 +174,8 @@ def segments(ground: Ground, how: Segmentation, method: str, nir: int | None, no
             f"{name} has no colours: what grows and what does not cannot be told. A floor plan is asked for with "
             "segmentation=plan"
         )
-    least = 1.0 if how.minimum_area is None else how.minimum_area
-    work = _Work(ground, least)
+    min_area = 1.0 if how.minimum_area is None else how.minimum_area
+    work = _Work(ground, min_area)
     if method == "index":
         grows = _by_index(ground, nir, notes, name)
         work.vegetation(grows)
@@ -212,24 +212,24 @@ def _by_index(ground: Ground, nir: int | None, notes: Notes, name: str) -> NDArr
     if nir is None:
         rgb = ground.rgb.astype(np.float32)
         total = np.maximum(rgb.sum(axis=2), 1.0)
-        index, least = (2 * rgb[..., 1] - rgb[..., 0] - rgb[..., 2]) / total, GREEN
+        index, minimum = (2 * rgb[..., 1] - rgb[..., 0] - rgb[..., 2]) / total, GREEN
     else:
         infrared, red = ground.raw[..., nir].astype(np.float64), _red(ground)
         with np.errstate(over="ignore", invalid="ignore"):  # what is no number, or beyond them, does not grow
             total = infrared + red
             index = np.divide(infrared - red, total, out=np.zeros(total.shape), where=total > 0)
         index = np.clip(np.nan_to_num(index, nan=0.0), -1.0, 1.0).astype(np.float32)
-        least = NDVI
+        minimum = NDVI
     index = cv2.GaussianBlur(np.where(ground.known, index, np.float32(0)).astype(np.float32), (3, 3), 0)
-    known = index[ground.known]
-    low, high = float(known.min()), float(known.max())
-    if high < least:
+    values = index[ground.known]
+    low, high = float(values.min()), float(values.max())
+    if high < minimum:
         raise CannotConvert(f"{name}: nothing in it grows, by its vegetation index of at most {high:.2f}")
-    threshold = least
+    threshold = minimum
     if high - low > SPREAD:
-        scaled = np.round((known - low) / (high - low) * 255).astype(np.uint8)
+        scaled = np.round((values - low) / (high - low) * 255).astype(np.uint8)
         cut, _ = cv2.threshold(scaled.reshape(-1, 1), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-        threshold = max(least, low + (cut + 0.5) / 255 * (high - low))
+        threshold = max(minimum, low + (cut + 0.5) / 255 * (high - low))
     word = "excess green" if nir is None else "NDVI"
     notes.fill("threshold", round(threshold, 4), f"{name}: what has a higher {word} is vegetation")
     return np.asarray(ground.known & (index > threshold))
@@ -241,36 +241,36 @@ def _red(ground: Ground) -> NDArray[np.float64]:
 
 
 def _groups(
-    lab: NDArray[np.float32], known: NDArray[np.bool_], clusters: int, seed: int
+    lab: NDArray[np.float32], valid: NDArray[np.bool_], clusters: int, seed: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """(the group of each pixel, the colours [k, 3] of the groups from dark to bright) by k-means."""
     import cv2
 
-    places = np.flatnonzero(known)
+    places = np.flatnonzero(valid)
     sample = lab.reshape(-1, 3)[places[:: max(1, len(places) // SAMPLE)]].astype(np.float32)
     k = min(clusters, len(np.unique(np.round(sample), axis=0)))
     if k < 2:
-        return np.zeros(known.shape, np.uint8), sample[:1]
+        return np.zeros(valid.shape, np.uint8), sample[:1]
     cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 0.2)
     _, _, centres = cv2.kmeans(sample, k, None, stop, 3, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
     centres = centres[np.lexsort(centres.T[::-1])]
-    out = np.empty(known.size, np.uint8)
+    out = np.empty(valid.size, np.uint8)
     flat = lab.reshape(-1, 3)
     for start in range(0, len(flat), 2**18):
         away = ((flat[start : start + 2**18, None, :] - centres[None]) ** 2).sum(axis=2)
         out[start : start + 2**18] = away.argmin(axis=1)
-    return out.reshape(known.shape), centres
+    return out.reshape(valid.shape), centres
 
 
 class _Work:
     """Regions as they are found."""
 
-    def __init__(self, ground: Ground, least: float) -> None:
+    def __init__(self, ground: Ground, min_area: float) -> None:
         import cv2
 
         self.size = ground.resolution
-        self.least = max(least / self.size**2, 1.0)
+        self.least = max(min_area / self.size**2, 1.0)
         self.height, self.width = (int(n) for n in ground.known.shape)
         self.label = np.zeros(ground.known.shape, np.int32)
         self.regions: list[Region] = []
@@ -285,8 +285,8 @@ class _Work:
 
     def small(self, notes: Notes, name: str) -> None:
         """Say what was left out for its size."""
-        least = self.least * self.size**2
-        notes.drop("spots", self.few, f"{name}: smaller than minimum_area={least:g} m²")
+        min_area = self.least * self.size**2
+        notes.drop("spots", self.few, f"{name}: smaller than minimum_area={min_area:g} m²")
 
     def add(self, mask: NDArray[np.bool_], at: tuple[slice, slice], region: Region) -> None:
         """A region: the mask within a window of the picture."""
@@ -339,8 +339,8 @@ class _Work:
                 self.open_[high, wide] |= grown
                 continue
             shade = float(light[high, wide][grown].std())
-            said = {"surface": "green", "area": self.metres(area)}
-            self.add(grown, (high, wide), Region("field", _fit(1.0 - shade / 30.0), said))
+            attributes = {"surface": "green", "area": self.metres(area)}
+            self.add(grown, (high, wide), Region("field", _fit(1.0 - shade / 30.0), attributes))
 
     def metres(self, area: float) -> float:
         """Pixels as square metres, to be told."""
@@ -364,8 +364,8 @@ class _Work:
             round_ = _roundness(crown)
             across = 2 * math.sqrt(size / math.pi) * self.size
             if size >= self.least and round_ >= ROUND and CROWNS[0] <= across <= CROWNS[1]:
-                said = {"area": self.metres(size), "width": round(across, 2)}
-                self.add(crown, _inner(at, inner), Region("tree", _fit(round_), said))
+                attributes = {"area": self.metres(size), "width": round(across, 2)}
+                self.add(crown, _inner(at, inner), Region("tree", _fit(round_), attributes))
             else:
                 rest[inner] |= crown
         window = self.label[at]
@@ -394,12 +394,12 @@ class _Work:
 class Colours:
     """Tells the kinds of areas that somebody else has found, by the same colours and shapes."""
 
-    def __init__(self, ground: Ground, least: float) -> None:
+    def __init__(self, ground: Ground, min_area: float) -> None:
         """least: square metres of the smallest thing."""
         import cv2
 
         self.size, self.grey = ground.resolution, ground.grey
-        self.least = max(least / self.size**2, 1.0)
+        self.least = max(min_area / self.size**2, 1.0)
         self.shape = ground.known.shape
         smooth = cv2.bilateralFilter(ground.rgb, 5, 25.0, 2.0).astype(np.float32)
         self.green = (2 * smooth[..., 1] - smooth[..., 0] - smooth[..., 2]) > GREEN * np.maximum(
@@ -445,7 +445,7 @@ def way(kind: str, mask: NDArray[np.bool_], size: float) -> dict[str, Any]:
     return {"width": round(width * size, 2)}
 
 
-def _band(piece: NDArray[np.bool_], area: int, least: float) -> tuple[float, float, Any]:
+def _band(piece: NDArray[np.bool_], area: int, min_pixels: float) -> tuple[float, float, Any]:
     """(length, width, outline) in pixels of the band with this area and this way around it."""
     import cv2
 
@@ -453,40 +453,40 @@ def _band(piece: NDArray[np.bool_], area: int, least: float) -> tuple[float, flo
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     plain = cv2.morphologyEx(np.pad(piece, 4).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     outlines, order = cv2.findContours(plain, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    large = [c for c, o in zip(outlines, order[0], strict=True) if o[3] < 0 or cv2.contourArea(c) >= least]
+    large = [c for c, o in zip(outlines, order[0], strict=True) if o[3] < 0 or cv2.contourArea(c) >= min_pixels]
     around = sum(cv2.arcLength(cv2.approxPolyDP(c, 2.0, True), True) for c in large) + 4 * len(large)
     length = (around + math.sqrt(max(around * around - 16 * area, 0.0))) / 4
     return length, area / length, max(outlines, key=cv2.contourArea)
 
 
 def _shaped(
-    piece: NDArray[np.bool_], light: NDArray[Any], area: int, least: float, size: float, ends: bool
+    piece: NDArray[np.bool_], light: NDArray[Any], area: int, min_pixels: float, size: float, ends: bool
 ) -> Region | None:
     """What a piece of ground or roof is by its shape. light: lightness of its window; area and least: pixels; size:
     metres a pixel; ends: whether it reaches the picture's edge."""
     import cv2
 
-    length, width, outer = _band(piece, area, least)
+    length, width, outer = _band(piece, area, min_pixels)
     (_, _), (w, h), _ = cv2.minAreaRect(outer)
     w, h = w + 1, h + 1
     filled = cv2.contourArea(outer) + cv2.arcLength(outer, True) / 2 + 1
     rectangular = min(1.0, filled / (w * h))
     uniform = max(0.0, 1.0 - float(light[piece].std()) / 25.0)
     square_metres = round(area * size**2, 2)
-    said: dict[str, Any] = {"area": square_metres}
+    attributes: dict[str, Any] = {"area": square_metres}
     metres, side = width * size, min(w, h) * size
     long = length >= LONG * width and metres <= ROAD and length * size >= 2 * WINDOW
     straight = rectangular >= RECTANGULAR and square_metres >= BUILDING and side >= SIDE
     # A way leads somewhere: a straight band that lies alone in the picture is rather a roof.
     if straight and (max(w, h) < LONG * min(w, h) or (not ends and max(w, h) < 3 * LONG * min(w, h))):
         sides = sorted((round(w * size, 2), round(h * size, 2)), reverse=True)
-        return Region("building", _fit(rectangular * uniform), {**said, "sides": sides})
+        return Region("building", _fit(rectangular * uniform), {**attributes, "sides": sides})
     if long:
         slender = 1.0 - LONG / 2 / max(length / width, LONG)
         kind: Kind = "path" if metres <= PATH else "road"
-        return Region(kind, _fit(slender * uniform), {**said, "width": round(metres, 2)})
+        return Region(kind, _fit(slender * uniform), {**attributes, "width": round(metres, 2)})
     if square_metres >= FIELD:
-        return Region("field", _fit(0.6 * uniform), {**said, "surface": "bare"})
+        return Region("field", _fit(0.6 * uniform), {**attributes, "surface": "bare"})
     return None
 
 

@@ -62,14 +62,14 @@ def space(free: NDArray[np.uint8], row: int, column: int, radius: float) -> Spac
     return Space(free, gap, row, column, int(count))
 
 
-def widest(where: Space) -> float:
+def widest(free_space: Space) -> float:
     """How far the freest cell is from obstacles, in cells."""
     from app.derive import _kernels_space as kernels
 
-    low, high = 0.0, float(max(where.mask.shape))
+    low, high = 0.0, float(max(free_space.mask.shape))
     while high - low > 0.01:
         middle = (low + high) / 2.0
-        if kernels.erode(where.gap, middle * middle, where.mask):
+        if kernels.erode(free_space.gap, middle * middle, free_space.mask):
             low = middle
         else:
             high = middle
@@ -77,7 +77,7 @@ def widest(where: Space) -> float:
 
 
 def skeleton(
-    where: Space, *, merge: float, spur: float, tolerance: float, island: float, voronoi: bool = False
+    free_space: Space, *, merge: float, spur: float, tolerance: float, island: float, voronoi: bool = False
 ) -> tuple[Graph, int]:
     """The skeleton of a space as a graph of straight, collision-free edges. Lengths are in cells.
 
@@ -88,16 +88,16 @@ def skeleton(
     """
     from app.derive import _kernels_skeleton as kernels
 
-    thinned = where.mask.copy()
-    cells = np.empty((ridges(thinned, where.gap) if voronoi else kernels.thin(thinned), 2), np.int32)
+    thinned = free_space.mask.copy()
+    cells = np.empty((ridges(thinned, free_space.gap) if voronoi else kernels.thin(thinned), 2), np.int32)
     rows = np.empty(len(thinned) + 1, np.int64)
     kernels.listed(thinned, cells, rows)
     raw = kernels.trace(thinned, cells, rows)
     del thinned
-    merged = kernels.contract(raw, where.gap, cells, merge)
-    lone, begin, path = kernels.chains(merged, kernels.prune(merged, where.gap, cells, spur))
+    merged = kernels.contract(raw, free_space.gap, cells, merge)
+    lone, begin, path = kernels.chains(merged, kernels.prune(merged, free_space.gap, cells, spur))
     keep = np.zeros(len(path), np.uint8)
-    kernels.simplify(where.mask, cells, begin, path, tolerance, keep)
+    kernels.simplify(free_space.mask, cells, begin, path, tolerance, keep)
     corner = path[keep == 1]
     line = np.repeat(np.arange(len(begin) - 1), np.diff(begin))[keep == 1]
     along = line[1:] == line[:-1]
@@ -106,7 +106,7 @@ def skeleton(
     edges = np.sort(np.searchsorted(used, pairs), axis=1)
     edges = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0)
     graph = Graph(cells[used].astype(np.int64), edges.astype(np.int64))
-    return without_islands(graph, where, island)
+    return without_islands(graph, free_space, island)
 
 
 BAND = 2**25
@@ -130,8 +130,8 @@ def ridges(mask: NDArray[np.uint8], gap: NDArray[np.uint16]) -> int:
     return int(kernels.finish(mask, left))
 
 
-def _by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], most: int) -> Iterator[NDArray[np.int32]]:
-    """The set cells as places in the flat mask, sorted by rank, then place; about ``most`` at a time.
+def _by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], limit: int) -> Iterator[NDArray[np.int32]]:
+    """The set cells as places in the flat mask, sorted by rank, then place; about ``limit`` at a time.
 
     Those of higher ranks may not change meanwhile.
     """
@@ -141,17 +141,17 @@ def _by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], most: int) -> It
     kernels.counted(mask, rank, counts)
     low = 0
     while low < len(counts):
-        fit = int(np.searchsorted(np.cumsum(counts[low:]), most, side="right"))
+        fit = int(np.searchsorted(np.cumsum(counts[low:]), limit, side="right"))
         high = low + max(1, fit)
-        here = counts[low:high]
-        if here.any():
-            order = np.empty(int(here.sum()), np.int32)
-            kernels.sorted_band(mask, rank, low, high, np.cumsum(here) - here, order)
+        band_counts = counts[low:high]
+        if band_counts.any():
+            order = np.empty(int(band_counts.sum()), np.int32)
+            kernels.sorted_band(mask, rank, low, high, np.cumsum(band_counts) - band_counts, order)
             yield order
         low = high
 
 
-def without_islands(graph: Graph, where: Space, island: float) -> tuple[Graph, int]:
+def without_islands(graph: Graph, free_space: Space, island: float) -> tuple[Graph, int]:
     """The graph without pieces that are less than ``island`` cells across, but always with the largest one.
 
     And how many such pieces there were.
@@ -165,7 +165,7 @@ def without_islands(graph: Graph, where: Space, island: float) -> tuple[Graph, i
     np.minimum.at(low, piece, graph.nodes)
     np.maximum.at(high, piece, graph.nodes)
     clearance = np.zeros(len(graph.nodes))
-    kernels.clearances(where.gap, graph.nodes, clearance)
+    kernels.clearances(free_space.gap, graph.nodes, clearance)
     widest = np.zeros(count)
     np.maximum.at(widest, piece, clearance)
     across = np.hypot(*(high - low).T) + 2.0 * widest
@@ -188,14 +188,14 @@ def pieces(graph: Graph) -> tuple[int, NDArray[np.int64]]:
     return int(count), piece.astype(np.int64)
 
 
-def only(graph: Graph, kept: NDArray[np.bool_]) -> Graph:
+def only(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
     """Some nodes (whole pieces) with their edges."""
-    place = np.cumsum(kept) - 1
-    return Graph(graph.nodes[kept], place[graph.edges[kept[graph.edges[:, 0]]]])
+    place = np.cumsum(mask) - 1
+    return Graph(graph.nodes[mask], place[graph.edges[mask[graph.edges[:, 0]]]])
 
 
 def filled(
-    graph: Graph, where: Space, *, spacing: float, detour: float, phase: tuple[float, float] = (0.0, 0.0)
+    graph: Graph, free_space: Space, *, spacing: float, detour: float, phase: tuple[float, float] = (0.0, 0.0)
 ) -> Graph:
     """The graph with nodes ``spacing`` cells apart also in the open, and the straight ways that save a detour.
 
@@ -205,12 +205,12 @@ def filled(
     """
     from app.derive import _kernels_roadmap as kernels
 
-    graph = divided(graph, where, spacing)
-    own = len(graph.nodes)
-    nodes = np.concatenate([graph.nodes, _lattice(graph, where, spacing, phase)])
+    graph = divided(graph, free_space, spacing)
+    node_count = len(graph.nodes)
+    nodes = np.concatenate([graph.nodes, _lattice(graph, free_space, spacing, phase)])
     pairs = _triangulated(nodes)
     pairs = pairs[lengths(nodes, pairs) <= 4.0 * spacing]
-    pairs = clear_only(pairs, nodes, where)
+    pairs = clear_only(pairs, nodes, free_space)
     straight = lengths(nodes, pairs)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], straight))
     pairs, straight = pairs[order], straight[order]
@@ -219,27 +219,27 @@ def filled(
     full = Graph(nodes, np.concatenate([graph.edges, pairs[taken == 1]]))
     # Lattice nodes in pieces that the graph left out go again.
     count, piece = pieces(full)
-    known = np.zeros(count, bool)
-    known[piece[:own]] = True
-    full = only(full, known[piece])
+    connected = np.zeros(count, bool)
+    connected[piece[:node_count]] = True
+    full = only(full, connected[piece])
     return tidy(full.nodes, full.edges)
 
 
-def clear_only(pairs: NDArray[np.int64], nodes: NDArray[np.int64], where: Space) -> NDArray[np.int64]:
+def clear_only(pairs: NDArray[np.int64], nodes: NDArray[np.int64], free_space: Space) -> NDArray[np.int64]:
     """The pairs whose straight line is collision-free."""
     from app.derive import _kernels_space as kernels
 
     good = np.zeros(len(pairs), np.uint8)
-    kernels.clear_pairs(where.mask, nodes, pairs, good)
+    kernels.clear_pairs(free_space.mask, nodes, pairs, good)
     return np.asarray(pairs[good == 1])
 
 
 def tidy(nodes: NDArray[np.int64], edges: NDArray[np.int64]) -> Graph:
     """A graph with its nodes sorted by row and column, equal ones joined, and each edge once."""
-    known, place = np.unique(nodes, axis=0, return_inverse=True)
+    distinct, place = np.unique(nodes, axis=0, return_inverse=True)
     linked = np.sort(place.reshape(-1)[edges], axis=1)
     linked = np.unique(linked[linked[:, 0] != linked[:, 1]], axis=0)
-    return Graph(known, linked)
+    return Graph(distinct, linked)
 
 
 def lengths(nodes: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -247,7 +247,7 @@ def lengths(nodes: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.fl
     return np.asarray(np.hypot(*(nodes[pairs[:, 0]] - nodes[pairs[:, 1]]).T))
 
 
-def divided(graph: Graph, where: Space, spacing: float) -> Graph:
+def divided(graph: Graph, free_space: Space, spacing: float) -> Graph:
     """Nodes also along the edges, at most ``spacing`` apart where the cells allow."""
     if not len(graph.edges):
         return graph
@@ -263,22 +263,22 @@ def divided(graph: Graph, where: Space, spacing: float) -> Graph:
 
     # Between the cells nearest to points of a clear line, a line may still cut a corner: such an edge stays whole.
     good = np.zeros(len(pairs), np.uint8)
-    kernels.clear_pairs(where.mask, ends, pairs, good)
-    whole = np.minimum.reduceat(good, first) == 0
-    cells = ends.reshape(-1, 2, 2)[~whole[edge]].reshape(-1, 2)
+    kernels.clear_pairs(free_space.mask, ends, pairs, good)
+    undivided = np.minimum.reduceat(good, first) == 0
+    cells = ends.reshape(-1, 2, 2)[~undivided[edge]].reshape(-1, 2)
     divided = np.arange(len(cells), dtype=np.int64).reshape(-1, 2) + len(graph.nodes)
-    return tidy(np.concatenate([graph.nodes, cells]), np.concatenate([graph.edges[whole], divided]))
+    return tidy(np.concatenate([graph.nodes, cells]), np.concatenate([graph.edges[undivided], divided]))
 
 
-def _lattice(graph: Graph, where: Space, spacing: float, phase: tuple[float, float]) -> NDArray[np.int64]:
+def _lattice(graph: Graph, free_space: Space, spacing: float, phase: tuple[float, float]) -> NDArray[np.int64]:
     """Cells of the space on a square lattice that are not near to a node already."""
     from scipy.spatial import cKDTree
 
     rows, columns = (
         np.unique(np.rint(np.arange(begin % spacing, size - 1, spacing)).astype(np.int64))
-        for begin, size in zip(phase, where.mask.shape, strict=True)
+        for begin, size in zip(phase, free_space.mask.shape, strict=True)
     )
-    at = np.argwhere(where.mask[np.ix_(rows, columns)])
+    at = np.argwhere(free_space.mask[np.ix_(rows, columns)])
     cells = np.stack([rows[at[:, 0]], columns[at[:, 1]]], axis=1)
     if not len(cells):
         return cells

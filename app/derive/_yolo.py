@@ -58,20 +58,20 @@ def model_of(supplied: Supplied, file: Loaded) -> Model:
     return Model(file, supplied.name, classes(supplied, file.session)[0], side)
 
 
-def segments(ground: Ground, model: Model, confidence: float, least: float, notes: Notes, name: str) -> Segments:
+def segments(ground: Ground, model: Model, confidence: float, min_area: float, notes: Notes, name: str) -> Segments:
     """What a model finds in a picture, the surest first where things overlap. least: square metres."""
-    found: list[Found] = []
+    detections: list[Found] = []
     for column in starts(ground.rgb.shape[1], model.side):
         for row in starts(ground.rgb.shape[0], model.side):
-            found += _tile(ground.rgb, row, column, model, confidence)
-    kept = _without_twice(found)
-    if not kept:
+            detections += _tile(ground.rgb, row, column, model, confidence)
+    remaining = _without_twice(detections)
+    if not remaining:
         raise CannotConvert(f"{name}: the model {model.name} finds nothing of a confidence of {confidence:g}")
     label = np.zeros(ground.known.shape, np.int32)
     regions: list[Region] = []
     other = small = 0
     height, width = len(label), len(label[0])
-    for one in kept:
+    for one in remaining:
         kind = model.classes[one.kind]
         if kind is None:
             other += 1
@@ -82,14 +82,14 @@ def segments(ground: Ground, model: Model, confidence: float, least: float, note
         mask = np.ones(window.shape, bool) if one.mask is None else one.mask[: window.shape[0], : window.shape[1]]
         mask = mask & (window == 0) & ground.known[y0:y1, x0:x1]
         area = int(mask.sum()) * ground.resolution**2
-        if area <= 0 or area < least:
+        if area <= 0 or area < min_area:
             small += 1
             continue
-        said = {"area": round(area, 2), "model": model.name, **way(kind, mask, ground.resolution)}
-        regions.append(Region(kind, round(one.score, 3), said))  # type: ignore[arg-type]
+        attributes = {"area": round(area, 2), "model": model.name, **way(kind, mask, ground.resolution)}
+        regions.append(Region(kind, round(one.score, 3), attributes))  # type: ignore[arg-type]
         window[mask] = len(regions)
     notes.drop("things", other, f"{name}: of classes that the model's operator gave no kind")
-    notes.drop("spots", small, f"{name}: smaller than minimum_area={least:g} m², or hidden by surer ones")
+    notes.drop("spots", small, f"{name}: smaller than minimum_area={min_area:g} m², or hidden by surer ones")
     return Segments(label, regions, np.zeros(label.shape, bool))
 
 
@@ -149,14 +149,14 @@ def _mask(weights: Array, prototypes: Array, side: int, box: tuple[float, float,
     return np.asarray(full[y0:y1, x0:x1] > 0.0)  # the sigmoid is above a half where its argument is above 0
 
 
-def _without_twice(found: list[Found]) -> list[Found]:
+def _without_twice(detections: list[Found]) -> list[Found]:
     """Non-maximum suppression over all tiles, class by class; the surest first."""
     import cv2
 
-    if not found:
+    if not detections:
         return []
-    found = sorted(found, key=lambda f: (-f.score, f.box))[:MOST]
-    boxes = [(f.box[0], f.box[1], f.box[2] - f.box[0], f.box[3] - f.box[1]) for f in found]
-    kinds = [f.kind for f in found]
-    kept = cv2.dnn.NMSBoxesBatched(boxes, [f.score for f in found], kinds, 0.0, SAME)
-    return [found[k] for k in sorted(int(i) for i in np.asarray(kept).ravel())]
+    detections = sorted(detections, key=lambda f: (-f.score, f.box))[:MOST]
+    boxes = [(f.box[0], f.box[1], f.box[2] - f.box[0], f.box[3] - f.box[1]) for f in detections]
+    kinds = [f.kind for f in detections]
+    indices = cv2.dnn.NMSBoxesBatched(boxes, [f.score for f in detections], kinds, 0.0, SAME)
+    return [detections[k] for k in sorted(int(i) for i in np.asarray(indices).ravel())]

@@ -57,23 +57,23 @@ def imagery_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -> 
         if on is not None and on.on_earth and on.frame is not None:
             geometry = np.array([g for _, g, _ in rows], object)
             back = shapely.set_precision(on.frame.geometries_to_wgs84(geometry), 1e-12, mode="pointwise")
-            rows = [(i, g, said) for (i, _, said), g in zip(rows, back, strict=True)]
+            rows = [(i, g, properties) for (i, _, properties), g in zip(rows, back, strict=True)]
         notes.warn("the objects are guessed from a picture: look at them before a robot goes by them", where=key.name)
-        made = features(rows, "wgs84" if on is not None and on.on_earth else "local")
-        parts[PartKey("objects", key.level, NAME)] = made
+        objects = features(rows, "wgs84" if on is not None and on.on_earth else "local")
+        parts[PartKey("objects", key.level, NAME)] = objects
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _regions(found: Segments, on: Ground, parameters: Parameters) -> list[Row]:
+def _regions(segments: Segments, on: Ground, parameters: Parameters) -> list[Row]:
     """Each region as a polygon, then the middle lines of paths and roads, in the local frame."""
     tolerance = on.resolution if parameters.outline_tolerance is None else parameters.outline_tolerance
-    shapes = polygons(found.label, on.transform, tolerance)
+    shapes = polygons(segments.label, on.transform, tolerance)
     rows: list[Row] = []
-    for k, region in enumerate(found.regions, 1):
+    for k, region in enumerate(segments.regions, 1):
         if k in shapes:
-            said = {"kind": region.kind, "confidence": region.confidence, **region.said}
-            rows.append((f"{region.kind}/{k}", shapes[k], said))
-    rows += _middles(found, on)
+            properties = {"kind": region.kind, "confidence": region.confidence, **region.said}
+            rows.append((f"{region.kind}/{k}", shapes[k], properties))
+    rows += _middles(segments, on)
     return rows
 
 
@@ -82,12 +82,12 @@ def polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict
     from rasterio.features import shapes
     from rasterio.transform import Affine
 
-    found: dict[int, list[Any]] = {}
+    pieces: dict[int, list[Any]] = {}
     for geometry, value in shapes(label, mask=label > 0, connectivity=4, transform=Affine(*transform)):
         rings = geometry["coordinates"]
-        found.setdefault(int(value), []).append(shapely.Polygon(rings[0], rings[1:]))
+        pieces.setdefault(int(value), []).append(shapely.Polygon(rings[0], rings[1:]))
     out = {}
-    for value, areas in found.items():
+    for value, areas in pieces.items():
         area = areas[0] if len(areas) == 1 else shapely.MultiPolygon(areas)
         if tolerance > 0:
             area = shapely.simplify(area, tolerance, preserve_topology=True)
@@ -97,22 +97,22 @@ def polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict
     return out
 
 
-def _middles(found: Segments, on: Ground) -> list[Row]:
+def _middles(segments: Segments, on: Ground) -> list[Row]:
     """The middle lines of paths and roads, joined where these meet."""
     from app.derive import _kernels_space, _skeleton
 
-    ways = [k for k, region in enumerate(found.regions, 1) if region.kind in ("path", "road")]
-    if not ways:
+    path_labels = [k for k, region in enumerate(segments.regions, 1) if region.kind in ("path", "road")]
+    if not path_labels:
         return []
-    mask = np.pad(np.isin(found.label, ways), 1).astype(np.uint8)
-    where = _skeleton.space(mask, -1, -1, 0.0)
-    widths = [float(found.regions[k - 1].said["width"]) for k in ways]
+    mask = np.pad(np.isin(segments.label, path_labels), 1).astype(np.uint8)
+    free_space = _skeleton.space(mask, -1, -1, 0.0)
+    widths = [float(segments.regions[k - 1].said["width"]) for k in path_labels]
     usual = float(np.median(widths)) / on.resolution
-    graph, _ = _skeleton.skeleton(where, merge=max(2.0, usual / 2), spur=usual, tolerance=1.0, island=0.0)
+    graph, _ = _skeleton.skeleton(free_space, merge=max(2.0, usual / 2), spur=usual, tolerance=1.0, island=0.0)
     if not len(graph.edges):
         return []
     wide = np.empty(len(graph.edges))
-    _kernels_space.widths(where.gap, graph.nodes, graph.edges, wide)
+    _kernels_space.widths(free_space.gap, graph.nodes, graph.edges, wide)
     at = np.empty((len(graph.nodes), 2))
     at[:, 0] = on.left + (graph.nodes[:, 1] - 0.5) * on.resolution
     at[:, 1] = on.top - (graph.nodes[:, 0] - 0.5) * on.resolution
@@ -127,8 +127,8 @@ def _middles(found: Segments, on: Ground) -> list[Row]:
     rows: list[Row] = []
     for k, line in enumerate(lines):
         width = min(narrow[(float(x), float(y))] for x, y in shapely.get_coordinates(line))
-        said = {"kind": "path", "width": round(width * on.resolution, 3), "middle_line": True}
-        rows.append((f"middle/{k}", line, said))
+        properties = {"kind": "path", "width": round(width * on.resolution, 3), "middle_line": True}
+        rows.append((f"middle/{k}", line, properties))
     return rows
 
 

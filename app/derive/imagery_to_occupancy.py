@@ -41,12 +41,12 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
             grid = plan_of(picture, layers.frame, parameters, notes, name)
         else:
             on = ground(picture, layers.frame, parameters.resolution, notes, name)
-            found = seen(on, picture, parameters, method, notes, name)
-            cells = np.full(found.label.shape, UNKNOWN, np.uint8)
-            cells[found.open_] = FREE
-            values = np.array([UNKNOWN, *(_value(r.kind) for r in found.regions)], np.uint8)
-            there = found.label > 0
-            cells[there] = values[found.label[there]]
+            segments = seen(on, picture, parameters, method, notes, name)
+            cells = np.full(segments.label.shape, UNKNOWN, np.uint8)
+            cells[segments.open_] = FREE
+            values = np.array([UNKNOWN, *(_value(r.kind) for r in segments.regions)], np.uint8)
+            mask = segments.label > 0
+            cells[mask] = values[segments.label[mask]]
             bottom = on.top - on.resolution * len(cells)
             origin = (round(on.left, 9), round(bottom, 9), 0.0)
             grid = OccupancyGrid(np.ascontiguousarray(cells[::-1]), on.resolution, origin)

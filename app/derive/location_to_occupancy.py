@@ -37,20 +37,20 @@ def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) 
     Raises MissingLayer where there is a datum but no fence, or objects have solids that cannot be read; CannotConvert
     where the grid would be too large.
     """
-    told = Notes()
-    known = sites(layers, told)
-    unreadable = [reason for site in known.values() for reason in site.unreadable]
+    reading_notes = Notes()
+    obstacles = sites(layers, reading_notes)
+    unreadable = [reason for site in obstacles.values() for reason in site.unreadable]
     if unreadable:
         raise unreadable_error(unreadable, "a blank grid would call ground free that is not known")
     parts: dict[PartKey, Part] = {}
     for level, fence in fences(layers, notes).items():
         frame = framed(shapely.bounds(fence).tolist(), parameters.resolution, notes)
         cells = blank(frame, fence, [])
-        if level in known:
-            known[level].draw_unknown(cells, frame)
+        if level in obstacles:
+            obstacles[level].draw_unknown(cells, frame)
         parts[PartKey("occupancy", level, MAP)] = OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
     if not parts:
         raise MissingLayer("a blank grid needs a fence: upload a datum.yaml with gnss_fence, or a drawing as location")
-    notes.warnings += told.warnings
+    notes.warnings += reading_notes.warnings
     notes.warn("the grid is blank: it is free wherever the fence allows, and knows of no obstacle")
     return Layers(parts, layers.datum, layers.levels)

@@ -126,7 +126,7 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
     if low > high:
         raise Invalid("band: the low height comes first", [Problem("the low height comes first", where="band")])
     closed, seen = parameters.doors == "closed", parameters.visuals
-    known = sites(
+    obstacles = sites(
         layers,
         notes,
         doors_closed=closed,
@@ -138,7 +138,7 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
     around = fences(layers, notes)
     parts: dict[PartKey, Part] = {}
     reach: list[tuple[float, float]] = []
-    for level, site in known.items():
+    for level, site in obstacles.items():
         fence = fence_of(around, level, GROUND)
         grid = _grid(site, fence, (low, high), parameters, level, notes)
         if grid is not None:
@@ -146,16 +146,16 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
         elif len(site.triangles):
             reach.append((float(site.triangles[:, :, 2].min()), float(site.triangles[:, :, 2].max())))
     if not parts:
-        there = (
+        extra = (
             f"; the solids reach from {min(r[0] for r in reach):g} to {max(r[1] for r in reach):g} m" if reach else ""
         )
-        what = f"at {low:g} m above the floor" if low == high else f"between {low:g} and {high:g} m above the floor"
-        unreadable = [reason for site in known.values() for reason in site.unreadable]
+        band = f"at {low:g} m above the floor" if low == high else f"between {low:g} and {high:g} m above the floor"
+        unreadable = [reason for site in obstacles.values() for reason in site.unreadable]
         if unreadable:
-            raise unreadable_error(unreadable, f"nothing that can be read stands in a robot's way {what}{there}")
-        there += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped if d["why"] != IN_NO_WAY)
+            raise unreadable_error(unreadable, f"nothing that can be read stands in a robot's way {band}{extra}")
+        extra += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped if d["why"] != IN_NO_WAY)
         raise MissingLayer(
-            f"no stored object stands in a robot's way {what}{there}: ask for another height or band, or upload walls, "
+            f"no stored object stands in a robot's way {band}{extra}: ask for another height or band, or upload walls, "
             "buildings, barriers, trees or a world with solids"
         )
     return Layers(parts, layers.datum, layers.levels)
@@ -166,34 +166,34 @@ def _grid(
 ) -> OccupancyGrid | None:
     """A level's grid; None where nothing stands in the way and no floor says what is free."""
     low, high = band
-    here = site.cut(low, high)
-    if not here.count and (site.unreadable or not site.free):
+    section = site.cut(low, high)
+    if not section.count and (site.unreadable or not site.free):
         return None
-    if not here.count:
-        rest = " but the ground around objects of unknown extent" if here.unknown else ""
+    if not section.count:
+        rest = " but the ground around objects of unknown extent" if section.unknown else ""
         notes.warn(f"nothing stands in a robot's way on the level {level}: all of its floor is free{rest}", where=level)
-    box = here.bounds() if fence is None else tuple(shapely.bounds(fence).tolist())
+    box = section.bounds() if fence is None else tuple(shapely.bounds(fence).tolist())
     if box is None:
         return None
     if fence is None:
         pad = parameters.padding
         box = (box[0] - pad, box[1] - pad, box[2] + pad, box[3] + pad)
-    elif here.count and not shapely.box(*(here.bounds() or box)).intersects(fence):
+    elif section.count and not shapely.box(*(section.bounds() or box)).intersects(fence):
         notes.warn(f"all obstacles of the level {level} lie outside the fence", where=level)
     frame = framed(box, parameters.resolution, notes)
     cells = blank(frame, fence, site.free)
-    here.draw(cells, frame, low, high)
+    section.draw(cells, frame, low, high)
     if fence is None and not site.free and not parameters.outside_free:
         _raster.flooded(cells, FREE, UNKNOWN)
         why = "neither floors nor a fence say how far the site reaches"
         notes.fill("ground that no walls enclose", "unknown", why, "outside_free")
     enclosed = bool((cells == FREE).any())
-    here.draw_unknown(cells, frame)
+    section.draw_unknown(cells, frame)
     _raster.grown(cells, OCCUPIED, parameters.inflate / frame.resolution)
     if not (cells == FREE).any():
         if site.unreadable:
             raise unreadable_error(site.unreadable, f"no free ground of the level {level} is known")
-        todo = COVERED if enclosed and here.unknown else ENCLOSE
+        todo = COVERED if enclosed and section.unknown else ENCLOSE
         notes.warn(f"no cell of the level {level} is free: {todo}", where=level)
     return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
 

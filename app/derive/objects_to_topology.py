@@ -46,9 +46,9 @@ def objects_to_topology(layers: Layers, parameters: Parameters, notes: Notes) ->
             by_level.setdefault(key.level, []).append((key.name, chosen))
     parts: dict[PartKey, Part] = {}
     for level, drawings in by_level.items():
-        made = _network([part for _, part in drawings], layers, parameters)
-        if len(made):
-            parts[PartKey("topology", level, NETWORK)] = made
+        network_part = _network([part for _, part in drawings], layers, parameters)
+        if len(network_part):
+            parts[PartKey("topology", level, NETWORK)] = network_part
     if not parts:
         raise MissingLayer(
             "a network can be made from drawn lines and points of interest, but the stored objects have none: upload "

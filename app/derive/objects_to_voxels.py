@@ -75,18 +75,18 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> L
     CannotConvert where the map would be too large.
     """
     closed, seen = parameters.doors == "closed", parameters.visuals
-    known = sites(layers, notes, doors_closed=closed, visuals=seen, world=parameters.world)
+    obstacles = sites(layers, notes, doors_closed=closed, visuals=seen, world=parameters.world)
     triangles: list[Array] = []
     guessed = 0
-    for level, site in known.items():
+    for level, site in obstacles.items():
         up = np.array([0.0, 0.0, layers.elevation(level)])
         if len(site.triangles):
             triangles += [one + up for one in np.split(site.triangles, np.flatnonzero(np.diff(site.owner)) + 1)]
-        made, without = _extruded(site, parameters.extrude)
-        triangles += [one + up for one in made]
+        pieces, without = _extruded(site, parameters.extrude)
+        triangles += [one + up for one in pieces]
         guessed += without
     if not triangles:
-        unreadable = [reason for site in known.values() for reason in site.unreadable]
+        unreadable = [reason for site in obstacles.values() for reason in site.unreadable]
         if unreadable:
             raise unreadable_error(unreadable, "no stored object is known to have a body")
         raise MissingLayer(
@@ -109,9 +109,9 @@ def _extruded(site: Site, otherwise: float) -> tuple[list[Array], int]:
         without += not math.isfinite(top)
         high = top if math.isfinite(top) else base + otherwise
         if high > base:
-            made = solids.extruded(shapely.make_valid(footprint), base, high)
-            if len(made):
-                out.append(made)
+            triangles = solids.extruded(shapely.make_valid(footprint), base, high)
+            if len(triangles):
+                out.append(triangles)
     return out, without
 
 

@@ -102,12 +102,12 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _step(grid: OccupancyGrid, pixel: float | None, what: str) -> int:
+def _step(grid: OccupancyGrid, pixel: float | None, label: str) -> int:
     """Cells along the side of a pixel."""
     if pixel is not None:
         step = max(1, round(pixel / grid.resolution))
         if grid.width * grid.height / step**2 > MOST_PIXELS:
-            raise CannotConvert(f"a plan of {what} with {pixel:g} m a pixel would have more than {MOST_PIXELS} pixels")
+            raise CannotConvert(f"a plan of {label} with {pixel:g} m a pixel would have more than {MOST_PIXELS} pixels")
         return step
     return max(1, math.ceil(math.sqrt(grid.width * grid.height / MOST_PIXELS)))
 
@@ -145,11 +145,11 @@ def _draw_objects(
         if not rows:
             continue
         try:
-            found = part.take(rows).in_local(layers.frame)
+            geometries = part.take(rows).in_local(layers.frame)
         except MissingDatum:
             notes.drop("objects", len(rows), "they are places on earth, and there is no datum: not drawn on the plan")
             continue
-        for row, geometry in zip(rows, found, strict=True):
+        for row, geometry in zip(rows, geometries, strict=True):
             width = part.properties[row].get("width")
             if isinstance(width, int | float) and not isinstance(width, bool) and 0 < width < 1000:
                 geometry = geometry if geometry.geom_type.endswith("Polygon") else geometry.buffer(width / 2)  # noqa: PLW2901
@@ -164,11 +164,11 @@ def _draw_network(
     for part in layers.vector("topology", level).values():
         edges = part.of_kind("edge")
         try:
-            found = edges.in_local(layers.frame)
+            geometries = edges.in_local(layers.frame)
         except MissingDatum:
             notes.drop("edges", len(edges), "they are places on earth, and there is no datum: not drawn on the plan")
             continue
-        _paint(pixels, list(found), EDGE, grid, frame)
+        _paint(pixels, list(geometries), EDGE, grid, frame)
 
 
 def _paint(

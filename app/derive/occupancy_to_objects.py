@@ -129,22 +129,22 @@ def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: N
         small=context.trunk / cell,
         tolerance=1.5 if parameters.tolerance is None else parameters.tolerance / cell,
     )
-    least = sizes.speck * cell
+    limit = sizes.speck * cell
     try:
-        found = figures(mask, grid.cells == FREE, sizes)
+        shapes = figures(mask, grid.cells == FREE, sizes)
     except CannotConvert as error:
         raise CannotConvert(f"{name}: {error.detail}") from error
-    notes.drop("specks", found.specks, f"{name}: less than minimum_size={least:g} m across")
-    count = len(found.discs) + len(found.boxes) + len(found.walls) + len(found.areas)
+    notes.drop("specks", shapes.specks, f"{name}: less than minimum_size={limit:g} m across")
+    count = len(shapes.discs) + len(shapes.boxes) + len(shapes.walls) + len(shapes.areas)
     if not count:
         raise CannotConvert(
-            f"{name} has nothing but {found.specks} specks less than {least:g} m across: give a smaller minimum_size"
+            f"{name} has nothing but {shapes.specks} specks less than {limit:g} m across: give a smaller minimum_size"
         )
     if count > MOST:
         raise CannotConvert(
-            f"{name} would be {count} objects, the limit is {MOST}: give a larger minimum_size than {least:g} m"
+            f"{name} would be {count} objects, the limit is {MOST}: give a larger minimum_size than {limit:g} m"
         )
-    return _rows(found, grid, context, parameters.height, floor)
+    return _rows(shapes, grid, context, parameters.height, floor)
 
 
 def _occupied(grid: OccupancyGrid, name: str) -> NDArray[np.uint8]:
@@ -157,14 +157,16 @@ def _occupied(grid: OccupancyGrid, name: str) -> NDArray[np.uint8]:
     mask = np.asarray(meaning[grid.cells])
     if not mask.any():
         counts = grid.counts()
-        told = ", ".join(f"{counts[n]} {n}" for n in ("free", "unknown", "other") if counts[n])
-        raise CannotConvert(f"{name} has no occupied cell ({told}), so it shows no objects: upload one with obstacles")
+        summary = ", ".join(f"{counts[n]} {n}" for n in ("free", "unknown", "other") if counts[n])
+        raise CannotConvert(
+            f"{name} has no occupied cell ({summary}), so it shows no objects: upload one with obstacles"
+        )
     if mask.all():
         raise CannotConvert(f"{name} is occupied all over: it shows no objects that stand somewhere")
     return mask
 
 
-def _rows(found: Found, grid: OccupancyGrid, context: Context, height: float | None, floor: float) -> list[Row]:
+def _rows(shapes: Found, grid: OccupancyGrid, context: Context, height: float | None, floor: float) -> list[Row]:
     """Posts, walls, furniture, obstacles, each numbered from 1, in the local frame."""
     cell = grid.resolution
     x, y, yaw = grid.origin
@@ -185,28 +187,28 @@ def _rows(found: Found, grid: OccupancyGrid, context: Context, height: float | N
         return {"kind": kind, "pose": pose, "size": [*size, h], "height": h, "shapes": [solid]}
 
     rows: list[Row] = []
-    for k, disc in enumerate(found.discs, 1):
+    for k, disc in enumerate(shapes.discs, 1):
         kind, radius = context.post, round(disc.radius * cell, 6)
         turn = np.arange(24) * (math.tau / 24)
         ring = np.stack([disc.x + disc.radius * np.cos(turn), disc.y + disc.radius * np.sin(turn)], axis=1)
-        said = body(kind, disc, [2 * radius] * 2, {"type": "cylinder", "radius": radius, "length": high(kind)})
-        rows.append((f"{kind}/{k}", shapely.Polygon(placed(ring)), {**said, "radius": radius}))
-    for kind, boxes in (("wall", found.walls), (context.furniture, found.boxes)):
+        properties = body(kind, disc, [2 * radius] * 2, {"type": "cylinder", "radius": radius, "length": high(kind)})
+        rows.append((f"{kind}/{k}", shapely.Polygon(placed(ring)), {**properties, "radius": radius}))
+    for kind, boxes in (("wall", shapes.walls), (context.furniture, shapes.boxes)):
         for k, box in enumerate(boxes, 1):
             size = [round(box.length * cell, 6), round(box.width * cell, 6)]
-            said = body(kind, box, size, {"type": "box", "size": [*size, high(kind)]})
+            properties = body(kind, box, size, {"type": "box", "size": [*size, high(kind)]})
             along, across = _axes(box)
             middle = np.array([box.x, box.y])
             if kind == "wall":
                 half = along * max(box.length - box.width, 0.1 * box.length) / 2  # its ends are square, as RMF's are
                 geometry: Any = shapely.LineString(placed(np.array([middle - half, middle + half])))
-                said["width"] = size[1]
+                properties["width"] = size[1]
             else:
                 a, b = along * box.length / 2, across * box.width / 2
                 corners = np.array([middle - a - b, middle + a - b, middle + a + b, middle - a + b])
                 geometry = shapely.Polygon(placed(corners))
-            rows.append((f"{kind}/{k}", geometry, said))
-    for k, area in enumerate(found.areas, 1):
+            rows.append((f"{kind}/{k}", geometry, properties))
+    for k, area in enumerate(shapes.areas, 1):
         outline = shapely.make_valid(shapely.transform(area, placed))
         rows.append((f"obstacle/{k}", outline, {"kind": "obstacle", "height": high("obstacle")}))
     return rows

@@ -118,10 +118,10 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
     from app.derive import _roadmap, _skeleton
 
     grid = _without_unseen(grid, parameters, notes, called)
-    where = _space(grid, parameters, called)
+    space = _space(grid, parameters, called)
     cell = grid.resolution
     graph, islands = _skeleton.skeleton(
-        where,
+        space,
         merge=max(parameters.robot_radius / cell, 2.0),
         spur=parameters.spur / cell,
         tolerance=parameters.tolerance / cell,
@@ -134,7 +134,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
         notes.warn(f"the network is in {count} pieces: no way that the robot fits joins them", where=called)
     if parameters.method == "roadmap":
         graph, alone = _roadmap.roadmap(
-            where,
+            space,
             graph,
             samples=parameters.samples,
             neighbours=parameters.neighbours,
@@ -143,22 +143,22 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
         )
         notes.drop("samples", alone, f"{called}: they see nothing to be joined to, or lie in places left out")
     elif parameters.method == "voronoi":
-        graph = _skeleton.divided(graph, where, max(parameters.spacing / cell, 2.0)) if parameters.spacing else graph
+        graph = _skeleton.divided(graph, space, max(parameters.spacing / cell, 2.0)) if parameters.spacing else graph
     elif parameters.spacing > 0.0:
         spacing = max(parameters.spacing / cell, 2.0)
         graph = _skeleton.filled(
-            graph, where, spacing=spacing, detour=parameters.detour, phase=_phase(grid, where, spacing)
+            graph, space, spacing=spacing, detour=parameters.detour, phase=_phase(grid, space, spacing)
         )
     if not len(graph.edges):
         supply = "a smaller robot_radius, more samples" if parameters.method == "roadmap" else "a smaller robot_radius"
         if parameters.method != "roadmap" and not parameters.spacing:
             supply = "a spacing above 0 (spacing=0 puts nodes at corners and crossings only), " + supply
         raise CannotConvert(
-            f"{called} leaves {where.cells} cells to a robot of radius {parameters.robot_radius:g} m, too few for a "
+            f"{called} leaves {space.cells} cells to a robot of radius {parameters.robot_radius:g} m, too few for a "
             f"way between two places: give {supply}, or a grid of more than one spot"
         )
-    row, column, width = where.row, where.column, _widths(where, graph)
-    del where  # three bytes a cell, which the features may need
+    row, column, width = space.row, space.column, _widths(space, graph)
+    del space  # three bytes a cell, which the features may need
     return _features(grid, row, column, graph, width)
 
 
@@ -179,8 +179,8 @@ def _check(parameters: Parameters) -> None:
     changed = [f.name for f in fields(parameters) if getattr(parameters, f.name) != f.default]
     wrong = [n for n in changed if parameters.method not in BELONGS.get(n, (parameters.method,))]
     if wrong:
-        told = {n: " or ".join(BELONGS[n]) for n in wrong}
-        problems = [Problem(f"belongs to method={told[n]}, not to {parameters.method}", where=n) for n in wrong]
+        methods = {n: " or ".join(BELONGS[n]) for n in wrong}
+        problems = [Problem(f"belongs to method={methods[n]}, not to {parameters.method}", where=n) for n in wrong]
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
 
 
@@ -190,44 +190,44 @@ def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> Space:
 
     if grid.cells.size >= 2**31 - 2 * (grid.width + grid.height):
         raise TooLarge(f"{called} has {grid.cells.size} cells; a network can be made of at most 2^31")
-    found = _skeleton.free_cells(grid, parameters.unknown)
-    if found is None:
+    free_cells = _skeleton.free_cells(grid, parameters.unknown)
+    if free_cells is None:
         counts = grid.counts()
-        told = ", ".join(f"{counts[n]} {n}" for n in ("occupied", "unknown", "other") if counts[n])
+        summary = ", ".join(f"{counts[n]} {n}" for n in ("occupied", "unknown", "other") if counts[n])
         hint = "; unknown=true drives through unknown cells" if counts["unknown"] and not parameters.unknown else ""
         raise CannotConvert(
-            f"{called} has no free cell ({told}), so there are no ways: upload a map with free space{hint}"
+            f"{called} has no free cell ({summary}), so there are no ways: upload a map with free space{hint}"
         )
-    free, row, column = found
+    free, row, column = free_cells
     if free.shape == (grid.height + 2, grid.width + 2) and free[1:-1, 1:-1].all():
         raise CannotConvert(
             f"{called} is free all over: without an obstacle nothing tells where ways are. Upload a map that has some, "
             f"or the network itself"
         )
-    where = _skeleton.space(free, row, column, parameters.robot_radius / grid.resolution)
-    if not where.cells:
-        widest = _skeleton.widest(where) * grid.resolution
+    space = _skeleton.space(free, row, column, parameters.robot_radius / grid.resolution)
+    if not space.cells:
+        widest = _skeleton.widest(space) * grid.resolution
         raise CannotConvert(
             f"{called} has no place for a robot of radius {parameters.robot_radius:g} m: the farthest that a free cell "
             f"is from obstacles is {widest:.3g} m. Give a robot_radius below that"
         )
-    return where
+    return space
 
 
-def _phase(grid: OccupancyGrid, where: Space, spacing: float) -> tuple[float, float]:
+def _phase(grid: OccupancyGrid, space: Space, spacing: float) -> tuple[float, float]:
     """Where a lattice that is fixed to the local frame begins in a space: row and column."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     along, across = (c * x + s * y) / grid.resolution, (c * y - s * x) / grid.resolution
-    return (-(across + where.row) % spacing, -(along + where.column) % spacing)
+    return (-(across + space.row) % spacing, -(along + space.column) % spacing)
 
 
-def _widths(where: Space, graph: Graph) -> NDArray[np.float64]:
+def _widths(space: Space, graph: Graph) -> NDArray[np.float64]:
     """The free width along each edge, in cells."""
     from app.derive import _kernels_space
 
     width = np.empty(len(graph.edges))
-    _kernels_space.widths(where.gap, graph.nodes, graph.edges, width)
+    _kernels_space.widths(space.gap, graph.nodes, graph.edges, width)
     return width
 
 

@@ -49,14 +49,14 @@ class Parameters:
 
 
 def _try(layers: Layers, parameters: Parameters) -> None:
-    found = [
+    blocks = [
         _placed(as_seen(grid), parameters, layers.elevation(key.level), key.name)
         for key, grid in _mains(layers).items()
     ]
-    blocks = [block for block in found if block is not None]
-    if not blocks:
+    filled_blocks = [block for block in blocks if block is not None]
+    if not filled_blocks:
         raise MissingLayer(NOTHING_KNOWN)
-    for block in blocks:
+    for block in filled_blocks:
         if np.count_nonzero(block.state) * (block.top - block.bottom) > MOST:  # so many, were all leaves the smallest
             _cut(block)
 
@@ -73,9 +73,9 @@ def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) ->
     for key, grid in _mains(layers).items():
         block = _placed(seen(grid, called(key), notes), parameters, layers.elevation(key.level), key.name)
         if block is not None:
-            made = VoxelMap(block.edge, *_leaves(block))
-            parts[PartKey("voxels", key.level, key.name)] = made
-            if not made.leaf_counts()["occupied"]:
+            voxels = VoxelMap(block.edge, *_leaves(block))
+            parts[PartKey("voxels", key.level, key.name)] = voxels
+            if not voxels.leaf_counts()["occupied"]:
                 notes.warn(f"{key.name}: the grid has no occupied cell, so the voxels hold free space only")
     if not parts:
         raise MissingLayer(NOTHING_KNOWN)
@@ -102,9 +102,9 @@ class _Block:
 def _mains(layers: Layers) -> dict[PartKey, OccupancyGrid]:
     """The grids to extrude."""
     grids = layers.grids()
-    found = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
-    mains = {key.level for key in found if key.name == MAP}
-    return {key: grid for key, grid in found.items() if key.name == MAP or key.level not in mains}
+    candidates = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
+    mains = {key.level for key in candidates if key.name == MAP}
+    return {key: grid for key, grid in candidates.items() if key.name == MAP or key.level not in mains}
 
 
 def _placed(grid: OccupancyGrid, parameters: Parameters, floor: float, name: str) -> _Block | None:
@@ -160,8 +160,8 @@ def _columns(grid: OccupancyGrid, edge: float, free: bool, name: str) -> tuple[S
         along = ((np.arange(start, min(height, start + ROWS)) + bottom + 0.5) * edge - y)[:, None]
         u = np.floor((across * c + along * s) / grid.resolution).astype(np.int64)
         v = np.floor((along * c - across * s) / grid.resolution).astype(np.int64)
-        there = (u >= 0) & (u < grid.width) & (v >= 0) & (v < grid.height)
-        out[start : start + ROWS][there] = state[v[there], u[there]]
+        inside = (u >= 0) & (u < grid.width) & (v >= 0) & (v < grid.height)
+        out[start : start + ROWS][inside] = state[v[inside], u[inside]]
     _splat(out, state, grid, edge, (left, bottom))
     return out, (left, bottom)
 
@@ -210,13 +210,13 @@ def _cut(block: _Block) -> list[tuple[int, NDArray[np.int64], Square]]:
 def _leaves(block: _Block) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
     """Depth, code and log-odds of a block's leaves, in order."""
     depths, codes, odds = [], [], []
-    for j, z, (x, y, what) in _cut(block):
+    for j, z, (x, y, values) in _cut(block):
         n, stack = len(x), len(z)
         # Of the squares as smallest voxels from the middle, so that their codes can be cut to the depth.
-        whole = [np.repeat(x << j, stack) - HALF, np.repeat(y << j, stack) - HALF, np.tile(z << j, n) - HALF]
-        codes.append(morton(*whole) >> np.uint64(3 * j))
+        coordinates = [np.repeat(x << j, stack) - HALF, np.repeat(y << j, stack) - HALF, np.tile(z << j, n) - HALF]
+        codes.append(morton(*coordinates) >> np.uint64(3 * j))
         depths.append(np.full(n * stack, DEPTH - j, np.uint8))
-        odds.append(np.repeat(np.array(LOG_ODDS, np.float32)[what.astype(np.intp) - 1], stack))
+        odds.append(np.repeat(np.array(LOG_ODDS, np.float32)[values.astype(np.intp) - 1], stack))
     depth, code, odd = np.concatenate(depths), np.concatenate(codes), np.concatenate(odds)
     order = np.argsort(code << (np.uint64(3) * (np.uint64(DEPTH) - depth.astype(np.uint64))))
     return depth[order], code[order], odd[order]
@@ -237,25 +237,25 @@ def _pieces(start: int, end: int) -> list[tuple[int, int]]:
 Square = tuple[NDArray[np.int64], NDArray[np.int64], States]
 
 
-def _squares(state: States, corner: tuple[int, int], most: int) -> list[tuple[Square, Square]]:
+def _squares(state: States, corner: tuple[int, int], max_level: int) -> list[tuple[Square, Square]]:
     """For each size 2^j up to 2^most: all aligned squares of known, equal columns, and those that lie in no larger one.
 
     A square is its x and y in units of its size, and its state. corner: x and y of the first column, from the tree's
     edge.
     """
     levels = [(state, corner)]
-    for _ in range(most):
+    for _ in range(max_level):
         levels.append(_halved(*levels[-1]))
     out = []
-    for j, (here, (x0, y0)) in enumerate(levels):
-        row, column = np.nonzero(here)
-        what = here[row, column]
+    for j, (level_states, (x0, y0)) in enumerate(levels):
+        row, column = np.nonzero(level_states)
+        values = level_states[row, column]
         x, y = column + x0, row + y0
         alone = np.ones(len(row), bool)
-        if j < most:
+        if j < max_level:
             above, (left, low) = levels[j + 1]
             alone = above[(y >> 1) - low, (x >> 1) - left] == 0
-        out.append(((x, y, what), (x[alone], y[alone], what[alone])))
+        out.append(((x, y, values), (x[alone], y[alone], values[alone])))
     return out
 
 

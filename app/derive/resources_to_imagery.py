@@ -59,10 +59,10 @@ def resources_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -
 def _drawings(layers: Layers) -> Iterator[tuple[str, str, tuple[float, float, float, float]]]:
     """(level, file, [scale, rotation, x, y]) as a building's documents tell them."""
     for key, part in layers.vector("objects").items():
-        said = part.document.get("openrmf")
-        if not isinstance(said, Mapping):
+        source_document = part.document.get("openrmf")
+        if not isinstance(source_document, Mapping):
             continue
-        level, turn = said.get("level"), said.get("transform")
+        level, turn = source_document.get("level"), source_document.get("transform")
         drawing = level.get("drawing") if isinstance(level, Mapping) else None
         name = drawing.get("filename") if isinstance(drawing, Mapping) else None
         if isinstance(name, str) and name and isinstance(turn, list | tuple) and len(turn) == 4:
@@ -71,10 +71,10 @@ def _drawings(layers: Layers) -> Iterator[tuple[str, str, tuple[float, float, fl
                 yield key.level, _found(name, layers.resources()), (scale, rotation, x, y)
 
 
-def _found(said: str, files: Mapping[str, bytes]) -> str:
+def _found(path: str, files: Mapping[str, bytes]) -> str:
     """The stored file that a drawing's name means: itself, else the first of that base name."""
-    base = said.replace("\\", "/").rpartition("/")[2]
-    return said if said in files else next((f for f in sorted(files) if f.rpartition("/")[2] == base), said)
+    base = path.replace("\\", "/").rpartition("/")[2]
+    return path if path in files else next((f for f in sorted(files) if f.rpartition("/")[2] == base), path)
 
 
 def _pixels(data: bytes, name: str, level: str, notes: Notes) -> NDArray[np.uint8] | None:

@@ -73,7 +73,7 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) 
     places on earth without one, CannotConvert where the grid would be too large.
     """
     around = fences(layers, notes)
-    known = _obstacles(layers, notes) if parameters.obstacles else {}
+    obstacles = _obstacles(layers, notes) if parameters.obstacles else {}
     parts: dict[PartKey, Part] = {}
     for level in dict.fromkeys(key.level for key in layers.vector("topology")):
         open_, through = _free(layers, level, parameters, notes)
@@ -87,10 +87,10 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) 
         cells = blank(frame, None, [shapely.Point(box[0], box[1])])  # a floor without an area: all is unknown
         ground = open_ if fence is None else shapely.intersection(open_, fence)
         _raster.paint(cells, _raster.areas(ground, frame, touched=False), FREE)
-        if level in known:
-            here = known[level].cut(HEIGHT, HEIGHT)
-            here.draw(cells, frame, HEIGHT, HEIGHT)
-            here.draw_unknown(cells, frame)
+        if level in obstacles:
+            section = obstacles[level].cut(HEIGHT, HEIGHT)
+            section.draw(cells, frame, HEIGHT, HEIGHT)
+            section.draw_unknown(cells, frame)
         if len(through):
             inside = through if fence is None else shapely.intersection(through, fence)
             _raster.paint(cells, _raster.areas(inside, frame, touched=False), FREE)
@@ -119,23 +119,23 @@ def _free(
             if p.get("stairs") is True and not parameters.stairs:
                 steps += 1
                 continue
-            said = _width(p)
-            assumed += said is None
+            width = _width(p)
+            assumed += width is None
             rows.append(k)
-            widths.append(said or parameters.edge_width or OF_HIGHWAY.get(_tag(p, "highway"), WIDTH))
+            widths.append(width or parameters.edge_width or OF_HIGHWAY.get(_tag(p, "highway"), WIDTH))
             inner.append(_tag(p, "tunnel") == "building_passage" or _tag(p, "covered") == "yes")
         lines = _metres(part.take(rows), layers)
-        made = shapely.buffer(lines, np.array(widths) / 2, quad_segs=4)
-        good = ~shapely.is_empty(made)
+        buffers = shapely.buffer(lines, np.array(widths) / 2, quad_segs=4)
+        good = ~shapely.is_empty(buffers)
         flat += int(np.count_nonzero(~good))
         # The lines too: an edge narrower than a cell would have gaps.
-        shapes += [*made[good], *lines[good]]
+        shapes += [*buffers[good], *lines[good]]
         through += np.array(inner, bool)[good].tolist() * 2
     notes.drop("edges over stairs", steps, "wheels cannot climb them; see stairs")
     notes.drop("edges without a course", flat, "they have no geometry")
     if assumed:
-        told = parameters.edge_width or f"{WIDTH} m, of a way that of its class"
-        notes.fill("width of edges", told, f"{assumed} edges do not say how wide they are", "edge_width")
+        width_text = parameters.edge_width or f"{WIDTH} m, of a way that of its class"
+        notes.fill("width of edges", width_text, f"{assumed} edges do not say how wide they are", "edge_width")
     areas = np.empty(len(shapes), object)
     areas[:] = shapes
     chosen = np.array(through, bool)
@@ -150,14 +150,14 @@ def _metres(part: Features, layers: Layers) -> NDArray[np.object_]:
 
 
 def _width(p: Properties) -> float | None:
-    said = p.get("width")
-    good = isinstance(said, (int, float)) and not isinstance(said, bool) and 0 < said <= WIDEST
-    return float(said) if good and said is not None else None
+    value = p.get("width")
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= WIDEST
+    return float(value) if good and value is not None else None
 
 
 def _tag(p: Properties, key: str) -> str:
-    own = p.get("osm")
-    tags = own.get("tags") if isinstance(own, Mapping) else None
+    source_properties = p.get("osm")
+    tags = source_properties.get("tags") if isinstance(source_properties, Mapping) else None
     value = tags.get(key) if isinstance(tags, Mapping) else None
     return value if isinstance(value, str) else ""
 

@@ -70,23 +70,23 @@ def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) ->
     for key, part in layers.of("voxels").items():
         if not isinstance(part, VoxelMap) or not len(part):
             continue
-        made = _projected(part, parameters, layers.elevation(key.level))
-        if made is None:
+        grid = _projected(part, parameters, layers.elevation(key.level))
+        if grid is None:
             z = part.bounds()
             seen.append(f"{key.name} from {z[2]:g} to {z[5]:g} m above the local origin" if z else key.name)
             continue
-        parts[PartKey("occupancy", key.level, key.name)] = made
-        _doubts(key, part, made, parameters, notes)
+        parts[PartKey("occupancy", key.level, key.name)] = grid
+        _doubts(key, part, grid, parameters, notes)
     if not parts:
         why = f"no voxel lies in the band; there are: {'; '.join(seen)}" if seen else "the voxel maps hold no voxels"
         raise MissingLayer(f"{why}. Ask with another band=low,high, or upload an octree or a point cloud")
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _doubts(key: PartKey, voxels: VoxelMap, made: OccupancyGrid, parameters: Parameters, notes: Notes) -> None:
-    counts = made.counts()
-    known = counts["occupied"] + counts["free"]
-    if parameters.band is None and counts["occupied"] >= FULL * known:
+def _doubts(key: PartKey, voxels: VoxelMap, grid: OccupancyGrid, parameters: Parameters, notes: Notes) -> None:
+    counts = grid.counts()
+    known_cells = counts["occupied"] + counts["free"]
+    if parameters.band is None and counts["occupied"] >= FULL * known_cells:
         notes.warn(
             f"{key.name}: nearly every column has something in it, the floor too: ask with band=low,high for the "
             "heights at which a robot meets it"
@@ -150,11 +150,11 @@ def _columns(voxels: VoxelMap, inside: NDArray[np.bool_], bounds: list[tuple[int
         top, left = y0 - 2 * start[0], x0 - 2 * start[1]
         picture = np.ascontiguousarray(picture[top : top + y1 - y0, left : left + x1 - x0])
         start = (y0, x0)
-        here = np.flatnonzero((voxels.depth == depth) & inside)
-        if not len(here):
+        indices = np.flatnonzero((voxels.depth == depth) & inside)
+        if not len(indices):
             continue
-        row, column = y[here].astype(np.int64) - y0, x[here].astype(np.int64) - x0
-        occupied = voxels.log_odds[here] >= 0
+        row, column = y[indices].astype(np.int64) - y0, x[indices].astype(np.int64) - x0
+        occupied = voxels.log_odds[indices] >= 0
         free = row[~occupied], column[~occupied]
         picture[free] = np.maximum(picture[free], 1)
         picture[row[occupied], column[occupied]] = 2
@@ -190,10 +190,10 @@ def _resampled(ranks: States, axis: int, source: tuple[int, int], span: tuple[in
 
 def _near(value: float) -> float:
     """A whole number where it is one but for the rounding of a division."""
-    whole = round(value)
-    return float(whole) if abs(value - whole) < 1e-6 else value
+    integer = round(value)
+    return float(integer) if abs(value - integer) < 1e-6 else value
 
 
 def _nears(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    whole = np.round(values)
-    return np.where(np.abs(values - whole) < 1e-6, whole, values)
+    integers = np.round(values)
+    return np.where(np.abs(values - integers) < 1e-6, integers, values)

@@ -134,8 +134,8 @@ class _Frame:
 
     def grid(self, cells: NDArray[np.uint8], name: str, info: Info) -> OccupancyGrid:
         """The mask; ``scale`` from white to black says each of its values."""
-        told = {masks.NAME: {"params": masks.params(name, info)}}
-        return OccupancyGrid(cells, self.resolution, (self.x, self.y, 0.0), "scale", 1.0, 0.0, False, told)
+        properties = {masks.NAME: {"params": masks.params(name, info)}}
+        return OccupancyGrid(cells, self.resolution, (self.x, self.y, 0.0), "scale", 1.0, 0.0, False, properties)
 
     def box(self) -> Any:
         """Its outline."""
@@ -176,16 +176,16 @@ def _shapes(part: Features, layers: Layers) -> Iterator[tuple[_Zone, Any]]:
 
 def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | None) -> _Frame:
     """The map's frame where there is one (its cells, or its place in other cells), else one around the zones."""
-    known = layers.grids(level).get(PartKey("occupancy", level, MAP))
-    if known is not None and known.origin[2] == 0.0 and resolution in (None, known.resolution):
-        return _Frame(known.origin[0], known.origin[1], known.resolution, known.width, known.height)
-    if known is None:
+    map_grid = layers.grids(level).get(PartKey("occupancy", level, MAP))
+    if map_grid is not None and map_grid.origin[2] == 0.0 and resolution in (None, map_grid.resolution):
+        return _Frame(map_grid.origin[0], map_grid.origin[1], map_grid.resolution, map_grid.width, map_grid.height)
+    if map_grid is None:
         low_high = shapely.total_bounds(np.array(shapes, object)) + MARGIN * np.array([-1.0, -1.0, 1.0, 1.0])
     else:
-        corners = known.corners()
+        corners = map_grid.corners()
         low_high = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
-    cell = resolution or (RESOLUTION if known is None else known.resolution)
-    if known is None and resolution is None:
+    cell = resolution or (RESOLUTION if map_grid is None else map_grid.resolution)
+    if map_grid is None and resolution is None:
         cell = _coarse_enough(cell, low_high)
     first = [math.floor(v / cell + 1e-6) for v in low_high[:2]]
     end = [math.ceil(v / cell - 1e-6) for v in low_high[2:]]
@@ -229,20 +229,20 @@ def _limits(zones: list[_Zone], parameters: Parameters, notes: Notes) -> tuple[l
 
     Limits are rounded down to what a cell can say, and never to 0, which would be none.
     """
-    said = [_said(z) for z in zones]
-    notes.drop("speed zones without a limit", said.count(None), "their value is no speed in m/s and no percentage")
-    known = [s for s in said if s is not None]
-    if not known:
+    limits = [_said(z) for z in zones]
+    notes.drop("speed zones without a limit", limits.count(None), "their value is no speed in m/s and no percentage")
+    valid_limits = [s for s in limits if s is not None]
+    if not valid_limits:
         return [], None
-    percent = parameters.speed_in == "percent" or (parameters.speed_in is None and all(p for _, p in known))
-    if parameters.max_speed is None and any(p is not percent for _, p in known):
+    percent = parameters.speed_in == "percent" or (parameters.speed_in is None and all(p for _, p in valid_limits))
+    if parameters.max_speed is None and any(p is not percent for _, p in valid_limits):
         raise CannotConvert(
             "limits in percent and in m/s can only be brought together with the robot's top speed: ask with "
             "max_speed=… (m/s)"
         )
     top = parameters.max_speed or 1.0
     exact: list[float | None] = []
-    for limit in said:
+    for limit in limits:
         if limit is None:
             exact.append(None)
         elif percent:
@@ -275,5 +275,5 @@ def _said(zone: _Zone) -> tuple[float, bool] | None:
     value = zone.value
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return (float(value), False) if value >= 0 and math.isfinite(value) else None
-    found = _SAID.match(value) if isinstance(value, str) else None
-    return None if found is None else (float(found[1]), found[2] in ("%", "percent"))
+    match = _SAID.match(value) if isinstance(value, str) else None
+    return None if match is None else (float(match[1]), match[2] in ("%", "percent"))

@@ -114,9 +114,9 @@ def router_configuration(options: BusOptions) -> str:
 def session_configuration(options: BusOptions) -> str:
     """The configuration of the server's own session: a client of its router, or of the operator's. FleetMapError."""
     config = _base(options)
-    where = options.connect if options.mode == "client" else reachable(options.listen)
+    endpoints = options.connect if options.mode == "client" else reachable(options.listen)
     _set(config, "mode", "client")
-    _set(config, "connect/endpoints", [part.strip() for part in where.split(",") if part.strip()])
+    _set(config, "connect/endpoints", [part.strip() for part in endpoints.split(",") if part.strip()])
     _set(config, "connect/timeout_ms", int(CONNECT_SECONDS * 1000))
     _set(config, "connect/exit_on_failure", True)
     _set(config, "connect/retry", {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2})
@@ -134,8 +134,8 @@ def session_configuration(options: BusOptions) -> str:
 
 def no_connection(options: BusOptions, error: Exception) -> str:
     """Why the server's own session found no router."""
-    where = options.connect if options.mode == "client" else reachable(options.listen)
-    return no_router(where, error, options.security.login, names=options.mode == "client")
+    endpoints = options.connect if options.mode == "client" else reachable(options.listen)
+    return no_router(endpoints, error, options.security.login, names=options.mode == "client")
 
 
 def check(options: BusOptions) -> None:
@@ -299,9 +299,9 @@ class Bus:
             with contextlib.suppress(Exception):
                 _end(publisher)
         self._publishers.clear()
-        for held in self._held:
+        for declaration in self._held:
             with contextlib.suppress(Exception):
-                _end(held)
+                _end(declaration)
         self._held = []
         if self._session is not None:
             with contextlib.suppress(Exception):
@@ -353,13 +353,13 @@ class Bus:
     def _answer(self, query: zenoh.Query, find: Callable[[zenoh.Query], Answer | Make]) -> None:
         """In a thread of ours: what ``find`` finds is the answer, or is left to the makers."""
         try:
-            found = find(query)
-            if not isinstance(found, Answer):
-                make = found
+            reply = find(query)
+            if not isinstance(reply, Answer):
+                make = reply
                 self._submit(self._makers, query, lambda _: make())
                 return
             with contextlib.suppress(zenoh.ZError):  # who asked is gone
-                query.reply(query.key_expr, found.payload, encoding=found.encoding)
+                query.reply(query.key_expr, reply.payload, encoding=reply.encoding)
         except Exception as error:  # noqa: BLE001  told, and logged where it is a mistake of ours
             self._refuse(query, error)
         self._waiting.release()
@@ -371,8 +371,8 @@ class Bus:
             query.reply_err(self._explain(error), encoding="application/problem+json")
 
 
-def _end(held: Any) -> None:
-    held.undeclare()
+def _end(declaration: Any) -> None:
+    declaration.undeclare()
 
 
 def _close(session: Any) -> None:

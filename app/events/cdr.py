@@ -37,19 +37,19 @@ class Grid:
 def occupancy_grid(grid: Grid, stamp: datetime, frame_id: str) -> bytes:
     """``nav_msgs/msg/OccupancyGrid``. stamp: for the header and ``map_load_time``."""
     x, y, yaw = grid.origin
-    made = _Writer(_header(stamp, frame_id))
-    made.pack("iIfII", *_time(stamp), grid.resolution, grid.width, grid.height)
-    made.pack("7d", x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
-    return made.sequence(grid.cells)
+    writer = _Writer(_header(stamp, frame_id))
+    writer.pack("iIfII", *_time(stamp), grid.resolution, grid.width, grid.height)
+    writer.pack("7d", x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    return writer.sequence(grid.cells)
 
 
 def occupancy_grid_update(
     x: int, y: int, width: int, height: int, cells: bytes, stamp: datetime, frame_id: str
 ) -> bytes:
     """``map_msgs/msg/OccupancyGridUpdate``: a rectangle of cells; (x, y) is its lower left cell (column, row)."""
-    made = _Writer(_header(stamp, frame_id))
-    made.pack("iiII", x, y, width, height)
-    return made.sequence(cells)
+    writer = _Writer(_header(stamp, frame_id))
+    writer.pack("iiII", x, y, width, height)
+    return writer.sequence(cells)
 
 
 def string(text: str) -> bytes:

@@ -71,22 +71,22 @@ def _show(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
         raise Invalid(f"{certificate} and {key} are no certificate and its unencrypted key (PEM): {error}") from error
 
 
-def no_router(where: str, error: Exception, login: Login, *, names: bool = True) -> str:
-    """Why nobody was reached at ``where``: what TLS has against it, of which Zenoh does not tell, else what Zenoh says.
+def no_router(hosts: str, error: Exception, login: Login, *, names: bool = True) -> str:
+    """Why nobody was reached at ``hosts``: what TLS has against it, of which Zenoh does not tell, else what Zenoh says.
 
-    where: endpoints, separated by commas; the first is asked. names: whether its certificate has to name it.
+    hosts: endpoints, separated by commas; the first is asked. names: whether its certificate has to name it.
     """
-    return f"no router at {where}: {_objection(where, login, names=names) or plain(str(error))}"
+    return f"no router at {hosts}: {_objection(hosts, login, names=names) or plain(str(error))}"
 
 
-def plain(said: str) -> str:
+def plain(text: str) -> str:
     """The first line of what Zenoh says, without the places in its source."""
-    return re.sub(r",? at /\S+", "", said.splitlines()[0] if said else "")[:300]
+    return re.sub(r",? at /\S+", "", text.splitlines()[0] if text else "")[:300]
 
 
-def _objection(where: str, login: Login, *, names: bool) -> str | None:
-    found = re.fullmatch(r"tls/\[?([^#?]+?)\]?:(\d+)(?:[#?].*)?", where.split(",", maxsplit=1)[0].strip())
-    if found is None:
+def _objection(endpoints: str, login: Login, *, names: bool) -> str | None:
+    match = re.fullmatch(r"tls/\[?([^#?]+?)\]?:(\d+)(?:[#?].*)?", endpoints.split(",", maxsplit=1)[0].strip())
+    if match is None:
         return None
     try:
         context = trusting(login.ca) if login.ca is not None else ssl.create_default_context()
@@ -94,8 +94,8 @@ def _objection(where: str, login: Login, *, names: bool) -> str | None:
         if login.certificate is not None and login.key is not None:
             _show(context, login.certificate, login.key)
         with (
-            socket.create_connection((found[1], int(found[2])), PROBE_SECONDS) as bare,
-            context.wrap_socket(bare, server_hostname=found[1]) as link,
+            socket.create_connection((match[1], int(match[2])), PROBE_SECONDS) as bare,
+            context.wrap_socket(bare, server_hostname=match[1]) as link,
         ):
             link.recv(1)  # who does not like our certificate says so only now
     except ssl.SSLCertVerificationError as error:

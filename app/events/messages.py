@@ -152,8 +152,8 @@ class RobotStatus:
         check("holds", (body.get("holds") is None) == (holds is None), "a version and its root")
         if problems:
             raise Invalid("; ".join(f"{p.where} {p.problem}" for p in problems), problems)
-        known = next(s for s in ROBOT_STATES if s == state)
-        return cls(str(channel), int(version or 0), str(root), known, detail, time, sequence, overlays, holds)
+        robot_state = next(s for s in ROBOT_STATES if s == state)
+        return cls(str(channel), int(version or 0), str(root), robot_state, detail, time, sequence, overlays, holds)
 
     def as_dict(self) -> dict[str, Any]:
         """The status without its empty members."""

@@ -51,9 +51,9 @@ class Relay(Single):
         self._publish_new()
         self._note(self._bus.state)  # not before: nothing goes out while the database is away
         # The database is asked all the same (another host may have committed), and the session looked after.
-        asked = time.monotonic()
+        last_read = time.monotonic()
         while not self._ending.wait(LOOK_SECONDS):
-            if self._store.generation() != generation or time.monotonic() - asked > POLL_SECONDS:
+            if self._store.generation() != generation or time.monotonic() - last_read > POLL_SECONDS:
                 return
 
     def _publish_new(self) -> None:

@@ -104,14 +104,14 @@ class Publisher:
             self._publisher.put(payload)
             return
         self._count += 1
-        said = (ext.Int64(self._count), ext.Int64(time.time_ns()), self._gid)
-        self._publisher.put(payload, attachment=ext.z_serialize(said))
+        attachment = (ext.Int64(self._count), ext.Int64(time.time_ns()), self._gid)
+        self._publisher.put(payload, attachment=ext.z_serialize(attachment))
 
     def close(self) -> None:
         """Say that it is gone."""
-        for held in (self._token, self._publisher):
+        for declaration in (self._token, self._publisher):
             with contextlib.suppress(Exception):
-                held.undeclare()
+                declaration.undeclare()
 
 
 @dataclass(slots=True)
@@ -172,9 +172,9 @@ class Ros2(Single):
         generation = self._generation()
         self._tell(self._look())
         self._note({"state": "connected", "topics": len(self._owners)})
-        asked = time.monotonic()
+        last_read = time.monotonic()
         while not self._ending.wait(LOOK_SECONDS):
-            if self._generation() != generation or time.monotonic() - asked > ASK_SECONDS:
+            if self._generation() != generation or time.monotonic() - last_read > ASK_SECONDS:
                 return
 
     def _open(self) -> bool:
@@ -236,10 +236,10 @@ class Ros2(Single):
     def _publish(self, name: str, place: _Place, version: Version, content: Content) -> None:
         namespace = ros_names.namespace_of(name, self._options.chosen)
         assert namespace is not None
-        wanted: set[str] = set()
+        topic_names: set[str] = set()
         for level, grid in content.grids.items():
             topic, updates = ros_names.map_topic(namespace, level), ros_names.update_topic(namespace, level)
-            if topic.name in wanted:
+            if topic.name in topic_names:
                 log.error("ROS 2: a level of %s is left out: another one has its topic %s", name, topic.name)
                 continue
             size = grid.width * grid.height
@@ -249,7 +249,7 @@ class Ros2(Single):
             out, changes = self._out(name, place, topic), self._out(name, place, updates)
             if out is None or changes is None:
                 continue
-            wanted |= {topic.name, updates.name}
+            topic_names |= {topic.name, updates.name}
             before = out.last
             if before == grid:
                 continue
@@ -262,18 +262,18 @@ class Ros2(Single):
             topic = ros_names.network_topic(namespace)
             out = self._out(name, place, topic)
             if out is not None:
-                wanted.add(topic.name)
+                topic_names.add(topic.name)
                 if out.last != content.network:
                     out.put(cdr.string(content.network))
                     out.last = content.network
                     log.info("ROS 2: %s is version %d of %s", topic.name, version.number, name)
-        self._retire(name, wanted)
+        self._retire(name, topic_names)
 
     def _out(self, name: str, place: _Place, topic: Topic) -> _Out | None:
         """The topic, declared; None where another environment has it."""
-        known = place.topics.get(topic.name)
-        if known is not None:
-            return known
+        existing_topic = place.topics.get(topic.name)
+        if existing_topic is not None:
+            return existing_topic
         owner = self._owners.get(topic.name)
         if owner is not None:
             log.error("ROS 2: %s of %s is left out: %s has that topic; give namespaces", topic.name, name, owner)
@@ -283,14 +283,14 @@ class Ros2(Single):
         for style in self._options.keys:
             self._entities += 1
             publishers.append(Publisher(self._session, topic, style, self._options.domain, self._entities))
-        made = _Out(publishers)
-        place.topics[topic.name] = made
+        new_topic = _Out(publishers)
+        place.topics[topic.name] = new_topic
         self._owners[topic.name] = name
-        return made
+        return new_topic
 
-    def _retire(self, name: str, wanted: Sequence[str] | set[str]) -> None:
+    def _retire(self, name: str, topic_names: Sequence[str] | set[str]) -> None:
         place = self._places[name]
-        for topic in [t for t in place.topics if t not in wanted]:
+        for topic in [t for t in place.topics if t not in topic_names]:
             place.topics.pop(topic).close()
             del self._owners[topic]
 

@@ -68,16 +68,20 @@ def main() -> int:
     import zenoh
 
     # Zenoh logs to standard output, of which the server reads one line: what else is said belongs to its log.
-    told = os.fdopen(os.dup(1), "w")
+    status_stream = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     zenoh.init_log_from_env_or("error")
     configuration = sys.stdin.readline()
     try:
         session = zenoh.open(zenoh.Config.from_json5(configuration))
     except Exception as error:  # noqa: BLE001  zenoh raises its own class for all; the parent tells it
-        print(str(error).splitlines()[0][:500] if str(error) else "the router did not start", file=told, flush=True)
+        print(
+            str(error).splitlines()[0][:500] if str(error) else "the router did not start",
+            file=status_stream,
+            flush=True,
+        )
         return 1
-    print("listening", file=told, flush=True)
+    print("listening", file=status_stream, flush=True)
     sys.stdin.read()
     session.close()  # type: ignore[no-untyped-call, unused-ignore]
     return 0

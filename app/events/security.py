@@ -55,8 +55,8 @@ class Security:
         out["transport/link/tls/enable_mtls"] = self.mutual
         if self.users is not None:
             users = {**read_users(self.users), SERVER: self._own_password()}
-            known = out.get("transport/auth/usrpwd", {"user": None, "password": None})
-            out["transport/auth/usrpwd"] = {**known, "dictionary_file": str(self._dictionary(users))}
+            authentication = out.get("transport/auth/usrpwd", {"user": None, "password": None})
+            out["transport/auth/usrpwd"] = {**authentication, "dictionary_file": str(self._dictionary(users))}
             if access:
                 out["access_control"] = access_control(prefix, [name for name in users if name != SERVER])
         return out
@@ -68,8 +68,8 @@ class Security:
         # It connects to an address of this machine, which no certificate may name.
         out["transport/link/tls/verify_name_on_connect"] = False
         if self.users is not None:
-            own = {"user": SERVER, "password": self._own_password(), "dictionary_file": None}
-            out["transport/auth/usrpwd"] = own
+            credentials = {"user": SERVER, "password": self._own_password(), "dictionary_file": None}
+            out["transport/auth/usrpwd"] = credentials
         return out
 
     def _own_password(self) -> str:
@@ -119,8 +119,8 @@ def read_users(path: Path) -> dict[str, str]:
         else:
             users[name] = password
     if problems or not users:
-        told = "; ".join(f"line {p.line}: {p.problem}" for p in problems[:20]) or "there is no user in it"
-        raise Invalid(f"{path}: {told}", problems)
+        summary = "; ".join(f"line {p.line}: {p.problem}" for p in problems[:20]) or "there is no user in it"
+        raise Invalid(f"{path}: {summary}", problems)
     return users
 
 
@@ -142,13 +142,13 @@ def access_control(prefix: str, robots: Iterable[str]) -> dict[str, Any]:
         {"rules": [rules[1]["id"], rules[2]["id"]], "subjects": ["robots"]},
     ]
     for name in names:
-        own = [
+        robot_rules = [
             rule(f"status of {name}", ["ingress"], ["put"], [messages.status_key(prefix, "*", name)]),
             rule(f"presence of {name}", ["ingress"], ["liveliness_token"], [messages.robot_key(prefix, name)]),
         ]
-        rules += own
+        rules += robot_rules
         subjects.append({"id": f"robot {name}", "usernames": [name]})
-        policies.append({"rules": [r["id"] for r in own], "subjects": [f"robot {name}"]})
+        policies.append({"rules": [r["id"] for r in robot_rules], "subjects": [f"robot {name}"]})
     return {
         "enabled": True,
         "default_permission": "deny",

@@ -108,10 +108,10 @@ class Single(ABC):
 def state_of(data_dir: Path, name: str) -> dict[str, Any]:
     """What /readyz says: ``starting``, ``connected``, or ``down`` with the reason."""
     try:
-        found: dict[str, Any] = json.loads(_state_file(data_dir, name).read_text())
+        state: dict[str, Any] = json.loads(_state_file(data_dir, name).read_text())
     except (OSError, ValueError):
         return {"state": "starting"}
-    return found
+    return state
 
 
 def _state_file(data_dir: Path, name: str) -> Path:

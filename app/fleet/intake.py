@@ -40,12 +40,12 @@ MAX_PRESENT = 100_000
 
 def report_of(status: RobotStatus) -> Report:
     """A status as the store takes it. A time that is none counts as not told: nothing depends on robots' clocks."""
-    said = None
+    reported_at = None
     if status.time is not None:
         with contextlib.suppress(ValueError, OverflowError):
-            said = datetime.fromisoformat(status.time)
-            said = said.astimezone(UTC) if said.tzinfo is not None else None
-    more = (status.sequence, said, status.overlays, status.holds)
+            reported_at = datetime.fromisoformat(status.time)
+            reported_at = reported_at.astimezone(UTC) if reported_at.tzinfo is not None else None
+    more = (status.sequence, reported_at, status.overlays, status.holds)
     return Report(status.channel, status.version, status.root, status.state, status.detail, *more)
 
 
@@ -111,25 +111,25 @@ class Intake:
 
     def noting(self, heard: Heard) -> Future[FleetMapError | None]:
         """The same without waiting: what the store has against it comes as the future's result."""
-        told: Future[FleetMapError | None] = Future()
+        result: Future[FleetMapError | None] = Future()
         if self._thread is None or self._ending.is_set():
             raise Unavailable("the server is starting or stopping: try again in a few seconds")
         try:
-            self._queue.put_nowait(_Said(heard, told))
+            self._queue.put_nowait(_Said(heard, result))
         except queue.Full:
             raise Unavailable("too many reports of robots wait: try again in a few seconds") from None
-        return told
+        return result
 
-    def alive(self, robot: str, there: bool) -> None:
+    def alive(self, robot: str, on_bus: bool) -> None:
         """A robot's session came or went."""
         if not ROBOT_NAME.fullmatch(robot):
             return
         with self._lock:
-            if there and len(self._there) < MAX_PRESENT:
+            if on_bus and len(self._there) < MAX_PRESENT:
                 self._there.add(robot)
                 self._new.add(robot)
                 self._gone.discard(robot)
-            elif not there:
+            elif not on_bus:
                 self._there.discard(robot)
                 self._new.discard(robot)
                 self._gone.add(robot)
@@ -149,9 +149,9 @@ class Intake:
                 batch = []
             except Unavailable as error:
                 log.warning("reports of robots wait: %s", error.detail)
-                for said in batch:
-                    _tell(said, error)
-                batch = [said for said in batch if said.told is None]
+                for queued in batch:
+                    _tell(queued, error)
+                batch = [queued for queued in batch if queued.told is None]
                 if self._ending.wait(RETRY_SECONDS):
                     return
             except Exception:
@@ -160,11 +160,11 @@ class Intake:
             if self._ending.is_set() and self._queue.empty():
                 return
 
-    def _take(self, seconds: float, most: int) -> list[_Said]:
+    def _take(self, seconds: float, limit: int) -> list[_Said]:
         out: list[_Said] = []
         refused: list[str] = []
         deadline = time.monotonic() + seconds
-        for _ in range(most):
+        for _ in range(limit):
             try:
                 wait = 0.0 if out or refused else max(0.0, deadline - time.monotonic())
                 item = self._queue.get(timeout=wait) if wait else self._queue.get_nowait()
@@ -194,51 +194,51 @@ class Intake:
         if not batch:
             return
         unheard: list[str] = []
-        for said, refused in zip(batch, self._store.note_reports([said.heard for said in batch]), strict=True):
-            if refused is not None and said.told is None:
-                unheard.append(f"a report of {said.heard.robot} was left out: {refused.detail}")
-            _tell(said, refused)
+        for queued, refused in zip(batch, self._store.note_reports([queued.heard for queued in batch]), strict=True):
+            if refused is not None and queued.told is None:
+                unheard.append(f"a report of {queued.heard.robot} was left out: {refused.detail}")
+            _tell(queued, refused)
         _warn(unheard)
 
     def _write_each(self, batch: list[_Said]) -> list[_Said]:
         """Each on its own, so that one that cannot be taken harms no other; those for which the database is away."""
         left = []
-        for said in batch:
+        for queued in batch:
             try:
-                self._write([said])
+                self._write([queued])
             except Unavailable as error:
-                _tell(said, error)
-                left += [said] if said.told is None else []
+                _tell(queued, error)
+                left += [queued] if queued.told is None else []
             except Exception:
-                log.exception("a report of %s was left out", said.heard.robot)
-                _tell(said, Unavailable("internal error; the server's log has the details"))
+                log.exception("a report of %s was left out", queued.heard.robot)
+                _tell(queued, Unavailable("internal error; the server's log has the details"))
         return left
 
     def _write_presence(self, *, everybody: bool) -> None:
         with self._lock:
-            there = set(self._there if everybody else self._new)
-            gone = set(self._gone)
-        if not there and not gone:
+            present_robots = set(self._there if everybody else self._new)
+            absent_robots = set(self._gone)
+        if not present_robots and not absent_robots:
             return
-        self._store.note_presence(there, gone, self._clock())
+        self._store.note_presence(present_robots, absent_robots, self._clock())
         with self._lock:
-            self._new -= there
-            self._gone -= gone
+            self._new -= present_robots
+            self._gone -= absent_robots
 
 
-def settle(told: Future[FleetMapError | None], seconds: float = 0.0) -> None:
+def settle(result: Future[FleetMapError | None], seconds: float = 0.0) -> None:
     """Raise what the store had against a report; Unavailable where it did not say within so many seconds."""
     try:
-        refused = told.result(seconds)
+        refused = result.result(seconds)
     except TimeoutError:
         raise Unavailable("the report could not be stored in time: try again in a few seconds") from None
     if refused is not None:
         raise refused
 
 
-def _tell(said: _Said, refused: FleetMapError | None) -> None:
-    if said.told is not None and not said.told.done():
-        said.told.set_result(refused)
+def _tell(queued: _Said, refused: FleetMapError | None) -> None:
+    if queued.told is not None and not queued.told.done():
+        queued.told.set_result(refused)
 
 
 def _warn(reasons: list[str]) -> None:

@@ -44,21 +44,21 @@ def closed_lanes(files: Mapping[str, bytes]) -> dict[str, list[int]]:
         for level in yaml.load(data, yaml.CSafeLoader)["levels"].values():
             in_lift = [bool((vertex[2:3] or [{}])[0].get("lift")) for vertex in level.get("vertices") or ()]
             for lane in level.get("lanes") or ():
-                said = lane[2] if len(lane) > 2 else {}
-                count = 2 if said.get("dock_name") and _has_entry_event(lane, said, in_lift) else 1
-                if said.get("blocked") is True:
+                parameters = lane[2] if len(lane) > 2 else {}
+                count = 2 if parameters.get("dock_name") and _has_entry_event(lane, parameters, in_lift) else 1
+                if parameters.get("blocked") is True:
                     closed += range(index, index + count)
                 index += count
         out[name] = closed
     return out
 
 
-def _has_entry_event(lane: Sequence[Any], said: Mapping[str, Any], in_lift: Sequence[bool]) -> bool:
+def _has_entry_event(lane: Sequence[Any], parameters: Mapping[str, Any], in_lift: Sequence[bool]) -> bool:
     """Whether a robot does something before it enters a lane: a lift session, or a door."""
     begin, end = in_lift[lane[0]], in_lift[lane[1]]
     if begin or end:
         return begin is not end
-    return bool("demo_mock_floor_name" in said or "door_name" in said)
+    return bool("demo_mock_floor_name" in parameters or "door_name" in parameters)
 
 
 def zone_sets(version: Version, closures: Closures, map_id: str) -> list[dict[str, Any]]:

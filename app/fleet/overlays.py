@@ -25,8 +25,8 @@ def permanent_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[
         key, edge = edge_of(store, [head], overlay.edge)
         if edge.properties.get(BLOCKED) is True and UNTIL not in edge.properties:
             return []
-        kept = {name: value for name, value in edge.properties.items() if name != UNTIL}
-        return [_put(key, edge, {**kept, BLOCKED: True})]
+        remaining = {name: value for name, value in edge.properties.items() if name != UNTIL}
+        return [_put(key, edge, {**remaining, BLOCKED: True})]
     about = {"id": overlay.id, "reporter": overlay.reporter}
     if overlay.detail:
         about["detail"] = overlay.detail
@@ -50,10 +50,10 @@ def edge_of(store: Store, versions: Iterable[Version], edge: str) -> tuple[PartK
         for name, number in names:
             for entry in version.parts:
                 if entry.key.layer == "topology":
-                    for found in store.get(version, entry.key, [name]):
-                        pieces = shapely.get_num_coordinates(found.geometry) - 1
-                        if found.properties.get("kind") == "edge" and (not number or number <= pieces > 1):
-                            return entry.key, found
+                    for feature in store.get(version, entry.key, [name]):
+                        pieces = shapely.get_num_coordinates(feature.geometry) - 1
+                        if feature.properties.get("kind") == "edge" and (not number or number <= pieces > 1):
+                            return entry.key, feature
     raise Invalid(
         f"{environment} has no edge {edge[:80]!r} in version {' or '.join(numbers)}: use an edge's id, as "
         "GET …/layers/topology lists it",

@@ -56,12 +56,12 @@ def lag_of(robot: Robot, channel: Channel, moves: Sequence[Move]) -> Lag:
 
     A robot that says no sequence has acted on the newest move that led to the root which it holds.
     """
-    held = robot.held
-    if held is not None and held.shows(channel.root, channel.closures.digest):
+    active_map = robot.held
+    if active_map is not None and active_map.shows(channel.root, channel.closures.digest):
         return Lag(0, False, None)
     acted = 0
-    if held is not None:
-        acted = held.sequence or next((m.sequence for m in reversed(moves) if m.root == held.root), 0)
+    if active_map is not None:
+        acted = active_map.sequence or next((m.sequence for m in reversed(moves) if m.root == active_map.root), 0)
     missed = [move for move in moves if move.sequence > acted]
     since = missed[0].time if missed else robot.since
     return Lag(len(missed), True, since)
@@ -105,21 +105,21 @@ def is_ready(robot: Robot, root: str) -> bool:
 
 def holding(robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None) -> Holding:
     """The proof of convergence of one channel. robots: of its environment; planned: root of what comes next."""
-    own = [robot for robot in robots if robot.report.channel == channel.name]
+    channel_robots = [robot for robot in robots if robot.report.channel == channel.name]
     overlays = channel.closures.digest
     hold, behind = [], []
-    for robot in own:
+    for robot in channel_robots:
         if robot.held is not None and robot.held.shows(channel.root, overlays):
             hold.append(robot.held.since)
         else:
             behind.append(robot)
     failed = sum(robot.report.state == "failed" for robot in behind)
     return Holding(
-        total=len(own),
-        online=sum(is_online(robot, now) for robot in own),
+        total=len(channel_robots),
+        online=sum(is_online(robot, now) for robot in channel_robots),
         holding=len(hold),
         lagging=len(behind) - failed,
         failed=failed,
-        ready=0 if planned is None else sum(robot.vouched and is_ready(robot, planned) for robot in own),
-        since=max([*hold, channel.time]) if own and not behind else None,
+        ready=0 if planned is None else sum(robot.vouched and is_ready(robot, planned) for robot in channel_robots),
+        since=max([*hold, channel.time]) if channel_robots and not behind else None,
     )

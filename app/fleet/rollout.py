@@ -38,8 +38,8 @@ def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Step | N
     online = sum(is_online(r, now) for r in robots)
     enough = rollout.ready is None or (online > 0 and _reaches(len(ready), rollout.ready, online))
     if enough and (rollout.activate_at is None or now >= rollout.activate_at):
-        told = "its time has come" if rollout.ready is None else f"{len(ready)} of {online} robots are ready"
-        return Step("move", "waiting", told)
+        reason = "its time has come" if rollout.ready is None else f"{len(ready)} of {online} robots are ready"
+        return Step("move", "waiting", reason)
     if rollout.deadline is not None and now >= rollout.deadline:
         return Step("end", "expired", f"only {len(ready)} of {online} robots are ready: the channel stays")
     return None

@@ -103,11 +103,11 @@ def read_state(message: Any) -> tuple[Maps, ...]:
     disabled: dict[str, list[str]] = {}
     failed: dict[str, list[tuple[str, str]]] = {}
     for k, item in enumerate(_list(message, "maps", MAX_MAPS)):
-        where = f"maps[{k}]"
-        map_id, version = _text(item, "mapId", where), _text(item, "mapVersion", where)
+        location = f"maps[{k}]"
+        map_id, version = _text(item, "mapId", location), _text(item, "mapVersion", location)
         status = item.get("mapStatus")
         if status not in ("ENABLED", "DISABLED"):
-            raise _refused("must be ENABLED or DISABLED", f"{where}.mapStatus")
+            raise _refused("must be ENABLED or DISABLED", f"{location}.mapStatus")
         (enabled if status == "ENABLED" else disabled).setdefault(map_id, []).append(version)
     for map_id, versions in enabled.items():
         if len(set(versions)) > 1:
@@ -127,12 +127,12 @@ def _failures(message: Mapping[str, Any]) -> dict[tuple[str, str, str], str]:
 
     Vehicles keep what failed in their lists: the same tried again, further down, counts instead.
     """
-    told: dict[str, str] = {}
+    descriptions: dict[str, str] = {}
     for k, error in enumerate(_list(message, "errors", MAX_ACTIONS)):
         for reference in _list(error, "errorReferences", MAX_ACTIONS, f"errors[{k}]."):
             if reference.get("referenceKey") == "actionId":
                 why = error.get("errorDescription") or error.get("errorType")
-                told.setdefault(str(reference.get("referenceValue")), why if isinstance(why, str) else "")
+                descriptions.setdefault(str(reference.get("referenceValue")), why if isinstance(why, str) else "")
     out: dict[tuple[str, str, str], str] = {}
     for name in ("actionStates", "instantActionStates"):
         for k, item in enumerate(_list(message, name, MAX_ACTIONS)):
@@ -143,7 +143,7 @@ def _failures(message: Mapping[str, Any]) -> dict[tuple[str, str, str], str]:
             out.pop(about, None)
             if item.get("actionStatus") not in ("FAILED", "RETRIABLE"):
                 continue
-            reasons = [told.get(ours[0])]
+            reasons = [descriptions.get(ours[0])]
             for member in ("actionResult", "resultDescription"):
                 text = item.get(member)
                 if text is not None and not isinstance(text, str):
@@ -153,24 +153,24 @@ def _failures(message: Mapping[str, Any]) -> dict[tuple[str, str, str], str]:
     return out
 
 
-def _list(message: Mapping[str, Any], name: str, most: int, within: str = "") -> Sequence[Mapping[str, Any]]:
-    found = message.get(name)
-    if found is None:
+def _list(message: Mapping[str, Any], name: str, limit: int, within: str = "") -> Sequence[Mapping[str, Any]]:
+    items = message.get(name)
+    if items is None:
         return ()
-    if not isinstance(found, list) or len(found) > most:
-        raise _refused(f"must be a list of at most {most}", within + name)
-    for k, item in enumerate(found):
+    if not isinstance(items, list) or len(items) > limit:
+        raise _refused(f"must be a list of at most {limit}", within + name)
+    for k, item in enumerate(items):
         if not isinstance(item, Mapping):
             raise _refused("must be an object", f"{within}{name}[{k}]")
-    return found
+    return items
 
 
-def _text(item: Mapping[str, Any], name: str, where: str) -> str:
-    found = item.get(name)
-    if not isinstance(found, str) or not found or len(found) > 512:
-        raise _refused("must be a text", f"{where}.{name}")
-    return found
+def _text(item: Mapping[str, Any], name: str, location: str) -> str:
+    value = item.get(name)
+    if not isinstance(value, str) or not value or len(value) > 512:
+        raise _refused("must be a text", f"{location}.{name}")
+    return value
 
 
-def _refused(problem: str, where: str) -> Invalid:
-    return Invalid(f"this is no VDA 5050 state: {where} {problem}", [Problem(problem, where=where)])
+def _refused(problem: str, location: str) -> Invalid:
+    return Invalid(f"this is no VDA 5050 state: {location} {problem}", [Problem(problem, where=location)])

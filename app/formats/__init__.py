@@ -150,15 +150,15 @@ class WriteContext:
     template: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)
 
-    def drop(self, what: str, count: int, why: str) -> None:
+    def drop(self, item: str, count: int, why: str) -> None:
         """This much of the stored information has no place in the format."""
         if count:
-            self.dropped.append({"what": what, "count": int(count), "why": why})  # also of NumPy's integers
+            self.dropped.append({"what": item, "count": int(count), "why": why})  # also of NumPy's integers
 
-    def fill(self, what: str, value: Any, why: str, option: str | None = None) -> None:
+    def fill(self, item: str, value: Any, why: str, option: str | None = None) -> None:
         """The format asks for this and no layer has it: a default was filled in. option: the parameter that says it."""
-        said = {} if option is None else {"option": option}
-        self.template.append({"what": what, "value": value, "why": why, **said})
+        option_entry = {} if option is None else {"option": option}
+        self.template.append({"what": item, "value": value, "why": why, **option_entry})
 
     def warn(self, problem: str, *, file: str | None = None, where: str | None = None) -> None:
         """The map was written, but its consumer may not like it."""
@@ -307,10 +307,10 @@ def all_formats() -> dict[str, Format]:
 
 def get_format(name: str) -> Format:
     """The format of this name; NotFound tells the known ones."""
-    known = all_formats()
-    if name not in known:
-        raise NotFound(f"there is no format {name!r}{did_you_mean(name, known)}; known formats: {', '.join(known)}")
-    return known[name]
+    formats = all_formats()
+    if name not in formats:
+        raise NotFound(f"there is no format {name!r}{did_you_mean(name, formats)}; known formats: {', '.join(formats)}")
+    return formats[name]
 
 
 def detect(name: str, data: bytes) -> Format | None:
@@ -330,50 +330,50 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
     is taken at its word, so that the reader can say what is wrong with it.
     """
     groups, used = [], set()
-    asked = get_format(format_name) if format_name else None
+    forced_format = get_format(format_name) if format_name else None
     for name in sorted(files):
         if files[name].startswith(_APPLE_DOUBLE):
             continue
-        known = asked if asked and asked.detect(name, files[name]) else None
-        known = known or (None if asked else detect(name, files[name]))
-        if known:
-            groups.append((known, name))
-    if asked and not groups:
-        if asked.read is None:
-            raise Invalid(f"{asked.name} can be served but not read")
-        main = next((n for n in sorted(files) if n.lower().endswith(asked.extensions)), None)
-        groups = [(asked, main or next(iter(sorted(files))))]
+        fmt = forced_format if forced_format and forced_format.detect(name, files[name]) else None
+        fmt = fmt or (None if forced_format else detect(name, files[name]))
+        if fmt:
+            groups.append((fmt, name))
+    if forced_format and not groups:
+        if forced_format.read is None:
+            raise Invalid(f"{forced_format.name} can be served but not read")
+        main = next((n for n in sorted(files) if n.lower().endswith(forced_format.extensions)), None)
+        groups = [(forced_format, main or next(iter(sorted(files))))]
     groups, belong = _sorted(files, groups)
     out = []
     mains = {main for _, main in groups}
     names = tuple(sorted(files))
-    speaking = tuple(sorted(main for known, main in groups if known.yields(main)))
-    speakers = {known.name for known, main in groups if known.yields(main)}
+    speaking = tuple(sorted(main for fmt, main in groups if fmt.yields(main)))
+    speakers = {fmt.name for fmt, main in groups if fmt.yields(main)}
     yielding = {
         other
-        for known, main in groups
-        if known.name in speakers and not known.yields(main)
-        for other in known.companions(main, files[main], speaking)
-        if known.yields(other)
+        for fmt, main in groups
+        if fmt.name in speakers and not fmt.yields(main)
+        for other in fmt.companions(main, files[main], speaking)
+        if fmt.yields(other)
     }
-    groups = [(known, main) for known, main in groups if main not in yielding]
+    groups = [(fmt, main) for fmt, main in groups if main not in yielding]
     mains -= yielding
     joined: dict[tuple[str, str], list[str]] = {}
-    for known, main in groups:
-        if known.joined:
-            joined.setdefault((known.name, main.rpartition("/")[0]), []).append(main)
-    for known, main in groups:
-        more = belong[main] if main in belong else known.companions(main, files[main], names)
-        others = [n for n in more if n in files and n not in mains]
-        if known.joined:
-            first, *further = joined[known.name, main.rpartition("/")[0]]
+    for fmt, main in groups:
+        if fmt.joined:
+            joined.setdefault((fmt.name, main.rpartition("/")[0]), []).append(main)
+    for fmt, main in groups:
+        more = belong[main] if main in belong else fmt.companions(main, files[main], names)
+        companions = [n for n in more if n in files and n not in mains]
+        if fmt.joined:
+            first, *further = joined[fmt.name, main.rpartition("/")[0]]
             if main != first:
                 continue
-            others += further
-        used.update([main, *others])
-        own = {n: files[n] for n in [main, *others]}
-        seen = {n: files[n] for n in known.looks_at(main, names) if n in files and n not in own}
-        out.append(Group(known, main, own, seen))
+            companions += further
+        used.update([main, *companions])
+        own_files = {n: files[n] for n in [main, *companions]}
+        seen = {n: files[n] for n in fmt.looks_at(main, names) if n in files and n not in own_files}
+        out.append(Group(fmt, main, own_files, seen))
     return out, sorted(set(files) - used)
 
 
@@ -382,12 +382,12 @@ def _sorted(
 ) -> tuple[list[tuple[Format, str]], dict[str, Iterable[str]]]:
     """The main files that stay ones, and what belongs to those of formats that look into the files."""
     belong: dict[str, Iterable[str]] = {}
-    for known in dict.fromkeys(known for known, _ in groups):
-        if known.sort is not None:
-            belong |= {m: list(o) for m, o in known.sort(files, [m for k, m in groups if k is known]).items()}
-    claimed = {name for others in belong.values() for name in others}
-    kept = [(k, m) for k, m in groups if (m in belong if k.sort is not None else m not in claimed)]
-    return kept, belong
+    for fmt in dict.fromkeys(fmt for fmt, _ in groups):
+        if fmt.sort is not None:
+            belong |= {m: list(o) for m, o in fmt.sort(files, [m for k, m in groups if k is fmt]).items()}
+    claimed = {name for companions in belong.values() for name in companions}
+    remaining = [(k, m) for k, m in groups if (m in belong if k.sort is not None else m not in claimed)]
+    return remaining, belong
 
 
 BAD_INPUT = (
@@ -416,16 +416,16 @@ def read(item: Group, context: ReadContext) -> Layers:
 
     Raises UnreadableFile (with file, line and reason), TooLarge or UnsafeArchive.
     """
-    known = item.format
-    if known.read is None:
-        raise Invalid(f"{known.name} can be served but not read")
+    fmt = item.format
+    if fmt.read is None:
+        raise Invalid(f"{fmt.name} can be served but not read")
     context.main = item.main
     if context.options is None:
-        context.options = known.read_options()
+        context.options = fmt.read_options()
     earlier = len(context.warnings)
     try:
         with _without_collector():
-            layers = known.read({**item.files, **item.borrowed} if item.borrowed else item.files, context)
+            layers = fmt.read({**item.files, **item.borrowed} if item.borrowed else item.files, context)
     except BadUpload as error:
         raise type(error)(
             error.detail, [_in_file(p, item.main) for p in error.problems] or [_said(error, item)]
@@ -440,9 +440,9 @@ def read(item: Group, context: ReadContext) -> Layers:
         ) from error
     except BAD_INPUT as error:
         line, reason = explain(error)
-        detail = f"{item.main} cannot be read as {known.title}: {reason}"
+        detail = f"{item.main} cannot be read as {fmt.title}: {reason}"
         raise UnreadableFile(detail, [Problem(reason, item.main, line)]) from error
-    if known.bends == "nodes":
+    if fmt.bends == "nodes":
         layers = bends.join(layers)
     count = sum(len(p) for p in layers.parts.values() if isinstance(p, Features))
     if count > context.limits.features:
@@ -451,7 +451,7 @@ def read(item: Group, context: ReadContext) -> Layers:
     return layers
 
 
-def grouped(warnings: Sequence[Problem], most: int) -> list[Problem]:
+def grouped(warnings: Sequence[Problem], limit: int) -> list[Problem]:
     """Warnings of one file with those that repeat as one: the first of its kind, how many more, and where.
 
     Two are of one kind if they differ only in names and numbers. Of kinds with at most ``ALIKE`` warnings all stay.
@@ -467,9 +467,9 @@ def grouped(warnings: Sequence[Problem], most: int) -> list[Problem]:
         examples = "; ".join(dict.fromkeys(one.where or one.problem for one in same[1:ALIKE]))[:240]
         reason = f"{same[0].problem} (and {len(same) - 1} more like it: {examples})"
         out.append(replace(same[0], problem=reason))
-    if len(out) > most:
-        reason = f"and {len(out) - most} more warnings"
-        out[most:] = [Problem(reason, out[-1].file)]
+    if len(out) > limit:
+        reason = f"and {len(out) - limit} more warnings"
+        out[limit:] = [Problem(reason, out[-1].file)]
     return out
 
 
@@ -482,37 +482,37 @@ MAX_RAW_WARNINGS = 100_000
 _VARIABLE = re.compile(r"""'[^']*'|"[^"]*"|\w+://\S+|\S*\d\S*|(?<=edge )\S+|^\S+(?= is not in the upload)""")
 
 
-def write(known: Format, layers: Layers, context: WriteContext) -> dict[str, bytes]:
+def write(fmt: Format, layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """Layers -> one map's files, main file first."""
-    if known.write is None:
-        raise Invalid(f"{known.name} can be read but not served")
+    if fmt.write is None:
+        raise Invalid(f"{fmt.name} can be read but not served")
     if context.options is None:
-        context.options = known.write_options()
-    layers = _straightened(known, layers, context)
+        context.options = fmt.write_options()
+    layers = _straightened(fmt, layers, context)
     with _without_collector():
-        files = known.write(layers, context)
-    told = SERVED.set(True)
+        files = fmt.write(layers, context)
+    token = SERVED.set(True)
     try:
-        context.warnings = _joined(context.warnings, check(known, files))
+        context.warnings = _joined(context.warnings, check(fmt, files))
     finally:
-        SERVED.reset(told)
+        SERVED.reset(token)
     return files
 
 
-def _straightened(known: Format, layers: Layers, context: WriteContext) -> Layers:
+def _straightened(fmt: Format, layers: Layers, context: WriteContext) -> Layers:
     """The layers with straight edges only, for formats whose consumers drive straight from node to node."""
-    straight, split = straightened(known, layers)
+    straight, split = straightened(fmt, layers)
     if split.nodes:
         edges = "1 edge bends" if split.edges == 1 else f"{split.edges} edges bend"
-        context.fill("nodes at bends", split.nodes, f"{edges}, and in {known.name} edges are straight")
+        context.fill("nodes at bends", split.nodes, f"{edges}, and in {fmt.name} edges are straight")
     return straight
 
 
-def straightened(known: Format, layers: Layers) -> tuple[Layers, bends.Split]:
+def straightened(fmt: Format, layers: Layers) -> tuple[Layers, bends.Split]:
     """The layers as a format's consumers drive them: networks with straight edges only where shapes do not count."""
-    if known.bends == "shape":
+    if fmt.bends == "shape":
         return layers, bends.Split()
-    return bends.split(layers, known.name if known.bends == "foreign" else None)
+    return bends.split(layers, fmt.name if fmt.bends == "foreign" else None)
 
 
 LISTED = 50
@@ -522,55 +522,55 @@ SERVED: ContextVar[bool] = ContextVar("SERVED", default=False)
 """Whether what is checked was just written here, so that of a large text a look at its head must do."""
 
 
-def check(known: Format, files: Files) -> list[Problem]:
+def check(fmt: Format, files: Files) -> list[Problem]:
     """What the consumers of a map would refuse (level ``error``) or may not like (``warning``), errors first.
 
     files: the map's, main file first. This runs on each map that is served, where it may cost a few milliseconds
     (``_rules.brief``). A format's ``check`` yields problems from its loader's rules and raises what is natural where
     the files do not parse at all, which is an error too.
     """
-    if known.check is None or not files:
+    if fmt.check is None or not files:
         return []
     main = next(iter(files))
-    found: dict[str, list[Problem]] = {"error": [], "warning": []}
+    findings: dict[str, list[Problem]] = {"error": [], "warning": []}
     more = {"error": 0, "warning": 0}
     seen: set[tuple[str | None, str | None, str]] = set()
     with _without_collector():
-        every = list(_findings(known, files, main))
+        every = list(_findings(fmt, files, main))
     for one in every:
         problem = replace(one, file=one.file or main, level=one.level or "error")
-        told = (problem.file, problem.where, problem.problem)
-        if told in seen:
+        finding_key = (problem.file, problem.where, problem.problem)
+        if finding_key in seen:
             continue
-        if len(found[str(problem.level)]) < LISTED:
-            seen.add(told)
-            found[str(problem.level)].append(problem)
+        if len(findings[str(problem.level)]) < LISTED:
+            seen.add(finding_key)
+            findings[str(problem.level)].append(problem)
         else:
             more[str(problem.level)] += 1
-    for level, problems in found.items():
+    for level, problems in findings.items():
         if more[level]:
             reason = f"and {more[level]} more findings of this level"
             problems.append(replace(problems[-1], problem=reason, line=None, where=None))
-    return found["error"] + found["warning"]
+    return findings["error"] + findings["warning"]
 
 
-def _findings(known: Format, files: Files, main: str) -> Iterator[Problem]:
-    assert known.check is not None
+def _findings(fmt: Format, files: Files, main: str) -> Iterator[Problem]:
+    assert fmt.check is not None
     try:
-        yield from known.check(files)
+        yield from fmt.check(files)
     except FleetMapError as error:
         yield from [replace(p, level="error") for p in error.problems] or [Problem(error.detail, main, level="error")]
     except BAD_INPUT as error:
         line, reason = explain(error)
-        yield Problem(f"it cannot be read as {known.title}: {reason}", main, line, level="error")
+        yield Problem(f"it cannot be read as {fmt.title}: {reason}", main, line, level="error")
 
 
-def _joined(said: Sequence[Problem], found: Iterable[Problem]) -> list[Problem]:
+def _joined(warnings: Sequence[Problem], findings: Iterable[Problem]) -> list[Problem]:
     """A writer's warnings and a check's findings; of two about one place the writer's own words stay, at its level."""
-    places: dict[tuple[str | None, str | None], int] = {(p.file, p.where): k for k, p in enumerate(said) if p.where}
-    texts = {p.problem for p in said}
-    out = list(said)
-    for one in found:
+    places: dict[tuple[str | None, str | None], int] = {(p.file, p.where): k for k, p in enumerate(warnings) if p.where}
+    texts = {p.problem for p in warnings}
+    out = list(warnings)
+    for one in findings:
         k = places.get((one.file, one.where))
         if k is not None:
             out[k] = replace(out[k], level="error" if "error" in (one.level, out[k].level) else "warning")
@@ -592,14 +592,14 @@ def _without_collector() -> Iterator[None]:
             gc.enable()
 
 
-def write_options(known: Format, values: Mapping[str, str]) -> Any:
+def write_options(fmt: Format, values: Mapping[str, str]) -> Any:
     """The format's write options from texts; Invalid says which are accepted."""
-    return parameters.parse(known.write_options, values, f"parameter of {known.name}")
+    return parameters.parse(fmt.write_options, values, f"parameter of {fmt.name}")
 
 
-def read_options(known: Format, values: Mapping[str, str]) -> Any:
+def read_options(fmt: Format, values: Mapping[str, str]) -> Any:
     """The format's read options from texts; Invalid says which are accepted."""
-    return parameters.parse(known.read_options, values, f"option of {known.name}")
+    return parameters.parse(fmt.read_options, values, f"option of {fmt.name}")
 
 
 def _in_file(problem: Problem, file: str) -> Problem:

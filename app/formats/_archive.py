@@ -117,22 +117,22 @@ def _check_sizes(entries: list[_Entry], packed: int, limits: Limits) -> None:
     if size > limits.unpacked_bytes:
         raise _too_large(size, limits.unpacked_bytes, "the limit")
     ratio = f"the limit for an archive of {packed} bytes"
-    for what, declared, bound in (
+    for noun, declared, bound in (
         ("images", size_of_images, limits.max_unpacked(packed, limits.pixels)),
         ("files", size - size_of_images, limits.max_unpacked(packed)),
     ):
         if declared > bound:
-            raise _too_large(declared, bound, ratio, what=f" of {what}")
+            raise _too_large(declared, bound, ratio, noun=f" of {noun}")
 
 
 def _is_image(name: str) -> bool:
     return name.lower().endswith(_IMAGES) or _ARRAY.fullmatch(name) is not None
 
 
-def _too_large(size: int, bound: int, limit: str, where: str | None = None, what: str = "") -> TooLarge:
-    place = f"{where}: " if where else ""
-    reason = f"declares {size} bytes{what}; {limit} is {bound}"
-    return TooLarge(f"the archive unfolds to too much: {place}{reason}", [Problem(reason, where=where)])
+def _too_large(size: int, bound: int, limit: str, location: str | None = None, noun: str = "") -> TooLarge:
+    prefix = f"{location}: " if location else ""
+    reason = f"declares {size} bytes{noun}; {limit} is {bound}"
+    return TooLarge(f"the archive unfolds to too much: {prefix}{reason}", [Problem(reason, where=location)])
 
 
 def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
@@ -162,29 +162,29 @@ def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
     return out.getvalue()
 
 
-def _unsafe(reason: str, where: str | None = None) -> UnsafeArchive:
-    place = f"{where}: " if where else ""
-    detail = f"unsafe archive: {place}{reason}; pack it anew with plain files"
-    return UnsafeArchive(detail, [Problem(reason, where=where)])
+def _unsafe(reason: str, location: str | None = None) -> UnsafeArchive:
+    prefix = f"{location}: " if location else ""
+    detail = f"unsafe archive: {prefix}{reason}; pack it anew with plain files"
+    return UnsafeArchive(detail, [Problem(reason, where=location)])
 
 
-def _damaged(reason: str, where: str | None = None) -> UnreadableFile:
-    place = f"{where}: " if where else ""
-    return UnreadableFile(f"damaged or not a ZIP archive: {place}{reason}", [Problem(reason, where=where)])
+def _damaged(reason: str, location: str | None = None) -> UnreadableFile:
+    prefix = f"{location}: " if location else ""
+    return UnreadableFile(f"damaged or not a ZIP archive: {prefix}{reason}", [Problem(reason, where=location)])
 
 
 def _end(data: bytes) -> tuple[int, int, int]:
     """Number of entries, start of the central directory, and its end."""
-    at = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16))
-    while at >= 0:
-        if at + _END.size <= len(data) and at + _END.size + _END.unpack_from(data, at)[7] == len(data):
+    offset = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16))
+    while offset >= 0:
+        if offset + _END.size <= len(data) and offset + _END.size + _END.unpack_from(data, offset)[7] == len(data):
             break
-        at = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16), at + 3) if at else -1
-    if at < 0:
+        offset = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16), offset + 3) if offset else -1
+    if offset < 0:
         raise _damaged("it has no end of central directory (is it cut off?)")
-    _, disk, first_disk, here, count, size, start, _ = _END.unpack_from(data, at)
-    stop = at
-    at64 = at - _LOCATOR64.size
+    _, disk, first_disk, disk_count, count, size, start, _ = _END.unpack_from(data, offset)
+    stop = offset
+    at64 = offset - _LOCATOR64.size
     if at64 >= 0 and data[at64 : at64 + 4] == b"PK\x06\x07":
         _, end_disk, end_at, disks = _LOCATOR64.unpack_from(data, at64)
         if end_disk or disks > 1 or end_at + _END64.size > at64 or data[end_at : end_at + 4] != b"PK\x06\x06":
@@ -195,15 +195,23 @@ def _end(data: bytes) -> tuple[int, int, int]:
         for small, large, mask in (
             (disk, disk64, _MASK16),
             (first_disk, first64, _MASK16),
-            (here, here64, _MASK16),
+            (disk_count, here64, _MASK16),
             (count, count64, _MASK16),
             (size, size64, _MASK32),
             (start, start64, _MASK32),
         ):
             if small not in (mask, large):
                 raise _unsafe("its two ends of central directory disagree")
-        disk, first_disk, here, count, size, start, stop = disk64, first64, here64, count64, size64, start64, end_at
-    if disk or first_disk or here != count:
+        disk, first_disk, disk_count, count, size, start, stop = (
+            disk64,
+            first64,
+            here64,
+            count64,
+            size64,
+            start64,
+            end_at,
+        )
+    if disk or first_disk or disk_count != count:
         raise _damaged("it is one part of a split archive: join the parts first")
     if start + size != stop:
         raise _damaged("its central directory is not where it says")
@@ -220,17 +228,33 @@ def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
             f"the archive has {count} members; the limit is {limits.files}",
             [Problem(f"{count} members; the limit is {limits.files}")],
         )
-    out, at = [], start
+    out, offset = [], start
     for _ in range(count):
-        if at + _CENTRAL.size > stop:
+        if offset + _CENTRAL.size > stop:
             raise _damaged("its central directory is shorter than it says")
-        head = _CENTRAL.unpack_from(data, at)
-        mark, made_by, _, flags, method, _, _, crc, packed, size, n_name, n_extra, n_comment, disk, _, attr, place = (
-            head
-        )
-        begin = at + _CENTRAL.size
-        at = begin + n_name + n_extra + n_comment
-        if mark != b"PK\x01\x02" or at > stop:
+        head = _CENTRAL.unpack_from(data, offset)
+        (
+            mark,
+            made_by,
+            _,
+            flags,
+            method,
+            _,
+            _,
+            crc,
+            packed,
+            size,
+            n_name,
+            n_extra,
+            n_comment,
+            disk,
+            _,
+            attr,
+            header_offset,
+        ) = head
+        begin = offset + _CENTRAL.size
+        offset = begin + n_name + n_extra + n_comment
+        if mark != b"PK\x01\x02" or offset > stop:
             raise _damaged("its central directory is broken")
         raw = data[begin : begin + n_name]
         extra = _extra(data[begin + n_name : begin + n_name + n_extra])
@@ -239,13 +263,13 @@ def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
         try:
             size = next(wide) if size == _MASK32 else size
             packed = next(wide) if packed == _MASK32 else packed
-            place = next(wide) if place == _MASK32 else place
+            header_offset = next(wide) if header_offset == _MASK32 else header_offset
         except StopIteration:
             raise _damaged("its ZIP64 sizes are missing", name) from None
         if disk not in (0, _MASK16):
             raise _damaged("it is one part of a split archive: join the parts first", name)
-        out.append(_Entry(name, raw, flags, method, crc, packed, size, place, attr >> 16))
-    if at != stop:
+        out.append(_Entry(name, raw, flags, method, crc, packed, size, header_offset, attr >> 16))
+    if offset != stop:
         raise _damaged("its central directory is longer than its members")
     return out, start
 
@@ -253,13 +277,13 @@ def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
 def _extra(block: bytes) -> dict[int, bytes]:
     """The extra fields by number. What is left over at the end is ignored, as every reader does."""
     out: dict[int, bytes] = {}
-    at = 0
-    while at + 4 <= len(block):
-        kind, length = struct.unpack_from("<2H", block, at)
-        if at + 4 + length > len(block):
+    offset = 0
+    while offset + 4 <= len(block):
+        kind, length = struct.unpack_from("<2H", block, offset)
+        if offset + 4 + length > len(block):
             break
-        out.setdefault(kind, block[at + 4 : at + 4 + length])
-        at += 4 + length
+        out.setdefault(kind, block[offset + 4 : offset + 4 + length])
+        offset += 4 + length
     return out
 
 
@@ -356,9 +380,9 @@ def _locate(data: bytes, e: _Entry, directory: int) -> tuple[int, int]:
         forms = ("<LLL", "<LQQ") if max(e.packed, e.size) <= _MASK32 else ("<LQQ",)
         for form in forms:
             body = struct.pack(form, e.crc, e.packed, e.size)
-            for whole in (b"PK\x07\x08" + body, body):
-                if tail.startswith(whole):
-                    return start, end + len(whole)
+            for descriptor in (b"PK\x07\x08" + body, body):
+                if tail.startswith(descriptor):
+                    return start, end + len(descriptor)
         raise _unsafe("its data descriptor and the directory disagree", e.name)
     return start, end
 
@@ -376,12 +400,12 @@ def _deflated(packed: memoryview, e: _Entry) -> bytes:
     """Unpack in pieces, so that neither the input is copied again and again nor the output grows beyond its size."""
     unpacker = zlib.decompressobj(-zlib.MAX_WBITS)
     parts, total = [], 0
-    for at in range(0, len(packed), _CHUNK):
-        piece: bytes | memoryview = packed[at : at + _CHUNK]
+    for offset in range(0, len(packed), _CHUNK):
+        piece: bytes | memoryview = packed[offset : offset + _CHUNK]
         while not unpacker.eof:
-            most = min(_CHUNK, e.size + 1 - total)
+            limit = min(_CHUNK, e.size + 1 - total)
             try:
-                part = unpacker.decompress(piece, most)
+                part = unpacker.decompress(piece, limit)
             except zlib.error as error:
                 raise _damaged(str(error), e.name) from None
             piece = unpacker.unconsumed_tail
@@ -389,10 +413,10 @@ def _deflated(packed: memoryview, e: _Entry) -> bytes:
             parts.append(part)
             if total > e.size:
                 raise _unsafe(f"unfolds to more than the {e.size} bytes it declares", e.name)
-            if not piece and len(part) < most:
+            if not piece and len(part) < limit:
                 break
         if unpacker.eof:
-            spare = len(unpacker.unused_data) + max(0, len(packed) - at - _CHUNK)
+            spare = len(unpacker.unused_data) + max(0, len(packed) - offset - _CHUNK)
             if total != e.size or spare:
                 raise _unsafe("has another size than it declares", e.name)
             return b"".join(parts)

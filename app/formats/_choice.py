@@ -11,10 +11,10 @@ from app.model.layers import MAP, Layer, PartKey
 from app.model.names import did_you_mean
 
 
-def file_stem(name: str, usual: str = MAP) -> str:
+def file_stem(name: str, default: str = MAP) -> str:
     """Turn a part's name into that of its files, without the ending: one folder deep, and not hidden."""
     # A second character ":" would make a Windows drive of it, which no archive may hold.
-    return re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", name.lstrip(".")).lstrip(".") or usual
+    return re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", name.lstrip(".")).lstrip(".") or default
 
 
 def the_one(
@@ -23,36 +23,38 @@ def the_one(
     name: str | None,
     level: str | None,
     *,
-    what: str,
+    noun: str,
     option: str,
     supply: str,
-    usual: str = MAP,
+    default: str = MAP,
 ) -> list[PartKey]:
     """The named part; else the one with the usual name, else the only one; on its level, else on the ground, else on
     the only one.
 
-    what: the part as users call it (``grid``). option: the parameter that names it. supply: what to upload. Raises
+    noun: the part as users call it (``grid``). option: the parameter that names it. supply: what to upload. Raises
     MissingLayer, NotFound, or Ambiguous with the names to choose from.
     """
     every = [key for key in keys if key.layer == layer]
     if not every:
-        raise MissingLayer(f"there is no {what}: {supply}")
-    found = [key for key in every if level in (None, key.level)]
-    names = sorted({key.name for key in found})
-    if not found:
-        there = sorted({key.level for key in every})
-        near = did_you_mean(level or "", there)
-        raise NotFound(f"there is no {what} on the level {level!r}{near}; there are {what}s on: {', '.join(there)}")
-    name = name or (usual if usual in names else names[0] if len(names) == 1 else None)
+        raise MissingLayer(f"there is no {noun}: {supply}")
+    matches = [key for key in every if level in (None, key.level)]
+    names = sorted({key.name for key in matches})
+    if not matches:
+        level_names = sorted({key.level for key in every})
+        near = did_you_mean(level or "", level_names)
+        raise NotFound(
+            f"there is no {noun} on the level {level!r}{near}; there are {noun}s on: {', '.join(level_names)}"
+        )
+    name = name or (default if default in names else names[0] if len(names) == 1 else None)
     if name is None:
-        raise Ambiguous(f"there are several {what}s, name one with {option}=…: {', '.join(names)}")
-    found = [key for key in found if key.name == name]
-    if not found:
-        raise NotFound(f"there is no {what} {name!r}{did_you_mean(name, names)}; there are: {', '.join(names)}")
-    if len(found) > 1:
-        ground = [key for key in found if key.level == GROUND]
+        raise Ambiguous(f"there are several {noun}s, name one with {option}=…: {', '.join(names)}")
+    matches = [key for key in matches if key.name == name]
+    if not matches:
+        raise NotFound(f"there is no {noun} {name!r}{did_you_mean(name, names)}; there are: {', '.join(names)}")
+    if len(matches) > 1:
+        ground = [key for key in matches if key.level == GROUND]
         if not ground:
-            levels = ", ".join(key.level for key in found)
-            raise Ambiguous(f"the {what} {name!r} is there on several levels, name one with level=…: {levels}")
-        found = ground
-    return found
+            levels = ", ".join(key.level for key in matches)
+            raise Ambiguous(f"the {noun} {name!r} is there on several levels, name one with level=…: {levels}")
+        matches = ground
+    return matches

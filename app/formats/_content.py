@@ -127,11 +127,11 @@ def read(files: Files, main: str, limits: Limits, unread: Callable[[], Collectio
         return f"its version is not {VERSION}"
     folder = main.removesuffix(MAIN)
     maps = {f"{folder}{path}": digest for path, digest in top["maps"].items()}
-    others = files.keys() - owned(files, main)
-    added = frozenset(others - maps.keys())
+    other_names = files.keys() - owned(files, main)
+    added = frozenset(other_names - maps.keys())
     new_maps = added.difference(unread()) if added else added
     for name in sorted(maps.keys() | new_maps):
-        if name not in others:
+        if name not in other_names:
             return f"{name} was removed"
         if name not in maps:
             return f"{name} was added"
@@ -162,11 +162,11 @@ def _decoded(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes], l
         return Features(ids, geometry, tuple(row["properties"]), np.array(row["local"], bool), row["document"])
     if kind is Resources:
         return Resources({str(path): files[name] for path, name in row["files"].items()})
-    most = limits.voxels if key.layer == "voxels" else limits.pixels
-    values = {name: _value(value, files, most) for name, value in row.items()}
-    for name, wanted in _KINDS.items():
-        if not isinstance(values.get(name, wanted()), wanted):
-            raise TypeError(f"{name} of the {key.layer} is no {wanted.__name__}")
+    limit = limits.voxels if key.layer == "voxels" else limits.pixels
+    values = {name: _value(value, files, limit) for name, value in row.items()}
+    for name, expected_class in _KINDS.items():
+        if not isinstance(values.get(name, expected_class()), expected_class):
+            raise TypeError(f"{name} of the {key.layer} is no {expected_class.__name__}")
     part: Part = kind(**values)
     if isinstance(part, Picture):
         _check_place(part)
@@ -181,13 +181,13 @@ def _check_place(picture: Picture) -> None:
         raise UnreadableFile(f"a picture: {reason}", [Problem(reason)])
 
 
-def _value(value: Any, files: Mapping[str, bytes], most: int) -> Any:
+def _value(value: Any, files: Mapping[str, bytes], limit: int) -> Any:
     """A field: an array of at most so many rows or pixels, a tuple of numbers, or what it is."""
     if isinstance(value, dict) and value.keys() == {"file", "type", "shape"}:
         shape = tuple(map(int, value["shape"]))
         if value["type"] not in _TYPES or min(shape, default=0) < 0:
             raise ValueError(f"{value['type']!r} {shape} is no array of numbers")
-        if math.prod(shape[:2]) > 4 * most or math.prod(shape) > 64 * most:
-            raise TooLarge(f"an array of the content is {shape}; the limit is {most}")
+        if math.prod(shape[:2]) > 4 * limit or math.prod(shape) > 64 * limit:
+            raise TooLarge(f"an array of the content is {shape}; the limit is {limit}")
         return np.frombuffer(files[value["file"]], np.dtype(value["type"])).reshape(shape)
     return tuple(value) if isinstance(value, list) else value

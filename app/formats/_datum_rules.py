@@ -26,14 +26,14 @@ def check(files: Files) -> Iterator[Problem]:
     if not isinstance(top, dict):
         yield refused("a datum is a mapping", main)
         return
-    place: dict[str, Any] = {}
-    for key, most in (("datum_latitude", 90.0), ("datum_longitude", 180.0)):
+    position: dict[str, Any] = {}
+    for key, bound in (("datum_latitude", 90.0), ("datum_longitude", 180.0)):
         value = top.get(key)
-        if not is_number(value) or abs(value) > most:
-            yield refused(f"must be degrees within ±{most:g}, is {shown(value)}", main, where=key)
+        if not is_number(value) or abs(value) > bound:
+            yield refused(f"must be degrees within ±{bound:g}, is {shown(value)}", main, where=key)
         else:
-            place[key] = value
-    if abs(place.get("datum_latitude", 0.0)) > MAX_DATUM_LATITUDE:
+            position[key] = value
+    if abs(position.get("datum_latitude", 0.0)) > MAX_DATUM_LATITUDE:
         reason = f"beyond ±{MAX_DATUM_LATITUDE:g} degrees no local frame is exact: this server refuses such a datum"
         yield refused(reason, main, where="datum_latitude")
     fence = top.get("gnss_fence")
@@ -49,24 +49,26 @@ def check(files: Files) -> Iterator[Problem]:
     size = top.get("gmapping")
     if size is not None and not (isinstance(size, dict) and all(is_number(size.get(w)) for w in SIZES)):
         yield refused(f"needs the numbers {', '.join(SIZES)}", main, where="gmapping")
-    yield from _navsat(top.get("navsat_transform_node"), place, main)
+    yield from _navsat(top.get("navsat_transform_node"), position, main)
 
 
-def _navsat(said: Any, place: dict[str, Any], main: str) -> Iterator[Problem]:
-    where = "navsat_transform_node.datum"
-    if said is None:
+def _navsat(parameters: Any, position: dict[str, Any], main: str) -> Iterator[Problem]:
+    location = "navsat_transform_node.datum"
+    if parameters is None:
         return
-    datum = said.get("datum") if isinstance(said, dict) else None
+    datum = parameters.get("datum") if isinstance(parameters, dict) else None
     if datum is None:
-        if isinstance(said, dict) and said.get("wait_for_datum"):
-            yield doubted("robot_localization waits for a datum that is not there", main, where=where)
+        if isinstance(parameters, dict) and parameters.get("wait_for_datum"):
+            yield doubted("robot_localization waits for a datum that is not there", main, where=location)
         return
     if not numbers(datum, 3, 3):
-        yield refused(f"must be [latitude, longitude, yaw], is {shown(datum)}", main, where=where)
+        yield refused(f"must be [latitude, longitude, yaw], is {shown(datum)}", main, where=location)
         return
     if len({type(v) for v in datum}) > 1:
-        yield doubted(f"ROS 2 wants values of one type in a list: write 0.0 for 0 in {shown(datum)}", main, where=where)
+        yield doubted(
+            f"ROS 2 wants values of one type in a list: write 0.0 for 0 in {shown(datum)}", main, where=location
+        )
     for value, key in zip(datum, ("datum_latitude", "datum_longitude"), strict=False):
-        if key in place and abs(value - place[key]) > SAME_DEGREES:
-            yield doubted(f"differs from {key} {place[key]!r}", main, where=where)
+        if key in position and abs(value - position[key]) > SAME_DEGREES:
+            yield doubted(f"differs from {key} {position[key]!r}", main, where=location)
             break

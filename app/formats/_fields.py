@@ -71,7 +71,7 @@ class Words:
 
     def check(self, value: Any) -> tuple[str, str]:
         """Return why the value is doubtful."""
-        if any(value == word and type(value) is type(word) for word in self.known):
+        if any(value == literal and type(value) is type(literal) for literal in self.known):
             return "", ""
         return "", f"unknown value {_shown(value)}: it is one of {', '.join(map(str, self.known))}"
 
@@ -158,9 +158,9 @@ def check(value: Any, shape: Any, context: ReadContext, file: str | None = None)
 
     Raises UnreadableFile for the first value that is out of range.
     """
-    found = _Findings(file)
-    _walk(value, shape, (), found)
-    found.report(context)
+    findings = _Findings(file)
+    _walk(value, shape, (), findings)
+    findings.report(context)
 
 
 class _Findings:
@@ -190,11 +190,11 @@ class _Findings:
             more = len(self.unknown) - SHOWN
             names += [f"and {more} more"] if more > 0 else []
             context.warn(f"unknown keys, kept without effect: {', '.join(names)}", file=self.file)
-        for count, where, reason in self.doubts.values():
-            context.warn(reason if count == 1 else f"{reason} ({count} times)", file=self.file, where=where)
+        for count, location, reason in self.doubts.values():
+            context.warn(reason if count == 1 else f"{reason} ({count} times)", file=self.file, where=location)
 
 
-def _walk(value: Any, shape: Any, path: Path, found: _Findings) -> None:
+def _walk(value: Any, shape: Any, path: Path, findings: _Findings) -> None:
     if shape is ANY or value is None:
         return
     if isinstance(value, _yaml.Tagged):
@@ -204,34 +204,34 @@ def _walk(value: Any, shape: Any, path: Path, found: _Findings) -> None:
         if not isinstance(value, dict):
             if shape.loose:
                 return
-            found.add_doubt(path, f"{_shown(value)} is no mapping")
+            findings.add_doubt(path, f"{_shown(value)} is no mapping")
             return
         if not (shape.open or shape.each is not ANY) and not value.keys() <= shape.known:
-            found.add_unknown(path, frozenset(value.keys() - shape.known))
+            findings.add_unknown(path, frozenset(value.keys() - shape.known))
         for key, rule in shape.rules:
             if (inner := value.get(key)) is not None:
-                _walk(inner, rule, (key, path), found)
+                _walk(inner, rule, (key, path), findings)
         if shape.each is not ANY:
             for key in value.keys() - shape.known:
-                _walk(value[key], shape.each, (key, path), found)
+                _walk(value[key], shape.each, (key, path), findings)
     elif kind is list:
         if not isinstance(value, list):
-            found.add_doubt(path, f"{_shown(value)} is no list")
+            findings.add_doubt(path, f"{_shown(value)} is no list")
             return
         for k, item in enumerate(value):
-            _walk(item, shape[0], (k, path), found)
+            _walk(item, shape[0], (k, path), findings)
     elif kind is tuple:  # a row: a shape for each place
         for k, (item, rule) in enumerate(zip(value, shape, strict=False) if isinstance(value, list) else ()):
-            _walk(item, rule, (k, path), found)
+            _walk(item, rule, (k, path), findings)
     elif kind is Typed:
-        _walk(value[1] if isinstance(value, list) and len(value) == 2 else value, shape.shape, path, found)
+        _walk(value[1] if isinstance(value, list) and len(value) == 2 else value, shape.shape, path, findings)
     else:
         refusal, doubt = shape.check(value)
         if refusal:
-            where = _where(path)
-            raise UnreadableFile(f"{where}: {refusal}", [Problem(refusal, found.file, where=where)])
+            location = _where(path)
+            raise UnreadableFile(f"{location}: {refusal}", [Problem(refusal, findings.file, where=location)])
         if doubt:
-            found.add_doubt(path, doubt)
+            findings.add_doubt(path, doubt)
 
 
 def _number(value: Any) -> float | None:

@@ -172,16 +172,16 @@ class _Packed:
 
     def write(self, packed: bytes) -> None:
         """Append some of the packed pixels."""
-        rest = memoryview(packed)
-        while rest:
+        remainder = memoryview(packed)
+        while remainder:
             if self.size == self.MOST:
                 self.close()
                 self.begin()
-            part = rest[: self.MOST - self.size]
+            part = remainder[: self.MOST - self.size]
             self.out.write(part)
             self.size += len(part)
             self.sum = zlib.crc32(part, self.sum)
-            rest = rest[len(part) :]
+            remainder = remainder[len(part) :]
 
     def close(self) -> None:
         """Finish the chunk: its checksum, and its length where it begins."""
@@ -243,64 +243,64 @@ def _check_size(width: int, height: int, limits: Limits) -> None:
 # --- PGM ----------------------------------------------------------------------------------------------------------
 def _read_pgm(data: bytes, limits: Limits) -> Grey:
     """P2 and P5 by netpbm's rules: white space and comments between the numbers, one white space before the pixels."""
-    at, numbers = 2, []
-    for what in ("width", "height", "highest value"):
-        at = _skip_blank(data, at)
-        end = at
-        while end < at + 10 and data[end : end + 1].isdigit():
+    offset, numbers = 2, []
+    for noun in ("width", "height", "highest value"):
+        offset = _skip_blank(data, offset)
+        end = offset
+        while end < offset + 10 and data[end : end + 1].isdigit():
             end += 1
-        if end == at or end == at + 10:
-            raise UnreadableFile(f"the PGM's {what} is not a number of up to 9 digits (at byte {at})")
-        numbers.append(int(data[at:end]))
-        at = end
-    width, height, most = numbers
-    if not 1 <= most <= 65535:
-        raise UnreadableFile(f"the PGM's highest value is {most}; it must be 1 to 65535")
+        if end == offset or end == offset + 10:
+            raise UnreadableFile(f"the PGM's {noun} is not a number of up to 9 digits (at byte {offset})")
+        numbers.append(int(data[offset:end]))
+        offset = end
+    width, height, maximum = numbers
+    if not 1 <= maximum <= 65535:
+        raise UnreadableFile(f"the PGM's highest value is {maximum}; it must be 1 to 65535")
     _check_size(width, height, limits)
-    if data[at : at + 1] not in (b" ", b"\t", b"\r", b"\n", b"\v", b"\f"):
-        raise UnreadableFile("the PGM ends after its header" if at >= len(data) else "the PGM's header is damaged")
-    at += 1
+    if data[offset : offset + 1] not in (b" ", b"\t", b"\r", b"\n", b"\v", b"\f"):
+        raise UnreadableFile("the PGM ends after its header" if offset >= len(data) else "the PGM's header is damaged")
+    offset += 1
     count = width * height
     values: NDArray[np.integer]
     if data[:2] == b"P2":
         if len(data) > limits.text_bytes:
             raise TooLarge(f"the plain PGM has {len(data)} bytes; the limit is {limits.text_bytes}: save it as P5")
-        values = _plain_numbers(data[at:], count)
+        values = _plain_numbers(data[offset:], count)
     else:
-        size = count * (1 if most < 256 else 2)
-        if len(data) - at < size:
+        size = count * (1 if maximum < 256 else 2)
+        if len(data) - offset < size:
             raise UnreadableFile(
-                f"the PGM is cut short: {width} × {height} pixels are {size} bytes, it has {len(data) - at}"
+                f"the PGM is cut short: {width} × {height} pixels are {size} bytes, it has {len(data) - offset}"
             )
-        values = np.frombuffer(data, np.uint8 if most < 256 else ">u2", count, at)
+        values = np.frombuffer(data, np.uint8 if maximum < 256 else ">u2", count, offset)
     rows = values.reshape(height, width)
-    table = None if most == 255 else _scaling(most)
+    table = None if maximum == 255 else _scaling(maximum)
 
     def strips() -> Strips:
         step = max(1, STRIP // width)
         for y in range(0, height, step):
             block = rows[y : y + step]
-            top = most if most in (255, 65535) and data[:2] == b"P5" else int(block.max())
-            if top > most:
-                raise UnreadableFile(f"the PGM has the value {top}, above the highest it declares ({most})")
+            top = maximum if maximum in (255, 65535) and data[:2] == b"P5" else int(block.max())
+            if top > maximum:
+                raise UnreadableFile(f"the PGM has the value {top}, above the highest it declares ({maximum})")
             yield y, (block.astype(np.uint8, copy=False) if table is None else table[block]), None
 
     return Grey(width, height, strips)
 
 
-def _skip_blank(data: bytes, at: int) -> int:
+def _skip_blank(data: bytes, offset: int) -> int:
     """The next byte that is neither white space nor in a comment."""
-    while at < len(data):
-        if data[at] == 0x23:
-            ends = [end for end in (data.find(b"\n", at), data.find(b"\r", at)) if end >= 0]
+    while offset < len(data):
+        if data[offset] == 0x23:
+            ends = [end for end in (data.find(b"\n", offset), data.find(b"\r", offset)) if end >= 0]
             if not ends:
                 return len(data)
-            at = min(ends)
-        elif data[at] not in b" \t\r\n\v\f":
-            return at
+            offset = min(ends)
+        elif data[offset] not in b" \t\r\n\v\f":
+            return offset
         else:
-            at += 1
-    return at
+            offset += 1
+    return offset
 
 
 def _plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
@@ -322,10 +322,10 @@ def _plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
     return values[:count]
 
 
-def _scaling(most: int) -> Bytes:
+def _scaling(maximum: int) -> Bytes:
     """0…most to 0…255 as GraphicsMagick does: to 16 bit, then to 8, each rounded."""
-    value = np.minimum(np.arange(256 if most < 256 else 65536, dtype=np.int64), most)
-    return (((65535 * value + most // 2) // most + 128) // 257).astype(np.uint8)
+    value = np.minimum(np.arange(256 if maximum < 256 else 65536, dtype=np.int64), maximum)
+    return (((65535 * value + maximum // 2) // maximum + 128) // 257).astype(np.uint8)
 
 
 # --- pictures that Pillow decodes ---------------------------------------------------------------------------------
@@ -347,12 +347,12 @@ def _image_strips(image: Image.Image) -> Strips:
 
 
 def _grey_and_opaque(rgba: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
-    word = np.ascontiguousarray(rgba).view("<u4")[..., 0]
-    opaque: NDArray[np.bool_] = word >= 0xFF000000
-    red = word & 0xFF
-    if bool(((word & 0xFFFFFF) == red * 0x010101).all()):
+    pixels = np.ascontiguousarray(rgba).view("<u4")[..., 0]
+    opaque: NDArray[np.bool_] = pixels >= 0xFF000000
+    red = pixels & 0xFF
+    if bool(((pixels & 0xFFFFFF) == red * 0x010101).all()):
         return red.astype(np.uint8), opaque
-    total = red * RED + ((word >> 8) & 0xFF) * GREEN + ((word >> 16) & 0xFF) * BLUE
+    total = red * RED + ((pixels >> 8) & 0xFF) * GREEN + ((pixels >> 16) & 0xFF) * BLUE
     return ((total + 500_000) // 1_000_000).astype(np.uint8), opaque
 
 
@@ -397,50 +397,50 @@ def _inflated(chunks: Iterator[memoryview]) -> Generator[bytes, int, None]:
     """The unfolded content of a zlib stream: send how many bytes are wanted next (fewer come at its end)."""
     unfold = zlib.decompressobj()
     pieces = (chunk[k : k + 2**14] for chunk in chunks for k in range(0, len(chunk), 2**14))
-    rest: bytes | memoryview = b""
-    wanted = yield b""
+    remainder: bytes | memoryview = b""
+    budget = yield b""
     while True:
         out = []
-        while wanted > 0 and not unfold.eof:
+        while budget > 0 and not unfold.eof:
             # With nothing new there may still be something that did not fit before.
-            part = unfold.decompress(rest, wanted)
-            rest = unfold.unconsumed_tail
-            if not part and not rest:
-                rest = next(pieces, b"")
-                if not rest:
+            part = unfold.decompress(remainder, budget)
+            remainder = unfold.unconsumed_tail
+            if not part and not remainder:
+                remainder = next(pieces, b"")
+                if not remainder:
                     break
             out.append(part)
-            wanted -= len(part)
-        wanted = yield b"".join(out)
+            budget -= len(part)
+        budget = yield b"".join(out)
 
 
 def _checked_png(data: bytes, limits: Limits) -> list[memoryview]:
     """The PNG's signature and the chunks that make its pixels, each one's checksum verified (Pillow skips IDAT's)."""
     view = memoryview(data)
-    at, kept, packed = 8, [view[:8]], 0
+    offset, chunks, packed = 8, [view[:8]], 0
     width = height = depth = colour = 0
     palette = False
     while True:
-        if at + 12 > len(data):
+        if offset + 12 > len(data):
             raise UnreadableFile("the PNG picture is cut short")
-        size = int.from_bytes(data[at : at + 4], "big")
-        kind, end = data[at + 4 : at + 8], at + 12 + size
+        size = int.from_bytes(data[offset : offset + 4], "big")
+        kind, end = data[offset + 4 : offset + 8], offset + 12 + size
         if end > len(data):
             raise UnreadableFile("the PNG picture is cut short")
-        if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise UnreadableFile(f"the PNG picture is damaged: wrong checksum of its chunk {kind!r} at byte {at}")
-        if len(kept) == 1:
+        if zlib.crc32(memoryview(data)[offset + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            raise UnreadableFile(f"the PNG picture is damaged: wrong checksum of its chunk {kind!r} at byte {offset}")
+        if len(chunks) == 1:
             if kind != b"IHDR" or size != 13:
                 raise UnreadableFile("the PNG picture does not begin with its header")
             width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
             _check_size(width, height, limits)
         palette = palette or kind == b"PLTE"
         if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
-            kept.append(view[at:end])
+            chunks.append(view[offset:end])
             packed += size if kind == b"IDAT" else 0
         elif not kind[0] & 0x20:
             raise UnreadableFile(f"the PNG picture needs the unknown chunk {kind!r}")
-        at = end
+        offset = end
         if kind == b"IEND":
             break
     if colour == 3 and not palette:
@@ -448,7 +448,7 @@ def _checked_png(data: bytes, limits: Limits) -> list[memoryview]:
     bits = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 1) * depth
     if (width * bits // 8) * height > packed * DEFLATE_RATIO:
         raise UnreadableFile(f"the PNG picture says {width} × {height} pixels, but {packed} bytes cannot hold them")
-    return kept
+    return chunks
 
 
 def _check_jpeg(data: bytes) -> None:

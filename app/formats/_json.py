@@ -46,17 +46,17 @@ def _check_depth(data: bytes) -> None:
         raise UnreadableFile(reason, [Problem(reason)])
 
 
-def ranks(words: str) -> dict[str, int]:
+def ranks(keys: str) -> dict[str, int]:
     """The words of a text with their places, for ``ordered``."""
-    return {word: rank for rank, word in enumerate(words.split())}
+    return {key: rank for rank, key in enumerate(keys.split())}
 
 
-def ordered(value: Any, words: Mapping[str, int]) -> Any:
+def ordered(value: Any, key_ranks: Mapping[str, int]) -> Any:
     """The value with the keys of all its objects in order: these words by their rank, then others by alphabet.
 
     So that equal values give equal bytes, however they were put together.
     """
     if isinstance(value, dict):
-        last = len(words)
-        return {k: ordered(value[k], words) for k in sorted(value, key=lambda k: (words.get(k, last), k))}
-    return [ordered(v, words) for v in value] if isinstance(value, list) else value
+        last = len(key_ranks)
+        return {k: ordered(value[k], key_ranks) for k in sorted(value, key=lambda k: (key_ranks.get(k, last), k))}
+    return [ordered(v, key_ranks) for v in value] if isinstance(value, list) else value

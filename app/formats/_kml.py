@@ -120,8 +120,8 @@ def child(element: etree._Element, name: str) -> etree._Element | None:
 
 def child_text(element: etree._Element, name: str) -> str:
     """The stripped text of the first child of this name, else an empty text."""
-    found = child(element, name)
-    return "" if found is None else (found.text or "").strip()
+    match = child(element, name)
+    return "" if match is None else (match.text or "").strip()
 
 
 # --- coordinates ------------------------------------------------------------------------------------------------------
@@ -319,10 +319,10 @@ def item_geometry(element: etree._Element) -> Any:
     """The geometry of a placemark or overlay, of any shape. Raises UnreadableFile."""
     if local_name(element) == "GroundOverlay":
         return overlay_footprint(element)
-    found = [c for c in element if isinstance(c.tag, str) and local_name(c) in GEOMETRIES]
-    if len(found) == 1:
-        return read_geometry(found[0])
-    shapes = [s for s in map(read_geometry, found) if not s.is_empty]
+    geometries = [c for c in element if isinstance(c.tag, str) and local_name(c) in GEOMETRIES]
+    if len(geometries) == 1:
+        return read_geometry(geometries[0])
+    shapes = [s for s in map(read_geometry, geometries) if not s.is_empty]
     return shapes[0] if len(shapes) == 1 else _joined(shapes)
 
 
@@ -557,11 +557,11 @@ class _Reader:
     def read(self, root: etree._Element, entry: str | None) -> None:
         """A document, and those that we have put inside it."""
         marks = self._marks(root)
-        for element, words in marks:
-            if words.get(MARK) == "document" and element is not root and element.getparent() is not None:
-                level = words.get("level") or self.context.level
+        for element, values in marks:
+            if values.get(MARK) == "document" and element is not root and element.getparent() is not None:
+                level = values.get("level") or self.context.level
                 self._detach(element)
-                self._read_one(element, words.get("document"), words.get("entry"), level, [])
+                self._read_one(element, values.get("document"), values.get("entry"), level, [])
         ours = [(e, w) for e, w in marks if w.get(MARK) != "document"]
         self._read_one(root, None, entry, self.context.level, ours)
 
@@ -571,9 +571,9 @@ class _Reader:
         for extended in root.iter("{*}ExtendedData"):
             parent = extended.getparent()
             if parent is not None and local_name(parent) in CONTAINERS:
-                words = _words(_values(extended), PLACE_WORDS | {"document", "entry"})
-                if MARK in words:
-                    out.append((parent, words))
+                values = _words(_values(extended), PLACE_WORDS | {"document", "entry"})
+                if MARK in values:
+                    out.append((parent, values))
         return out
 
     def _detach(self, element: etree._Element) -> None:
@@ -596,138 +596,138 @@ class _Reader:
         items = _items(root)
         for schema in root.iter("{*}Schema"):
             if schema.get("parent"):
-                what = f"<{schema.get('name', '')[:80]}> elements, placemarks of KML's oldest Schema form,"
-                self.context.warn(f"{what} are kept but not read as objects", line=schema.sourceline)
+                noun = f"<{schema.get('name', '')[:80]}> elements, placemarks of KML's oldest Schema form,"
+                self.context.warn(f"{noun} are kept but not read as objects", line=schema.sourceline)
         parsed = self._sequences(items)
         _check_places(items, parsed)
-        mine, theirs = [], []
+        own_items, other_items = [], []
         for item in items:
-            words = _words(item.data, PLACE_WORDS)
-            if words.get("layer") in USUAL_PART:
-                mine.append((item, words))
+            values = _words(item.data, PLACE_WORDS)
+            if values.get("layer") in USUAL_PART:
+                own_items.append((item, values))
             else:
-                theirs.append(item)
-        self._take(mine, parsed)
-        whole = self._remove_ours(root, ours)
-        if (theirs or not whole) and self.context.wants("objects"):
-            self._keep(root, theirs, parsed, name, entry, level)
+                other_items.append(item)
+        self._take(own_items, parsed)
+        all_own = self._remove_ours(root, ours)
+        if (other_items or not all_own) and self.context.wants("objects"):
+            self._keep(root, other_items, parsed, name, entry, level)
 
     # --- our own words ---
 
-    def _key(self, words: Mapping[str, str], layer: str) -> PartKey:
-        part = words.get("part") or USUAL_PART[layer] or FAMILY
-        return PartKey(layer, words.get("level") or self.context.level, part)  # type: ignore[arg-type]
+    def _key(self, values: Mapping[str, str], layer: str) -> PartKey:
+        part = values.get("part") or USUAL_PART[layer] or FAMILY
+        return PartKey(layer, values.get("level") or self.context.level, part)  # type: ignore[arg-type]
 
-    def _take(self, mine: Sequence[tuple[_Item, dict[str, str]]], parsed: Sequences) -> None:
+    def _take(self, own_items: Sequence[tuple[_Item, dict[str, str]]], parsed: Sequences) -> None:
         """Items of ours go back to their parts."""
-        geometry = _geometries([item for item, _ in mine], parsed)
-        metres = _metres([words.get("local") for _, words in mine], [item.element for item, _ in mine])
-        for (item, words), drawn, exact in zip(mine, geometry, metres, strict=True):
+        geometry = _geometries([item for item, _ in own_items], parsed)
+        metres = _metres([values.get("local") for _, values in own_items], [item.element for item, _ in own_items])
+        for (item, values), drawn, exact in zip(own_items, geometry, metres, strict=True):
             element = item.element
             parent = element.getparent()
             if parent is not None:
                 parent.remove(element)
-            layer = words["layer"]
+            layer = values["layer"]
             title = child_text(element, "name")
             if layer in ("occupancy", "imagery"):
-                self._take_raster(element, words, title)
+                self._take_raster(element, values, title)
                 continue
             properties: dict[str, Any] = {"name": title} if title else {}
-            for label, text in words.items():
+            for label, text in values.items():
                 if label not in OWN_WORDS:
                     properties[label] = unspell(text)
-            if "more" in words and isinstance(more := unspell(words["more"]), dict):
+            if "more" in values and isinstance(more := unspell(values["more"]), dict):
                 properties |= more
-            if layer == "location" and properties.get("kind") == "datum" and "id" not in words:
+            if layer == "location" and properties.get("kind") == "datum" and "id" not in values:
                 self._take_datum(properties, element)
                 continue
             shape = drawn
-            if words.get("geometry") == "GeometryCollection" and drawn.geom_type != "GeometryCollection":
+            if values.get("geometry") == "GeometryCollection" and drawn.geom_type != "GeometryCollection":
                 shape = shapely.geometrycollections(list(shapely.get_parts(drawn)))
-            own = self.own.setdefault(self._key(words, layer), _Own())
-            own.ids.append(_usable(words.get("id") or title or local_name(element)))
-            own.geometry.append(shape)
-            own.properties.append(properties)
-            own.local.append(exact)
+            part_items = self.own.setdefault(self._key(values, layer), _Own())
+            part_items.ids.append(_usable(values.get("id") or title or local_name(element)))
+            part_items.geometry.append(shape)
+            part_items.properties.append(properties)
+            part_items.local.append(exact)
 
     def _take_datum(self, properties: Mapping[str, Any], element: etree._Element) -> None:
-        wanted = ("latitude", "longitude", "altitude", "heading")
-        numbers = {n: properties[n] for n in wanted if isinstance(properties.get(n), int | float)}
+        names = ("latitude", "longitude", "altitude", "heading")
+        numbers = {n: properties[n] for n in names if isinstance(properties.get(n), int | float)}
         if "latitude" not in numbers or "longitude" not in numbers:
             reason = "the datum has no latitude and longitude"
             raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)])
         self.datum = Datum(**numbers)
 
-    def _take_raster(self, element: etree._Element, words: Mapping[str, str], title: str) -> None:
+    def _take_raster(self, element: etree._Element, values: Mapping[str, str], title: str) -> None:
         """A grid or a picture of ours, where its image travels with the drawing."""
         icon = child(element, "Icon")
         href = "" if icon is None else child_text(icon, "href")
-        layer = words["layer"]
-        label = words.get("part") or title or USUAL_PART[layer]
-        what = "grid" if layer == "occupancy" else "picture"
+        layer = values["layer"]
+        label = values.get("part") or title or USUAL_PART[layer]
+        noun = "grid" if layer == "occupancy" else "picture"
         data = self.pictures.get(href)
         if data is None:
             self.context.warn(
-                f"its image {href!r} is not in the upload, so the {what} is left out: upload the KMZ, or both files",
+                f"its image {href!r} is not in the upload, so the {noun} is left out: upload the KMZ, or both files",
                 line=element.sourceline,
                 where=label,
             )
             return
-        said = {n: unspell(t) for n, t in words.items()}
+        parameters = {n: unspell(t) for n, t in values.items()}
         self.used.add(href)
         read = self._grid if layer == "occupancy" else self._picture
         try:
-            self.rasters[self._key(words, layer)] = read(data, href, said)
+            self.rasters[self._key(values, layer)] = read(data, href, parameters)
         except (KeyError, TypeError) as error:
-            reason = f"the {what} {label} lacks what places it: {error}"
+            reason = f"the {noun} {label} lacks what places it: {error}"
             raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)]) from error
 
-    def _grid(self, data: bytes, href: str, said: Mapping[str, Any]) -> OccupancyGrid:
+    def _grid(self, data: bytes, href: str, parameters: Mapping[str, Any]) -> OccupancyGrid:
         """A grid: the image's palette index is the cell."""
         image = _image.read_image(data, self.context.limits)
         if image.mode != "P":
             raise UnreadableFile(f"{href} is no longer the picture of a grid: its colours have changed")
-        properties = said.get("properties")
+        properties = parameters.get("properties")
         return OccupancyGrid(
             np.ascontiguousarray(np.asarray(image, np.uint8)[::-1]),
-            float(said["resolution"]),
-            tuple(float(v) for v in said["origin"]),  # type: ignore[arg-type]
-            said.get("mode", "trinary"),
-            float(said.get("occupied_thresh", 0.65)),
-            float(said.get("free_thresh", 0.196)),
-            bool(said.get("negate", False)),
+            float(parameters["resolution"]),
+            tuple(float(v) for v in parameters["origin"]),  # type: ignore[arg-type]
+            parameters.get("mode", "trinary"),
+            float(parameters.get("occupied_thresh", 0.65)),
+            float(parameters.get("free_thresh", 0.196)),
+            bool(parameters.get("negate", False)),
             properties if isinstance(properties, dict) else {},
         )
 
-    def _picture(self, data: bytes, href: str, said: Mapping[str, Any]) -> Picture:
+    def _picture(self, data: bytes, href: str, parameters: Mapping[str, Any]) -> Picture:
         """A picture: its pixels, and the exact place that its overlay has in our words."""
         image = _image.read_image(data, self.context.limits)
         if image.mode not in ("L", "LA", "RGB", "RGBA"):
             raise UnreadableFile(f"{href} is no longer the picture that was written: its colours have changed")
         pixels = np.asarray(image, np.uint8).reshape(image.height, image.width, -1)
-        a, b, c, d, e, f = (float(v) for v in said["transform"])
-        properties = said.get("properties")
-        own = properties if isinstance(properties, dict) else {}
-        return Picture(np.ascontiguousarray(pixels), (a, b, c, d, e, f), str(said["crs"]), own)
+        a, b, c, d, e, f = (float(v) for v in parameters["transform"])
+        properties = parameters.get("properties")
+        picture_properties = properties if isinstance(properties, dict) else {}
+        return Picture(np.ascontiguousarray(pixels), (a, b, c, d, e, f), str(parameters["crs"]), picture_properties)
 
     def _remove_ours(self, root: etree._Element, ours: list[tuple[etree._Element, dict[str, str]]]) -> bool:
         """Take out our folders and styles; True where nothing of anybody else is left in the file."""
-        for element, words in reversed(ours):
+        for element, values in reversed(ours):
             for extended in element.findall("{*}ExtendedData")[:1]:
                 element.remove(extended)
             for style in element.findall("{*}Style"):
                 if style.get("id", "").startswith(STYLE):
                     element.remove(style)
-            if words[MARK] == "part" and words.get("layer") in VECTOR_LAYERS:
-                level = words.get("level") or self.context.level
-                elevation = unspell(words.get("elevation", "0"))
+            if values[MARK] == "part" and values.get("layer") in VECTOR_LAYERS:
+                level = values.get("level") or self.context.level
+                elevation = unspell(values.get("elevation", "0"))
                 if isinstance(elevation, int | float):
                     self.levels[level] = float(elevation)
-                document = unspell(words.get("document", "{}"))
-                own = self.own.setdefault(self._key(words, words["layer"]), _Own())
-                own.document |= document if isinstance(document, dict) else {}
+                document = unspell(values.get("document", "{}"))
+                part_items = self.own.setdefault(self._key(values, values["layer"]), _Own())
+                part_items.document |= document if isinstance(document, dict) else {}
             described = child(element, "description")
-            if words[MARK] == "map" and described is not None:
+            if values[MARK] == "map" and described is not None:
                 self.credit += [line for line in (described.text or "").splitlines() if line]
             left = [c for c in element if local_name(c) not in ("name", "description", "visibility", "open")]
             parent = element.getparent()
@@ -746,18 +746,18 @@ class _Reader:
         for item in items:
             if len(item.geometries) != 1 or local_name(item.element) == "GroundOverlay":
                 continue
-            found = _plain_sequences(item.geometries[0])
-            if found is None:
+            sequences = _plain_sequences(item.geometries[0])
+            if sequences is None:
                 continue
-            item.shape = found[0]
-            for role, c in found[1]:
+            item.shape = sequences[0]
+            for role, c in sequences[1]:
                 item.sequences += ((role, len(texts), c),)
                 texts.append(c.text or "")
         if not texts:
             return Sequences(np.empty((0, 3)), np.zeros(1, np.int64), np.zeros(0, bool))
         parsed = parse_coordinates(texts)
         count = np.diff(parsed.start)
-        least = {"P": 1, "L": 2, "R": 3}
+        min_points = {"P": 1, "L": 2, "R": 3}
         closed = np.zeros(len(texts), bool)
         full = count > 0
         ends = parsed.points[parsed.start[1:][full] - 1]
@@ -771,7 +771,7 @@ class _Reader:
         for item in items:
             for role, k, _ in item.sequences:
                 n = counts[k]
-                if odd[k] or n < least[role] or (role == "P" and n > 1) or (role == "R" and not closes[k]):
+                if odd[k] or n < min_points[role] or (role == "P" and n > 1) or (role == "R" and not closes[k]):
                     item.shape = ""
             if item.sequences and not item.shape:
                 strange.append(item.element)
@@ -802,23 +802,23 @@ class _Reader:
         for k, item in enumerate(items):
             title = titles[k]
             kind = "overlay" if local_name(item.element) in OVERLAYS else _KINDS[types[k]] or _mixed(geometry[k])
-            own: dict[str, Any] = {"kind": kind}
-            kept: dict[str, Any] = {"place": k}
+            item_properties: dict[str, Any] = {"kind": kind}
+            source_element: dict[str, Any] = {"place": k}
             if title is not None and title[1]:
-                own["name"] = title[1]
+                item_properties["name"] = title[1]
             for label, value in item.data:
                 aside = label in RESERVED
-                (kept.setdefault("data", {}) if aside else own)[label] = value.text or ""
-            own[FAMILY] = kept
-            properties.append(own)
+                (source_element.setdefault("data", {}) if aside else item_properties)[label] = value.text or ""
+            item_properties[FAMILY] = source_element
+            properties.append(item_properties)
         self.columns.setdefault(level, []).append((ids, list(geometry), properties))
         documents = self.documents.setdefault(level, {})
         if self.context.whole:
             xml = _keep_text(root, items, [t[0] if t else None for t in titles], properties)
             key = name or hashlib.sha256(f"{entry or ''}\0{xml}".encode()).hexdigest()[:DOCUMENT_KEY_DIGITS]
             documents[key] = {"xml": xml} if entry is None else {"xml": xml, "entry": entry}
-            for own in properties:
-                own[FAMILY]["document"] = key
+            for item_properties in properties:
+                item_properties[FAMILY]["document"] = key
 
     # --- the result ---
 
@@ -833,10 +833,10 @@ class _Reader:
             document = {FAMILY: {"documents": self.documents[level]}} if self.documents[level] else {}
             key = PartKey("objects", level, FAMILY)
             parts[key] = Features(tuple(ids), geometry, tuple(properties), np.zeros(len(ids), bool), document)
-        for key, own in self.own.items():
-            made = self._own_part(key, own)
-            known = parts.get(key)
-            parts[key] = _both(known, made) if isinstance(known, Features) else made
+        for key, part_items in self.own.items():
+            part = self._own_part(key, part_items)
+            existing = parts.get(key)
+            parts[key] = _both(existing, part) if isinstance(existing, Features) else part
         parts = self._credited(parts)
         levels = tuple(Level(n, e) for n, e in sorted(self.levels.items(), key=lambda v: (v[1], v[0])))
         return Layers(parts, self.datum, levels or (Level(self.context.level),))
@@ -844,36 +844,36 @@ class _Reader:
     def _credited(self, parts: dict[PartKey, Part]) -> dict[PartKey, Part]:
         """Our map's description tells the licences and credits of all its parts; some parts tell their own besides."""
         stated = {
-            k: said if isinstance(said := p.document.get("attribution"), list) else []
+            k: texts if isinstance(texts := p.document.get("attribution"), list) else []
             for k, p in parts.items()
             if isinstance(p, Features)
         }
-        known = [text for said in stated.values() for text in said]
-        extra = [text for text in self.credit if text not in known]
+        all_texts = [text for texts in stated.values() for text in texts]
+        extra = [text for text in self.credit if text not in all_texts]
         out = dict(parts)
         for key, part in parts.items() if extra else ():
             if isinstance(part, Features):
                 out[key] = part.with_document({**part.document, "attribution": [*stated[key], *extra]})
         return out
 
-    def _own_part(self, key: PartKey, own: _Own) -> Features:
+    def _own_part(self, key: PartKey, part_items: _Own) -> Features:
         """Items of ours as they were: the exact metres where they were local, unless somebody has moved them."""
-        n = len(own.ids)
-        ids = unique_ids(own.ids)
-        if ids != own.ids:
-            again = [i for i, c in Counter(own.ids).items() if c > 1]
+        n = len(part_items.ids)
+        ids = unique_ids(part_items.ids)
+        if ids != part_items.ids:
+            repeats = [i for i, c in Counter(part_items.ids).items() if c > 1]
             self.context.warn(
-                f"{len(again)} ids of {key.layer} are used twice: later ones got #2, #3 …", where=again[0]
+                f"{len(repeats)} ids of {key.layer} are used twice: later ones got #2, #3 …", where=repeats[0]
             )
         geometry = np.empty(n, object)
-        geometry[:] = own.geometry
-        local = np.array([m is not None for m in own.local], bool)
-        where = np.flatnonzero(local)
-        if len(where):
-            metres = np.empty(len(where), object)
-            metres[:] = [own.local[k] for k in where]
-            geometry[where] = self._unmoved(geometry[where], metres)
-        return Features(tuple(ids), geometry, tuple(own.properties), local, own.document)
+        geometry[:] = part_items.geometry
+        local = np.array([m is not None for m in part_items.local], bool)
+        indices = np.flatnonzero(local)
+        if len(indices):
+            metres = np.empty(len(indices), object)
+            metres[:] = [part_items.local[k] for k in indices]
+            geometry[indices] = self._unmoved(geometry[indices], metres)
+        return Features(tuple(ids), geometry, tuple(part_items.properties), local, part_items.document)
 
     def _unmoved(self, drawn: NDArray[np.object_], metres: NDArray[np.object_]) -> NDArray[np.object_]:
         """The exact metres, or what was drawn since, brought to metres."""
@@ -916,10 +916,10 @@ def _both(a: Features, b: Features) -> Features:
 def _check_places(items: Sequence[_Item], parsed: Sequences) -> None:
     """Refuse coordinates that are not on earth, with the line of their geometry."""
     points = parsed.points
-    good = (np.abs(points[:, 0]) <= 180.0) & (np.abs(points[:, 1]) <= 90.0) & (np.abs(points[:, 2]) <= MAX_METRES)
-    if good.all():
+    valid = (np.abs(points[:, 0]) <= 180.0) & (np.abs(points[:, 1]) <= 90.0) & (np.abs(points[:, 2]) <= MAX_METRES)
+    if valid.all():
         return
-    at = int(np.flatnonzero(~good)[0])
+    at = int(np.flatnonzero(~valid)[0])
     sequence = int(np.searchsorted(parsed.start, at, "right")) - 1
     owner = next((i for i in items if any(k == sequence for _, k, _ in i.sequences)), None)
     x, y, _ = points[at]
@@ -931,25 +931,25 @@ def _items(root: etree._Element) -> list[_Item]:
     """The placemarks and overlays of the document: those that stand in nothing but containers (elsewhere, as in an
     Update or in an element that nobody knows, they are part of what they stand in).
     """
-    good: dict[etree._Element, bool] = {}
+    usable: dict[etree._Element, bool] = {}
 
     def contained(element: etree._Element) -> bool:
         chain = []
-        while element is not None and element not in good:
+        while element is not None and element not in usable:
             chain.append(element)
             if local_name(element) not in CONTAINERS:
-                good[element] = False
+                usable[element] = False
                 break
             element = element.getparent()
-        answer = True if element is None else good[element]
-        good.update(dict.fromkeys(chain, answer))
+        answer = True if element is None else usable[element]
+        usable.update(dict.fromkeys(chain, answer))
         return answer
 
     items: list[_Item] = []
     index: dict[etree._Element, _Item] = {}
     for element in root.iter(*(f"{{*}}{name}" for name in sorted(ITEMS))):
         parent = element.getparent()
-        if parent is None or good.get(parent) or contained(parent):
+        if parent is None or usable.get(parent) or contained(parent):
             item = _Item(element)
             items.append(item)
             index[element] = item
@@ -984,11 +984,11 @@ def _values(extended: etree._Element) -> list[tuple[str, etree._Element]]:
 
 def _words(data: Iterable[tuple[str, etree._Element]], names: frozenset[str]) -> dict[str, str]:
     """The values by name as texts; of these names as they were before ``spell`` quoted what looks like a number."""
-    words = {name: value.text or "" for name, value in data}
-    for name in names & words.keys():
-        value = unspell(words[name])
-        words[name] = value if isinstance(value, str) else words[name]
-    return words
+    values = {name: value.text or "" for name, value in data}
+    for name in names & values.keys():
+        value = unspell(values[name])
+        values[name] = value if isinstance(value, str) else values[name]
+    return values
 
 
 def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Element]]] | None:
@@ -999,24 +999,24 @@ def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Ele
     if name == "Polygon":
         if len(g) == 1 and (c := _only_ring(g[0])) is not None:
             return "A1", [("R", c)]
-        found = list(g.iter("{*}coordinates"))
-        for k, c in enumerate(found):
+        coordinates = list(g.iter("{*}coordinates"))
+        for k, c in enumerate(coordinates):
             ring = c.getparent()
             side = ring.getparent()
-            word = "outerBoundaryIs" if k == 0 else "innerBoundaryIs"
+            tag = "outerBoundaryIs" if k == 0 else "innerBoundaryIs"
             alone = len(list(ring.iterchildren(c.tag))) == 1 and not len(c)
-            if not alone or local_name(side) != word or side.getparent() is not g:
+            if not alone or local_name(side) != tag or side.getparent() is not g:
                 return None
-        return (f"A{len(found)}", [("R", c) for c in found]) if found else None
+        return (f"A{len(coordinates)}", [("R", c) for c in coordinates]) if coordinates else None
     if name in SIMPLE:
         if len(g) == 1 and not len(g[0]) and g[0].tag.endswith("}coordinates"):
             role = "P" if name == "Point" else "L"
             return role, [(role, g[0])]
-        found = list(g.iterchildren("{*}coordinates"))
-        if len(found) != 1 or len(found[0]) or len(list(g.iter("{*}coordinates"))) != 1:
+        coordinates = list(g.iterchildren("{*}coordinates"))
+        if len(coordinates) != 1 or len(coordinates[0]) or len(list(g.iter("{*}coordinates"))) != 1:
             return None
         role = "P" if name == "Point" else "L"
-        return role, [(role, found[0])]
+        return role, [(role, coordinates[0])]
     if name != "MultiGeometry":
         return None
     shape, out = "M", []
@@ -1042,10 +1042,10 @@ def _only_ring(side: etree._Element) -> etree._Element | None:
 def _geometries(items: Sequence[_Item], parsed: Sequences) -> NDArray[np.object_]:
     """All geometries, the plain ones made by the array. 3-D only where an altitude is not 0."""
     out = np.full(len(items), NO_GEOMETRY, object)
-    wanted: dict[str, list[tuple[int, int]]] = {"P": [], "L": [], "A1": []}
+    rows_by_shape: dict[str, list[tuple[int, int]]] = {"P": [], "L": [], "A1": []}
     for n, item in enumerate(items):
-        if item.shape in wanted:
-            wanted[item.shape].append((n, item.sequences[0][1]))
+        if item.shape in rows_by_shape:
+            rows_by_shape[item.shape].append((n, item.sequences[0][1]))
         elif item.shape:
             out[n] = _assembled(item, parsed)
         else:
@@ -1058,10 +1058,10 @@ def _geometries(items: Sequence[_Item], parsed: Sequences) -> NDArray[np.object_
         ),
     }
     deep_points = np.concatenate([[0], np.cumsum(parsed.points[:, 2] != 0.0)])
-    for shape, rows in wanted.items():
+    for shape, rows in rows_by_shape.items():
         if not rows:
             continue
-        place, sequence = np.array(rows).T
+        indices, sequence = np.array(rows).T
         begin, end = parsed.start[sequence], parsed.start[sequence + 1]
         deep = deep_points[end] > deep_points[begin]
         for mask, width in ((~deep, 2), (deep, 3)):
@@ -1070,9 +1070,9 @@ def _geometries(items: Sequence[_Item], parsed: Sequences) -> NDArray[np.object_
             size = (end - begin)[mask]
             offset = np.repeat(begin[mask] - np.concatenate([[0], np.cumsum(size)[:-1]]), size)
             points = parsed.points[np.arange(size.sum()) + offset, :width]
-            made = np.empty(len(size), object)
-            make[shape](points, np.repeat(np.arange(len(size)), size), made)
-            out[place[mask]] = made
+            geometries = np.empty(len(size), object)
+            make[shape](points, np.repeat(np.arange(len(size)), size), geometries)
+            out[indices[mask]] = geometries
     return out
 
 
@@ -1082,13 +1082,13 @@ def _assembled(item: _Item, parsed: Sequences) -> Any:
     deep = any(p[:, 2].any() for p in lists)
     rows = iter([p if deep else p[:, :2] for p in lists])
     shapes = []
-    for word in re.findall(r"P|L|A\d+", item.shape):
-        if word == "P":
+    for piece in re.findall(r"P|L|A\d+", item.shape):
+        if piece == "P":
             shapes.append(shapely.points(next(rows)[0]))
-        elif word == "L":
+        elif piece == "L":
             shapes.append(shapely.linestrings(next(rows)))
         else:
-            rings = [shapely.linearrings(next(rows)) for _ in range(int(word[1:]))]
+            rings = [shapely.linearrings(next(rows)) for _ in range(int(piece[1:]))]
             shapes.append(shapely.polygons(rings[0], holes=rings[1:] or None))
     return _joined(shapes) if item.shape[0] == "M" else shapes[0]
 
@@ -1120,10 +1120,10 @@ def _identify(
             ids.append(_usable(attribute))
         else:
             ids.append(_usable(title[1] if title and title[1] else attribute or local_name(item.element)))
-    again = [n for n, c in Counter(t[1] for t in titles if t and t[1]).items() if c > 1]
-    if again:
-        others = f" and {len(again) - 1} more" if len(again) > 1 else ""
-        context.warn(f"several placemarks are called {again[0]!r}{others}; all are kept", where=again[0][:200])
+    repeats = [n for n, c in Counter(t[1] for t in titles if t and t[1]).items() if c > 1]
+    if repeats:
+        suffix = f" and {len(repeats) - 1} more" if len(repeats) > 1 else ""
+        context.warn(f"several placemarks are called {repeats[0]!r}{suffix}; all are kept", where=repeats[0][:200])
     return ids, titles
 
 
@@ -1135,7 +1135,7 @@ def _keep_text(
 ) -> str:
     """Put each item's element as text, with slots, into its properties; the rest of the document is the answer."""
     names = values = coordinates = 0
-    for item, title, own in zip(items, titles, properties, strict=True):
+    for item, title, item_properties in zip(items, titles, properties, strict=True):
         if title is not None:
             title.text = _M_NAME
             names += 1
@@ -1143,7 +1143,7 @@ def _keep_text(
             value.text = f"{_M_OPEN}{quote(label)}{_M_CLOSE}"
             values += 1
         if item.shape:
-            own[FAMILY]["shape"] = item.shape
+            item_properties[FAMILY]["shape"] = item.shape
             for _, _, c in item.sequences:
                 c.text = _M_COORDINATES
             coordinates += len(item.sequences)
@@ -1155,10 +1155,10 @@ def _keep_text(
         reason = "the file has runs of control characters (U+0091 U+009C U+0082 …) that serve as marks here"
         raise UnreadableFile(reason, [Problem(reason)])
     skeleton = []
-    for k, (own, first) in enumerate(zip(properties, begins, strict=True)):
+    for k, (item_properties, first) in enumerate(zip(properties, begins, strict=True)):
         if first:
             skeleton += [next(pieces), f"<?items {k}?>"]
-        own[FAMILY]["xml"] = next(pieces)
+        item_properties[FAMILY]["xml"] = next(pieces)
     return "".join([*skeleton, *pieces])
 
 
@@ -1237,14 +1237,14 @@ def _metres(texts: Sequence[str | None], elements: Sequence[etree._Element]) -> 
     for width in (2, 3):
         dots = [(k, v) for k, (w, v) in points if w == width]
         if dots:
-            for (k, _), made in zip(dots, shapely.points(np.array([v for _, v in dots], np.float64)), strict=True):
-                out[k] = made
+            for (k, _), geometry in zip(dots, shapely.points(np.array([v for _, v in dots], np.float64)), strict=True):
+                out[k] = geometry
         strings = [(k, v) for k, (w, v) in lines if w == width and len(v) > 1]
         if strings:
             index = np.repeat(np.arange(len(strings)), [len(v) for _, v in strings])
             flat = np.array([p for _, v in strings for p in v], np.float64).reshape(-1, width)
-            for (k, _), made in zip(strings, shapely.linestrings(flat, indices=index), strict=True):
-                out[k] = made
+            for (k, _), geometry in zip(strings, shapely.linestrings(flat, indices=index), strict=True):
+                out[k] = geometry
     for k, text in enumerate(texts):
         if text is not None and out[k] is None:
             raise _no_metres(elements[k])

@@ -39,8 +39,8 @@ def check_archive(files: Files) -> Iterator[Problem]:
     if len(kml) > 1:
         yield doubted(f"has {len(kml)} .kml; readers take the first one, {kml[0]}", main)
     folder = posixpath.dirname(kml[0])
-    known = {posixpath.relpath(name, folder) if folder else name for name in entries}
-    yield from _document(entries[kml[0]], main, known)
+    entry_names = {posixpath.relpath(name, folder) if folder else name for name in entries}
+    yield from _document(entries[kml[0]], main, entry_names)
 
 
 def _document(data: bytes, main: str, entries: Collection[str] | None) -> Iterator[Problem]:
@@ -56,21 +56,23 @@ def _document(data: bytes, main: str, entries: Collection[str] | None) -> Iterat
     elif not (name.namespace or "").startswith(SPACES):
         yield doubted("the root is in no KML namespace: GDAL does not take it for KML", main, line=root.sourceline)
     ids = [str(i) for i in root.xpath("//@*[local-name() = 'id']")]
-    if again := repeated(ids):
-        yield doubted(f"{len(again)} ids are given twice; styles and updates are found by them: {names(again)}", main)
-    known = set(ids)
+    if repeats := repeated(ids):
+        yield doubted(
+            f"{len(repeats)} ids are given twice; styles and updates are found by them: {names(repeats)}", main
+        )
+    id_set = set(ids)
     urls = {(e.text or "").strip() for e in root.iter("{*}styleUrl")}
-    if lost := sorted(u for u in urls if u.startswith("#") and u[1:] not in known):
-        yield doubted(f"{len(lost)} styles are not there: {names(lost)}", main)
-    wrong = [e.sourceline for e in root.iter("{*}coordinates") if not _on_earth(e.text)]
-    if wrong:
-        reason = f"{len(wrong)} coordinates do not begin with a longitude and a latitude; the first is on this line"
-        yield refused(reason, main, line=wrong[0])
+    if absent := sorted(u for u in urls if u.startswith("#") and u[1:] not in id_set):
+        yield doubted(f"{len(absent)} styles are not there: {names(absent)}", main)
+    bad_lines = [e.sourceline for e in root.iter("{*}coordinates") if not _on_earth(e.text)]
+    if bad_lines:
+        reason = f"{len(bad_lines)} coordinates do not begin with a longitude and a latitude; the first is on this line"
+        yield refused(reason, main, line=bad_lines[0])
     if entries is not None:
         hrefs = {(e.text or "").strip() for e in root.iter("{*}href")}
         inside = {h.partition("#")[0] for h in hrefs if h and ":" not in h and not h.startswith("#")}
-        if lost := sorted(h for h in inside if h and posixpath.normpath(h) not in entries):
-            yield doubted(f"{len(lost)} files that it refers to are not in the archive: {names(lost)}", main)
+        if absent := sorted(h for h in inside if h and posixpath.normpath(h) not in entries):
+            yield doubted(f"{len(absent)} files that it refers to are not in the archive: {names(absent)}", main)
 
 
 def _on_earth(text: str | None) -> bool:

@@ -112,14 +112,14 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
     shared = [text for text in context.attribution if text not in claimed]
     for key in sorted(parts):
         part = parts[key]
-        rest: Features | None = part
+        remainder: Features | None = part
         if key.layer == "objects" and key.name == FAMILY:
-            kept, rest = _drawings(key, part, frame, context)
-            documents += kept
+            drawings, remainder = _drawings(key, part, frame, context)
+            documents += drawings
         elif key.layer == "topology":
-            rest = _undrawn(part, drawn)
-        if rest is not None:
-            folders.append(_folder(key, rest, layers, frame, shared))
+            remainder = _undrawn(part, drawn)
+        if remainder is not None:
+            folders.append(_folder(key, remainder, layers, frame, shared))
     overlays, pictures = _overlays(layers, context, with_pictures, taken)
     # A drawing that is all there is comes back as it was: the datum stands beside what is ours, not inside it.
     datum = [_datum(layers)] if folders or overlays or not documents else []
@@ -218,18 +218,18 @@ def _coordinate_texts(
     if thin:
         begin = np.array(bounds[:-1], np.int64)
         four = np.flatnonzero(from_area & (np.diff(bounds) == 4))
-        known = np.nan_to_num(points)
-        back = four[(known[begin[four] + 1] == known[begin[four] + 2]).all(axis=1)]
+        finite = np.nan_to_num(points)
+        back = four[(finite[begin[four] + 1] == finite[begin[four] + 2]).all(axis=1)]
         for k in back.tolist():
             a = bounds[k]
             texts[k] = glue.join([positions[a], positions[a + 1], positions[a + 3]])
     places = np.searchsorted(owner[part_of], np.arange(len(geometry) + 1)).tolist()
-    words = [_LETTERS.get(t, f"A{n}") if n else "" for t, n in zip(types.tolist(), count.tolist(), strict=True)]
-    own = np.searchsorted(owner, np.arange(len(geometry) + 1)).tolist()
+    letters = [_LETTERS.get(t, f"A{n}") if n else "" for t, n in zip(types.tolist(), count.tolist(), strict=True)]
+    starts = np.searchsorted(owner, np.arange(len(geometry) + 1)).tolist()
     several = (shapely.get_type_id(geometry) > 3).tolist()
     shape = [
-        ("M" if many else "") + (words[a] if b - a == 1 else "".join(words[a:b]))
-        for a, b, many in zip(own, own[1:], several, strict=False)
+        ("M" if many else "") + (letters[a] if b - a == 1 else "".join(letters[a:b]))
+        for a, b, many in zip(starts, starts[1:], several, strict=False)
     ]
     return _Texts(texts, places, shape)
 
@@ -271,20 +271,20 @@ def _element(geometry: Any, lists: Iterator[str], extra: str = "") -> str:
 
 def _undrawn(part: Features, drawn: set[str]) -> Features | None:
     """A network without what was made from a drawing that is written too; None where nothing else is in it."""
-    made = [isinstance(i := p.get("drawn_from"), str) and i in drawn for p in part.properties]
-    if not any(made):
+    mask = [isinstance(i := p.get("drawn_from"), str) and i in drawn for p in part.properties]
+    if not any(mask):
         return part
-    return part.take(~np.array(made)) if not all(made) else None
+    return part.take(~np.array(mask)) if not all(mask) else None
 
 
 def _place_words(key: PartKey) -> str:
     """Where an item belongs, as far as it is not what a reader takes for granted."""
-    words = _data("layer", key.layer)
+    data = _data("layer", key.layer)
     if key.level != GROUND:
-        words += _data("level", key.level)
+        data += _data("level", key.level)
     if key.name != (USUAL_PART[key.layer] or FAMILY):
-        words += _data("part", key.name)
-    return words
+        data += _data("part", key.name)
+    return data
 
 
 def _datum(layers: Layers) -> str:
@@ -292,35 +292,35 @@ def _datum(layers: Layers) -> str:
     datum = layers.datum
     if datum is None:
         return ""
-    words = "".join(_data(n, v) for n, v in {"kind": "datum", **datum.as_dict()}.items())
+    data = "".join(_data(n, v) for n, v in {"kind": "datum", **datum.as_dict()}.items())
     at = ",".join(_text.numbers([datum.longitude, datum.latitude], _text.DEGREES))
     return (
-        f"<Placemark><name>datum</name><ExtendedData>{_data('layer', 'location')}{words}</ExtendedData>"
+        f"<Placemark><name>datum</name><ExtendedData>{_data('layer', 'location')}{data}</ExtendedData>"
         f"<Point><coordinates>{at}</coordinates></Point></Placemark>\n"
     )
 
 
 def _stated(part: Features) -> list[str]:
     """The licences and credits that a part's own document tells."""
-    said = part.document.get("attribution")
-    return [text for text in said if isinstance(text, str)] if isinstance(said, list) else []
+    attribution = part.document.get("attribution")
+    return [text for text in attribution if isinstance(text, str)] if isinstance(attribution, list) else []
 
 
 def _folder(key: PartKey, part: Features, layers: Layers, frame: LocalFrame | None, shared: Sequence[str] = ()) -> str:
     """A part in our own words. shared: credits that no part's document tells."""
-    words = [_data(MARK, "part"), _place_words(key)]
+    data = [_data(MARK, "part"), _place_words(key)]
     elevation = layers.elevation(key.level)
     if elevation:
-        words.append(_data("elevation", elevation))
+        data.append(_data("elevation", elevation))
     document = part.document if key.name != FAMILY else {}
     if shared and key.name != FAMILY:
         document = {**document, "attribution": [*_stated(part), *shared]}
     if document:
-        words.append(_data("document", dict(document)))
+        data.append(_data("document", dict(document)))
     title = key.layer if key.level == GROUND else f"{key.layer}, {key.level}"
     return "".join(
         [
-            f"<Folder><name>{escape(title)}</name><ExtendedData>{''.join(words)}</ExtendedData>\n",
+            f"<Folder><name>{escape(title)}</name><ExtendedData>{''.join(data)}</ExtendedData>\n",
             *_placemarks(key, part, frame),
             "</Folder>\n",
         ]
@@ -332,12 +332,12 @@ def _placemarks(key: PartKey, part: Features, frame: LocalFrame | None) -> Itera
     geometry = part.in_wgs84(frame)
     texts = _degrees(geometry)
     exact = _local_words(part)
-    place = _place_words(key)
+    part_data = _place_words(key)
     opening: dict[str, str] = {}
     types = shapely.get_type_id(geometry).tolist()
     for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
         out = ["<Placemark>"]
-        words = [place, f'<Data name="id"><value>{spell(i)}</value></Data>']
+        data = [part_data, f'<Data name="id"><value>{spell(i)}</value></Data>']
         more: dict[str, Any] = {}
         for label in sorted(p):
             value = p[label]
@@ -348,19 +348,19 @@ def _placemarks(key: PartKey, part: Features, frame: LocalFrame | None) -> Itera
                     continue
             start = opening.get(label)
             if start is None:
-                good = label not in OWN_WORDS and label and label.isprintable() and label == label.strip()
-                start = opening[label] = f'<Data name="{quoted(label)}"><value>' if good else ""
+                plain = label not in OWN_WORDS and label and label.isprintable() and label == label.strip()
+                start = opening[label] = f'<Data name="{quoted(label)}"><value>' if plain else ""
             if start:
-                words.append(f"{start}{spell(value)}</value></Data>")
+                data.append(f"{start}{spell(value)}</value></Data>")
             else:
                 more[label] = value
         if more:
-            words.append(_data("more", more))
+            data.append(_data("more", more))
         if exact[k]:
-            words.append(f'<Data name="local"><value>{exact[k]}</value></Data>')
+            data.append(f'<Data name="local"><value>{exact[k]}</value></Data>')
         if types[k] == 7 and not geometry[k].is_empty:
-            words.append('<Data name="geometry"><value>GeometryCollection</value></Data>')
-        out.append(f"<styleUrl>#{STYLE}{_style(key.layer, p)}</styleUrl><ExtendedData>{''.join(words)}</ExtendedData>")
+            data.append('<Data name="geometry"><value>GeometryCollection</value></Data>')
+        out.append(f"<styleUrl>#{STYLE}{_style(key.layer, p)}</styleUrl><ExtendedData>{''.join(data)}</ExtendedData>")
         if types[k] == 0 and texts.start[k] < texts.start[k + 1] and not geometry[k].is_empty:
             out.append(f"<Point><coordinates>{texts.texts[texts.start[k]]}</coordinates></Point>")
         else:
@@ -378,12 +378,12 @@ def _style(layer: Layer, properties: Properties) -> str:
 def _local_words(part: Features) -> list[str]:
     """The exact metres of local items as JSON, an empty text for the others."""
     out = [""] * len(part)
-    where = np.flatnonzero(part.local)
-    if not len(where):
+    indices = np.flatnonzero(part.local)
+    if not len(indices):
         return out
-    geometry = part.geometry[where]
+    geometry = part.geometry[indices]
     texts = _coordinate_texts(geometry, _text.METRES, _bracket, ",")
-    for n, k in enumerate(where.tolist()):
+    for n, k in enumerate(indices.tolist()):
         shape, lists = texts.shape[n], texts.of(n)
         if shape == "P":
             out[k] = lists[0]
@@ -404,7 +404,7 @@ def _overlays(
     """Each grid and picture as a GroundOverlay at its place, with all that its image does not say, and the images."""
     out: list[str] = []
     images: dict[str, bytes] = {}
-    kept: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for key, part in layers.parts.items():
         if not isinstance(part, OccupancyGrid | Picture):
             continue
@@ -418,8 +418,8 @@ def _overlays(
             name, n = f"{stem}-{n}.png", n + 1
         images[name] = _png(key, part, context) if with_pictures else b""
         out.append(_overlay(key, part, name, corners))
-        kept[key.layer] += 1
-    for layer, count in sorted(kept.items() if not with_pictures else ()):
+        counts[key.layer] += 1
+    for layer, count in sorted(counts.items() if not with_pictures else ()):
         why = "their images travel in KMZ, or beside the KML with pictures=true; without them it tells where they lie"
         context.drop(layer, count, why)
     return out, images if with_pictures else {}
@@ -480,9 +480,9 @@ def _overlay(key: PartKey, part: OccupancyGrid | Picture, href: str, ring: NDArr
     sides = frame.to_wgs84(metres.mean(axis=0) + np.array([[w, 0.0], [-w, 0.0], [0.0, h], [0.0, -h]]))
     east, west, north, south = sides[0, 0], sides[1, 0], sides[2, 1], sides[3, 1]
     turn = round(math.degrees(math.atan2(right[1], right[0])), 9) + 0.0
-    words: dict[str, Any]
+    parameters: dict[str, Any]
     if isinstance(part, OccupancyGrid):
-        words = {
+        parameters = {
             "resolution": part.resolution,
             "origin": list(part.origin),
             "mode": part.mode,
@@ -492,17 +492,19 @@ def _overlay(key: PartKey, part: OccupancyGrid | Picture, href: str, ring: NDArr
             "size": [part.width, part.height],
         }
     else:
-        words = {"crs": part.crs, "transform": list(part.transform)}
+        parameters = {"crs": part.crs, "transform": list(part.transform)}
     if part.properties:
-        own = part.properties
+        properties = part.properties
         plain = isinstance(part, OccupancyGrid) or _is_shown_as_it_is(part)
-        words["properties"] = dict(own) if plain else {k: v for k, v in own.items() if k == "attribution"}
-    told = _place_words(key) + "".join(_data(n, v) for n, v in words.items())
+        parameters["properties"] = (
+            dict(properties) if plain else {k: v for k, v in properties.items() if k == "attribution"}
+        )
+    data = _place_words(key) + "".join(_data(n, v) for n, v in parameters.items())
     box = zip(("north", "south", "east", "west", "rotation"), (north, south, east, west, turn), strict=True)
     sides_text = "".join(f"<{n}>{_text.number(v, _text.DEGREES)}</{n}>" for n, v in box if n != "rotation" or v)
     quad = _degrees(shapely.linestrings(ring[None])).texts[0]
     return (
-        f"<GroundOverlay><name>{escape(key.name)}</name><ExtendedData>{told}</ExtendedData>"
+        f"<GroundOverlay><name>{escape(key.name)}</name><ExtendedData>{data}</ExtendedData>"
         f"<Icon><href>{escape(href)}</href></Icon><LatLonBox>{sides_text}</LatLonBox>"
         f'<gx:LatLonQuad xmlns:gx="{GX}"><coordinates>{quad}</coordinates></gx:LatLonQuad></GroundOverlay>\n'
     )
@@ -525,16 +527,16 @@ def _drawn_together(layers: Layers) -> dict[PartKey, Features]:
         part = out[key]
         if key.layer not in ("location", "zones"):
             continue
-        said = part.document.get(FAMILY)
-        known = _skeletons(part)
-        drawn = np.array([_kept(p, known) is not None for p in part.properties])
+        source_document = part.document.get(FAMILY)
+        skeletons = _skeletons(part)
+        drawn = np.array([_kept(p, skeletons) is not None for p in part.properties])
         if not drawn.any():
             continue
         home = PartKey("objects", key.level, FAMILY)
-        others = [out[home]] if home in out else []
-        moved = part.take(drawn).with_document({FAMILY: said})
-        ids = unique_ids(moved.ids, {i for other in others for i in other.ids})
-        out[home] = concatenate([*others, replace(moved, ids=tuple(ids))])
+        siblings = [out[home]] if home in out else []
+        moved = part.take(drawn).with_document({FAMILY: source_document})
+        ids = unique_ids(moved.ids, {i for other in siblings for i in other.ids})
+        out[home] = concatenate([*siblings, replace(moved, ids=tuple(ids))])
         left = {name: value for name, value in part.document.items() if name != FAMILY}
         out[key] = part.take(~drawn).with_document(left)
         if drawn.all() and not left:
@@ -544,66 +546,68 @@ def _drawn_together(layers: Layers) -> dict[PartKey, Features]:
 
 def _skeletons(part: Features) -> dict[str, Mapping[str, Any]]:
     """The drawings that a part remembers, by name. Edits can put anything there: what does not fit is left out."""
-    said = part.document.get(FAMILY)
-    known = said.get("documents") if isinstance(said, Mapping) else None
+    source_document = part.document.get(FAMILY)
+    documents = source_document.get("documents") if isinstance(source_document, Mapping) else None
     return {
         name: document
-        for name, document in (known.items() if isinstance(known, Mapping) else ())
+        for name, document in (documents.items() if isinstance(documents, Mapping) else ())
         if isinstance(document, Mapping)
         and isinstance(document.get("xml"), str)
         and isinstance(document.get("entry"), str | None)
     }
 
 
-def _kept(p: Properties, known: Mapping[str, Any]) -> Mapping[str, Any] | None:
+def _kept(p: Properties, documents: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """What an item remembers of its element in one of the known drawings, where that can be made use of."""
-    kept = p.get(FAMILY)
+    source_element = p.get(FAMILY)
     usable = (
-        isinstance(kept, Mapping)
-        and isinstance(name := kept.get("document"), str)
-        and name in known
-        and isinstance(kept.get("xml"), str)
-        and isinstance(kept.get("shape"), str | None)
-        and isinstance(kept.get("place", 0), int)
+        isinstance(source_element, Mapping)
+        and isinstance(name := source_element.get("document"), str)
+        and name in documents
+        and isinstance(source_element.get("xml"), str)
+        and isinstance(source_element.get("shape"), str | None)
+        and isinstance(source_element.get("place", 0), int)
     )
-    return kept if usable else None
+    return source_element if usable else None
 
 
 def _drawings(
     key: PartKey, part: Features, frame: LocalFrame | None, context: WriteContext
 ) -> tuple[list[_Document], Features | None]:
     """The uploaded drawings with their items in place, and the objects that belong to none of them."""
-    known = _skeletons(part)
+    skeletons = _skeletons(part)
     geometry = part.in_wgs84(frame)
     texts = _degrees(geometry, thin=True)
-    placed: dict[str, list[tuple[int, int, str]]] = {name: [] for name in known}
+    placed: dict[str, list[tuple[int, int, str]]] = {name: [] for name in skeletons}
     loose = []
-    roots = {name: _declarations(document["xml"]) for name, document in known.items()}
+    roots = {name: _declarations(document["xml"]) for name, document in skeletons.items()}
     for k, p in enumerate(part.properties):
-        kept = _kept(p, known)
-        if kept is None:
+        source_element = _kept(p, skeletons)
+        if source_element is None:
             loose.append(k)
             continue
-        name = kept["document"]
+        name = source_element["document"]
         try:
-            placed[name].append((kept.get("place", 0), k, _filled(kept, p, geometry[k], texts, k, roots[name])))
+            placed[name].append(
+                (source_element.get("place", 0), k, _filled(source_element, p, geometry[k], texts, k, roots[name]))
+            )
         except (etree.LxmlError, ValueError, LookupError, AttributeError, StopIteration):
             loose.append(k)  # not an element as it was read from a file
     documents = []
-    for name, document in sorted(known.items()):
+    for name, document in sorted(skeletons.items()):
         items = sorted(placed[name])
-        whole = _in_place(document["xml"], items)
-        if not _well_formed(whole):
+        text = _in_place(document["xml"], items)
+        if not _well_formed(text):
             bad = {k for _, k, xml in items if not _well_formed(f"<w{roots[name]}>{xml}</w>")}
             items = [item for item in items if item[1] not in bad]
-            whole = _in_place(document["xml"], items)
-            if not _well_formed(whole):
+            text = _in_place(document["xml"], items)
+            if not _well_formed(text):
                 bad.update(k for _, k, _ in items)
                 context.drop("drawing", 1, "what is remembered of its document is damaged; its objects are written")
-                whole = ""
+                text = ""
             loose += bad
-        if whole:
-            documents.append(_Document(key.level, name, document.get("entry"), whole))
+        if text:
+            documents.append(_Document(key.level, name, document.get("entry"), text))
     return documents, part.take(sorted(loose)) if loose else None
 
 
@@ -622,8 +626,8 @@ def _in_place(skeleton: str, items: Sequence[tuple[int, int, str]]) -> str:
     starts = [int(n[:18]) for n in pieces[1::2]]
     groups: list[list[str]] = [[] for _ in starts]
     over: list[str] = []
-    for place, _, xml in items:
-        at = bisect.bisect_right(starts, place) - 1
+    for position, _, xml in items:
+        at = bisect.bisect_right(starts, position) - 1
         (groups[at] if at >= 0 else over).append(xml)
     out = [pieces[0]]
     for group, after in zip(groups, pieces[2::2], strict=True):
@@ -638,10 +642,12 @@ def _declarations(xml: str) -> str:
     return "".join(_XMLNS.findall(root[3])) if root else ""
 
 
-def _filled(kept: Mapping[str, Any], p: Properties, geometry: Any, texts: _Texts, k: int, declarations: str) -> str:
+def _filled(
+    source_element: Mapping[str, Any], p: Properties, geometry: Any, texts: _Texts, k: int, declarations: str
+) -> str:
     """A kept element with the name, the values and the place that the object has now."""
-    xml: str = kept["xml"]
-    shape = kept.get("shape")
+    xml: str = source_element["xml"]
+    shape = source_element.get("shape")
     if shape is None:
         xml = _same_or_redrawn(xml, geometry, declarations, texts.of(k))
     elif shape != texts.shape[k]:
@@ -659,7 +665,7 @@ def _filled(kept: Mapping[str, Any], p: Properties, geometry: Any, texts: _Texts
     elif name is not None and "<name>" not in xml:
         xml = _ROOT.sub(lambda m: _with_name(m, escape(str(name))), xml, count=1)
     if "<?d " in xml:
-        aside = kept.get("data")
+        aside = source_element.get("data")
         aside = aside if isinstance(aside, Mapping) else {}
         xml = SLOT.sub(lambda m: _value(unquote(m[2]), p, aside) if m[2] is not None else "", xml)
     return xml
@@ -667,11 +673,11 @@ def _filled(kept: Mapping[str, Any], p: Properties, geometry: Any, texts: _Texts
 
 def _with_name(start: re.Match[str], name: str) -> str:
     """A start tag, and the name as its first child."""
-    whole, _, attributes, empty = start.groups()
-    prefix = whole.rpartition(":")[0]
+    qname, _, attributes, empty = start.groups()
+    prefix = qname.rpartition(":")[0]
     tag = f"{prefix}:name" if prefix else "name"
-    close = f"</{whole}>" if empty else ""
-    return f"<{whole}{attributes}><{tag}>{name}</{tag}>{close}"
+    close = f"</{qname}>" if empty else ""
+    return f"<{qname}{attributes}><{tag}>{name}</{tag}>{close}"
 
 
 def _value(label: str, p: Properties, aside: Mapping[str, Any]) -> str:
@@ -711,10 +717,10 @@ def _redrawn(xml: str, geometry: Any, declarations: str, lists: list[str]) -> st
     spot = child(old[0], "Location") if len(old) == 1 and local_name(old[0]) == "Model" else None
     if spot is not None and geometry.geom_type == "Point" and not geometry.is_empty:
         numbers = lists[0].split(",")
-        for word, text in zip(("longitude", "latitude", "altitude"), [*numbers, "0.0"][:3], strict=True):
-            found = child(spot, word)
-            if found is not None:
-                found.text = text
+        for name, text in zip(("longitude", "latitude", "altitude"), [*numbers, "0.0"][:3], strict=True):
+            match = child(spot, name)
+            if match is not None:
+                match.text = text
         return _unparsed(element)
     at = element.index(old[0]) if old else len(element)
     modes = old[0] if old and local_name(old[0]) in ("Point", "LineString", "LinearRing", "Polygon") else ()
@@ -723,18 +729,18 @@ def _redrawn(xml: str, geometry: Any, declarations: str, lists: list[str]) -> st
     extra = "".join(f"<{local_name(c)}>{escape(c.text or '')}</{local_name(c)}>" for c in keep)
     for c in old:
         element.remove(c)
-    made = _element(geometry, iter(lists), extra)
-    if made:
+    element_text = _element(geometry, iter(lists), extra)
+    if element_text:
         declared = f' xmlns="{namespace}"' if namespace else ""
-        element.insert(at, etree.fromstring(f"<w{declared}>{made}</w>")[0])
+        element.insert(at, etree.fromstring(f"<w{declared}>{element_text}</w>")[0])
     return _unparsed(element)
 
 
 def _moved_overlay(element: etree._Element, geometry: Any, lists: list[str]) -> str:
-    for word in ("LatLonBox", "LatLonQuad"):
-        found = child(element, word)
-        if found is not None:
-            element.remove(found)
+    for name in ("LatLonBox", "LatLonQuad"):
+        old_box = child(element, name)
+        if old_box is not None:
+            element.remove(old_box)
     corners = [] if geometry.is_empty or geometry.geom_type != "Polygon" else lists[0].split(" ")[:-1]
     if len(corners) == 4:
         quad = f'<gx:LatLonQuad xmlns:gx="{GX}"><coordinates>{" ".join(corners)}</coordinates></gx:LatLonQuad>'
@@ -757,14 +763,14 @@ def _distinct(documents: list[str]) -> list[str]:
     used: set[str] = set()
     out = []
     for xml in documents:
-        mine = {m[2] for m in _STYLE_ID.finditer(xml)}
+        style_ids = {m[2] for m in _STYLE_ID.finditer(xml)}
         names: dict[str, str] = {}
-        for i in sorted(mine & used):
+        for i in sorted(style_ids & used):
             n = 2
-            while f"{i}-{n}" in used or f"{i}-{n}" in mine or f"{i}-{n}" in names.values():
+            while f"{i}-{n}" in used or f"{i}-{n}" in style_ids or f"{i}-{n}" in names.values():
                 n += 1
             names[i] = f"{i}-{n}"
-        used |= {names.get(i, i) for i in mine}
+        used |= {names.get(i, i) for i in style_ids}
         out.append(_renamed(xml, names) if names else xml)
     return out
 
@@ -776,11 +782,11 @@ def _renamed(xml: str, names: Mapping[str, str]) -> str:
 
 def _wrapped(document: _Document, xml: str) -> str:
     """A whole document inside ours: its root becomes a Document that says where it came from."""
-    words = _data(MARK, "document") + _data("document", document.name)
+    data = _data(MARK, "document") + _data("document", document.name)
     if document.entry is not None:
-        words += _data("entry", document.entry)
+        data += _data("entry", document.entry)
     if document.level != GROUND:
-        words += _data("level", document.level)
+        data += _data("level", document.level)
     declarations = _declarations(xml)
     root = _ROOT.match(xml)
     if root and root[2] == "kml":
@@ -789,6 +795,6 @@ def _wrapped(document: _Document, xml: str) -> str:
     title = _TITLE.search(xml)
     shown = title[1] if title and title[1].strip() else "drawing"
     return (
-        f'<Document{default}{declarations}><name>{shown}</name><ExtendedData xmlns="{KML}">{words}</ExtendedData>'
+        f'<Document{default}{declarations}><name>{shown}</name><ExtendedData xmlns="{KML}">{data}</ExtendedData>'
         f"{xml}</Document>\n"
     )

@@ -51,12 +51,12 @@ class Runs:
         """[n] the last point of each line."""
         return self.at[self.first[1:] - 1]
 
-    def turned(self, which: NDArray[np.bool_]) -> Runs:
+    def turned(self, mask: NDArray[np.bool_]) -> Runs:
         """The same with these lines the other way round."""
         owner = self.owner
-        place = np.arange(len(self.at))
-        back = self.first[owner] + self.first[owner + 1] - 1 - place
-        return Runs(self.at[np.where(which[owner], back, place)], self.first)
+        positions = np.arange(len(self.at))
+        back = self.first[owner] + self.first[owner + 1] - 1 - positions
+        return Runs(self.at[np.where(mask[owner], back, positions)], self.first)
 
 
 def runs(lines: Sequence[Sequence[int]]) -> Runs:
@@ -85,12 +85,12 @@ def _middle(lines: Runs, xy: Array) -> Array:
 
 def _side(lines: Runs, points: Array, xy: Array) -> Array:
     """[n] positive where a line's point is on its left, negative on its right."""
-    place = xy[lines.at]
+    coordinates = xy[lines.at]
     inner = np.ones(len(lines.at), bool)
     inner[lines.first[1:] - 1] = False
     start = np.flatnonzero(inner)  # a segment begins at every point but a line's last
     owner = lines.owner[start]
-    a, along = place[start], place[start + 1] - place[start]
+    a, along = coordinates[start], coordinates[start + 1] - coordinates[start]
     p = points[owner] - a
     length = (along**2).sum(axis=1)
     t = np.clip((p * along).sum(axis=1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
@@ -102,15 +102,15 @@ def _side(lines: Runs, points: Array, xy: Array) -> Array:
     unit = along / np.sqrt(np.where(length > 0, length, 1.0))[:, None]
     normal = np.column_stack([-unit[:, 1], unit[:, 0]])
     # At a corner the two segments decide together: the sum of their normals points to the left of both.
-    chosen = normal[nearest].copy()
+    nearest_normal = normal[nearest].copy()
     before, after = nearest - 1, nearest + 1
     at_start = (t[nearest] == 0.0) & (before >= 0) & (owner[np.maximum(before, 0)] == owner[nearest])
     last = len(owner) - 1
     at_end = (t[nearest] == 1.0) & (after <= last) & (owner[np.minimum(after, last)] == owner[nearest])
-    chosen[at_start] += normal[before[at_start]]
-    chosen[at_end] += normal[after[at_end]]
+    nearest_normal[at_start] += normal[before[at_start]]
+    nearest_normal[at_end] += normal[after[at_end]]
     offset = np.where((at_start | at_end)[:, None], away[nearest], p[nearest])
-    side: Array = (offset * chosen).sum(axis=1)
+    side: Array = (offset * nearest_normal).sum(axis=1)
     return side
 
 
@@ -135,9 +135,9 @@ def middles(left: Runs, right: Runs, xy: Array, places: Array) -> tuple[Array, P
     query = t + 2.0 * owner
     sides = []
     for lines, ratios in zip((left, right), ratio, strict=True):
-        known = ratios + 2.0 * lines.owner
+        knots = ratios + 2.0 * lines.owner
         values = places[lines.at]
-        sides.append(np.column_stack([np.interp(query, known, column) for column in values.T]))
+        sides.append(np.column_stack([np.interp(query, knots, column) for column in values.T]))
     return (sides[0] + sides[1]) / 2.0, owner
 
 

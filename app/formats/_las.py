@@ -220,9 +220,9 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
     import laspy
 
     places = np.stack([columns[axis].astype(np.float64) for axis in AXES], axis=1)
-    good = np.isfinite(places).all(axis=1)
-    context.drop("points", int(np.count_nonzero(~good)), "LAS has no points without finite coordinates")
-    places = places[good]
+    valid = np.isfinite(places).all(axis=1)
+    context.drop("points", int(np.count_nonzero(~valid)), "LAS has no points without finite coordinates")
+    places = places[valid]
     coloured = all(name in columns for name in RGB)
     header = laspy.LasHeader(version="1.4", point_format=7 if coloured else 6)
     header.generating_software = SOFTWARE
@@ -238,16 +238,16 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
     if scale > SCALE:
         context.warn(f"the cloud is so large that its points are written in steps of {scale:g} m")
     extra: dict[str, NDArray[Any]] = {}
-    whole: dict[str, NDArray[Any]] = {}
+    standard: dict[str, NDArray[Any]] = {}
     for name, column in columns.items():
         if name in AXES or (coloured and name in RGB):
             continue
-        chosen = column[good]
-        if name == "gps_time" or (name in WHOLE and _within(chosen, WHOLE[name])):
-            whole[name] = chosen
+        values = column[valid]
+        if name == "gps_time" or (name in WHOLE and _within(values, WHOLE[name])):
+            standard[name] = values
         else:
             taken = {d.lower() for d in header.point_format.dimension_names} | {n.lower() for n in extra}
-            extra[_free(name, taken)] = chosen
+            extra[_free(name, taken)] = values
     if extra:
         header.add_extra_dims(
             [laspy.ExtraBytesParams(name=n, type=c.dtype.newbyteorder("<")) for n, c in extra.items()]
@@ -256,12 +256,12 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
     las.points = laspy.ScaleAwarePointRecord.zeros(len(places), header=header)
     for k, axis in enumerate(AXES):
         las[axis.upper()] = np.round((places[:, k] - header.offsets[k]) / scale).astype(np.int32)
-    for name, column in {**whole, **extra}.items():
+    for name, column in {**standard, **extra}.items():
         las[name] = column
     las.return_number = np.ones(len(places), np.uint8)
     las.number_of_returns = np.ones(len(places), np.uint8)
     for name in RGB if coloured else ():
-        las[name] = columns[name][good].astype(np.uint16) * np.uint16(257)
+        las[name] = columns[name][valid].astype(np.uint16) * np.uint16(257)
     las.update_header()
     out = io.BytesIO()
     las.write(out, do_compress=compress, laz_backend=laspy.LazBackend.Lazrs)
@@ -270,13 +270,13 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
     return bytes(written)
 
 
-def _within(column: NDArray[Any], most: int) -> bool:
+def _within(column: NDArray[Any], maximum: int) -> bool:
     """Whether all values are whole numbers from 0 to this."""
     if not len(column):
         return True
     if column.dtype.kind == "f" and not bool((np.isfinite(column) & (column == np.floor(column))).all()):
         return False
-    return int(column.min()) >= 0 and int(column.max()) <= most
+    return int(column.min()) >= 0 and int(column.max()) <= maximum
 
 
 def _free(name: str, taken: set[str]) -> str:

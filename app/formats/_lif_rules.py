@@ -29,8 +29,8 @@ def check(files: Files) -> Iterator[Problem]:
         return
     meta = top.get("metaInformation")
     draft = isinstance(meta, dict) and str(meta.get("lifVersion", "")).startswith("2")
-    if lost := missing(meta, META[1:] if draft else META):
-        yield refused(f"the specification requires {', '.join(lost)}", main, where="metaInformation")
+    if absent := missing(meta, META[1:] if draft else META):
+        yield refused(f"the specification requires {', '.join(absent)}", main, where="metaInformation")
     layouts = top.get("layouts")
     path = "layouts"
     if layouts is None and isinstance(top.get("origins"), list):
@@ -42,69 +42,69 @@ def check(files: Files) -> Iterator[Problem]:
     ids: dict[str, list[str]] = {"nodeId": [], "edgeId": [], "stationId": [], "layoutId": []}
     ends: list[tuple[str, list[Any]]] = []
     for k, layout in mappings(layouts):
-        where = f"{path}[{k}]"
+        location = f"{path}[{k}]"
         for key in missing(layout, ("layoutId", "nodes")):
-            yield refused("the specification requires it", main, where=f"{where}.{key}")
+            yield refused("the specification requires it", main, where=f"{location}.{key}")
         for key in missing(layout, ("layoutVersion", "edges", "stations")):
-            yield doubted("the specification requires it", main, where=f"{where}.{key}")
+            yield doubted("the specification requires it", main, where=f"{location}.{key}")
         ids["layoutId"].append(str(layout.get("layoutId")))
-        yield from _items(layout, ids, ends, main, where)
-    for key, found in ids.items():
-        if again := repeated(found):
-            yield refused(f"{len(again)} are not unique within the file: {names(again)}", main, where=key)
-    known = set(ids["nodeId"])
-    if lost := [item for item, refs in ends if not all(isinstance(r, str) and r in known for r in refs)]:
-        reason = f"{len(lost)} edges or stations name a node that is not there: {names(lost)}"
+        yield from _items(layout, ids, ends, main, location)
+    for key, values in ids.items():
+        if repeats := repeated(values):
+            yield refused(f"{len(repeats)} are not unique within the file: {names(repeats)}", main, where=key)
+    node_ids = set(ids["nodeId"])
+    if absent := [item for item, refs in ends if not all(isinstance(r, str) and r in node_ids for r in refs)]:
+        reason = f"{len(absent)} edges or stations name a node that is not there: {names(absent)}"
         yield refused(reason, main, where=path)
 
 
 def _items(
-    layout: dict[str, Any], ids: dict[str, list[str]], ends: list[tuple[str, list[Any]]], main: str, where: str
+    layout: dict[str, Any], ids: dict[str, list[str]], ends: list[tuple[str, list[Any]]], main: str, location: str
 ) -> Iterator[Problem]:
     for k, node in mappings(layout.get("nodes")):
-        place = f"{where}.nodes[{k}]"
+        item_location = f"{location}.nodes[{k}]"
         at = node.get("nodePosition")
         if not isinstance(node.get("nodeId"), str):
-            yield refused("a node needs a nodeId", main, where=place)
+            yield refused("a node needs a nodeId", main, where=item_location)
         if not isinstance(at, dict) or not (is_number(at.get("x")) and is_number(at.get("y"))):
-            yield refused("a node needs a nodePosition with x and y", main, where=place)
+            yield refused("a node needs a nodePosition with x and y", main, where=item_location)
         ids["nodeId"].append(str(node.get("nodeId")))
-        yield from _vehicles(node, "NodeProperties", main, place)
+        yield from _vehicles(node, "NodeProperties", main, item_location)
     for k, edge in mappings(layout.get("edges")):
-        place = f"{where}.edges[{k}]"
-        if lost := missing(edge, ("edgeId", "startNodeId", "endNodeId")):
-            yield refused(f"an edge needs {', '.join(lost)}", main, where=place)
+        item_location = f"{location}.edges[{k}]"
+        if absent := missing(edge, ("edgeId", "startNodeId", "endNodeId")):
+            yield refused(f"an edge needs {', '.join(absent)}", main, where=item_location)
         ids["edgeId"].append(str(edge.get("edgeId")))
         ends.append((str(edge.get("edgeId")), [edge.get("startNodeId"), edge.get("endNodeId")]))
-        yield from _vehicles(edge, "EdgeProperties", main, place)
+        yield from _vehicles(edge, "EdgeProperties", main, item_location)
     for k, station in mappings(layout.get("stations")):
-        place = f"{where}.stations[{k}]"
+        item_location = f"{location}.stations[{k}]"
         refs = station.get("interactionNodeIds")
         if not isinstance(station.get("stationId"), str) or not isinstance(refs, list):
-            yield refused("a station needs a stationId and interactionNodeIds", main, where=place)
+            yield refused("a station needs a stationId and interactionNodeIds", main, where=item_location)
             continue
         ids["stationId"].append(station["stationId"])
         ends.append((station["stationId"], refs))
 
 
-def _vehicles(item: dict[str, Any], end: str, main: str, where: str) -> Iterator[Problem]:
-    key, word = next(
+def _vehicles(item: dict[str, Any], end: str, main: str, location: str) -> Iterator[Problem]:
+    key, noun = next(
         ((f"{w}{end}", w) for w in ("vehicleType", "mobileRobotType") if f"{w}{end}" in item), (f"vehicleType{end}", "")
     )
-    said = item.get(key)
-    if not isinstance(said, list) or not said:
-        yield refused("needs an entry for one type of vehicle at least", main, where=f"{where}.{key}")
+    entries = item.get(key)
+    if not isinstance(entries, list) or not entries:
+        yield refused("needs an entry for one type of vehicle at least", main, where=f"{location}.{key}")
         return
-    for k, one in enumerate(said):
-        place = f"{where}.{key}[{k}]"
-        if len(missing(one, (f"{word}Id", f"{word}s"))) > 1:
-            yield refused(f"needs a {word}Id", main, where=place)
+    for k, one in enumerate(entries):
+        item_location = f"{location}.{key}[{k}]"
+        if len(missing(one, (f"{noun}Id", f"{noun}s"))) > 1:
+            yield refused(f"needs a {noun}Id", main, where=item_location)
             continue
         theta = one.get("theta")
         if theta is not None and not is_number(theta):
-            yield refused(f"must be a number, is {shown(theta)}", main, where=f"{place}.theta")
+            yield refused(f"must be a number, is {shown(theta)}", main, where=f"{item_location}.theta")
         elif theta is not None and abs(theta) > math.pi + 1e-6:
-            yield doubted(f"{theta:g} is no angle in radians from -π to π", main, where=f"{place}.theta")
+            yield doubted(f"{theta:g} is no angle in radians from -π to π", main, where=f"{item_location}.theta")
         if one.get("orientationType") not in (None, *ORIENTATIONS):
             reason = f"must be one of {', '.join(ORIENTATIONS)}, is {shown(one['orientationType'])}"
-            yield refused(reason, main, where=f"{place}.orientationType")
+            yield refused(reason, main, where=f"{item_location}.orientationType")

@@ -109,13 +109,13 @@ def _squeeze(data: Any, out: Any, table: Any) -> int:
         length = 0
         before = 0
         if i + 2 < n:
-            word = (int(data[i]) << 16) | (int(data[i + 1]) << 8) | int(data[i + 2])
-            slot = ((word * 2654435761) >> 12) & 16383
+            triple = (int(data[i]) << 16) | (int(data[i + 1]) << 8) | int(data[i + 2])
+            slot = ((triple * 2654435761) >> 12) & 16383
             before = int(table[slot])
             table[slot] = i
             if before >= 0 and i - before <= 8192:
-                most = min(n - i, 264)
-                while length < most and data[before + length] == data[i + length]:
+                max_length = min(n - i, 264)
+                while length < max_length and data[before + length] == data[i + length]:
                     length += 1
         if length < 3:
             i += 1

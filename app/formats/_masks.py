@@ -27,8 +27,8 @@ def companions(main: str, names: Sequence[str]) -> list[str]:
     stem = base.rpartition(".")[0]
     stems = dict.fromkeys([stem, stem.removesuffix("_mask")])
     ends = [s + more + end for more in (SUFFIX, "_params") for s in stems for end in (".yaml", ".yml")]
-    known = set(names)
-    return [n for n in (f"{folder}/{end}".lstrip("/") for end in ends) if n in known and n != main]
+    name_set = set(names)
+    return [n for n in (f"{folder}/{end}".lstrip("/") for end in ends) if n in name_set and n != main]
 
 
 def read(file: str, data: bytes, context: ReadContext) -> dict[str, Any]:
@@ -43,42 +43,42 @@ def read(file: str, data: bytes, context: ReadContext) -> dict[str, Any]:
             f"{file}: {error.detail}",
             [Problem(p.problem, file, p.line, p.where) for p in error.problems] or [Problem(error.detail, file)],
         ) from error
-    found = list(masks.servers(document))
-    if not found:
+    servers = list(masks.servers(document))
+    if not servers:
         context.warn(f"it has no parameters of a {masks.NODE}: it is kept as a source only", file=file)
         return {}
-    if len(found) > 1:
-        context.warn(f"it has parameters of {len(found)} filter info servers: the first one counts", file=file)
-    wrong = list(_wrong(found[0]))
-    if wrong:
-        places = [Problem(reason, file, where=where) for where, reason in wrong]
-        raise UnreadableFile(f"{file}: " + "; ".join(reason for _, reason in wrong), places)
+    if len(servers) > 1:
+        context.warn(f"it has parameters of {len(servers)} filter info servers: the first one counts", file=file)
+    faults = list(_wrong(servers[0]))
+    if faults:
+        places = [Problem(reason, file, where=location) for location, reason in faults]
+        raise UnreadableFile(f"{file}: " + "; ".join(reason for _, reason in faults), places)
     return {masks.NAME: {"params": document}}
 
 
-def _wrong(said: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _wrong(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """(key, what is wrong with it)."""
-    kind = said.get("type", KEEPOUT)
+    kind = parameters.get("type", KEEPOUT)
     if isinstance(kind, bool) or not isinstance(kind, int) or kind not in masks.TYPES:
         yield "type", f"type must be a whole number from 0 to {masks.TYPES[-1]}, got {str(kind)[:40]!r}"
     for key in ("base", "multiplier"):
-        value = said.get(key, 0.0)
+        value = parameters.get(key, 0.0)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             yield key, f"{key} must be a number, got {str(value)[:40]!r}"
     for key in ("mask_topic", "filter_info_topic"):
-        if not isinstance(said.get(key, ""), str):
-            yield key, f"{key} must be a text, got {str(said[key])[:40]!r}"
+        if not isinstance(parameters.get(key, ""), str):
+            yield key, f"{key} must be a text, got {str(parameters[key])[:40]!r}"
 
 
 def _kept(grid: OccupancyGrid) -> dict[str, Any] | None:
     """The parameter file that a grid keeps, with base and multiplier as floats (ROS refuses whole numbers there)."""
-    known = grid.properties.get(masks.NAME)
-    document = known.get("params") if isinstance(known, Mapping) else None
-    found = next(masks.servers(document), None)
-    if found is None or list(_wrong(found)):  # whoever edited it meant something else
+    source_properties = grid.properties.get(masks.NAME)
+    document = source_properties.get("params") if isinstance(source_properties, Mapping) else None
+    server = next(masks.servers(document), None)
+    if server is None or list(_wrong(server)):  # whoever edited it meant something else
         return None
-    whole: dict[str, Any] = _with_floats(document, 0)
-    return whole
+    normalised: dict[str, Any] = _with_floats(document, 0)
+    return normalised
 
 
 def _with_floats(value: Any, depth: int) -> Any:
@@ -87,9 +87,9 @@ def _with_floats(value: Any, depth: int) -> Any:
     out: dict[str, Any] = {}
     for name, node in value.items():
         if masks.is_filter_info(name, node):
-            said = node[masks.PARAMETERS]
-            floats = {k: float(v) for k, v in said.items() if k in ("base", "multiplier") and isinstance(v, int)}
-            out[name] = {**node, masks.PARAMETERS: {**said, **floats}}
+            parameters = node[masks.PARAMETERS]
+            floats = {k: float(v) for k, v in parameters.items() if k in ("base", "multiplier") and isinstance(v, int)}
+            out[name] = {**node, masks.PARAMETERS: {**parameters, **floats}}
         else:
             out[name] = _with_floats(node, depth + 1)
     return out

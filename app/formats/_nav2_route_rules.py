@@ -34,48 +34,52 @@ def check(files: Files) -> Iterator[Problem]:
     if not isinstance(rows, list):
         yield refused("there is no array of features", main, where="features")
         return
-    if not isinstance(top.get("crs", {}), dict) or any(word in str(top.get("crs")) for word in ON_EARTH):
+    if not isinstance(top.get("crs", {}), dict) or any(name in str(top.get("crs")) for name in ON_EARTH):
         reason = "says longitude and latitude; the route server ignores it and takes the numbers for metres"
         yield doubted(reason, main, where="crs")
     nodes: list[int] = []
     edges: list[tuple[int, Any, Any]] = []
     far = 0
     for k, row in enumerate(rows):
-        where = f"features[{k}]"
-        geometry, said = (row.get("geometry"), row.get("properties")) if isinstance(row, dict) else (None, None)
+        location = f"features[{k}]"
+        geometry, properties = (row.get("geometry"), row.get("properties")) if isinstance(row, dict) else (None, None)
         if not isinstance(geometry, dict):
-            yield refused("has no geometry", main, where=where)
+            yield refused("has no geometry", main, where=location)
             continue
         kind = geometry.get("type")
         if kind != "Point" and kind not in LINES:
             continue  # the route server passes over it
-        if not isinstance(said, dict):
-            yield refused("has no properties", main, where=where)
+        if not isinstance(properties, dict):
+            yield refused("has no properties", main, where=location)
             continue
-        if not _is_id(said.get("id")):
-            reason = f"must be a whole number from 0 to {MOST_ID}, is {shown(said.get('id'))}"
-            yield refused(reason, main, where=f"{where}.properties.id")
+        if not _is_id(properties.get("id")):
+            reason = f"must be a whole number from 0 to {MOST_ID}, is {shown(properties.get('id'))}"
+            yield refused(reason, main, where=f"{location}.properties.id")
             continue
         if kind == "Point":
-            nodes.append(said["id"])
+            nodes.append(properties["id"])
             at = geometry.get("coordinates")
             if not isinstance(at, list) or len(at) < 2 or not all(map(is_number, at[:2])):
-                yield refused("a node needs the coordinates [x, y]", main, where=where)
+                yield refused("a node needs the coordinates [x, y]", main, where=location)
             else:
                 far += max(abs(at[0]), abs(at[1])) > FAR
-            if not isinstance(said.get("frame", ""), str):
-                yield refused(f"must be a text, is {shown(said['frame'])}", main, where=f"{where}.properties.frame")
+            if not isinstance(properties.get("frame", ""), str):
+                yield refused(
+                    f"must be a text, is {shown(properties['frame'])}", main, where=f"{location}.properties.frame"
+                )
         else:
-            edges.append((said["id"], said.get("startid"), said.get("endid")))
-            if not is_number(said.get("cost", 0.0)):
-                yield refused(f"must be a number, is {shown(said['cost'])}", main, where=f"{where}.properties.cost")
-            if not isinstance(said.get("overridable", True), bool):
-                reason = f"must be true or false, is {shown(said['overridable'])}"
-                yield refused(reason, main, where=f"{where}.properties.overridable")
-        if "metadata" in said:
-            yield from _metadata(said["metadata"], main, f"{where}.properties.metadata")
-        if "operations" in said:
-            yield from _operations(said["operations"], main, f"{where}.properties.operations")
+            edges.append((properties["id"], properties.get("startid"), properties.get("endid")))
+            if not is_number(properties.get("cost", 0.0)):
+                yield refused(
+                    f"must be a number, is {shown(properties['cost'])}", main, where=f"{location}.properties.cost"
+                )
+            if not isinstance(properties.get("overridable", True), bool):
+                reason = f"must be true or false, is {shown(properties['overridable'])}"
+                yield refused(reason, main, where=f"{location}.properties.overridable")
+        if "metadata" in properties:
+            yield from _metadata(properties["metadata"], main, f"{location}.properties.metadata")
+        if "operations" in properties:
+            yield from _operations(properties["operations"], main, f"{location}.properties.operations")
     yield from _graph(nodes, edges, main)
     if far:
         reason = f"{far} nodes lie more than {FAR:g} m from the origin; the server's 32 bit floats step by 2 mm there"
@@ -91,40 +95,40 @@ def _graph(nodes: list[int], edges: list[tuple[int, Any, Any]], main: str) -> It
         yield refused("there is no node (a Point with an id)", main, where="features")
     if not edges:
         yield refused("there is no edge (a LineString with an id)", main, where="features")
-    known = set(nodes)
-    lost = [n for n, *ends in edges if not all(_is_id(end) and end in known for end in ends)]
-    if lost:
-        yield refused(f"{len(lost)} edges begin or end at a node that is not there: {names(lost)}", main)
-    for what, ids in (("nodes", nodes), ("edges", [n for n, _, _ in edges])):
-        if again := [n for n, count in Counter(ids).items() if count > 1]:
-            yield doubted(f"{len(again)} ids are given to several {what}; one of them wins: {names(again)}", main)
+    node_ids = set(nodes)
+    dangling = [n for n, *ends in edges if not all(_is_id(end) and end in node_ids for end in ends)]
+    if dangling:
+        yield refused(f"{len(dangling)} edges begin or end at a node that is not there: {names(dangling)}", main)
+    for noun, ids in (("nodes", nodes), ("edges", [n for n, _, _ in edges])):
+        if repeats := [n for n, count in Counter(ids).items() if count > 1]:
+            yield doubted(f"{len(repeats)} ids are given to several {noun}; one of them wins: {names(repeats)}", main)
         if large := [n for n in ids if n > MOST_SHORT_ID]:
-            use = "ComputeRoute and ComputeAndTrackRoute" if what == "nodes" else "DynamicEdges"
-            reason = f"{len(large)} {what} have an id above {MOST_SHORT_ID}, which {use} cannot name: {names(large)}"
+            use = "ComputeRoute and ComputeAndTrackRoute" if noun == "nodes" else "DynamicEdges"
+            reason = f"{len(large)} {noun} have an id above {MOST_SHORT_ID}, which {use} cannot name: {names(large)}"
             yield doubted(reason, main)
 
 
-def _metadata(said: Any, main: str, where: str) -> Iterator[Problem]:
-    if not isinstance(said, dict):
-        yield refused(f"must be an object, is {shown(said)}", main, where=where)
+def _metadata(metadata: Any, main: str, location: str) -> Iterator[Problem]:
+    if not isinstance(metadata, dict):
+        yield refused(f"must be an object, is {shown(metadata)}", main, where=location)
         return
-    for word, value in said.items():
-        inside = f"{where}.{word[:60]}"
+    for key, value in metadata.items():
+        inside = f"{location}.{key[:60]}"
         if isinstance(value, dict):
             yield from _metadata(value, main, inside)
         elif any(v is None or isinstance(v, (dict, list)) for v in (value if isinstance(value, list) else [value])):
             yield refused("the loader takes numbers, texts, truth values and lists of these only", main, where=inside)
-        elif word in FLOATS and isinstance(value, int):
+        elif key in FLOATS and isinstance(value, int):
             reason = f"is read as a float, at which the integer {shown(value)} throws: write it with a point"
             yield refused(reason, main, where=inside)
 
 
-def _operations(said: Any, main: str, where: str) -> Iterator[Problem]:
-    if not isinstance(said, (dict, list)):
-        yield refused("must be an object of operations", main, where=where)
+def _operations(operations: Any, main: str, location: str) -> Iterator[Problem]:
+    if not isinstance(operations, (dict, list)):
+        yield refused("must be an object of operations", main, where=location)
         return
-    for name, one in said.items() if isinstance(said, dict) else enumerate(said):
-        inside = f"{where}.{str(name)[:60]}"
+    for name, one in operations.items() if isinstance(operations, dict) else enumerate(operations):
+        inside = f"{location}.{str(name)[:60]}"
         if not isinstance(one, dict) or not isinstance(one.get("type"), str):
             yield refused("an operation needs a type", main, where=inside)
         elif one.get("trigger") not in TRIGGERS:

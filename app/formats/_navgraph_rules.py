@@ -41,22 +41,22 @@ def check(files: Files) -> Iterator[Problem]:
     for k, item in enumerate(nodes if isinstance(nodes, list) else ()):
         tag, node = _untagged(item)
         tags += [tag] if tag else []
-        where = f"nodes[{k}]"
+        location = f"nodes[{k}]"
         if not isinstance(node, dict) or not isinstance(node.get("name"), str):
-            yield refused("a node is a mapping with a name", main, where=where)
+            yield refused("a node is a mapping with a name", main, where=location)
             continue
         called.append(node["name"])
         if tag == PREFIX + "unconnected":
             alone.add(node["name"])
         elif tag and tag.removeprefix(PREFIX) not in NODE_TAGS and tag.startswith(PREFIX):
-            yield doubted(f"Fawkes knows no tag {shown(tag.removeprefix(PREFIX))} of a node", main, where=where)
+            yield doubted(f"Fawkes knows no tag {shown(tag.removeprefix(PREFIX))} of a node", main, where=location)
         at = node.get("pos")
         if not isinstance(at, list) or len(at) != 2 or any(cpp_number(v) is None for v in at):
-            yield refused(f"must be [x, y], is {shown(at)}", main, where=f"{where}.pos")
+            yield refused(f"must be [x, y], is {shown(at)}", main, where=f"{location}.pos")
         if "properties" in node:
-            yield from _properties(node["properties"], main, f"{where}.properties")
-    if again := repeated(called):
-        yield refused(f"{len(again)} nodes have a name that is taken: {names(again)}", main, where="nodes")
+            yield from _properties(node["properties"], main, f"{location}.properties")
+    if repeats := repeated(called):
+        yield refused(f"{len(repeats)} nodes have a name that is taken: {names(repeats)}", main, where="nodes")
     yield from _connections(top.get("connections"), set(called), alone, tags, main)
     if foreign := [tag for tag in tags if not tag.startswith(PREFIX)]:
         reason = (
@@ -69,21 +69,23 @@ def _untagged(item: Any) -> tuple[str, Any]:
     return (item.tag, item.value) if isinstance(item, _yaml.Tagged) else ("", item)
 
 
-def _properties(said: Any, main: str, where: str) -> Iterator[Problem]:
-    if not isinstance(said, list):
-        yield refused(f"must be a list of properties, is {shown(said)}", main, where=where)
+def _properties(properties: Any, main: str, location: str) -> Iterator[Problem]:
+    if not isinstance(properties, list):
+        yield refused(f"must be a list of properties, is {shown(properties)}", main, where=location)
         return
-    for k, one in enumerate(said):
+    for k, one in enumerate(properties):
         values = one.values() if isinstance(one, dict) else [one]
         if not all(isinstance(v, str) for v in values):
-            yield refused("a property is a word or a key with a single value", main, where=f"{where}[{k}]")
+            yield refused("a property is a word or a key with a single value", main, where=f"{location}[{k}]")
 
 
-def _connections(said: Any, known: set[str], alone: set[str], tags: list[str], main: str) -> Iterator[Problem]:
+def _connections(
+    connections: Any, node_names: set[str], alone: set[str], tags: list[str], main: str
+) -> Iterator[Problem]:
     reached: set[str] = set()
-    lost: list[str] = []
+    dangling: list[str] = []
     pairs: list[tuple[str, str]] = []
-    for k, item in enumerate(said if isinstance(said, list) else ()):
+    for k, item in enumerate(connections if isinstance(connections, list) else ()):
         tag, ends = _untagged(item)
         tags += [tag] if tag else []
         if not isinstance(ends, list) or len(ends) != 2 or not all(isinstance(end, str) for end in ends):
@@ -92,14 +94,14 @@ def _connections(said: Any, known: set[str], alone: set[str], tags: list[str], m
         if tag.startswith(PREFIX) and tag.removeprefix(PREFIX) not in EDGE_TAGS:
             reason = f"Fawkes knows no tag {shown(tag.removeprefix(PREFIX))} of a connection"
             yield doubted(reason, main, where=f"connections[{k}]")
-        lost += [str(end) for end in ends if end not in known]
+        dangling += [str(end) for end in ends if end not in node_names]
         reached.update(map(str, ends))
         pairs.append((str(ends[0]), str(ends[1])))
-    if lost:
-        yield refused(f"{len(lost)} ends of connections are no nodes: {names(lost)}", main, where="connections")
-    if again := repeated(pairs):
-        told = names("-".join(pair) for pair in again)
-        yield doubted(f"{len(again)} connections stand there twice: {told}", main, where="connections")
-    if lonely := sorted(known - reached - alone):
+    if dangling:
+        yield refused(f"{len(dangling)} ends of connections are no nodes: {names(dangling)}", main, where="connections")
+    if repeats := repeated(pairs):
+        pair_names = names("-".join(pair) for pair in repeats)
+        yield doubted(f"{len(repeats)} connections stand there twice: {pair_names}", main, where="connections")
+    if lonely := sorted(node_names - reached - alone):
         reason = f"{len(lonely)} nodes have no connection and are not !unconnected: {names(lonely)}"
         yield refused(reason, main, where="nodes")

@@ -33,21 +33,21 @@ AMONG_PARTS = frozenset({"drawn_from"})
 """Canonical properties that speak of other parts of the environment, not of the item."""
 
 
-def refuse(reason: str, where: str) -> NoReturn:
+def refuse(reason: str, location: str) -> NoReturn:
     """UnreadableFile for what stands at this key."""
-    raise UnreadableFile(f"{where}: {reason}", [Problem(reason, where=where)])
+    raise UnreadableFile(f"{location}: {reason}", [Problem(reason, where=location)])
 
 
-def is_name(said: str) -> bool:
+def is_name(name: str) -> bool:
     """Whether a text can stand in one line of any format."""
-    return 0 < len(said) <= MAX_NAME and is_writable(said)
+    return 0 < len(name) <= MAX_NAME and is_writable(name)
 
 
-def checked_name(said: str, where: str) -> str:
+def checked_name(name: str, location: str) -> str:
     """The name, refused where it is none."""
-    if not is_name(said):
-        refuse(f"a name must have 1 to {MAX_NAME} characters and no control characters, got {said[:60]!r}", where)
-    return said
+    if not is_name(name):
+        refuse(f"a name must have 1 to {MAX_NAME} characters and no control characters, got {name[:60]!r}", location)
+    return name
 
 
 def identifier(name: str) -> str:
@@ -57,12 +57,12 @@ def identifier(name: str) -> str:
     return f"{name[: LONGEST_ID - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
 
-def number(value: Any, where: str) -> float:
+def number(value: Any, location: str) -> float:
     """A finite number; refused are texts, booleans and what is too large for a float."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        refuse(f"{str(value)[:60]!r} is not a number", where)
+        refuse(f"{str(value)[:60]!r} is not a number", location)
     if not math.isfinite(value):
-        refuse("the number is not finite", where)
+        refuse("the number is not finite", location)
     return float(value)
 
 
@@ -120,13 +120,17 @@ def is_flat(orientation: Any) -> bool:
     return yaw(orientation) is None or max(abs(orientation[0]), abs(orientation[1])) < SAME_ANGLE
 
 
-def said_yaw(said: Any, orientation: Any) -> float | None:
+def said_yaw(source_yaw: Any, orientation: Any) -> float | None:
     """The angle of a quaternion in radians: as its source said it where that is the same angle, else from -π to π."""
     now = yaw(orientation)
     if now is None:
         return None
-    known = isinstance(said, (int, float)) and not isinstance(said, bool)
-    return said if known and abs(math.remainder(said - now, math.tau)) < SAME_ANGLE else round(now, 12) + 0.0
+    is_number = isinstance(source_yaw, (int, float)) and not isinstance(source_yaw, bool)
+    return (
+        source_yaw
+        if is_number and abs(math.remainder(source_yaw - now, math.tau)) < SAME_ANGLE
+        else round(now, 12) + 0.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,59 +185,59 @@ def joined(layers: Layers, context: WriteContext) -> Net:
         is_point = (shapely.get_type_id(geometry) == 0) & ~shapely.is_empty(geometry)
         places = [k for k in np.flatnonzero(is_point).tolist() if part.properties[k].get("kind") == "node"]
         strange += sum(p.get("kind") != "edge" for p in part.properties) - len(places)
-        said = [part.ids[k] for k in places]
-        ids = unique_ids(said, taken)
-        renamed += [a for a, b in zip(said, ids, strict=True) if a != b]
+        part_ids = [part.ids[k] for k in places]
+        ids = unique_ids(part_ids, taken)
+        renamed += [a for a, b in zip(part_ids, ids, strict=True) if a != b]
         taken.update(ids)
-        home = dict(zip(said, range(len(net.nodes), len(net.nodes) + len(said)), strict=True))
+        home = dict(zip(part_ids, range(len(net.nodes), len(net.nodes) + len(part_ids)), strict=True))
         homes.append(home)
         everywhere = {**home, **everywhere}
         xyz = shapely.get_coordinates(geometry[places], include_z=True)
         for k, i, (x, y, z) in zip(places, ids, xyz.tolist(), strict=True):
             net.nodes.append(Node(i, x, y, None if math.isnan(z) else z, part.properties[k], key.level))
         net.levels.append(key.level)
-    lost = _join_edges(net, parts, shapes, homes, everywhere)
+    dropped_count = _join_edges(net, parts, shapes, homes, everywhere)
     if renamed:
         context.warn(f"{len(renamed)} ids stand in several networks and got a number: {some(renamed)}")
     context.drop("items that are neither a node with a point nor an edge", strange, "they are no part of a network")
-    context.drop("edges that begin or end at no node", lost, "there is nothing that they could join")
+    context.drop("edges that begin or end at no node", dropped_count, "there is nothing that they could join")
     return net
 
 
 def _join_edges(net: Net, parts: Any, shapes: Any, homes: list[dict[str, int]], everywhere: dict[str, int]) -> int:
     taken: set[str] = set()
-    lost = 0
+    dropped_count = 0
     for (key, part), home in zip(parts.items(), homes, strict=True):
         rows: list[tuple[int, int, int]] = []
         for k, p in enumerate(part.properties):
             if p.get("kind") != "edge":
                 continue
             ends = [p.get("source"), p.get("target")]
-            found = [home.get(e, everywhere.get(e)) if isinstance(e, str) else None for e in ends]
-            if found[0] is None or found[1] is None:
-                lost += 1
+            end_nodes = [home.get(e, everywhere.get(e)) if isinstance(e, str) else None for e in ends]
+            if end_nodes[0] is None or end_nodes[1] is None:
+                dropped_count += 1
             else:
-                rows.append((k, found[0], found[1]))
+                rows.append((k, end_nodes[0], end_nodes[1]))
         ids = unique_ids((part.ids[k] for k, _, _ in rows), taken)
         taken.update(ids)
         for (k, source, target), i in zip(rows, ids, strict=True):
             net.edges.append(Edge(i, source, target, part.properties[k], shapes[key][k], key.level))
-    return lost
+    return dropped_count
 
 
 def known_document(layers: Layers, name: str) -> dict[str, Any]:
     """What the first network's source of this format says as a whole; empty where there is none."""
     for part in layers.vector("topology").values():
-        said = part.document.get(name)
-        if isinstance(said, dict):
-            return dict(said)
+        document = part.document.get(name)
+        if isinstance(document, dict):
+            return dict(document)
     return {}
 
 
 def own(properties: Properties, name: str) -> dict[str, Any]:
     """What a format knows of an item; empty where it knows nothing."""
-    said = properties.get(name)
-    return said if isinstance(said, dict) else {}
+    members = properties.get(name)
+    return members if isinstance(members, dict) else {}
 
 
 def count(items: Any) -> int:
@@ -251,12 +255,12 @@ def only_2d(net: Net, context: WriteContext, why: str) -> None:
 def without_repeats(names: Sequence[str]) -> list[str]:
     """The names that stand more than once, each once, in order."""
     seen: set[str] = set()
-    again: dict[str, None] = {}
+    repeats: dict[str, None] = {}
     for name in names:
         if name in seen:
-            again[name] = None
+            repeats[name] = None
         seen.add(name)
-    return list(again)
+    return list(repeats)
 
 
 def empty(document: Properties) -> Features:

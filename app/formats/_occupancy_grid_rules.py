@@ -36,45 +36,45 @@ def check(files: Files) -> Iterator[Problem]:
     main = next((n for n in files if _image.kind_of(files[n]) is None), None)
     if main is None:
         return
-    said = _yaml.load(files[main], _YAML, typed=False)
-    if not isinstance(said, dict):
+    members = _yaml.load(files[main], _YAML, typed=False)
+    if not isinstance(members, dict):
         yield refused("a map's YAML is a mapping", main)
         return
     for key in REQUIRED:
-        if said.get(key) is None:
+        if members.get(key) is None:
             yield refused("map_server refuses a map without this key", main, where=key)
     thresholds: dict[str, float] = {}
     for key in ("resolution", "free_thresh", "occupied_thresh"):
-        if said.get(key) is not None:
-            number = cpp_number(said[key])
+        if members.get(key) is not None:
+            number = cpp_number(members[key])
             if number is None or not math.isfinite(number):
-                yield refused(f"must be a finite number, is {shown(said[key])}", main, where=key)
+                yield refused(f"must be a finite number, is {shown(members[key])}", main, where=key)
                 continue
             thresholds[key] = number
-            yield from _for_python(said[key], main, key)
+            yield from _for_python(members[key], main, key)
     if thresholds.get("resolution", 1.0) < LEAST_RESOLUTION:
         yield refused(f"Nav2 refuses a resolution below {LEAST_RESOLUTION:g} m", main, where="resolution")
-    yield from _origin(said.get("origin"), main)
-    mode = said.get("mode", "trinary")
+    yield from _origin(members.get("origin"), main)
+    mode = members.get("mode", "trinary")
     if mode not in MODES:
         yield refused(f"must be one of {', '.join(MODES)}, is {shown(mode)}", main, where="mode")
-    negate = _negate(said.get("negate"))
-    if said.get("negate") is not None and negate is None:
-        yield refused(f"must be 0, 1, true or false, is {shown(said['negate'])}", main, where="negate")
+    negate = _negate(members.get("negate"))
+    if members.get("negate") is not None and negate is None:
+        yield refused(f"must be 0, 1, true or false, is {shown(members['negate'])}", main, where="negate")
     free, occupied = thresholds.get("free_thresh", 0.0), thresholds.get("occupied_thresh", 1.0)
     for key in ("free_thresh", "occupied_thresh"):
         if not 0.0 <= thresholds.get(key, 0.0) <= 1.0:
             yield doubted("lies outside of 0 to 1, so it never or always holds", main, where=key)
     if mode in ("trinary", "scale") and free > occupied:
         yield doubted("is above occupied_thresh: where both hold a cell is free", main, where="free_thresh")
-    if said.get("image") is not None:
-        yield from _picture(said, main, files, str(mode), bool(negate), (free, occupied))
+    if members.get("image") is not None:
+        yield from _picture(members, main, files, str(mode), bool(negate), (free, occupied))
 
 
 def _negate(value: Any) -> bool | None:
-    said = cpp_bool(value)
-    if said is not None:
-        return said
+    flag = cpp_bool(value)
+    if flag is not None:
+        return flag
     number = cpp_number(value)
     return bool(number) if number is not None and number.is_integer() else None
 
@@ -85,14 +85,14 @@ def _for_python(text: str, main: str, key: str) -> Iterator[Problem]:
         yield doubted(reason, main, where=key)
 
 
-def _origin(said: Any, main: str) -> Iterator[Problem]:
-    if said is None:
+def _origin(origin: Any, main: str) -> Iterator[Problem]:
+    if origin is None:
         return
-    pose = [cpp_number(v) for v in said] if isinstance(said, list) else []
+    pose = [cpp_number(v) for v in origin] if isinstance(origin, list) else []
     if len(pose) != 3 or any(v is None or not math.isfinite(v) for v in pose):
-        yield refused(f"must be three finite numbers [x, y, yaw], is {shown(said)}", main, where="origin")
+        yield refused(f"must be three finite numbers [x, y, yaw], is {shown(origin)}", main, where="origin")
         return
-    for text in said:
+    for text in origin:
         yield from _for_python(text, main, "origin")
     if pose[2]:
         reason = f"Nav2's static layer and AMCL ignore the yaw of {pose[2]:g} rad: bake it into the cells, yaw 0"
@@ -100,9 +100,9 @@ def _origin(said: Any, main: str) -> Iterator[Problem]:
 
 
 def _picture(
-    said: Mapping[str, Any], main: str, files: Files, mode: str, negate: bool, thresholds: tuple[float, float]
+    members: Mapping[str, Any], main: str, files: Files, mode: str, negate: bool, thresholds: tuple[float, float]
 ) -> Iterator[Problem]:
-    image = said["image"]
+    image = members["image"]
     if not isinstance(image, str) or not image:
         yield refused(f"must be the name of a picture, is {shown(image)}", main, where="image")
         return

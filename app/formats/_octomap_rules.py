@@ -46,8 +46,8 @@ def check(files: Files) -> Iterator[Problem]:
         reason = "the first line must be '# Octomap OcTree file' or '… binary file', and a line 'data' end the header"
         yield refused(reason, main, line=1)
         return
-    said = {key.decode(): value.decode("latin1") for key, value in _KEYS.findall(data[: start.start()])}
-    tree, size, res = said.get("id"), said.get("size"), said.get("res")
+    header = {key.decode(): value.decode("latin1") for key, value in _KEYS.findall(data[: start.start()])}
+    tree, size, res = header.get("id"), header.get("size"), header.get("res")
     if tree not in NODE_BYTES:
         yield refused(f"octomap itself knows no tree of the type {shown(tree)}", main, where="id")
     if size is None or not size.isdigit():
@@ -77,19 +77,19 @@ def _binary(body: bytes, count: int | None, main: str) -> Iterator[Problem]:
     """Two bits for each child: the nodes that are told of, and the inner nodes that must follow."""
     if not count and not body:
         return
-    words = np.frombuffer(body, "<u2", len(body) // 2)
+    masks = np.frombuffer(body, "<u2", len(body) // 2)
     assert isinstance(_INNER, np.ndarray)
     assert isinstance(_CHILDREN, np.ndarray)
     # Depth first, the stream ends where no inner node is open any more.
-    open_nodes = 1 + np.cumsum(_INNER[words].astype(np.int64) - 1)
+    open_nodes = 1 + np.cumsum(_INNER[masks].astype(np.int64) - 1)
     ends = np.flatnonzero(open_nodes == 0)
     if not len(ends):
         yield refused("it is cut short: an inner node's children are missing", main)
         return
     used = int(ends[0]) + 1
-    if used < len(words):
+    if used < len(masks):
         yield doubted(f"{len(body) - 2 * used} bytes follow the tree", main)
-    nodes = 1 + int(_CHILDREN[words[:used]].sum(dtype=np.int64))
+    nodes = 1 + int(_CHILDREN[masks[:used]].sum(dtype=np.int64))
     if count is not None and nodes != count:
         yield doubted(
             f"the header says {count} nodes, the tree has {nodes}: octomap tells an error", main, where="size"

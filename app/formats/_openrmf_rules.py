@@ -77,94 +77,96 @@ def check(files: Files) -> Iterator[Problem]:
         yield from _lift(lift, levels, main, f"lifts.{name}")
 
 
-def _parameters(said: Any, main: str, where: str) -> Iterator[Problem]:
+def _parameters(parameters: Any, main: str, location: str) -> Iterator[Problem]:
     """Typed parameters: [type, value]."""
-    if not said:
+    if not parameters:
         return
-    if not isinstance(said, dict):
-        yield refused(f"must be a mapping, is {shown(said)}", main, where=where)
+    if not isinstance(parameters, dict):
+        yield refused(f"must be a mapping, is {shown(parameters)}", main, where=location)
         return
-    for key, value in said.items():
-        place = f"{where}.{key}"
+    for key, value in parameters.items():
+        item_location = f"{location}.{key}"
         if not isinstance(value, list) or len(value) != 2 or value[0] not in KINDS or isinstance(value[0], bool):
             reason = f"must be [type, value] (1 text, 2 integer, 3 decimal, 4 truth value), is {shown(value)}"
-            yield refused(reason, main, where=place)
+            yield refused(reason, main, where=item_location)
         elif not isinstance(value[1], KINDS[value[0]]) or (value[0] in (2, 3) and isinstance(value[1], bool)):
-            yield refused(f"the value {shown(value[1])} is not of its type {value[0]}", main, where=place)
+            yield refused(f"the value {shown(value[1])} is not of its type {value[0]}", main, where=item_location)
 
 
-def _level(level: dict[str, Any], main: str, where: str, files: Files, *, measured: bool) -> Iterator[Problem]:
+def _level(level: dict[str, Any], main: str, location: str, files: Files, *, measured: bool) -> Iterator[Problem]:
     drawing = level.get("drawing")
     if drawing is not None:
         image = drawing.get("filename") if isinstance(drawing, dict) else None
         if not isinstance(image, str):
-            yield refused("a drawing needs a filename", main, where=f"{where}.drawing")
+            yield refused("a drawing needs a filename", main, where=f"{location}.drawing")
         elif image and posixpath.normpath(posixpath.join(posixpath.dirname(main), image)) not in files:
-            yield doubted(f"the drawing {shown(image)} is not there", main, where=f"{where}.drawing.filename")
+            yield doubted(f"the drawing {shown(image)} is not there", main, where=f"{location}.drawing.filename")
     if "elevation" in level and not is_number(level["elevation"]):
-        yield refused(f"must be a number, is {shown(level['elevation'])}", main, where=f"{where}.elevation")
+        yield refused(f"must be a number, is {shown(level['elevation'])}", main, where=f"{location}.elevation")
     vertices = level.get("vertices") or []
     if not isinstance(vertices, list):
-        yield refused("must be a list", main, where=f"{where}.vertices")
+        yield refused("must be a list", main, where=f"{location}.vertices")
         return
     for k, row in enumerate(vertices):
         if not isinstance(row, list) or len(row) < 4 or not numbers(row[:3], 3):
-            yield refused("a vertex is [x, y, z, name, {…}]", main, where=f"{where}.vertices[{k}]")
+            yield refused("a vertex is [x, y, z, name, {…}]", main, where=f"{location}.vertices[{k}]")
         elif len(row) > 4:
-            yield from _parameters(row[4], main, f"{where}.vertices[{k}]")
+            yield from _parameters(row[4], main, f"{location}.vertices[{k}]")
     called = [
         row[3] for row in vertices if isinstance(row, list) and len(row) > 3 and isinstance(row[3], str) and row[3]
     ]
-    if again := repeated(called):
-        reason = f"{len(again)} names are given to several vertices; fleet adapters refuse that: {names(again)}"
-        yield doubted(reason, main, where=f"{where}.vertices")
-    for word in EDGES:
-        yield from _edges(level.get(word), word, vertices, main, f"{where}.{word}")
+    if repeats := repeated(called):
+        reason = f"{len(repeats)} names are given to several vertices; fleet adapters refuse that: {names(repeats)}"
+        yield doubted(reason, main, where=f"{location}.vertices")
+    for section in EDGES:
+        yield from _edges(level.get(section), section, vertices, main, f"{location}.{section}")
     if measured and not level.get("measurements"):
         reason = "the reference level has no measurement: a pixel counts as a metre"
-        yield doubted(reason, main, where=f"{where}.measurements")
-    for word in ("floors", "holes"):
-        for k, area in mappings(level.get(word)):
+        yield doubted(reason, main, where=f"{location}.measurements")
+    for section in ("floors", "holes"):
+        for k, area in mappings(level.get(section)):
             ring = area.get("vertices")
             if not isinstance(ring, list) or len(ring) < 3 or not all(_is_index(i, vertices) for i in ring):
-                yield refused("needs three vertices or more that are there", main, where=f"{where}.{word}[{k}]")
+                yield refused("needs three vertices or more that are there", main, where=f"{location}.{section}[{k}]")
     for k, row in enumerate(level.get("fiducials") or ()):
         if not isinstance(row, list) or len(row) < 3 or not numbers(row[:2], 2):
-            yield refused("a fiducial is [x, y, name]", main, where=f"{where}.fiducials[{k}]")
+            yield refused("a fiducial is [x, y, name]", main, where=f"{location}.fiducials[{k}]")
 
 
 def _is_index(value: Any, vertices: list[Any]) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < len(vertices)
 
 
-def _edges(rows: Any, word: str, vertices: list[Any], main: str, where: str) -> Iterator[Problem]:
+def _edges(rows: Any, section: str, vertices: list[Any], main: str, location: str) -> Iterator[Problem]:
     if not rows:
         return
     if not isinstance(rows, list):
-        yield refused("must be a list", main, where=where)
+        yield refused("must be a list", main, where=location)
         return
     for k, row in enumerate(rows):
-        place = f"{where}[{k}]"
+        item_location = f"{location}[{k}]"
         if not isinstance(row, list) or len(row) < 2 or not all(_is_index(i, vertices) for i in row[:2]):
-            yield refused(f"must be [i, j, {{…}}] with vertices below {len(vertices)}", main, where=place)
+            yield refused(f"must be [i, j, {{…}}] with vertices below {len(vertices)}", main, where=item_location)
             continue
-        said = row[2] if len(row) > 2 and isinstance(row[2], dict) else {}
-        yield from _parameters(row[2] if len(row) > 2 else None, main, place)
-        value = {key: v[1] for key, v in said.items() if isinstance(v, list) and len(v) == 2}
-        if word == "measurements":
+        parameters = row[2] if len(row) > 2 and isinstance(row[2], dict) else {}
+        yield from _parameters(row[2] if len(row) > 2 else None, main, item_location)
+        value = {key: v[1] for key, v in parameters.items() if isinstance(v, list) and len(v) == 2}
+        if section == "measurements":
             if not is_number(value.get("distance")):
-                yield refused("a measurement needs a distance", main, where=place)
+                yield refused("a measurement needs a distance", main, where=item_location)
             a, b = vertices[row[0]], vertices[row[1]]
             if isinstance(a, list) and isinstance(b, list) and a[:2] == b[:2]:
-                yield refused("a measurement of length 0: the scale is a division by it", main, where=place)
-        elif word == "doors":
-            if lost := [key for key in ("name", "type") if value.get(key) is None]:
-                yield refused(f"a door needs {' and '.join(lost)}", main, where=place)
+                yield refused("a measurement of length 0: the scale is a division by it", main, where=item_location)
+        elif section == "doors":
+            if absent := [key for key in ("name", "type") if value.get(key) is None]:
+                yield refused(f"a door needs {' and '.join(absent)}", main, where=item_location)
             elif value["type"] not in DOORS:
-                yield doubted(f"the generator has no door of the type {shown(value['type'])}", main, where=place)
-        elif word == "lanes" and value.get("graph_idx", 0) not in range(GRAPHS):
+                yield doubted(
+                    f"the generator has no door of the type {shown(value['type'])}", main, where=item_location
+                )
+        elif section == "lanes" and value.get("graph_idx", 0) not in range(GRAPHS):
             reason = f"only graphs 0 to {GRAPHS - 1} are generated; this lane is of {shown(value['graph_idx'])}"
-            yield doubted(reason, main, where=place)
+            yield doubted(reason, main, where=item_location)
 
 
 def _aligned(levels: Mapping[str, Any], reference: str, main: str) -> Iterator[Problem]:
@@ -182,9 +184,9 @@ def _aligned(levels: Mapping[str, Any], reference: str, main: str) -> Iterator[P
 
 
 def _on_earth(top: Mapping[str, Any], system: str, levels: Mapping[str, Any], main: str) -> Iterator[Problem]:
-    said = top.get("parameters") if isinstance(top.get("parameters"), dict) else {}
-    assert isinstance(said, dict)
-    value = {key: v[1] for key, v in said.items() if isinstance(v, list) and len(v) == 2}
+    parameters = top.get("parameters") if isinstance(top.get("parameters"), dict) else {}
+    assert isinstance(parameters, dict)
+    value = {key: v[1] for key, v in parameters.items() if isinstance(v, list) and len(v) == 2}
     crs = value.get("generate_crs")
     if system in ("web_mercator", "wgs84") and not crs:
         yield refused(f"{system} needs the parameter generate_crs", main, where="parameters.generate_crs")
@@ -205,24 +207,24 @@ def _on_earth(top: Mapping[str, Any], system: str, levels: Mapping[str, Any], ma
             yield doubted(reason, main, where="parameters.generate_origin_vertex")
 
 
-def _lift(lift: Any, levels: Mapping[str, Any], main: str, where: str) -> Iterator[Problem]:
+def _lift(lift: Any, levels: Mapping[str, Any], main: str, location: str) -> Iterator[Problem]:
     if not isinstance(lift, dict):
-        yield refused("must be a mapping", main, where=where)
+        yield refused("must be a mapping", main, where=location)
         return
-    if lost := [key for key in LIFT if not is_number(lift.get(key))]:
-        yield refused(f"a lift needs the numbers {', '.join(lost)}", main, where=where)
+    if absent := [key for key in LIFT if not is_number(lift.get(key))]:
+        yield refused(f"a lift needs the numbers {', '.join(absent)}", main, where=location)
     for key in ("reference_floor_name", "highest_floor", "lowest_floor"):
         floor = lift.get(key)
         if (floor or (key == "reference_floor_name" and floor is not None)) and floor not in levels:
-            yield refused(f"there is no level {shown(floor)}", main, where=f"{where}.{key}")
+            yield refused(f"there is no level {shown(floor)}", main, where=f"{location}.{key}")
     doors = lift.get("doors")
     for name, door in doors.items() if isinstance(doors, dict) else ():
-        if lost := missing(door, DOOR):
-            yield refused(f"a lift door needs {', '.join(lost)}", main, where=f"{where}.doors.{name}")
+        if absent := missing(door, DOOR):
+            yield refused(f"a lift door needs {', '.join(absent)}", main, where=f"{location}.doors.{name}")
     stops = lift.get("level_doors")
     for floor, listed in stops.items() if isinstance(stops, dict) else ():
         if floor not in levels:
-            yield refused(f"there is no level {shown(floor)}", main, where=f"{where}.level_doors")
-        lost = [d for d in listed if d not in (doors or {})] if isinstance(listed, list) else []
-        if lost:
-            yield doubted(f"the lift has no door {names(lost)}", main, where=f"{where}.level_doors.{floor}")
+            yield refused(f"there is no level {shown(floor)}", main, where=f"{location}.level_doors")
+        absent = [d for d in listed if d not in (doors or {})] if isinstance(listed, list) else []
+        if absent:
+            yield doubted(f"the lift has no door {names(absent)}", main, where=f"{location}.level_doors.{floor}")

@@ -104,7 +104,7 @@ def parse(data: bytes, limits: Limits, *, highways_only: bool = False) -> Data:
     return _scan(data, limits, highways_only) or _events(data, limits)
 
 
-def unpack(data: bytes, limits: Limits, most: int | None = None) -> bytes:
+def unpack(data: bytes, limits: Limits, limit: int | None = None) -> bytes:
     """The content of a ``.gz`` or ``.bz2``, else the bytes as they are; most: stop there (to look at the beginning)."""
     if data[:2] == b"\x1f\x8b":
         new: Callable[[], Any] = lambda: zlib.decompressobj(wbits=31)  # noqa: E731
@@ -112,27 +112,27 @@ def unpack(data: bytes, limits: Limits, most: int | None = None) -> bytes:
         new = bz2.BZ2Decompressor
     else:
         return data
-    out, rest, size = [], data, 0
-    bound = limits.max_unpacked(len(data)) if most is None else most
+    out, remainder, size = [], data, 0
+    bound = limits.max_unpacked(len(data)) if limit is None else limit
     try:
-        while rest:
+        while remainder:
             stream = new()
             while not stream.eof:
-                piece = stream.decompress(rest, 2**20)
+                piece = stream.decompress(remainder, 2**20)
                 out.append(piece)
                 size += len(piece)
                 if size > bound:
-                    if most is not None:
-                        return b"".join(out)[:most]
+                    if limit is not None:
+                        return b"".join(out)[:limit]
                     limits.check_unpacked(size, len(data))
-                rest = stream.unconsumed_tail if hasattr(stream, "unconsumed_tail") else b""
-                if not piece and not rest and not stream.eof:
-                    if most is not None:
+                remainder = stream.unconsumed_tail if hasattr(stream, "unconsumed_tail") else b""
+                if not piece and not remainder and not stream.eof:
+                    if limit is not None:
                         return b"".join(out)
                     raise UnreadableFile("the compressed file ends before its end", [Problem("truncated")])
-            rest = stream.unused_data
+            remainder = stream.unused_data
     except (zlib.error, OSError) as error:
-        if most is not None:
+        if limit is not None:
             return b"".join(out)
         raise UnreadableFile(f"the file cannot be decompressed: {error}", [Problem(str(error))]) from error
     return b"".join(out)
@@ -262,12 +262,12 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
 
     def attributes(k: int) -> Attributes:
         text = texts[k]
-        known = cache.get(text)
-        if known is None:
-            known = cache[text] = children.attributes(text)
-        return known
+        cached = cache.get(text)
+        if cached is None:
+            cached = cache[text] = children.attributes(text)
+        return cached
 
-    found = Data(
+    osm_data = Data(
         ids,
         np.concatenate(places),
         tags,
@@ -278,8 +278,8 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
         [_attributes(b) for b in bounds],
         [],
     )
-    _check(found, lambda k: _line_of_node(data, k))
-    return found
+    _check(osm_data, lambda k: _line_of_node(data, k))
+    return osm_data
 
 
 def _well_formed(data: bytes) -> None:
@@ -322,28 +322,28 @@ class _Children:
         """The attributes in this part of a tag."""
         return self.mapping(_ATTRIBUTE.findall(text))
 
-    def mapping(self, found: list[tuple[bytes, bytes]]) -> dict[str, str]:
+    def mapping(self, pairs: list[tuple[bytes, bytes]]) -> dict[str, str]:
         """Keys and values as texts. Mappings of the same keys share their table of keys."""
         texts = self.texts
-        keys = tuple([k for k, _ in found])
+        keys = tuple([k for k, _ in pairs])
         pattern = self.alike.get(keys)
         if pattern is None:
             if len(self.alike) >= PATTERNS or len(set(keys)) != len(keys):
-                return {texts[k]: texts[v] for k, v in found}
+                return {texts[k]: texts[v] for k, v in pairs}
             pattern = self.alike[keys] = alike(*[texts[k] for k in keys])
         out = pattern.copy()
-        for name, (_, v) in zip(pattern, found, strict=True):
+        for name, (_, v) in zip(pattern, pairs, strict=True):
             out[name] = texts[v]
         return out
 
-    def tags(self, body: bytes, others: int) -> Tags:
-        """The tags in an element's body that has ``others`` further elements."""
-        found = _TAG.findall(body)
-        self.tagged += len(found)
-        if body.count(b"<") != len(found) + others:
+    def tags(self, body: bytes, other_count: int) -> Tags:
+        """The tags in an element's body that has ``other_count`` further elements."""
+        pairs = _TAG.findall(body)
+        self.tagged += len(pairs)
+        if body.count(b"<") != len(pairs) + other_count:
             self.regular = False
-        out = self.mapping(found)
-        if len(out) != len(found):
+        out = self.mapping(pairs)
+        if len(out) != len(pairs):
             # A key twice: the careful way tells of it.
             self.regular = False
         return out
@@ -372,8 +372,8 @@ def _scan_relations(data: bytes, children: _Children) -> list[Relation] | None:
         if head is None:
             return None
         end = head.end()
-        found = _MEMBER.findall(part, end)
-        members = [(t.decode(), int(r or other), unescape(role or named)) for t, r, role, named, other in found]
+        rows = _MEMBER.findall(part, end)
+        members = [(t.decode(), int(r or other), unescape(role or named)) for t, r, role, named, other in rows]
         children.members += len(members)
         tags = children.tags(part[end:], len(members))
         out.append(Relation(int(head[1]), members, tags, children.attributes(head[2])))
@@ -477,9 +477,9 @@ class _Careful:
 
     def attributes(self, element: etree._Element) -> Attributes:
         out = _xml.attributes(element)
-        most = self.limits.xml_attribute_bytes
-        if any(len(v) > most for v in out.values()):
-            _refuse(f"an attribute is longer than {most} characters", element)
+        limit = self.limits.xml_attribute_bytes
+        if any(len(v) > limit for v in out.values()):
+            _refuse(f"an attribute is longer than {limit} characters", element)
         return out
 
     def take(self, element: etree._Element) -> None:
@@ -497,18 +497,22 @@ class _Careful:
         members: list[tuple[str, int, str]] = []
         children: list[Unknown] = []
         for child in element:
-            said = self.attributes(child)
-            if child.tag == "tag" and "k" in said:
-                if said["k"] in tags:
-                    self.warn(f"the tag {said['k']} stands twice; the last one counts", child, element, identity)
-                tags[said["k"]] = said.get("v", "")
+            child_attributes = self.attributes(child)
+            if child.tag == "tag" and "k" in child_attributes:
+                if child_attributes["k"] in tags:
+                    self.warn(
+                        f"the tag {child_attributes['k']} stands twice; the last one counts", child, element, identity
+                    )
+                tags[child_attributes["k"]] = child_attributes.get("v", "")
             elif child.tag == "nd" and element.tag == "way":
-                refs.append(_integer(said.get("ref"), child, "ref"))
+                refs.append(_integer(child_attributes.get("ref"), child, "ref"))
             elif child.tag == "member" and element.tag == "relation":
-                kind = said.get("type", "")
+                kind = child_attributes.get("type", "")
                 if kind not in ("node", "way", "relation"):
                     _refuse(f"a member's type must be node, way or relation, not {kind!r}", child)
-                members.append((kind, _integer(said.get("ref"), child, "ref"), said.get("role", "")))
+                members.append(
+                    (kind, _integer(child_attributes.get("ref"), child, "ref"), child_attributes.get("role", ""))
+                )
             else:
                 children.append(self.unknown(child))
                 self.warn(f"<{child.tag}> inside <{element.tag}> is not known to OSM", child, element, identity)
@@ -559,7 +563,7 @@ class _Careful:
         self.problems.append((problem, at.sourceline, f"{owner.tag} {identity}"))
 
     def finish(self) -> Data:
-        found = Data(
+        osm_data = Data(
             self.ids,
             np.array(self.lonlat, np.float64).reshape(-1, 2),
             self.tags,
@@ -572,8 +576,8 @@ class _Careful:
             self.node_children,
             self.problems,
         )
-        _check(found, self.lines.__getitem__)
-        return found
+        _check(osm_data, self.lines.__getitem__)
+        return osm_data
 
 
 def _refuse(reason: str, element: etree._Element) -> NoReturn:
@@ -592,29 +596,29 @@ def _degrees(text: str, element: etree._Element) -> float:
     return float(text)
 
 
-def _check(found: Data, line: Callable[[int], int | None]) -> None:
+def _check(osm_data: Data, line: Callable[[int], int | None]) -> None:
     """Ids within 64 bits, places on earth."""
-    refs = chain.from_iterable(way.refs for way in found.ways)
-    others = chain((w.id for w in found.ways), (r.id for r in found.relations))
-    members = (m[1] for r in found.relations for m in r.members)
-    for what, values in (
-        ("node", found.ids),
+    refs = chain.from_iterable(way.refs for way in osm_data.ways)
+    other_ids = chain((w.id for w in osm_data.ways), (r.id for r in osm_data.relations))
+    members = (m[1] for r in osm_data.relations for m in r.members)
+    for noun, values in (
+        ("node", osm_data.ids),
         ("way's reference", refs),
-        ("way or relation", others),
+        ("way or relation", other_ids),
         ("member", members),
     ):
         try:
             np.fromiter(values, np.int64)
         except OverflowError:
-            reason = f"the id of a {what} does not fit into 64 bits"
+            reason = f"the id of a {noun} does not fit into 64 bits"
             raise UnreadableFile(reason, [Problem(reason)]) from None
-    bad = (np.abs(found.lonlat) > [180.0, 90.0]).any(axis=1) | np.isinf(found.lonlat).any(axis=1)
+    bad = (np.abs(osm_data.lonlat) > [180.0, 90.0]).any(axis=1) | np.isinf(osm_data.lonlat).any(axis=1)
     if bad.any():
         k = int(np.flatnonzero(bad)[0])
-        lon, lat = found.lonlat[k].tolist()
+        lon, lat = osm_data.lonlat[k].tolist()
         reason = f"lat {lat:g}, lon {lon:g} is no place on earth: latitude must be within ±90, longitude within ±180"
         raise UnreadableFile(
-            f"node {found.ids[k]}: {reason}", [Problem(reason, line=line(k), where=f"node {found.ids[k]}")]
+            f"node {osm_data.ids[k]}: {reason}", [Problem(reason, line=line(k), where=f"node {osm_data.ids[k]}")]
         )
 
 

@@ -39,31 +39,31 @@ def check(files: Files) -> Iterator[Problem]:
         return
     if root.get("version") != "0.6":
         yield refused(f"must be 0.6, is {root.get('version')!r}", main, line=root.sourceline, where="version")
-    found = _Found()
+    elements = _Found()
     try:
-        found.take(root)
+        elements.take(root)
     except (TypeError, ValueError):
-        yield refused("an id or a ref is missing or no whole number", main, line=found.line)
+        yield refused("an id or a ref is missing or no whole number", main, line=elements.line)
         return
-    for kind, ids in found.ids.items():
-        if again := repeated(ids):
-            yield doubted(f"{len(again)} ids are given to several {kind}s: {names(again)}", main)
+    for kind, ids in elements.ids.items():
+        if repeats := repeated(ids):
+            yield doubted(f"{len(repeats)} ids are given to several {kind}s: {names(repeats)}", main)
         if new := [i for i in ids if i < 0]:
             reason = (
                 f"{len(new)} {kind}s have negative ids, as JOSM gives them to what is new: GDAL reads them with "
                 "OSM_USE_CUSTOM_INDEXING=NO"
             )
             yield doubted(reason, main)
-        if bare := found.bare[kind]:
+        if bare := elements.bare[kind]:
             yield doubted(f"{bare} {kind}s have no version from 1: osmium's merging of changes needs them", main)
-    if found.nowhere:
-        yield refused(f"{len(found.nowhere)} nodes have no place: {names(found.nowhere)}", main)
-    if absent := sorted(found.refs - set(found.ids["node"])):
+    if elements.nowhere:
+        yield refused(f"{len(elements.nowhere)} nodes have no place: {names(elements.nowhere)}", main)
+    if absent := sorted(elements.refs - set(elements.ids["node"])):
         yield doubted(f"{len(absent)} nodes of ways are not in the file: {names(absent)}", main)
-    if found.long:
-        yield doubted(f"{len(found.long)} ways have more than {MOST_NODES} nodes: {names(found.long)}", main)
+    if elements.long:
+        yield doubted(f"{len(elements.long)} ways have more than {MOST_NODES} nodes: {names(elements.long)}", main)
     if root.tag == "osm":
-        yield from _order(found, main)
+        yield from _order(elements, main)
 
 
 @dataclass(slots=True)
@@ -86,17 +86,21 @@ class _Found:
                 if kind in ("create", "modify", "delete"):
                     self.take(element)
                 continue
-            said = element.attrib
+            attributes = element.attrib
             self.line = element.sourceline
-            i = int(str(said["id"]) if "id" in said else "")
+            i = int(str(attributes["id"]) if "id" in attributes else "")
             self.ids[str(kind)].append(i)
             if not self.kinds or self.kinds[-1] != kind:
                 self.kinds.append(str(kind))
-            if i > 0 and not str(said.get("version", "")).isdigit():
+            if i > 0 and not str(attributes.get("version", "")).isdigit():
                 self.bare[str(kind)] += 1
             if kind == "node":
-                gone = said.get("action") == "delete" or said.get("visible") == "false" or parent.tag == "delete"
-                if not gone and ("lat" not in said or "lon" not in said):
+                is_deleted = (
+                    attributes.get("action") == "delete"
+                    or attributes.get("visible") == "false"
+                    or parent.tag == "delete"
+                )
+                if not is_deleted and ("lat" not in attributes or "lon" not in attributes):
                     self.nowhere.append(i)
             elif kind == "way":
                 refs = [int(nd.get("ref", "")) for nd in element.iterchildren("nd")]
@@ -105,11 +109,11 @@ class _Found:
                     self.long.append(i)
 
 
-def _order(found: _Found, main: str) -> Iterator[Problem]:
-    if found.kinds != [kind for kind in KINDS if kind in found.kinds]:
+def _order(elements: _Found, main: str) -> Iterator[Problem]:
+    if elements.kinds != [kind for kind in KINDS if kind in elements.kinds]:
         yield doubted("types are mixed: GDAL and osmium want all nodes, then all ways, then all relations", main)
         return
-    for kind, ids in found.ids.items():
+    for kind, ids in elements.ids.items():
         if any(b < a for a, b in pairwise(i for i in ids if i > 0)):
             yield doubted(f"the {kind}s are not sorted by id: some of osmium's commands need `osmium sort`", main)
             return

@@ -77,16 +77,16 @@ def _lines(
 ) -> Iterator[str]:
     cache: dict[int, str] = {}
 
-    def attributes(said: Mapping[str, str]) -> str:
-        if not said:
+    def attributes(values: Mapping[str, str]) -> str:
+        if not values:
             return ""
-        known = cache.get(id(said))
-        if known is None:
+        cached = cache.get(id(values))
+        if cached is None:
             # Keyed by identity: thousands of elements of one changeset share one mapping, which lives here.
             if len(cache) >= SHARED:
                 cache.clear()  # a file in which every element has its own history
-            known = cache[id(said)] = attribute_text(said, RESERVED)
-        return known
+            cached = cache[id(values)] = attribute_text(values, RESERVED)
+        return cached
 
     def unknown(kind: str, i: int) -> list[str]:
         return element_lines(children[kind, i], "  ") if (kind, i) in children else []
@@ -98,33 +98,33 @@ def _lines(
     lat = degrees([nodes[i].lat for i in order])
     for i, x, y in zip(order, lon, lat, strict=True):
         node = nodes[i]
-        place = f' lat="{y}" lon="{x}"' if x is not None else ""
+        position = f' lat="{y}" lon="{x}"' if x is not None else ""
         further = unknown("node", i) if children else ()
         if node.tags or further:
-            yield f' <node id="{i}"{attributes(node.attributes)}{place}>'
+            yield f' <node id="{i}"{attributes(node.attributes)}{position}>'
             yield from tag_lines(node.tags)
             yield from further
             yield " </node>"
         else:
-            yield f' <node id="{i}"{attributes(node.attributes)}{place}/>'
+            yield f' <node id="{i}"{attributes(node.attributes)}{position}/>'
     for i in sorted(ways, key=rank):
-        refs, tags, said = ways[i]
+        refs, tags, element_attributes = ways[i]
         further = unknown("way", i)
         if not refs and not tags and not further:
-            yield f' <way id="{i}"{attributes(said)}/>'
+            yield f' <way id="{i}"{attributes(element_attributes)}/>'
             continue
-        yield f' <way id="{i}"{attributes(said)}>'
+        yield f' <way id="{i}"{attributes(element_attributes)}>'
         yield from [f'  <nd ref="{r}"/>' for r in refs]
         yield from tag_lines(tags)
         yield from further
         yield " </way>"
     for i in sorted(relations, key=rank):
-        members, tags, said = relations[i]
+        members, tags, element_attributes = relations[i]
         further = unknown("relation", i)
         if not members and not tags and not further:
-            yield f' <relation id="{i}"{attributes(said)}/>'
+            yield f' <relation id="{i}"{attributes(element_attributes)}/>'
             continue
-        yield f' <relation id="{i}"{attributes(said)}>'
+        yield f' <relation id="{i}"{attributes(element_attributes)}>'
         yield from [f'  <member type="{escape(t)}" ref="{r}" role="{escape(role)}"/>' for t, r, role in members]
         yield from tag_lines(tags)
         yield from further
@@ -139,10 +139,12 @@ def element_lines(rows: Any, indent: str = " ", depth: int = 1) -> list[str]:
     """
     lines = []
     for row in rows if isinstance(rows, list) and depth <= MAX_UNKNOWN_DEPTH else []:
-        name, said, text, inner = ([*row, "", []] if len(row) == 2 else [*row, []])[:4] if is_row(row) else ("",) * 4
+        name, attributes, text, inner = (
+            ([*row, "", []] if len(row) == 2 else [*row, []])[:4] if is_row(row) else ("",) * 4
+        )
         if not _NAME.fullmatch(str(name)):
             continue
-        start = f"{indent}<{name}{attribute_text(as_texts(said), frozenset())}>{escape(str(text))}"
+        start = f"{indent}<{name}{attribute_text(as_texts(attributes), frozenset())}>{escape(str(text))}"
         below = element_lines(inner, f"{indent} ", depth + 1)
         lines += [start, *below, f"{indent}</{name}>"] if below else [f"{start}</{name}>"]
     return lines
@@ -208,9 +210,9 @@ def plain(text: str) -> str:
     return f"{float(text):.12f}".rstrip("0") if "e" in text else text
 
 
-def attribute_text(said: Mapping[str, str], without: frozenset[str]) -> str:
+def attribute_text(attributes: Mapping[str, str], without: frozenset[str]) -> str:
     """XML attributes, each with a space before it; those that XML could not name are left out."""
-    return "".join(f' {k}="{escape(v)}"' for k, v in said.items() if k not in without and _NAME.fullmatch(k))
+    return "".join(f' {k}="{escape(v)}"' for k, v in attributes.items() if k not in without and _NAME.fullmatch(k))
 
 
 def tag_lines(tags: Mapping[str, str]) -> list[str]:

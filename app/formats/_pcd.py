@@ -82,10 +82,10 @@ def parse(data: bytes, context: ReadContext) -> Cloud:
 
 
 def _header(data: bytes, context: ReadContext) -> _Header:
-    said: dict[str, tuple[list[str], int]] = {}
+    entries: dict[str, tuple[list[str], int]] = {}
     comments: list[str] = []
     position, number = 3 if data.startswith(b"\xef\xbb\xbf") else 0, 0
-    while "DATA" not in said:
+    while "DATA" not in entries:
         end = data.find(b"\n", position, HEADER_BYTES)
         if end < 0:
             raise wrong("the header does not end: the line DATA is missing", number + 1, "DATA")
@@ -94,38 +94,38 @@ def _header(data: bytes, context: ReadContext) -> _Header:
         if line.startswith("#"):
             comments.append(line)
             continue
-        word, *values = line.split() or [""]
-        if word in WORDS:
-            said[word] = (values, number)
-        elif word:
-            context.warn(f"unknown word {word[:40]!r} in the header: left out", line=number, where=word[:40])
-    for word in ("SIZE", "TYPE", "WIDTH"):
-        if word not in said:
-            raise wrong(f"the header does not tell {word}", where=word)
-    fields = _fields(said)
-    width = _whole(said, "WIDTH")
-    height = _whole(said, "HEIGHT") if "HEIGHT" in said else 1
-    if "POINTS" in said and _whole(said, "POINTS") != width * height:
-        reason = f"POINTS is {_whole(said, 'POINTS')}, but WIDTH times HEIGHT is {width * height}"
-        raise wrong(reason, said["POINTS"][1], "POINTS")
-    (kind, *_), line_number = said["DATA"][0] or [""], said["DATA"][1]
-    known = next((k for k in KINDS if k == kind), None)
-    if known is None:
+        key, *values = line.split() or [""]
+        if key in WORDS:
+            entries[key] = (values, number)
+        elif key:
+            context.warn(f"unknown word {key[:40]!r} in the header: left out", line=number, where=key[:40])
+    for key in ("SIZE", "TYPE", "WIDTH"):
+        if key not in entries:
+            raise wrong(f"the header does not tell {key}", where=key)
+    fields = _fields(entries)
+    width = _whole(entries, "WIDTH")
+    height = _whole(entries, "HEIGHT") if "HEIGHT" in entries else 1
+    if "POINTS" in entries and _whole(entries, "POINTS") != width * height:
+        reason = f"POINTS is {_whole(entries, 'POINTS')}, but WIDTH times HEIGHT is {width * height}"
+        raise wrong(reason, entries["POINTS"][1], "POINTS")
+    (kind, *_), line_number = entries["DATA"][0] or [""], entries["DATA"][1]
+    data_kind = next((k for k in KINDS if k == kind), None)
+    if data_kind is None:
         raise wrong(f"DATA must be one of {', '.join(KINDS)}, got {kind[:40]!r}", line_number, "DATA")
-    usual = [c for c in comments if not c.startswith("# .PCD")]
-    return _Header(fields, width, height, _viewpoint(said), tuple(usual), known, position, number)
+    user_comments = [c for c in comments if not c.startswith("# .PCD")]
+    return _Header(fields, width, height, _viewpoint(entries), tuple(user_comments), data_kind, position, number)
 
 
-def _fields(said: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
-    word = "FIELDS" if "FIELDS" in said else "COLUMNS"
-    if word not in said:
+def _fields(entries: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
+    key = "FIELDS" if "FIELDS" in entries else "COLUMNS"
+    if key not in entries:
         raise wrong("the header does not tell FIELDS", where="FIELDS")
-    names, line = said[word]
-    counts, count_line = said.get("COUNT", (["1"] * len(names), line))
-    (sizes, size_line), (types, type_line) = said["SIZE"], said["TYPE"]
-    for what, values, at in (("SIZE", sizes, size_line), ("TYPE", types, type_line), ("COUNT", counts, count_line)):
+    names, line = entries[key]
+    counts, count_line = entries.get("COUNT", (["1"] * len(names), line))
+    (sizes, size_line), (types, type_line) = entries["SIZE"], entries["TYPE"]
+    for label, values, at in (("SIZE", sizes, size_line), ("TYPE", types, type_line), ("COUNT", counts, count_line)):
         if len(values) != len(names):
-            raise wrong(f"{what} has {len(values)} values for {len(names)} fields", at, what)
+            raise wrong(f"{label} has {len(values)} values for {len(names)} fields", at, label)
     out = []
     seen: set[str] = set()
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
@@ -137,23 +137,23 @@ def _fields(said: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
                 f"field {name[:40]}: COUNT must be a number from 1 to 99999, got {count[:8]!r}", count_line, "COUNT"
             )
         if name != PADDING and name in seen:
-            raise wrong(f"two fields are called {name[:40]!r}", line, word)
+            raise wrong(f"two fields are called {name[:40]!r}", line, key)
         seen.add(name)
         out.append(_Field(name, np.dtype(dtype), int(count)))
     return tuple(out)
 
 
-def _whole(said: Mapping[str, tuple[list[str], int]], word: str) -> int:
-    values, line = said[word]
+def _whole(entries: Mapping[str, tuple[list[str], int]], key: str) -> int:
+    values, line = entries[key]
     if len(values) != 1 or not re.fullmatch(r"[0-9]{1,12}", values[0]):
-        raise wrong(f"{word} must be a whole number, got {' '.join(values)[:40]!r}", line, word)
+        raise wrong(f"{key} must be a whole number, got {' '.join(values)[:40]!r}", line, key)
     return int(values[0])
 
 
-def _viewpoint(said: Mapping[str, tuple[list[str], int]]) -> tuple[float, ...]:
-    if "VIEWPOINT" not in said:
+def _viewpoint(entries: Mapping[str, tuple[list[str], int]]) -> tuple[float, ...]:
+    if "VIEWPOINT" not in entries:
         return UNTURNED
-    values, line = said["VIEWPOINT"]
+    values, line = entries["VIEWPOINT"]
     pattern = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
     if len(values) != 7 or not all(re.fullmatch(pattern, v, re.ASCII) for v in values):
         raise wrong(f"VIEWPOINT must be seven numbers, got {' '.join(values)[:80]!r}", line, "VIEWPOINT")
@@ -186,11 +186,13 @@ def _from_text(data: bytes, header: _Header, count: int, context: ReadContext) -
 def _from_binary(
     data: bytes, header: _Header, count: int, record: int, context: ReadContext
 ) -> dict[str, NDArray[Any]]:
-    rest = len(data) - header.body
-    if rest < count * record:
-        raise wrong(f"{count} points of {record} bytes take {count * record} bytes, the file has {rest}", where="DATA")
-    if rest > count * record:
-        context.warn(f"{rest - count * record} bytes follow after the last point", where="DATA")
+    body_size = len(data) - header.body
+    if body_size < count * record:
+        raise wrong(
+            f"{count} points of {record} bytes take {count * record} bytes, the file has {body_size}", where="DATA"
+        )
+    if body_size > count * record:
+        context.warn(f"{body_size - count * record} bytes follow after the last point", where="DATA")
     return _columns(np.frombuffer(data, _dtype(header.fields), count, header.body), header.fields)
 
 
@@ -202,7 +204,7 @@ def _from_compressed(data: bytes, header: _Header, count: int, context: ReadCont
     packed, size = struct.unpack_from("<II", data, header.body)
     real = tuple(f for f in header.fields if f.name != PADDING)
     fields = next(
-        (chosen for chosen in (real, header.fields) if size == count * sum(f.dtype.itemsize * f.count for f in chosen)),
+        (fields for fields in (real, header.fields) if size == count * sum(f.dtype.itemsize * f.count for f in fields)),
         None,
     )
     if fields is None:
@@ -293,6 +295,6 @@ def for_pcl(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
                 else:
                     out["rgb"] = packed.astype("<u4").view("<f4")
         elif not (name == "alpha" and coloured):
-            said = names.get(name, re.sub(r"[^!-~]", "_", name))
-            out[said if said not in out and said != PADDING else f"{said}_{len(out)}"] = column
+            ascii_name = names.get(name, re.sub(r"[^!-~]", "_", name))
+            out[ascii_name if ascii_name not in out and ascii_name != PADDING else f"{ascii_name}_{len(out)}"] = column
     return out

@@ -110,28 +110,28 @@ def _header(data: bytes) -> _Header:
             raise wrong("the header does not end: the line end_header is missing", number + 1, "end_header")
         number += 1
         line, position = data[position:end].decode("utf-8", "replace").strip(), end + 1
-        word, *values = line.split() or [""]
+        key, *values = line.split() or [""]
         if number == 1:
             if line != "ply":
                 raise wrong("the first line must be 'ply'", 1)
-        elif word in ("comment", "obj_info"):
+        elif key in ("comment", "obj_info"):
             comments.append(line)
-        elif word == "format":
+        elif key == "format":
             kind = next((k for k in KINDS if values == [k, "1.0"]), None)
             if kind is None:
                 raise wrong(f"the format must be one of {', '.join(KINDS)} in version 1.0, got {line[:80]!r}", number)
-        elif word == "element":
+        elif key == "element":
             if len(values) != 2 or not re.fullmatch(r"[0-9]{1,12}", values[1]):
                 raise wrong(f"an element has a name and a number, got {line[:80]!r}", number, "element")
             elements.append(_Element(values[0], int(values[1]), [], number))
-        elif word == "property":
+        elif key == "property":
             if not elements:
                 raise wrong("a property stands before the first element", number, "property")
             _add_property(elements[-1], values, line, number)
-        elif word == "end_header":
+        elif key == "end_header":
             break
-        elif word:
-            raise wrong(f"unknown word {word[:40]!r} in the header", number, word[:40])
+        elif key:
+            raise wrong(f"unknown word {key[:40]!r} in the header", number, key[:40])
     if kind is None:
         raise wrong("the header does not tell the format", where="format")
     return _Header(kind, tuple(elements), tuple(comments), position, number)
@@ -257,6 +257,6 @@ def _single(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Names without blanks, each once."""
     out: dict[str, NDArray[Any]] = {}
     for name, column in columns.items():
-        said = re.sub(r"[^!-~]", "_", name)
-        out[said if said not in out else f"{said}_{len(out)}"] = column
+        ascii_name = re.sub(r"[^!-~]", "_", name)
+        out[ascii_name if ascii_name not in out else f"{ascii_name}_{len(out)}"] = column
     return out

@@ -140,9 +140,9 @@ def table(
     try:
         out = np.loadtxt(io.BytesIO(text), dtype, comments=None, skiprows=skip, max_rows=rows + alone, ndmin=1)
     except (ValueError, OverflowError) as error:
-        said = re.search(r"at row (\d+)", str(error))
+        match = re.search(r"at row (\d+)", str(error))
         # NumPy counts rows from 0 where a value is wrong, from 1 where there are too many or too few.
-        line = first_line + skip + int(said[1]) - (" columns " in str(error)) if said else None
+        line = first_line + skip + int(match[1]) - (" columns " in str(error)) if match else None
         reason = str(error).partition(";")[0][:200]
         raise wrong(f"a row of numbers cannot be read: {reason}", line) from error
     if len(out) < rows:
@@ -165,21 +165,27 @@ def read(files: Files, context: ReadContext, form: str, parse: Parse) -> Layers:
     name = context.grid or main.rpartition("/")[2].rpartition(".")[0] or MAP
     if cloud.viewpoint[3:] != (1.0, 0.0, 0.0, 0.0):
         context.warn("the VIEWPOINT turns the cloud: it is kept, and the points are taken as they stand")
-    for what, count in cloud.further.items():
-        context.warn(f"{count} × {what}: kept with the file, only the points become voxels", where=what)
+    for noun, count in cloud.further.items():
+        context.warn(f"{count} × {noun}: kept with the file, only the points become voxels", where=noun)
     voxels, placed, datum = _voxelised(cloud, options, context)
     path = f"{name}.{form}"
-    said = {
+    source_properties = {
         "file": path,
         "sha256": hashlib.sha256(data).hexdigest(),
         "leaves": _fingerprint(voxels),
         "points": len(cloud),
         **placed,
     }
-    kept = VoxelMap(
-        voxels.resolution, voxels.depth, voxels.code, voxels.log_odds, voxels.colour, voxels.binary, {PROPERTY: said}
+    voxel_map = VoxelMap(
+        voxels.resolution,
+        voxels.depth,
+        voxels.code,
+        voxels.log_odds,
+        voxels.colour,
+        voxels.binary,
+        {PROPERTY: source_properties},
     )
-    parts: dict[PartKey, Part] = {PartKey("voxels", context.level, name): kept}
+    parts: dict[PartKey, Part] = {PartKey("voxels", context.level, name): voxel_map}
     if context.wants("resources"):
         parts[PartKey("resources", context.level, cloud_name(name))] = Resources({path: data})
     return Layers(parts, datum)
@@ -189,17 +195,17 @@ def _voxelised(
     cloud: Cloud, options: ReadOptions, context: ReadContext
 ) -> tuple[VoxelMap, dict[str, Any], Datum | None]:
     """The voxels, how the points came to their places, and the datum where the cloud brought one."""
-    frame, found = context.frame, None
+    frame, corner = context.frame, None
     local: Array | None = None
     placed: dict[str, Any] = {}
     crs, earth = _on_earth(cloud, options, context)
     if earth is not None:
         if frame is None:
-            found = _corner(earth)
-            frame = local_frame(found)
+            corner = _corner(earth)
+            frame = local_frame(corner)
             context.warn(
-                f"the environment has no datum: the cloud's south-west corner, latitude {found.latitude!r}, longitude "
-                f"{found.longitude!r}, is taken; upload a datum.yaml or PATCH the environment to set another"
+                f"the environment has no datum: the cloud's south-west corner, latitude {corner.latitude!r}, longitude "
+                f"{corner.longitude!r}, is taken; upload a datum.yaml or PATCH the environment to set another"
             )
         local = frame.to_local(earth)
         placed |= {"crs": crs, "datum": frame.datum.as_dict()}
@@ -212,34 +218,34 @@ def _voxelised(
 
     low, high, finite = np.full(3, math.inf), np.full(3, -math.inf), 0
     for places in chunks():
-        known = places[_usable(places)]
-        finite += len(known)
-        if len(known):
-            low, high = np.minimum(low, known.min(axis=0)), np.maximum(high, known.max(axis=0))
+        finite_places = places[_usable(places)]
+        finite += len(finite_places)
+        if len(finite_places):
+            low, high = np.minimum(low, finite_places.min(axis=0)), np.maximum(high, finite_places.max(axis=0))
     if finite < n:
         context.warn(f"{n - finite} of {n} points have no coordinates of a place: kept with the file, no voxels")
     if not finite:
         context.warn("the cloud has no points with coordinates")
         resolution = options.resolution or RESOLUTIONS[0]
         none = np.empty(0, np.uint64)
-        return VoxelMap(resolution, np.empty(0, np.uint8), none, np.empty(0, np.float32)), placed, found
+        return VoxelMap(resolution, np.empty(0, np.uint8), none, np.empty(0, np.float32)), placed, corner
     resolution, shift = _fitted(low, high, options, context)
     if any(shift):
         placed["origin"] = list(shift)
     codes, rows = [], []
     factor, start = 1.0 / resolution, 0
     for places in chunks():
-        good = _usable(places)
-        index = np.floor((places[good] - np.array(shift)) * factor).astype(np.int64)
+        usable = _usable(places)
+        index = np.floor((places[usable] - np.array(shift)) * factor).astype(np.int64)
         # What lies on the tree's far side by the rounding of a product belongs to its last voxel.
         np.clip(index, -HALF, HALF - 1, out=index)
         codes.append(morton(index[:, 0], index[:, 1], index[:, 2]))
-        rows.append(start + np.flatnonzero(good))
+        rows.append(start + np.flatnonzero(usable))
         start += len(places)
     code, colour = _merged(np.concatenate(codes), rows, colours(cloud))
     depth = np.full(len(code), DEPTH, np.uint8)
     odds = np.full(len(code), LOG_ODDS[1], np.float32)
-    return VoxelMap(resolution, depth, code, odds, colour, colour is None), placed, found
+    return VoxelMap(resolution, depth, code, odds, colour, colour is None), placed, corner
 
 
 def _merged(
@@ -286,8 +292,8 @@ def _usable(places: Array) -> NDArray[np.bool_]:
 
 def _corner(earth: Array) -> Datum:
     """The south-west corner of (longitude, latitude), to a ten-millionth of a degree."""
-    good = np.isfinite(earth[:, :2]).all(axis=1)
-    west, south = np.floor(earth[good, :2].min(axis=0) * 1e7) / 1e7
+    valid = np.isfinite(earth[:, :2]).all(axis=1)
+    west, south = np.floor(earth[valid, :2].min(axis=0) * 1e7) / 1e7
     return Datum(float(np.clip(south, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), float(west))
 
 
@@ -349,9 +355,9 @@ def colours(cloud: Cloud) -> NDArray[np.uint8] | None:
     if any(name not in cloud.columns or cloud.columns[name].ndim != 1 for name in RGB):
         return None
     out = np.empty((len(cloud), 3), np.uint8)
-    given = [cloud.columns[name] for name in RGB]
-    wide = any(c.dtype.itemsize > 1 and c.size and c.dtype.kind in "ui" and int(c.max()) > 255 for c in given)
-    for k, column in enumerate(given):
+    channels = [cloud.columns[name] for name in RGB]
+    wide = any(c.dtype.itemsize > 1 and c.size and c.dtype.kind in "ui" and int(c.max()) > 255 for c in channels)
+    for k, column in enumerate(channels):
         if column.dtype.kind == "f":
             out[:, k] = np.round(np.clip(np.nan_to_num(column, nan=0.0), 0.0, 1.0) * 255)
         else:
@@ -430,25 +436,25 @@ def source(
     voxels = layers.parts[keys[0]]
     if not isinstance(voxels, VoxelMap):
         raise AssertionError(f"{keys[0]} is no voxel map")
-    said = voxels.properties.get(PROPERTY)
-    data = _kept(layers, keys[0], voxels, said) if isinstance(said, Mapping) else None
-    if data is None or not isinstance(said, Mapping):
+    source_properties = voxels.properties.get(PROPERTY)
+    data = _kept(layers, keys[0], voxels, source_properties) if isinstance(source_properties, Mapping) else None
+    if data is None or not isinstance(source_properties, Mapping):
         if frame == "source":
             raise Invalid("frame=source asks for an uploaded cloud, and this voxel map was not made of one")
         return Source(lambda: centres(voxels, context), None, "", local=True)
-    form = str(said["file"]).rpartition(".")[2]
-    moved = "crs" in said or "origin" in said
+    form = str(source_properties["file"]).rpartition(".")[2]
+    moved = "crs" in source_properties or "origin" in source_properties
     local = moved and (frame == "local" or (frame is None and form not in forms))
     if moved and not local:
         context.warn("the points stand in the coordinates they came in: ask with frame=local for the local frame")
-    own = form in forms and not local
+    same_form = form in forms and not local
     parse = parsers[form]
 
     def load() -> Cloud:
         cloud = parse(data, ReadContext(limits=_NO_LIMITS))
-        return _moved(cloud, said, context) if local else cloud
+        return _moved(cloud, source_properties, context) if local else cloud
 
-    return Source(load, data if own else None, form, local)
+    return Source(load, data if same_form else None, form, local)
 
 
 _NO_LIMITS = Limits(voxels=2**62, text_bytes=2**62, unpacked_bytes=2**62)
@@ -458,31 +464,31 @@ _NO_LIMITS = Limits(voxels=2**62, text_bytes=2**62, unpacked_bytes=2**62)
 def choose(keys: Sequence[PartKey], name: str | None, level: str | None) -> list[PartKey]:
     """The voxel map that is asked for, and the file that belongs to it."""
     supply = "upload one (a point cloud or an OctoMap file)"
-    found = the_one(keys, "voxels", name, level, what="voxel map", option="name", supply=supply)
-    belongs = [PartKey("resources", key.level, cloud_name(key.name)) for key in found]
-    return [*found, *(key for key in keys if key in belongs)]
+    matches = the_one(keys, "voxels", name, level, noun="voxel map", option="name", supply=supply)
+    belongs = [PartKey("resources", key.level, cloud_name(key.name)) for key in matches]
+    return [*matches, *(key for key in keys if key in belongs)]
 
 
-def _kept(layers: Layers, key: PartKey, voxels: VoxelMap, said: Mapping[str, Any]) -> bytes | None:
+def _kept(layers: Layers, key: PartKey, voxels: VoxelMap, source_properties: Mapping[str, Any]) -> bytes | None:
     """The file that a voxel map was made of, if it is there and tells of these very leaves."""
     part = layers.parts.get(PartKey("resources", key.level, cloud_name(key.name)))
-    data = part.files.get(str(said.get("file"))) if isinstance(part, Resources) else None
-    if data is None or said.get("leaves") != _fingerprint(voxels):
+    data = part.files.get(str(source_properties.get("file"))) if isinstance(part, Resources) else None
+    if data is None or source_properties.get("leaves") != _fingerprint(voxels):
         return None
-    return data if hashlib.sha256(data).hexdigest() == said.get("sha256") else None
+    return data if hashlib.sha256(data).hexdigest() == source_properties.get("sha256") else None
 
 
-def _moved(cloud: Cloud, said: Mapping[str, Any], context: WriteContext) -> Cloud:
+def _moved(cloud: Cloud, source_properties: Mapping[str, Any], context: WriteContext) -> Cloud:
     """The points in the local frame, as they were when they became voxels; normals turn along."""
     columns = dict(cloud.columns)
     places = cloud.places(0, len(cloud))
     normals = next((n for n in NORMALS if all(name in columns and columns[name].ndim == 1 for name in n)), None)
-    if "crs" in said:
-        frame = local_frame(Datum(**said["datum"]))
+    if "crs" in source_properties:
+        frame = local_frame(Datum(**source_properties["datum"]))
         if normals is not None:
-            _turn(columns, normals, places, str(said["crs"]), frame)
-        places = frame.to_local(crs_to_wgs84(str(said["crs"]), places))
-    places = places - np.array(said.get("origin", (0.0, 0.0, 0.0)))
+            _turn(columns, normals, places, str(source_properties["crs"]), frame)
+        places = frame.to_local(crs_to_wgs84(str(source_properties["crs"]), places))
+    places = places - np.array(source_properties.get("origin", (0.0, 0.0, 0.0)))
     columns |= {axis: places[:, k] for k, axis in enumerate(AXES)}
     if cloud.viewpoint != UNTURNED:
         context.drop("viewpoint", 1, "it stands in the coordinates of the source: ask with frame=source")
@@ -491,10 +497,10 @@ def _moved(cloud: Cloud, said: Mapping[str, Any], context: WriteContext) -> Clou
 
 def _turn(columns: dict[str, NDArray[Any]], names: Sequence[str], places: Array, crs: str, frame: LocalFrame) -> None:
     """Normals of a projected CRS about the vertical into the local frame, by the angle in the cloud's middle."""
-    good = places[np.isfinite(places).all(axis=1)]
-    if not len(good):
+    finite = places[np.isfinite(places).all(axis=1)]
+    if not len(finite):
         return
-    middle = (good.min(axis=0) + good.max(axis=0)) / 2
+    middle = (finite.min(axis=0) + finite.max(axis=0)) / 2
     step = np.array([middle, middle + np.array([1.0, 0.0, 0.0])])
     a, b = frame.to_local(crs_to_wgs84(crs, step))
     angle = math.atan2(b[1] - a[1], b[0] - a[0])
@@ -542,10 +548,10 @@ PARTS = Parts("voxels", "name", file_stem)
 def by_file(endings: Sequence[str]) -> Callable[[str], dict[str, str]]:
     """``lab.pcd`` asks for the voxel map ``lab``."""
 
-    def told(name: str) -> dict[str, str]:
+    def parse_name(name: str) -> dict[str, str]:
         stem, _, end = name.rpartition(".")
         if not stem or end not in endings:
             return {}
         return {} if stem == MAP else {"name": stem}
 
-    return told
+    return parse_name

@@ -69,10 +69,10 @@ def is_tiff(data: bytes) -> bool:
 
 def is_georeferenced(data: bytes) -> bool:
     """Whether the first page of a TIFF says where it lies, by its tags alone."""
-    found = _tags(data)
-    if GEO_TAGS & found.keys():
+    tags = _tags(data)
+    if GEO_TAGS & tags.keys():
         return True
-    start, size = found.get(GDAL_METADATA, (0, 0))
+    start, size = tags.get(GDAL_METADATA, (0, 0))
     return OWN_TAG.encode() in data[start : start + size]
 
 
@@ -91,10 +91,10 @@ def stated_code(data: bytes) -> int | None:
     start, size = _tags(data).get(GEO_KEYS, (0, 0))
     order = "<" if data[:2] == b"II" else ">"
     try:
-        words = struct.unpack_from(f"{order}{min(size, 4096)}H", data, start)
+        shorts = struct.unpack_from(f"{order}{min(size, 4096)}H", data, start)
     except struct.error:
         return None
-    keys = {words[k]: words[k + 3] for k in range(4, len(words) - 3, 4) if words[k + 1] == 0 and words[k + 2] == 1}
+    keys = {shorts[k]: shorts[k + 3] for k in range(4, len(shorts) - 3, 4) if shorts[k + 1] == 0 and shorts[k + 2] == 1}
     code = keys.get(PROJECTED) or keys.get(GEOGRAPHIC)
     return None if code in (None, 0, USER_DEFINED) else code
 
@@ -121,14 +121,14 @@ def _pages(data: bytes) -> Iterator[tuple[str, bool, int, int]]:
         return
     order = "<" if data[:2] == b"II" else ">"
     big = data[2:4] in (b"+\0", b"\0+")
-    place, number, step = (order + "Q", order + "Q", 20) if big else (order + "I", order + "H", 12)
+    offset_format, number, step = (order + "Q", order + "Q", 20) if big else (order + "I", order + "H", 12)
     try:
-        (at,) = struct.unpack_from(place, data, 8 if big else 4)
+        (at,) = struct.unpack_from(offset_format, data, 8 if big else 4)
         while at:
             (count,) = struct.unpack_from(number, data, at)
             at += struct.calcsize(number)
             yield order, big, at, count
-            (at,) = struct.unpack_from(place, data, at + count * step)
+            (at,) = struct.unpack_from(offset_format, data, at + count * step)
     except (struct.error, OverflowError):
         return
 
@@ -137,9 +137,9 @@ def _pages(data: bytes) -> Iterator[tuple[str, bool, int, int]]:
 def crs_name(crs: Any) -> str:
     """A CRS of rasterio as pictures name it: ``EPSG:32630`` where that is exactly it, else WKT; ``local`` for one that
     is not tied to the earth. Raises UnreadableFile for one that would make PROJ open files."""
-    found = crs.to_authority(confidence_threshold=100)
-    if found:
-        name = ":".join(found)
+    authority = crs.to_authority(confidence_threshold=100)
+    if authority:
+        name = ":".join(authority)
         if type(crs).from_user_input(name) == crs:
             return name
     text = str(crs.to_wkt(version="WKT2_2019"))
@@ -179,10 +179,10 @@ def lies_nowhere(picture: Picture) -> str | None:
 
 def _reason(error: BaseException) -> str:
     """What GDAL said first of all, without the names it has for memory."""
-    said = str(error)
+    message = str(error)
     while (deeper := error.__cause__ or error.__context__) is not None and str(deeper):
-        error, said = deeper, str(deeper)
-    text = _MEMORY_NAME.sub("", said).replace("'/vsimem", "'").strip()
+        error, message = deeper, str(deeper)
+    text = _MEMORY_NAME.sub("", message).replace("'/vsimem", "'").strip()
     return re.sub(r"/vsimem/\S*", "the file", text)[:300] or type(error).__name__
 
 
@@ -226,9 +226,9 @@ def _check_size(dataset: Any, limits: Limits) -> None:
     if len(kinds) != 1 or kinds[0] not in DATA_TYPES:
         raise UnreadableFile(f"the TIFF's pixels are {', '.join(kinds)}; whole and floating numbers are read")
     size = width * height * count * np.dtype(kinds[0]).itemsize
-    most = limits.memory_bytes // MEMORY_SHARE
-    if size > most:
-        raise TooLarge(f"the TIFF's pixels take {size} bytes ({count} bands of {kinds[0]}); the limit is {most}")
+    limit = limits.memory_bytes // MEMORY_SHARE
+    if size > limit:
+        raise TooLarge(f"the TIFF's pixels take {size} bytes ({count} bands of {kinds[0]}); the limit is {limit}")
 
 
 def _decoded(dataset: Any, rasterio: Any) -> Raster:
@@ -253,8 +253,8 @@ def _decoded(dataset: Any, rasterio: Any) -> Raster:
         full = 127 if kind == np.int8 else 255
         np.multiply(dataset.read_masks(1) != 0, full, out=pixels[count], casting="unsafe")
     transform: Affine | None = tuple(float(v) for v in dataset.transform[:6])  # type: ignore[assignment]
-    own = _texts(dataset.tags())
-    local = own.pop(OWN_TAG, None) == LOCAL
+    dataset_tags = _texts(dataset.tags())
+    local = dataset_tags.pop(OWN_TAG, None) == LOCAL
     crs = crs_name(dataset.crs) if dataset.crs else LOCAL if local else None
     if transform == NO_TRANSFORM and not local:
         transform = None
@@ -274,13 +274,16 @@ def _decoded(dataset: Any, rasterio: Any) -> Raster:
             raise UnreadableFile("it is placed by a sensor model (RPC) only: orthorectify it first (gdalwarp -rpc)")
     bands = []
     for k, colour in enumerate(colours):
-        said = {
+        band_values = {
             "description": dataset.descriptions[k] or None,
             "unit": dataset.units[k] or None,
             "scale": _unless(dataset.scales[k], 1.0),
             "offset": _unless(dataset.offsets[k], 0.0),
         }
-        band: dict[str, Any] = {"colour": colour, **{name: value for name, value in said.items() if value is not None}}
+        band: dict[str, Any] = {
+            "colour": colour,
+            **{name: value for name, value in band_values.items() if value is not None},
+        }
         tags = _texts(dataset.tags(k + 1))
         if tags:
             band["satellite"] = {"tags": tags}
@@ -289,18 +292,18 @@ def _decoded(dataset: Any, rasterio: Any) -> Raster:
         bands.append({"colour": "mask"})
     properties: dict[str, Any] = {"bands": bands}
     if nodata is not None:
-        whole = math.isfinite(nodata) and kind.kind in "iu" and float(nodata).is_integer()
-        properties["nodata"] = int(nodata) if whole else nodata if math.isfinite(nodata) else str(float(nodata))
+        is_integer = math.isfinite(nodata) and kind.kind in "iu" and float(nodata).is_integer()
+        properties["nodata"] = int(nodata) if is_integer else nodata if math.isfinite(nodata) else str(float(nodata))
     if "palette" in colours:
         table = dataset.colormap(colours.index("palette") + 1)
         properties["palette"] = [list(table[k]) for k in sorted(table)]
-    if own.get("AREA_OR_POINT") == "Area":
-        del own["AREA_OR_POINT"]
-    own.pop("OVR_RESAMPLING_ALG", None)
-    if own.get("TIFFTAG_COPYRIGHT"):
-        properties["attribution"] = [own["TIFFTAG_COPYRIGHT"]]
-    if own:
-        properties["satellite"] = {"tags": own}
+    if dataset_tags.get("AREA_OR_POINT") == "Area":
+        del dataset_tags["AREA_OR_POINT"]
+    dataset_tags.pop("OVR_RESAMPLING_ALG", None)
+    if dataset_tags.get("TIFFTAG_COPYRIGHT"):
+        properties["attribution"] = [dataset_tags["TIFFTAG_COPYRIGHT"]]
+    if dataset_tags:
+        properties["satellite"] = {"tags": dataset_tags}
     return Raster(np.moveaxis(pixels, 0, 2), transform, crs, properties, tuple(doubts))
 
 
@@ -316,9 +319,9 @@ def _windows(dataset: Any, rasterio: Any) -> Iterator[Any]:
             yield rasterio.windows.Window(x, y, min(columns, dataset.width - x), min(rows, dataset.height - y))
 
 
-def _unless(value: float, usual: float) -> float | None:
+def _unless(value: float, default: float) -> float | None:
     """A number that says something: finite, and not the usual one."""
-    return float(value) if math.isfinite(value) and value != usual else None
+    return float(value) if math.isfinite(value) and value != default else None
 
 
 def _texts(tags: Mapping[str, str]) -> dict[str, str]:
@@ -335,12 +338,12 @@ def fitted(points: Sequence[tuple[float, float, float, float]]) -> tuple[Affine,
     table = np.array(points, np.float64)
     if not np.isfinite(table).all():
         return None
-    place = np.column_stack([table[:, 0], table[:, 1], np.ones(len(table))])
-    found, _, rank, _ = np.linalg.lstsq(place, table[:, 2:], rcond=None)
+    design = np.column_stack([table[:, 0], table[:, 1], np.ones(len(table))])
+    solution, _, rank, _ = np.linalg.lstsq(design, table[:, 2:], rcond=None)
     if rank < 3:
         return None
-    (a, d), (b, e), (c, f) = found.tolist()
-    off = place @ found - table[:, 2:]
+    (a, d), (b, e), (c, f) = solution.tolist()
+    off = design @ solution - table[:, 2:]
     area = abs(a * e - b * d)
     worst = float(np.hypot(off[:, 0], off[:, 1]).max())
     return (a, b, c, d, e, f), worst / math.sqrt(area) if area > 0.0 else math.inf
@@ -389,16 +392,18 @@ def _is_shade(picture: Picture) -> bool:
 def _describe(
     dataset: Any, picture: Picture, colours: Sequence[str], crs: str | None, tags: Mapping[str, str], rasterio: Any
 ) -> None:
-    known = rasterio.enums.ColorInterp
+    interpretations = rasterio.enums.ColorInterp
     dataset.transform = rasterio.Affine(*picture.transform)
     if crs is not None:
         dataset.crs = rasterio.crs.CRS.from_user_input(crs)
     nodata = picture.nodata
     if nodata is not None and _holds(picture.pixels.dtype, nodata):
         dataset.nodata = nodata
-    dataset.colorinterp = [known[c] if c in known.__members__ else known.undefined for c in colours]
-    said = picture.properties.get("bands")
-    bands = list(said)[: len(colours)] if isinstance(said, list | tuple) else []
+    dataset.colorinterp = [
+        interpretations[c] if c in interpretations.__members__ else interpretations.undefined for c in colours
+    ]
+    source_bands = picture.properties.get("bands")
+    bands = list(source_bands)[: len(colours)] if isinstance(source_bands, list | tuple) else []
     for k, band in enumerate(bands):
         if not isinstance(band, Mapping):
             continue
@@ -406,13 +411,13 @@ def _describe(
             dataset.set_band_description(k + 1, band["description"])
         if isinstance(band.get("unit"), str):
             dataset.set_band_unit(k + 1, band["unit"])
-        own = band.get("satellite")
-        if isinstance(own, Mapping) and isinstance(own.get("tags"), Mapping):
-            dataset.update_tags(k + 1, **{str(n): str(v) for n, v in sorted(own["tags"].items())})
-    for name, usual in (("scale", 1.0), ("offset", 0.0)):
-        values = [b.get(name, usual) if isinstance(b, Mapping) else usual for b in bands]
-        if any(v != usual for v in values):
-            setattr(dataset, name + "s", [float(v) for v in values] + [usual] * (len(colours) - len(values)))
+        source_properties = band.get("satellite")
+        if isinstance(source_properties, Mapping) and isinstance(source_properties.get("tags"), Mapping):
+            dataset.update_tags(k + 1, **{str(n): str(v) for n, v in sorted(source_properties["tags"].items())})
+    for name, default in (("scale", 1.0), ("offset", 0.0)):
+        values = [b.get(name, default) if isinstance(b, Mapping) else default for b in bands]
+        if any(v != default for v in values):
+            setattr(dataset, name + "s", [float(v) for v in values] + [default] * (len(colours) - len(values)))
     palette = picture.properties.get("palette")
     if "palette" in colours and isinstance(palette, list | tuple):
         table = {k: tuple(int(v) for v in entry) for k, entry in enumerate(palette)}

@@ -39,30 +39,30 @@ LONGEST = 240
 Array = NDArray[np.float64]
 
 
-def refuse(reason: str, where: str) -> NoReturn:
+def refuse(reason: str, location: str) -> NoReturn:
     """Raise UnreadableFile that names the place."""
-    raise UnreadableFile(f"{where}: {reason}" if where else reason, [Problem(reason, where=where or None)])
+    raise UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, where=location or None)])
 
 
-def mapping(value: Any, where: str) -> dict[str, Any]:
+def mapping(value: Any, location: str) -> dict[str, Any]:
     """A mapping; nothing at all is an empty one."""
     if value is None:
         return {}
     if not isinstance(value, dict):
-        refuse("must be a mapping", where)
+        refuse("must be a mapping", location)
     return value
 
 
-def listing(value: Any, where: str) -> list[Any]:
+def listing(value: Any, location: str) -> list[Any]:
     """A list; nothing at all (or ``{}``, as the editor writes it) is an empty one."""
     if value is None or value == {}:
         return []
     if not isinstance(value, list):
-        refuse("must be a list", where)
+        refuse("must be a list", location)
     return value
 
 
-def number(value: Any, where: str) -> float:
+def number(value: Any, location: str) -> float:
     """A number of usual size, also one in quotes."""
     if isinstance(value, str):
         try:
@@ -70,37 +70,37 @@ def number(value: Any, where: str) -> float:
         except ValueError:
             value = None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        refuse("must be a number", where)
+        refuse("must be a number", location)
     if abs(value) > MAX_METRES:
-        refuse(f"is beyond ±{MAX_METRES:g}", where)
+        refuse(f"is beyond ±{MAX_METRES:g}", location)
     return float(value)
 
 
-def places(rows: Sequence[Any], where: str) -> Array:
+def places(rows: Sequence[Any], location: str) -> Array:
     """float64 [n, 2]: the first two numbers of each row."""
     try:
         flat = [v for row in rows for v in (row[0], row[1])]
     except (TypeError, LookupError):
         k = next(k for k, row in enumerate(rows) if not isinstance(row, list) or len(row) < 2)
-        refuse("must be a list that begins with x and y", f"{where}[{k}]")
+        refuse("must be a list that begins with x and y", f"{location}[{k}]")
     if not all(map((float, int).__contains__, map(type, flat))):
-        flat = [number(v, f"{where}[{k // 2}][{k % 2}]") for k, v in enumerate(flat)]
+        flat = [number(v, f"{location}[{k // 2}][{k % 2}]") for k, v in enumerate(flat)]
     return np.array(flat, np.float64).reshape(-1, 2)
 
 
-def index(value: Any, where: str) -> int:
+def index(value: Any, location: str) -> int:
     """A vertex' place in its level's list."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int):
-        refuse("must be the number of a vertex", where)
+        refuse("must be the number of a vertex", location)
     return value
 
 
 def value_of(parameters: Any, key: str, default: Any = None) -> Any:
     """The value of a parameter ``[type, value]``."""
-    said = parameters.get(key) if isinstance(parameters, Mapping) else None
-    return said[1] if isinstance(said, list) and len(said) == 2 else default
+    pair = parameters.get(key) if isinstance(parameters, Mapping) else None
+    return pair[1] if isinstance(pair, list) and len(pair) == 2 else default
 
 
 def typed(value: Any) -> Any:
@@ -110,18 +110,18 @@ def typed(value: Any) -> Any:
     return value if kind is None else [kind, value]
 
 
-def short(text: str, most: int = LONGEST) -> str:
+def short(text: str, max_length: int = LONGEST) -> str:
     """The text, or where it is too long for an id its beginning and a hash of all of it."""
-    if len(text) <= most:
+    if len(text) <= max_length:
         return text
-    return f"{text[: most - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"
+    return f"{text[: max_length - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"
 
 
 def limit(p: Properties) -> float:
     """An edge's speed limit in metres per second; 0 where there is none."""
-    said = p.get("speed_limit")
-    good = isinstance(said, (int, float)) and not isinstance(said, bool) and math.isfinite(said) and said > 0
-    return float(said) if good and said is not None else 0.0
+    speed = p.get("speed_limit")
+    valid = isinstance(speed, (int, float)) and not isinstance(speed, bool) and math.isfinite(speed) and speed > 0
+    return float(speed) if valid and speed is not None else 0.0
 
 
 def turned(orientation: Any) -> Any:
@@ -131,22 +131,22 @@ def turned(orientation: Any) -> Any:
 
 def pose_of(p: Properties) -> list[float] | None:
     """An object's pose [x, y, z, roll, pitch, yaw], or None."""
-    said = p.get("pose")
-    if not isinstance(said, (list, tuple)) or len(said) != 6:
+    pose = p.get("pose")
+    if not isinstance(pose, (list, tuple)) or len(pose) != 6:
         return None
-    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in said):
+    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in pose):
         return None
-    return list(map(float, said))
+    return list(map(float, pose))
 
 
 def size_of(p: Properties) -> tuple[float, float] | None:
     """An object's width (along x) and depth (along y), metres, or None."""
-    said = p.get("size")
-    if not isinstance(said, (list, tuple)) or len(said) < 2:
+    size = p.get("size")
+    if not isinstance(size, (list, tuple)) or len(size) < 2:
         return None
-    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in said):
+    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in size):
         return None
-    return float(said[0]), float(said[1])
+    return float(size[0]), float(size[1])
 
 
 def ends(geometry: Any) -> Array:
@@ -167,7 +167,7 @@ class Storey:
 
 def storeys(layers: Layers) -> list[Storey]:
     """The levels in the order of their file; those that came from elsewhere last."""
-    found: dict[str, Storey] = {}
+    by_level: dict[str, Storey] = {}
     own_names = {
         (str(p.get("kind")), str(p.get("name")))
         for key, part in layers.vector("objects").items()
@@ -181,23 +181,27 @@ def storeys(layers: Layers) -> list[Storey]:
                 [k for k, p in enumerate(part.properties) if (str(p.get("kind")), str(p.get("name"))) not in own_names]
             )
         if key.name in (BUILDING, NAV_GRAPH) and (len(part) or BUILDING in part.document):
-            found.setdefault(key.level, Storey(key.level)).objects.append(part)
+            by_level.setdefault(key.level, Storey(key.level)).objects.append(part)
     for key, part in layers.vector("topology").items():
         if len(part) or BUILDING in part.document:
-            found.setdefault(key.level, Storey(key.level)).networks.append(part)
-    for storey in found.values():
+            by_level.setdefault(key.level, Storey(key.level)).networks.append(part)
+    for storey in by_level.values():
         for part in [*storey.objects, *storey.networks]:
-            said = part.document.get(BUILDING)
-            if isinstance(said, dict) and not storey.document:
-                storey.document = said
+            building = part.document.get(BUILDING)
+            if isinstance(building, dict) and not storey.document:
+                storey.document = building
     rank = {level.name: (level.elevation, level.name) for level in layers.levels}
 
     def order(storey: Storey) -> tuple[bool, int, tuple[float, str]]:
-        said = storey.document.get("order")
-        known = isinstance(said, int)
-        return (not known, said if isinstance(said, int) else 0, rank.get(storey.name, (0.0, storey.name)))
+        position = storey.document.get("order")
+        has_position = isinstance(position, int)
+        return (
+            not has_position,
+            position if isinstance(position, int) else 0,
+            rank.get(storey.name, (0.0, storey.name)),
+        )
 
-    return sorted(found.values(), key=order)
+    return sorted(by_level.values(), key=order)
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,26 +238,26 @@ class Robots:
             self._find(sorted(nodes, key=lambda node: (node[0], natural(node[1]))))
 
     def _find(self, nodes: Sequence[tuple[str, str, Properties]]) -> None:
-        wanted = {name.strip() for name in self._options.chargers or ()} - {""}
-        said = [_vertex_says(p) for _, _, p in nodes]
-        taken = {str(known[ROBOT]) for known in said if known.get(ROBOT)}
+        charger_names = {name.strip() for name in self._options.chargers or ()} - {""}
+        parameter_sets = [_vertex_says(p) for _, _, p in nodes]
+        taken = {str(parameters[ROBOT]) for parameters in parameter_sets if parameters.get(ROBOT)}
         met: set[str] = set()
         number = 0
-        for (level, i, p), known in zip(nodes, said, strict=True):
-            names = wanted & {i, str(p.get("name"))}
+        for (level, i, p), parameters in zip(nodes, parameter_sets, strict=True):
+            names = charger_names & {i, str(p.get("name"))}
             met |= names
-            more: dict[str, Any] = {word: True for word in CHARGER if names and word not in known}
-            charger = bool(names) or known.get(CHARGER[0]) is True
-            if charger and not known.get(ROBOT) and self._options.robot_name is not None:
+            more: dict[str, Any] = {key: True for key in CHARGER if names and key not in parameters}
+            charger = bool(names) or parameters.get(CHARGER[0]) is True
+            if charger and not parameters.get(ROBOT) and self._options.robot_name is not None:
                 number += 1
                 while f"{self._options.robot_name}_{number}" in taken:
                     number += 1
                 more[ROBOT] = f"{self._options.robot_name}_{number}"
-                if not known.get(ROBOT_TYPE):
+                if not parameters.get(ROBOT_TYPE):
                     more[ROBOT_TYPE] = self._options.robot_type
             if more:
                 self._more[level, i] = more
-        self._unknown = sorted(wanted - met)
+        self._unknown = sorted(charger_names - met)
 
     def at(self, level: str, i: str) -> dict[str, Any]:
         """What a vertex' parameters say more, by word."""
@@ -262,8 +266,8 @@ class Robots:
     def report(self, context: WriteContext) -> None:
         """Declare what was filled in, and which nodes there are not."""
         many = list(self._more.values())
-        if made := sum(CHARGER[0] in more for more in many):
-            context.fill("vertices: " + ", ".join(CHARGER), True, f"{made} nodes do not say it", "chargers")
+        if charger_count := sum(CHARGER[0] in more for more in many):
+            context.fill("vertices: " + ", ".join(CHARGER), True, f"{charger_count} nodes do not say it", "chargers")
         if names := sorted((str(more[ROBOT]) for more in many if ROBOT in more), key=natural):
             why = f"{len(names)} chargers name no robot"
             context.fill(f"vertices: {ROBOT}", names if len(names) <= 20 else [*names[:20], "…"], why, "robot_name")
@@ -298,13 +302,13 @@ class Flow:
             if not value:
                 return "{}"
             key = orjson.dumps(value).decode()  # the bytes take 4 kB, however few they are
-            said = self._known.get(key)
-            if said is None:
+            text = self._known.get(key)
+            if text is None:
                 if len(self._known) >= self.MOST:
                     self._known.clear()
-                said = "{" + ", ".join(f"{_yaml.text(k)}: {self(value[k])}" for k in sorted(value)) + "}"
-                self._known[key] = said
-            return said
+                text = "{" + ", ".join(f"{_yaml.text(k)}: {self(value[k])}" for k in sorted(value)) + "}"
+                self._known[key] = text
+            return text
         if isinstance(value, (list, tuple)):
             return "[" + ", ".join(map(self, value)) + "]"
         return _yaml.text(value)

@@ -19,9 +19,11 @@ def companions_of(pattern: re.Pattern[bytes]) -> Callable[[str, bytes, Sequence[
 
     def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
         """The images that the main file names."""
-        said = {found[found.lastindex or 0].decode("utf-8", "replace").strip() for found in pattern.finditer(data)}
-        known = _by_base(names)
-        files = (_find(name, main, known) for name in sorted(said) if name)
+        image_names = {
+            match[match.lastindex or 0].decode("utf-8", "replace").strip() for match in pattern.finditer(data)
+        }
+        by_base = _by_base(names)
+        files = (_find(name, main, by_base) for name in sorted(image_names) if name)
         return [name for name in dict.fromkeys(files) if name]
 
     return companions
@@ -30,35 +32,37 @@ def companions_of(pattern: re.Pattern[bytes]) -> Callable[[str, bytes, Sequence[
 def images(files: Files, main: str, named: Iterable[tuple[str, str]], context: ReadContext) -> dict[str, bytes]:
     """The images by the path that the served map names them with. named: (place, name) as the main file says it."""
     out: dict[str, bytes] = {}
-    known = _by_base(files)
-    for where, said in named:
-        if not said:
+    by_base = _by_base(files)
+    for location, reference in named:
+        if not reference:
             continue
-        found = _find(said, main, known)
-        if found is None:
-            context.warn(f"the image {said[:200]!r} is not in the upload: the map is read without it", where=where)
+        path = _find(reference, main, by_base)
+        if path is None:
+            context.warn(
+                f"the image {reference[:200]!r} is not in the upload: the map is read without it", where=location
+            )
             continue
-        name = _plain(said)
+        name = _plain(reference)
         if name is None:
-            name = _base(said)
-            context.warn(f"the image {said[:200]!r} is of another machine: {found} is taken", where=where)
-        out[name] = files[found]
+            name = _base(reference)
+            context.warn(f"the image {reference[:200]!r} is of another machine: {path} is taken", where=location)
+        out[name] = files[path]
     return out
 
 
-def stored(said: str, resources: Mapping[str, bytes]) -> str | None:
+def stored(reference: str, resources: Mapping[str, bytes]) -> str | None:
     """The name of the stored image that a map names, or None."""
-    return next((name for name in (_plain(said), _base(said)) if name in resources), None)
+    return next((name for name in (_plain(reference), _base(reference)) if name in resources), None)
 
 
-def _plain(said: str) -> str | None:
+def _plain(reference: str) -> str | None:
     """The name as a safe path below the map's folder, or None where it leads elsewhere."""
-    path = PurePosixPath(said)
-    return None if _ELSEWHERE.search(said) or ".." in path.parts or not path.name else str(path)
+    path = PurePosixPath(reference)
+    return None if _ELSEWHERE.search(reference) or ".." in path.parts or not path.name else str(path)
 
 
-def _base(said: str) -> str:
-    return said.replace("\\", "/").rpartition("/")[2]
+def _base(reference: str) -> str:
+    return reference.replace("\\", "/").rpartition("/")[2]
 
 
 def _by_base(names: Iterable[str]) -> dict[str, list[str]]:
@@ -69,9 +73,9 @@ def _by_base(names: Iterable[str]) -> dict[str, list[str]]:
     return out
 
 
-def _find(said: str, main: str, known: Mapping[str, Sequence[str]]) -> str | None:
+def _find(reference: str, main: str, by_base: Mapping[str, Sequence[str]]) -> str | None:
     """The file of the upload that a map means: beside it, else the first of that base name."""
-    found = known.get(_base(said), ())
+    candidates = by_base.get(_base(reference), ())
     folder = main.rpartition("/")[0]
-    beside = [f"{folder}/{name}" if folder else name for name in (_plain(said), _base(said)) if name]
-    return next((name for name in beside if name in found), found[0] if found else None)
+    beside = [f"{folder}/{name}" if folder else name for name in (_plain(reference), _base(reference)) if name]
+    return next((name for name in beside if name in candidates), candidates[0] if candidates else None)

@@ -115,54 +115,54 @@ SINGLE = 1e-6
 # --- values ----------------------------------------------------------------------------------------------------------
 
 
-def reference(value: Any, where: str) -> str:
+def reference(value: Any, location: str) -> str:
     """The id of an element, as the key that it has in its mapping."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
-        refuse("must be the id of an element, a whole number below 2^32", where)
+        refuse("must be the id of an element, a whole number below 2^32", location)
     return str(value)
 
 
-def references(value: Any, where: str, count: int | None = None) -> list[str]:
+def references(value: Any, location: str, count: int | None = None) -> list[str]:
     """The ids of a list; count: how many there must be."""
     if not isinstance(value, list) or (count is not None and len(value) != count):
-        refuse(f"must be a list of {count} ids" if count else "must be a list of ids", where)
-    return [reference(v, f"{where}[{k}]") for k, v in enumerate(value)]
+        refuse(f"must be a list of {count} ids" if count else "must be a list of ids", location)
+    return [reference(v, f"{location}[{k}]") for k, v in enumerate(value)]
 
 
-def by_id(value: Any, where: str) -> list[tuple[str, Any]]:
+def by_id(value: Any, location: str) -> list[tuple[str, Any]]:
     """The members of a mapping whose keys are ids, by number."""
-    said = mapping(value, where)
-    for key in said:
+    members = mapping(value, location)
+    for key in members:
         if not key.isascii() or not key.isdigit() or len(key) > 10 or int(key) >= 2**32 or str(int(key)) != key:
-            refuse(f"{key[:40]!r} is no id: a whole number below 2^32", where)
-    return [(key, said[key]) for key in sorted(said, key=int)]
+            refuse(f"{key[:40]!r} is no id: a whole number below 2^32", location)
+    return [(key, members[key]) for key in sorted(members, key=int)]
 
 
-def elements(value: Any, where: str) -> list[tuple[str, dict[str, Any]]]:
+def elements(value: Any, location: str) -> list[tuple[str, dict[str, Any]]]:
     """The elements of a mapping by id, by number; each is a mapping."""
-    listed = by_id(value, where)
-    for key, said in listed:
-        if not isinstance(said, dict):
-            refuse("must be a mapping", f"{where}.{key}")
+    listed = by_id(value, location)
+    for key, element in listed:
+        if not isinstance(element, dict):
+            refuse("must be a mapping", f"{location}.{key}")
     return listed
 
 
-def variant(value: Any, where: str) -> tuple[str, Any]:
+def variant(value: Any, location: str) -> tuple[str, Any]:
     """(name, content) of an enum's value."""
     if isinstance(value, str):
         return value, None
     if not isinstance(value, dict) or len(value) != 1:
-        refuse('must be a variant: a text or {"Variant": content}', where)
+        refuse('must be a variant: a text or {"Variant": content}', location)
     return next(iter(value.items()))
 
 
-def vector(value: Any, size: int, where: str) -> list[float]:
+def vector(value: Any, size: int, location: str) -> list[float]:
     """That many numbers."""
     if not isinstance(value, list) or len(value) != size:
-        refuse(f"must be a list of {size} numbers", where)
-    out = [number(v, f"{where}[{k}]") for k, v in enumerate(value)]
+        refuse(f"must be a list of {size} numbers", location)
+    out = [number(v, f"{location}[{k}]") for k, v in enumerate(value)]
     if max(map(abs, out)) > MAX_METRES:
-        refuse(f"is beyond ±{MAX_METRES:g}", where)
+        refuse(f"is beyond ±{MAX_METRES:g}", location)
     return out
 
 
@@ -175,46 +175,46 @@ def text(value: Any, where: str) -> str:
     return value
 
 
-def angle(value: Any, where: str) -> float:
+def angle(value: Any, location: str) -> float:
     """Radians."""
-    name, content = variant(value, where)
+    name, content = variant(value, location)
     if name not in ("deg", "rad"):
-        refuse(f"must be deg or rad, is {name[:40]!r}", where)
-    said = number(content, where)
-    if abs(said) > MAX_METRES:
-        refuse(f"is beyond ±{MAX_METRES:g}", where)
-    return math.radians(said) if name == "deg" else said
+        refuse(f"must be deg or rad, is {name[:40]!r}", location)
+    amount = number(content, location)
+    if abs(amount) > MAX_METRES:
+        refuse(f"is beyond ±{MAX_METRES:g}", location)
+    return math.radians(amount) if name == "deg" else amount
 
 
-def pose(value: Any, where: str) -> list[float]:
+def pose(value: Any, location: str) -> list[float]:
     """[x, y, z, roll, pitch, yaw] of a pose, metres and radians."""
-    said = mapping(value, where)
-    at = vector(said.get("trans"), 3, f"{where}.trans")
-    name, content = variant(said.get("rot", {"yaw": {"rad": 0.0}}), f"{where}.rot")
+    members = mapping(value, location)
+    at = vector(members.get("trans"), 3, f"{location}.trans")
+    name, content = variant(members.get("rot", {"yaw": {"rad": 0.0}}), f"{location}.rot")
     if name == "yaw":
-        return [*at, 0.0, 0.0, angle(content, f"{where}.rot")]
+        return [*at, 0.0, 0.0, angle(content, f"{location}.rot")]
     if name == "euler_xyz":
         if not isinstance(content, list) or len(content) != 3:
-            refuse("must be three angles", f"{where}.rot")
-        return [*at, *(angle(v, f"{where}.rot[{k}]") for k, v in enumerate(content))]
+            refuse("must be three angles", f"{location}.rot")
+        return [*at, *(angle(v, f"{location}.rot[{k}]") for k, v in enumerate(content))]
     if name != "quat":
-        refuse(f"must be yaw, euler_xyz or quat, is {name[:40]!r}", f"{where}.rot")
-    x, y, z, w = vector(content, 4, f"{where}.rot")
+        refuse(f"must be yaw, euler_xyz or quat, is {name[:40]!r}", f"{location}.rot")
+    x, y, z, w = vector(content, 4, f"{location}.rot")
     length = x * x + y * y + z * z + w * w
     if not 1e-12 < length < 1e12:
-        refuse("is no rotation: the quaternion has no length", f"{where}.rot")
+        refuse("is no rotation: the quaternion has no length", f"{location}.rot")
     roll = math.atan2(2 * (w * x + y * z), length - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x) / length)))
     return [*at, roll, pitch, math.atan2(2 * (w * z + x * y), length - 2 * (y * y + z * z))]
 
 
-def said_pose(now: Sequence[float], said: Any) -> dict[str, Any]:
+def said_pose(now: Sequence[float], source_pose: Any) -> dict[str, Any]:
     """The pose as a site says it; as it was said where it is the same."""
-    if isinstance(said, dict):
-        was = pose(said, "pose")
+    if isinstance(source_pose, dict):
+        was = pose(source_pose, "pose")
         turns = (abs(math.remainder(a - b, math.tau)) for a, b in zip(was[3:], now[3:], strict=True))
         if max(map(abs, np.subtract(was[:3], now[:3]))) < SAME_METRES and max(turns) < SAME_METRES:
-            return said
+            return source_pose
     turn: dict[str, Any] = {"yaw": {"rad": round(now[5], 12) + 0.0}}
     if abs(now[3]) > SAME_METRES or abs(now[4]) > SAME_METRES:
         turn = {"euler_xyz": [{"rad": round(v, 12) + 0.0} for v in now[3:]]}
@@ -226,27 +226,27 @@ def metres(value: float) -> float:
     return round(float(value), 9) + 0.0
 
 
-def place(anchor: Any, category: str, where: str) -> list[float]:
+def place(anchor: Any, category: str, location: str) -> list[float]:
     """[x, y, z] of an anchor, for elements of this category."""
-    name, content = variant(anchor, where)
+    name, content = variant(anchor, location)
     if name == "Translate2D":
-        return [*vector(content, 2, where), 0.0]
+        return [*vector(content, 2, location), 0.0]
     if name == "CategorizedTranslate2D":
-        said = mapping(content, where)
-        return [*vector(said.get(category, said.get("General")), 2, where), 0.0]
+        members = mapping(content, location)
+        return [*vector(members.get(category, members.get("General")), 2, location), 0.0]
     if name != "Pose3D":
-        refuse(f"must be Translate2D, CategorizedTranslate2D or Pose3D, is {name[:40]!r}", where)
-    return pose(content, where)[:3]
+        refuse(f"must be Translate2D, CategorizedTranslate2D or Pose3D, is {name[:40]!r}", location)
+    return pose(content, location)[:3]
 
 
-def said_anchor(now: Sequence[float], said: Any) -> dict[str, Any]:
+def said_anchor(now: Sequence[float], source_anchor: Any) -> dict[str, Any]:
     """The anchor at this place [x, y, z]; as it was said, moved there with all its categories."""
-    if not isinstance(said, dict):
+    if not isinstance(source_anchor, dict):
         return {"Translate2D": [metres(now[0]), metres(now[1])]}
-    was = place(said, "General", "anchor")
-    name, content = variant(said, "anchor")
+    was = place(source_anchor, "General", "anchor")
+    name, content = variant(source_anchor, "anchor")
     if max(map(abs, np.subtract(was, now))) < SAME_METRES:
-        return said
+        return source_anchor
     if name == "Pose3D":
         return {name: {**content, "trans": [metres(v) for v in now]}}
     moved = np.subtract(now[:2], was[:2])
@@ -267,20 +267,20 @@ def digest(site: Mapping[str, Any]) -> str:
     return hashlib.sha256(orjson.dumps(ordered(site))).hexdigest()[:16]
 
 
-def unknown(said: Mapping[str, Any], section: str) -> list[str]:
+def unknown(members: Mapping[str, Any], section: str) -> list[str]:
     """The members that no release of the format has."""
-    return sorted(said.keys() - MEMBERS[section])
+    return sorted(members.keys() - MEMBERS[section])
 
 
-def height(said: Any, where: str) -> float | None:
+def height(value: Any, location: str) -> float | None:
     """Metres of a top or bottom that is fixed."""
-    if said is None:
+    if value is None:
         return None
-    name, content = variant(said, where)
+    name, content = variant(value, location)
     if name not in ("fixed", "level_height_ratio"):
-        refuse(f"must be fixed or level_height_ratio, is {name[:40]!r}", where)
-    found = number(content, where)
-    return found if name == "fixed" else None
+        refuse(f"must be fixed or level_height_ratio, is {name[:40]!r}", location)
+    amount = number(content, location)
+    return amount if name == "fixed" else None
 
 
 # --- doors -----------------------------------------------------------------------------------------------------------
@@ -289,53 +289,55 @@ def height(said: Any, where: str) -> float | None:
 DOORS = ("SingleSliding", "DoubleSliding", "SingleSwing", "DoubleSwing", "Model")
 
 
-def door_parameters(kind: Any, where: str) -> dict[str, Any]:
+def door_parameters(kind: Any, location: str) -> dict[str, Any]:
     """A door's kind in a building's words; a swing to both sides is of the forward one."""
-    name, content = variant(kind, where)
+    name, content = variant(kind, location)
     if name not in DOORS or not isinstance(content, dict):
-        refuse(f"must be one of {', '.join(DOORS)} and its members", where)
+        refuse(f"must be one of {', '.join(DOORS)} and its members", location)
     if name == "Model":
         return {}
-    said, sliding = content, name.endswith("Sliding")
+    members, sliding = content, name.endswith("Sliding")
     out: dict[str, Any] = {"type": [1, ("double_" if name[0] == "D" else "") + ("sliding" if sliding else "hinged")]}
     if name[0] == "D":
-        ratio = number(said.get("left_right_ratio", 1.0), f"{where}.left_right_ratio")
+        ratio = number(members.get("left_right_ratio", 1.0), f"{location}.left_right_ratio")
         out["right_left_ratio"] = [3, 1.0 / ratio if abs(ratio) > 1e-9 else 1.0]
     if sliding:  # the editor reads a building's sliding door as one towards its right
-        out["motion_axis"] = [1, "end" if said.get("towards") == "Left" else "start"]
+        out["motion_axis"] = [1, "end" if members.get("towards") == "Left" else "start"]
         return out | {"motion_degrees": [3, 90.0], "motion_direction": [2, 1]}
-    right = said.get("pivot_on", "Left") == "Right"
-    swing, turn = variant(said.get("swing", {"Forward": {"deg": 90.0}}), f"{where}.swing")
-    turn = mapping(turn, where).get("forward") if swing == "Both" else turn
-    degrees = turn["deg"] if isinstance(turn, dict) and "deg" in turn else math.degrees(angle(turn, f"{where}.swing"))
+    right = members.get("pivot_on", "Left") == "Right"
+    swing, turn = variant(members.get("swing", {"Forward": {"deg": 90.0}}), f"{location}.swing")
+    turn = mapping(turn, location).get("forward") if swing == "Both" else turn
+    degrees = (
+        turn["deg"] if isinstance(turn, dict) and "deg" in turn else math.degrees(angle(turn, f"{location}.swing"))
+    )
     forward = swing != "Backward"
     return out | {
         "motion_axis": [1, "end" if right else "start"],
-        "motion_degrees": [3, number(degrees, f"{where}.swing")],
+        "motion_degrees": [3, number(degrees, f"{location}.swing")],
         "motion_direction": [2, 1 if forward == right else -1],
     }
 
 
-def door_kind(parameters: Mapping[str, Any], said: Any) -> dict[str, Any]:
+def door_kind(parameters: Mapping[str, Any], source_kind: Any) -> dict[str, Any]:
     """The door's kind in a site's words; what it was said as where the building's words are still the same."""
-    if said is not None:
-        was = door_parameters(said, "kind")
+    if source_kind is not None:
+        was = door_parameters(source_kind, "kind")
         if not was or all(value_of(was, k) == value_of(parameters, k) for k in was):
-            return dict(said)
+            return dict(source_kind)
     kind = str(value_of(parameters, "type", "hinged"))
     double = kind.startswith("double_")
     right = value_of(parameters, "motion_axis", "start") == "end"
     ratio = value_of(parameters, "right_left_ratio", 1.0)
-    good = isinstance(ratio, (int, float)) and not isinstance(ratio, bool) and ratio > 1e-9
-    shares = {"left_right_ratio": 1.0 / ratio if good else 1.0}
+    valid = isinstance(ratio, (int, float)) and not isinstance(ratio, bool) and ratio > 1e-9
+    shares = {"left_right_ratio": 1.0 / ratio if valid else 1.0}
     if kind.removeprefix("double_") in ("sliding", "telescope"):
         if double:
             return {"DoubleSliding": shares}
         return {"SingleSliding": {"towards": "Left" if right else "Right"}}
     degrees = value_of(parameters, "motion_degrees", 90.0)
-    good = isinstance(degrees, (int, float)) and not isinstance(degrees, bool)
+    valid = isinstance(degrees, (int, float)) and not isinstance(degrees, bool)
     forward = (value_of(parameters, "motion_direction", 1) != -1) == right
-    swing = {"Forward" if forward else "Backward": {"deg": float(degrees) if good else 90.0}}
+    swing = {"Forward" if forward else "Backward": {"deg": float(degrees) if valid else 90.0}}
     if double:
         return {"DoubleSwing": {"swing": swing, **shares}}
     return {"SingleSwing": {"pivot_on": "Right" if right else "Left", "swing": swing}}
@@ -352,8 +354,8 @@ FACES: Mapping[str, tuple[float, float]] = {
 """The way out of the cabin; to its left lies the door's positive shift."""
 
 
-def _or(value: Any, usual: float, where: str) -> float:
-    return usual if value is None else number(value, where)
+def _or(value: Any, default: float, location: str) -> float:
+    return default if value is None else number(value, location)
 
 
 @dataclass(frozen=True, slots=True)
@@ -392,82 +394,82 @@ class Cabin:
         return [self.x, self.y, self.yaw]
 
 
-def rectangle(properties: Mapping[str, Any], where: str) -> dict[str, Any]:
+def rectangle(properties: Mapping[str, Any], location: str) -> dict[str, Any]:
     """The parameters of a lift's cabin."""
-    name, content = variant(properties.get("cabin"), f"{where}.cabin")
+    name, content = variant(properties.get("cabin"), f"{location}.cabin")
     if name != "Rect":
-        refuse(f"must be Rect, is {name[:40]!r}", f"{where}.cabin")
-    return mapping(content, f"{where}.cabin")
+        refuse(f"must be Rect, is {name[:40]!r}", f"{location}.cabin")
+    return mapping(content, f"{location}.cabin")
 
 
-def offset_of(rect: Mapping[str, Any], where: str) -> tuple[float, float]:
+def offset_of(rect: Mapping[str, Any], location: str) -> tuple[float, float]:
     """The cabin's middle from the middle of its reference anchors."""
-    front = mapping(rect.get("front_door"), f"{where}.front_door")
-    depth = number(rect.get("depth"), f"{where}.depth")
-    wall, gap = _or(rect.get("wall_thickness"), CABIN_WALL, where), _or(rect.get("gap"), CABIN_GAP, where)
-    door = _or(front.get("thickness"), CABIN_DOOR, where)
-    return -depth / 2.0 - wall - gap - door / 2.0, _or(rect.get("shift"), 0.0, where)
+    front = mapping(rect.get("front_door"), f"{location}.front_door")
+    depth = number(rect.get("depth"), f"{location}.depth")
+    wall, gap = _or(rect.get("wall_thickness"), CABIN_WALL, location), _or(rect.get("gap"), CABIN_GAP, location)
+    door = _or(front.get("thickness"), CABIN_DOOR, location)
+    return -depth / 2.0 - wall - gap - door / 2.0, _or(rect.get("shift"), 0.0, location)
 
 
-def cabin_of(properties: Mapping[str, Any], left: Sequence[float], right: Sequence[float], where: str) -> Cabin:
+def cabin_of(properties: Mapping[str, Any], left: Sequence[float], right: Sequence[float], location: str) -> Cabin:
     """The cabin by its parameters and the places of its reference anchors."""
-    rect = rectangle(properties, where)
+    rect = rectangle(properties, location)
     dx, dy = left[0] - right[0], left[1] - right[1]
     yaw = math.atan2(-dx, dy) if dx or dy else 0.0
-    x, y = offset_of(rect, f"{where}.cabin")
+    x, y = offset_of(rect, f"{location}.cabin")
     c, s = math.cos(yaw), math.sin(yaw)
     middle = (left[0] + right[0]) / 2.0, (left[1] + right[1]) / 2.0
-    depth, width = (number(rect.get(key), f"{where}.cabin.{key}") for key in ("depth", "width"))
+    depth, width = (number(rect.get(key), f"{location}.cabin.{key}") for key in ("depth", "width"))
     if depth <= 0 or width <= 0:
-        refuse("must have a depth and a width above 0", f"{where}.cabin")
+        refuse("must have a depth and a width above 0", f"{location}.cabin")
     return Cabin(middle[0] + c * x - s * y, middle[1] + s * x + c * y, yaw, depth, width, (x, y))
 
 
-def cabin_door(rect: Mapping[str, Any], face: str, where: str) -> dict[str, Any] | None:
+def cabin_door(rect: Mapping[str, Any], face: str, location: str) -> dict[str, Any] | None:
     """The door on this face in a building's words: its middle in the cabin's frame."""
-    said = rect.get(face)
-    if said is None:
+    door = rect.get(face)
+    if door is None:
         return None
-    said = mapping(said, where)
-    (ux, uy), reach = FACES[face], _reach(rect, face, said, where)
-    shift = _or(said.get("shifted"), 0.0, f"{where}.shifted")
+    door = mapping(door, location)
+    (ux, uy), reach = FACES[face], _reach(rect, face, door, location)
+    shift = _or(door.get("shifted"), 0.0, f"{location}.shifted")
     return {
         "door_type": 2,
         "motion_axis_orientation": 0.0 if uy else round(math.pi / 2, 9),
-        "width": number(said.get("width"), f"{where}.width"),
+        "width": number(door.get("width"), f"{location}.width"),
         "x": metres(ux * reach - uy * shift),
         "y": metres(uy * reach + ux * shift),
     }
 
 
-def _reach(rect: Mapping[str, Any], face: str, said: Mapping[str, Any], where: str) -> float:
+def _reach(rect: Mapping[str, Any], face: str, door: Mapping[str, Any], location: str) -> float:
     """Metres from the cabin's middle to the middle of a door's leaf."""
-    half = number(rect.get("depth" if FACES[face][0] else "width"), where) / 2.0
-    wall = _or(rect.get("wall_thickness"), CABIN_WALL, where)
-    gap = _or(said.get("custom_gap"), _or(rect.get("gap"), CABIN_GAP, where), where)
-    return half + wall + gap + _or(said.get("thickness"), CABIN_DOOR, where) / 2.0
+    half = number(rect.get("depth" if FACES[face][0] else "width"), location) / 2.0
+    wall = _or(rect.get("wall_thickness"), CABIN_WALL, location)
+    gap = _or(door.get("custom_gap"), _or(rect.get("gap"), CABIN_GAP, location), location)
+    return half + wall + gap + _or(door.get("thickness"), CABIN_DOOR, location) / 2.0
 
 
-def door_placement(door: Mapping[str, Any], rect: Mapping[str, Any], where: str) -> tuple[str, dict[str, Any]]:
+def door_placement(door: Mapping[str, Any], rect: Mapping[str, Any], location: str) -> tuple[str, dict[str, Any]]:
     """(face, placement) of a building's lift door."""
-    x, y = number(door.get("x"), f"{where}.x"), number(door.get("y"), f"{where}.y")
+    x, y = number(door.get("x"), f"{location}.x"), number(door.get("y"), f"{location}.y")
     side = abs(y) * rect["depth"] > abs(x) * rect["width"]
     face = ("left_door" if y > 0 else "right_door") if side else ("front_door" if x >= 0 else "back_door")
     ux, uy = FACES[face]
-    usual = _reach(rect, face, {"custom_gap": 0.0}, where)
-    shift, gap = metres(ux * y - uy * x), metres(ux * x + uy * y - usual)
-    out = {"width": number(door.get("width"), f"{where}.width"), "custom_gap": gap}
+    reach = _reach(rect, face, {"custom_gap": 0.0}, location)
+    shift, gap = metres(ux * y - uy * x), metres(ux * x + uy * y - reach)
+    out = {"width": number(door.get("width"), f"{location}.width"), "custom_gap": gap}
     return face, out | ({"shifted": shift} if shift else {})
 
 
 def door_anchors(rect: Mapping[str, Any], face: str) -> list[dict[str, Any]]:
     """The anchors left and right of a cabin's door, in the cabin's frame (``level_door_anchors``)."""
-    said = rect[face]
-    (ux, uy), reach = FACES[face], _reach(rect, face, said, face)
-    half = _or(said.get("thickness"), CABIN_DOOR, face) / 2.0
-    shift = _or(said.get("shifted"), 0.0, face)
+    door = rect[face]
+    (ux, uy), reach = FACES[face], _reach(rect, face, door, face)
+    half = _or(door.get("thickness"), CABIN_DOOR, face) / 2.0
+    shift = _or(door.get("shifted"), 0.0, face)
     out = []
-    for along in (said["width"] / 2.0 + shift, -said["width"] / 2.0 + shift):
+    for along in (door["width"] / 2.0 + shift, -door["width"] / 2.0 + shift):
         x, y = ux * reach - uy * along, uy * reach + ux * along
         floor = [metres(x - half * ux), metres(y - half * uy)]
         out.append({"CategorizedTranslate2D": {"General": [metres(x), metres(y)], "Floor": floor}})
@@ -482,30 +484,30 @@ def cabin_size(cabin: Cabin) -> list[float]:
 # --- graphs, models, textures ----------------------------------------------------------------------------------------
 
 
-def graphs_of(said: Any, known: Mapping[str, int], where: str) -> tuple[int, int]:
+def graphs_of(choice: Any, numbers_by_id: Mapping[str, int], location: str) -> tuple[int, int]:
     """(the first graph of an element, how many it is of). known: the graphs' numbers by id, smallest first."""
-    name, content = variant("All" if said is None else said, where)
+    name, content = variant("All" if choice is None else choice, location)
     if name not in ("All", "Only", "AllExcept"):
-        refuse(f"must be All, Only or AllExcept, is {name[:40]!r}", where)
-    ids = set() if name == "All" else set(references(content, where)) & known.keys()
+        refuse(f"must be All, Only or AllExcept, is {name[:40]!r}", location)
+    ids = set() if name == "All" else set(references(content, location)) & numbers_by_id.keys()
     if name == "Only":
-        return min((known[i] for i in ids), default=0), len(ids)
-    return next((number_ for i, number_ in known.items() if i not in ids), 0), len(known) - len(ids)
+        return min((numbers_by_id[i] for i in ids), default=0), len(ids)
+    return next((number_ for i, number_ in numbers_by_id.items() if i not in ids), 0), len(numbers_by_id) - len(ids)
 
 
 def graph_numbers(graphs: Iterable[tuple[str, Mapping[str, Any]]], ranking: Sequence[str]) -> dict[str, int]:
     """A building's number of each graph: its name where all are numbers, else its rank."""
     listed = sorted(graphs, key=lambda item: ranking.index(item[0]) if item[0] in ranking else len(ranking))
-    names = [str(said.get("name")) for _, said in listed]
+    names = [str(graph.get("name")) for _, graph in listed]
     numbered = all(n.isascii() and n.isdigit() and len(n) < 4 for n in names) and len(set(names)) == len(names)
     out = {i: int(n) if numbered else k for k, ((i, _), n) in enumerate(zip(listed, names, strict=True))}
     return dict(sorted(out.items(), key=lambda item: item[1]))
 
 
-def asset(said: Any, where: str) -> tuple[str, str]:
+def asset(value: Any, location: str) -> tuple[str, str]:
     """(kind, name) of where something is found."""
-    name, content = variant(said, where)
-    return name, text(content, where)
+    name, content = variant(value, location)
+    return name, text(content, location)
 
 
 TEXTURES = "OpenRobotics/RMF_Materials/textures/"
@@ -513,20 +515,20 @@ TEXTURES = "OpenRobotics/RMF_Materials/textures/"
 
 def texture_parameters(group: Mapping[str, Any], kind: str) -> dict[str, Any]:
     """The texture of a wall or floor in a building's words; nothing where it is of another place."""
-    said = mapping(group.get("texture"), "texture")
-    source, name = asset(said.get("source", "Local"), "texture")
+    texture = mapping(group.get("texture"), "texture")
+    source, name = asset(texture.get("source", "Local"), "texture")
     if source != "Remote" or not name.startswith(TEXTURES) or not name.endswith(".png"):
         return {}
     out: dict[str, Any] = {"texture_name": [1, name[len(TEXTURES) : -len(".png")]]}
     if kind == "floor":
-        if said.get("rotation") is not None:
-            out["texture_rotation"] = [3, round(math.degrees(angle(said["rotation"], "texture.rotation")), 9)]
-        if said.get("width") is not None:
-            out["texture_scale"] = [3, number(said["width"], "texture.width")]
+        if texture.get("rotation") is not None:
+            out["texture_rotation"] = [3, round(math.degrees(angle(texture["rotation"], "texture.rotation")), 9)]
+        if texture.get("width") is not None:
+            out["texture_scale"] = [3, number(texture["width"], "texture.width")]
         return out
-    for member, word in (("alpha", "alpha"), ("width", "texture_width"), ("height", "texture_height")):
-        if said.get(member) is not None:
-            out[word] = [3, number(said[member], f"texture.{member}")]
+    for member, key in (("alpha", "alpha"), ("width", "texture_width"), ("height", "texture_height")):
+        if texture.get(member) is not None:
+            out[key] = [3, number(texture[member], f"texture.{member}")]
     return out
 
 
@@ -535,21 +537,21 @@ def texture_group(parameters: Mapping[str, Any], kind: str) -> dict[str, Any] | 
     name = value_of(parameters, "texture_name")
     if not isinstance(name, str) or not name:
         return None
-    said: dict[str, Any] = {"source": {"Remote": f"{TEXTURES}{name}.png"}}
+    texture: dict[str, Any] = {"source": {"Remote": f"{TEXTURES}{name}.png"}}
     scale = value_of(parameters, "texture_scale", 1.0)
     scale = float(scale) if isinstance(scale, (int, float)) and scale > 0 else 1.0
     if kind == "floor":
-        said |= {"width": scale, "height": scale}
+        texture |= {"width": scale, "height": scale}
         turn = value_of(parameters, "texture_rotation")
         if isinstance(turn, (int, float)):
-            said["rotation"] = {"deg": float(turn)}
+            texture["rotation"] = {"deg": float(turn)}
     else:
-        for member, word, by in (
+        for member, key, by in (
             ("alpha", "alpha", 1.0),
             ("width", "texture_width", scale),
             ("height", "texture_height", scale),
         ):
-            value = value_of(parameters, word)
+            value = value_of(parameters, key)
             if isinstance(value, (int, float)):
-                said[member] = float(value) / by
-    return {"name": name, "texture": said}
+                texture[member] = float(value) / by
+    return {"name": name, "texture": texture}

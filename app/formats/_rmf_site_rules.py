@@ -40,23 +40,23 @@ def check(files: Files) -> Iterator[Problem]:
     if not isinstance(properties, dict) or not isinstance(properties.get("name"), str):
         yield refused("a site needs a name", main, where="properties.name")
     elif (offset := properties.get("geographic_offset")) is not None:
-        if lost := missing(offset, ("anchor", "zoom", "visible")):
-            yield refused(f"needs {', '.join(lost)}", main, where="properties.geographic_offset")
+        if absent := missing(offset, ("anchor", "zoom", "visible")):
+            yield refused(f"needs {', '.join(absent)}", main, where="properties.geographic_offset")
         elif not numbers(offset["anchor"], 2, 2) or not -80 <= offset["anchor"][0] <= 84:
             reason = "must be [latitude, longitude] within the zones of UTM (80° S to 84° N)"
             yield refused(reason, main, where="properties.geographic_offset.anchor")
     yield from _site(top, main)
 
 
-def _section(said: Any, section: str, main: str, where: str) -> Iterator[Problem]:
+def _section(members: Any, section: str, main: str, location: str) -> Iterator[Problem]:
     """Elements that lack a member."""
-    for i, one in _elements(said):
-        if lost := missing(one, REQUIRED[section]):
-            yield refused(f"needs {', '.join(lost)}", main, where=f"{where}.{i}")
+    for i, one in _elements(members):
+        if absent := missing(one, REQUIRED[section]):
+            yield refused(f"needs {', '.join(absent)}", main, where=f"{location}.{i}")
 
 
-def _elements(said: Any) -> list[tuple[str, Any]]:
-    return list(said.items()) if isinstance(said, dict) else []
+def _elements(members: Any) -> list[tuple[str, Any]]:
+    return list(members.items()) if isinstance(members, dict) else []
 
 
 def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
@@ -65,42 +65,42 @@ def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
         yield refused("a site needs a level", main, where="levels")
     site = {i for i, _ in _elements(top.get("anchors"))}
     ids = list(site)
-    known = set(site)
+    anchor_ids = set(site)
     for i, level in levels:
-        where = f"levels.{i}"
+        location = f"levels.{i}"
         properties = level.get("properties") if isinstance(level, dict) else None
         if not isinstance(properties, dict) or not is_number(properties.get("elevation")) or "name" not in properties:
-            yield refused("needs a name and an elevation", main, where=f"{where}.properties")
+            yield refused("needs a name and an elevation", main, where=f"{location}.properties")
             continue
-        here = {a for a, _ in _elements(level.get("anchors"))}
-        ids += [i, *here]
-        known |= here
+        level_anchors = {a for a, _ in _elements(level.get("anchors"))}
+        ids += [i, *level_anchors]
+        anchor_ids |= level_anchors
         for section in ("doors", "walls", "floors", "drawings"):
-            yield from _section(level.get(section), section, main, f"{where}.{section}")
+            yield from _section(level.get(section), section, main, f"{location}.{section}")
             ids += [key for key, _ in _elements(level.get(section))]
         for section in ("doors", "walls", "floors"):
-            yield from _stands(level.get(section), here | site, main, f"{where}.{section}")
-    if again := repeated(level["properties"].get("name") for _, level in levels if _is_named(level)):
-        yield doubted(f"levels with the same name: {names(again)}", main, where="levels")
+            yield from _stands(level.get(section), level_anchors | site, main, f"{location}.{section}")
+    if repeats := repeated(level["properties"].get("name") for _, level in levels if _is_named(level)):
+        yield doubted(f"levels with the same name: {names(repeats)}", main, where="levels")
     for i, lift in _elements(top.get("lifts")):
         yield from _section({i: lift}, "lifts", main, "lifts")
         cabin = {a for a, _ in _elements(lift.get("cabin_anchors"))} if isinstance(lift, dict) else set()
         ids += [i, *cabin]
-        known |= cabin
+        anchor_ids |= cabin
         properties = lift.get("properties") if isinstance(lift, dict) else None
         yield from _stands({i: _ends(properties)}, site, main, "lifts")
-    yield from _navigation(top.get("navigation"), known, ids, main)
+    yield from _navigation(top.get("navigation"), anchor_ids, ids, main)
     yield from _section(top.get("model_instances"), "model_instances", main, "model_instances")
     described = {i for i, _ in _elements(top.get("model_descriptions"))}
-    lost = [
+    dangling = [
         i
         for i, one in _elements(top.get("model_instances"))
         if isinstance(one, dict) and one.get("description") is not None and str(one["description"]) not in described
     ]
-    if lost:
-        yield refused(f"no description of the models {names(lost)}", main, where="model_instances")
-    if again := repeated(ids):
-        yield refused(f"ids that several elements have: {names(again)}", main)
+    if dangling:
+        yield refused(f"no description of the models {names(dangling)}", main, where="model_instances")
+    if repeats := repeated(ids):
+        yield refused(f"ids that several elements have: {names(repeats)}", main)
 
 
 def _is_named(level: Any) -> bool:
@@ -111,32 +111,32 @@ def _ends(properties: Any) -> dict[str, Any]:
     return {"anchors": properties.get("reference_anchors")} if isinstance(properties, dict) else {}
 
 
-def _stands(said: Any, anchors: set[str], main: str, where: str) -> Iterator[Problem]:
+def _stands(members: Any, anchors: set[str], main: str, location: str) -> Iterator[Problem]:
     """Elements on anchors that are not there."""
-    lost = [
+    dangling = [
         i
-        for i, one in _elements(said)
+        for i, one in _elements(members)
         if isinstance(one, dict) and any(str(a) not in anchors for a in one.get("anchors") or ())
     ]
-    if lost:
-        yield refused(f"{names(lost)} stand on anchors that are not there", main, where=where)
+    if dangling:
+        yield refused(f"{names(dangling)} stand on anchors that are not there", main, where=location)
 
 
-def _navigation(said: Any, anchors: set[str], ids: list[str], main: str) -> Iterator[Problem]:
-    guided = said.get("guided") if isinstance(said, dict) else None
+def _navigation(navigation: Any, anchors: set[str], ids: list[str], main: str) -> Iterator[Problem]:
+    guided = navigation.get("guided") if isinstance(navigation, dict) else None
     if not isinstance(guided, dict):
         return
-    where = "navigation.guided"
-    if lost := missing(guided, ("graphs", "ranking", "lanes", "locations")):
-        yield refused(f"needs {', '.join(lost)}", main, where=where)
+    location = "navigation.guided"
+    if absent := missing(guided, ("graphs", "ranking", "lanes", "locations")):
+        yield refused(f"needs {', '.join(absent)}", main, where=location)
     for section in ("lanes", "locations"):
-        yield from _section(guided.get(section), section, main, f"{where}.{section}")
+        yield from _section(guided.get(section), section, main, f"{location}.{section}")
         ids += [i for i, _ in _elements(guided.get(section))]
-    yield from _stands(guided.get("lanes"), anchors, main, f"{where}.lanes")
+    yield from _stands(guided.get("lanes"), anchors, main, f"{location}.lanes")
     places = {
         i: {"anchors": [one.get("anchor")]} for i, one in _elements(guided.get("locations")) if isinstance(one, dict)
     }
-    yield from _stands(places, anchors, main, f"{where}.locations")
+    yield from _stands(places, anchors, main, f"{location}.locations")
     called = [one.get("name") for _, one in _elements(guided.get("locations")) if isinstance(one, dict)]
-    if again := repeated(name for name in called if name and name != "<Unnamed>"):
-        yield doubted(f"locations with the same name: {names(again)}", main, where=f"{where}.locations")
+    if repeats := repeated(name for name in called if name and name != "<Unnamed>"):
+        yield doubted(f"locations with the same name: {names(repeats)}", main, where=f"{location}.locations")

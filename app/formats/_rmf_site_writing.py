@@ -82,8 +82,8 @@ class _Floor:
 
     @property
     def anchors(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.said["anchors"]
-        return found
+        anchors: dict[str, Any] = self.said["anchors"]
+        return anchors
 
 
 @dataclass(slots=True)
@@ -159,10 +159,10 @@ class _Writer:
 
     # ids
 
-    def _claim(self, wanted: Any = None) -> str:
+    def _claim(self, hint: Any = None) -> str:
         """The wanted id where no other element has it, else a new one."""
-        key = str(wanted)
-        if isinstance(wanted, int) and not isinstance(wanted, bool) and 0 <= wanted < 2**32 and key not in self.claimed:
+        key = str(hint)
+        if isinstance(hint, int) and not isinstance(hint, bool) and 0 <= hint < 2**32 and key not in self.claimed:
             self.claimed.add(key)
             return key
         while (key := str(self.next)) in self.mentioned or key in self.claimed:
@@ -234,17 +234,25 @@ class _Writer:
     def _properties(self) -> dict[str, Any]:
         out = dict(mapping(self.known.get("properties"), "properties"))
         if "name" not in out:
-            said = next((s.document["building"].get("name") for s in self._storeys() if "building" in s.document), None)
-            out["name"] = said if isinstance(said, str) and said else self.options.building or self.context.title
-            if out["name"] != said:
+            source_value = next(
+                (s.document["building"].get("name") for s in self._storeys() if "building" in s.document), None
+            )
+            out["name"] = (
+                source_value
+                if isinstance(source_value, str) and source_value
+                else self.options.building or self.context.title
+            )
+            if out["name"] != source_value:
                 self.context.fill("properties.name", out["name"], "no source names the site", "building")
         datum = self.layers.datum
         if datum is not None:
             was = mapping(out.get("geographic_offset"), "geographic_offset")
-            said = was.get("anchor")
+            source_value = was.get("anchor")
             now = [datum.latitude, datum.longitude]
-            same = isinstance(said, list) and [np.float32(v) for v in said] == [np.float32(v) for v in now]
-            offset = {"zoom": ZOOM, "visible": False, **was, "anchor": said if same else now}
+            same = isinstance(source_value, list) and [np.float32(v) for v in source_value] == [
+                np.float32(v) for v in now
+            ]
+            offset = {"zoom": ZOOM, "visible": False, **was, "anchor": source_value if same else now}
             out["geographic_offset"] = offset
             why = "a site's +y axis is north, and (0, 0) has no altitude"
             self.context.drop("the datum's heading", abs(datum.heading) > 1e-9, why)
@@ -255,26 +263,26 @@ class _Writer:
         return (floor.storey for floor in self.floors)
 
     def _ranking(self) -> list[int]:
-        known = [i for i in self.guided.get("ranking") or [] if str(i) in self.graphs]
-        return known + [int(i) for i in self.graphs if int(i) not in known]
+        ranking = [i for i in self.guided.get("ranking") or [] if str(i) in self.graphs]
+        return ranking + [int(i) for i in self.graphs if int(i) not in ranking]
 
     # levels
 
     def _floor(self, storey: Storey, document: dict[str, Any]) -> _Floor:
-        rest = dict(mapping(document.get("level"), "level"))
-        wanted = rest.pop("id", None)
-        i = self._claim(int(wanted) if isinstance(wanted, str) and wanted.isdigit() else None)
-        self.claimed.update(_ids_of(rest))
-        said = mapping(rest.get("properties"), "properties")
+        level = dict(mapping(document.get("level"), "level"))
+        level_id = level.pop("id", None)
+        i = self._claim(int(level_id) if isinstance(level_id, str) and level_id.isdigit() else None)
+        self.claimed.update(_ids_of(level))
+        source_properties = mapping(level.get("properties"), "properties")
         listed = next((level.elevation for level in self.layers.levels if level.name == storey.name), None)
         old = mapping(storey.document.get("level"), "level").get("elevation", 0.0)
-        elevation = float(said.get("elevation", old) or 0.0) if listed is None else listed
-        properties = {**said, "name": storey.name, "elevation": elevation}
-        floor = _Floor(storey, i, elevation, document, {**rest, "properties": properties, "anchors": {}})
+        elevation = float(source_properties.get("elevation", old) or 0.0) if listed is None else listed
+        properties = {**source_properties, "name": storey.name, "elevation": elevation}
+        floor = _Floor(storey, i, elevation, document, {**level, "properties": properties, "anchors": {}})
         if not document:
             spoken = mapping(storey.document.get("level"), "level")
-            for word in ("layers", "features", "constraints", "lights", "physical_cameras"):
-                self.lost[f"a building's {word}"] += bool(spoken.get(word))
+            for section in ("layers", "features", "constraints", "lights", "physical_cameras"):
+                self.lost[f"a building's {section}"] += bool(spoken.get(section))
         return floor
 
     def _coordinates(self, part: Features) -> np.ndarray[Any, np.dtype[np.object_]]:
@@ -282,7 +290,7 @@ class _Writer:
 
     def _nodes(self, floor: _Floor) -> None:
         """The nodes as anchors and locations, in the order of their source."""
-        found: list[tuple[tuple[bool, int, int, str], str, Properties, list[float]]] = []
+        nodes: list[tuple[tuple[bool, int, int, str], str, Properties, list[float]]] = []
         for part in floor.storey.networks:
             geometry = self._coordinates(part)
             for i, p, g in zip(part.ids, part.properties, geometry, strict=True):
@@ -294,63 +302,65 @@ class _Writer:
                 at = own(p, BUILDING).get("index", own(p, NAV_GRAPH).get("index"))
                 order = (not isinstance(at, int), at if isinstance(at, int) else 0, len(i), i)
                 xyz = [g.x, g.y, g.z - floor.elevation if g.has_z else 0.0]
-                found.append((order, i, p, xyz))
+                nodes.append((order, i, p, xyz))
                 self.lost["nodes' orientations"] += p.get("orientation") is not None
-        for _, i, p, xyz in sorted(found, key=lambda item: item[0]):
-            rest, words = self._rest(floor, p), {**_words(p), **self.robots.at(floor.storey.name, i)}
-            lift = self.lifts.get(str(rest.get("lift") or words.get("lift_cabin") or words.get("lift") or ""))
+        for _, i, p, xyz in sorted(nodes, key=lambda item: item[0]):
+            members, parameters = self._rest(floor, p), {**_words(p), **self.robots.at(floor.storey.name, i)}
+            lift = self.lifts.get(
+                str(members.get("lift") or parameters.get("lift_cabin") or parameters.get("lift") or "")
+            )
             name = str(p.get("name") or ("" if BUILDING in p or NAV_GRAPH in p else i))
-            anchor = self._node_anchor(floor, lift, xyz, rest, name)
+            anchor = self._node_anchor(floor, lift, xyz, members, name)
             floor.nodes.setdefault(i, anchor)
-            if words.get("dock_name"):
-                self.docks[floor.storey.name, i] = str(words["dock_name"])
-            self._location(anchor, name, words, mapping(rest.get("locations"), "locations"))
-            self._robot(floor, words, rest, xyz)
-            for word in words.keys() - SAID_ELSEWHERE:
-                self.lost[f"vertices' {word}"] += 1
+            if parameters.get("dock_name"):
+                self.docks[floor.storey.name, i] = str(parameters["dock_name"])
+            self._location(anchor, name, parameters, mapping(members.get("locations"), "locations"))
+            self._robot(floor, parameters, members, xyz)
+            for key in parameters.keys() - SAID_ELSEWHERE:
+                self.lost[f"vertices' {key}"] += 1
             if BUILDING not in p and NAV_GRAPH not in p:
                 self.lost["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
 
     def _node_anchor(
-        self, floor: _Floor, lift: _Lift | None, xyz: list[float], rest: Mapping[str, Any], name: str
+        self, floor: _Floor, lift: _Lift | None, xyz: list[float], members: Mapping[str, Any], name: str
     ) -> str:
         if lift is None:
-            anchor = self._claim(rest.get("anchor"))
-            floor.anchors[anchor] = self._said_anchor(xyz, rest.get("says"))
+            anchor = self._claim(members.get("anchor"))
+            floor.anchors[anchor] = self._said_anchor(xyz, members.get("says"))
             floor.by_place.setdefault(_spot(xyz), anchor)
             return anchor
         inside = lift.cabin.inward(xyz)
         spot = (round(inside[0], 6) + 0.0, round(inside[1], 6) + 0.0, name)
         if spot not in lift.by_place:
-            lift.by_place[spot] = anchor = self._claim(rest.get("anchor"))
-            lift.anchors[anchor] = self._said_anchor([*inside, 0.0], rest.get("says"))
+            lift.by_place[spot] = anchor = self._claim(members.get("anchor"))
+            lift.anchors[anchor] = self._said_anchor([*inside, 0.0], members.get("says"))
         return lift.by_place[spot]
 
-    def _said_anchor(self, xyz: Sequence[float], said: Any) -> dict[str, Any]:
-        if said is None and abs(xyz[2]) > SAME_METRES:
+    def _said_anchor(self, xyz: Sequence[float], source_anchor: Any) -> dict[str, Any]:
+        if source_anchor is None and abs(xyz[2]) > SAME_METRES:
             self.lost["heights of nodes above their level"] += 1
-        return _rmf_site.said_anchor(xyz if said is not None else [*xyz[:2], 0.0], said)
+        return _rmf_site.said_anchor(xyz if source_anchor is not None else [*xyz[:2], 0.0], source_anchor)
 
-    def _location(self, anchor: str, name: str, words: Mapping[str, Any], said: Mapping[str, Any]) -> None:
+    def _location(self, anchor: str, name: str, parameters: Mapping[str, Any], locations: Mapping[str, Any]) -> None:
         """A node's locations; a new one where it has a name, a tag or a mutex group."""
-        tags = [tag for word, tag in TAGS.items() if words.get(word) is True]
-        mutex = words.get("mutex")
-        if not said:
+        tags = [tag for key, tag in TAGS.items() if parameters.get(key) is True]
+        mutex = parameters.get("mutex")
+        if not locations:
             if name or tags or mutex:
                 group = {} if not mutex else {"mutex": int(self._mutex(str(mutex)))}
                 one = {"anchor": int(anchor), "tags": tags, "name": name, **group, "graphs": "All"}
                 self.locations[self._claim()] = one
             return
-        spoken = [str(one.get("name") or "") for one in said.values()]
+        spoken = [str(one.get("name") or "") for one in locations.values()]
         same_name = name in spoken or (not name and set(spoken) <= {"", _rmf_site.UNNAMED})
-        known = {tag for one in said.values() for tag in one.get("tags") or [] if isinstance(tag, str)}
-        for k, (i, one) in enumerate(said.items()):
+        source_tags = {tag for one in locations.values() for tag in one.get("tags") or [] if isinstance(tag, str)}
+        for k, (i, one) in enumerate(locations.items()):
             if self.locations.get(i, {}).get("anchor") == int(anchor):
                 continue  # of a lift's cabin, whose anchor is a node of several levels
             now = {**one, "anchor": int(anchor)}
             if not k and not same_name:
                 now["name"] = name
-            if not k and known & set(TAGS.values()) != set(tags):
+            if not k and source_tags & set(TAGS.values()) != set(tags):
                 now["tags"] = [*tags, *(t for t in one.get("tags") or [] if t not in TAGS.values())]
             self.locations[self._claim(int(i))] = now
 
@@ -379,19 +389,19 @@ class _Writer:
                 self.lost["edges' bends between their nodes"] += bends > 2
                 self.lost["edges' actions"] += p.get("action") is not None
                 self.lost["edges' widths"] += p.get("width") is not None
-                way = self._way(floor, p, (anchors[0], anchors[1]), ends)
+                direction = self._way(floor, p, (anchors[0], anchors[1]), ends)
                 lane = self._rest(floor, p).get("lane")
                 group: Any = lane if isinstance(lane, int) else (floor.id, i if order is None else order)
                 if order is None and not isinstance(lane, int):  # with the edge back that says the same
-                    signature = _key([way.motion, way.rest])
-                    partners = waiting.get((floor.id, way.target, way.source, signature))
-                    if partners and way.source != way.target:
+                    signature = _key([direction.motion, direction.rest])
+                    partners = waiting.get((floor.id, direction.target, direction.source, signature))
+                    if partners and direction.source != direction.target:
                         group = partners.pop()
                     else:
-                        waiting.setdefault((floor.id, way.source, way.target, signature), []).append(group)
-                groups.setdefault(group, []).append(way)
-        for group, ways in groups.items():
-            self._lane(group if isinstance(group, int) else None, ways)
+                        waiting.setdefault((floor.id, direction.source, direction.target, signature), []).append(group)
+                groups.setdefault(group, []).append(direction)
+        for group, directions in groups.items():
+            self._lane(group if isinstance(group, int) else None, directions)
 
     def _edges(self, floor: _Floor) -> Iterator[tuple[int | None, str, Properties, int]]:
         """(place of its lane in a building, id, properties, coordinates) of a level's edges, in their lanes' order."""
@@ -401,8 +411,8 @@ class _Writer:
             for i, p, bends in zip(part.ids, part.properties, counts.tolist(), strict=True):
                 if p.get("kind") == "edge":
                     at = own(p, BUILDING).get("index")
-                    known = at if isinstance(at, int) else None
-                    listed.append((known, i, p, bends))
+                    lane_id = at if isinstance(at, int) else None
+                    listed.append((lane_id, i, p, bends))
                 else:
                     self.lost["items of networks that are neither node nor edge"] += p.get("kind") != "node"
         listed.sort(
@@ -411,33 +421,33 @@ class _Writer:
         return iter(listed)
 
     def _way(self, floor: _Floor, p: Properties, anchors: tuple[str, str], ends: Sequence[str]) -> _Way:
-        rest, words = self._rest(floor, p), _words(p)
-        said = mapping(rest.get("says"), "lane")
+        members, parameters = self._rest(floor, p), _words(p)
+        lane = mapping(members.get("says"), "lane")
         limit = _rmf.limit(p)
-        if rest:
-            reverse = rest.get("reverse") is True
-            back = said.get("reverse")
+        if members:
+            reverse = members.get("reverse") is True
+            back = lane.get("reverse")
             different = back.get("Different") if isinstance(back, dict) else None
-            motion = dict(mapping(different if reverse and different is not None else said.get("forward"), "motion"))
+            motion = dict(mapping(different if reverse and different is not None else lane.get("forward"), "motion"))
             if (motion.get("speed_limit") or 0.0) != limit:
                 motion.pop("speed_limit", None)
                 motion |= {"speed_limit": limit} if limit else {}
-            return _Way(*anchors, motion, said, reverse)
+            return _Way(*anchors, motion, lane, reverse)
         new = BUILDING not in p and NAV_GRAPH not in p
         if new:
             self.made["lanes"] += 1
             self.lost["edges' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
             limit = limit or self.options.speed_limit
         reverse = own(p, BUILDING).get("reverse") is True
-        orientation = words.get("orientation", words.get("orientation_constraint"))
+        orientation = parameters.get("orientation", parameters.get("orientation_constraint"))
         orientation = _rmf.turned(orientation) if reverse else orientation
         motion = {"orientation_constraint": ORIENTATIONS[orientation]} if orientation in ORIENTATIONS else {}
         motion |= {"speed_limit": limit} if limit else {}
-        dock = words.get("dock_name") or self.docks.get((floor.storey.name, ends[1]))
+        dock = parameters.get("dock_name") or self.docks.get((floor.storey.name, ends[1]))
         motion |= {"dock": {"name": str(dock)}} if dock else {}
-        number = words.get("graph_idx", own(p, NAV_GRAPH).get("graph", self.options.graph if new else 0))
+        number = parameters.get("graph_idx", own(p, NAV_GRAPH).get("graph", self.options.graph if new else 0))
         number = number if isinstance(number, int) and not isinstance(number, bool) else 0
-        mutex = words.get("mutex")
+        mutex = parameters.get("mutex")
         group = {"mutex": int(self._mutex(str(mutex)))} if mutex else {}
         return _Way(*anchors, motion, {"graphs": {"Only": [int(self._graph(number))]}, **group}, reverse)
 
@@ -448,21 +458,23 @@ class _Writer:
             self.graphs[i] = {"name": str(number), "color": list(COLOURS[(len(self.graphs)) % len(COLOURS)])}
         return self.numbers[number]
 
-    def _lane(self, wanted: int | None, ways: Sequence[_Way]) -> None:
+    def _lane(self, hint: int | None, directions: Sequence[_Way]) -> None:
         """Directions as a lane; those that are no pair as lanes of their own."""
-        first = next((way for way in ways if not way.reverse), ways[0])
-        back = next((w for w in ways if w is not first and (w.source, w.target) == (first.target, first.source)), None)
-        said: dict[str, Any] = {k: v for k, v in first.rest.items() if k not in ("forward", "reverse")}
-        said["anchors"] = [int(first.source), int(first.target)]
+        first = next((direction for direction in directions if not direction.reverse), directions[0])
+        back = next(
+            (w for w in directions if w is not first and (w.source, w.target) == (first.target, first.source)), None
+        )
+        lane: dict[str, Any] = {k: v for k, v in first.rest.items() if k not in ("forward", "reverse")}
+        lane["anchors"] = [int(first.source), int(first.target)]
         if first.motion:
-            said["forward"] = first.motion
+            lane["forward"] = first.motion
         if back is None:
-            said["reverse"] = "Disable"
+            lane["reverse"] = "Disable"
         elif back.motion != first.motion:
-            said["reverse"] = {"Different": back.motion}
-        said.setdefault("graphs", "All")
-        self.lanes[self._claim(wanted)] = said
-        for other in ways:
+            lane["reverse"] = {"Different": back.motion}
+        lane.setdefault("graphs", "All")
+        self.lanes[self._claim(hint)] = lane
+        for other in directions:
             if other is not first and other is not back:
                 self._lane(None, [other])
 
@@ -472,22 +484,22 @@ class _Writer:
         sections = {"wall": "walls", "door": "doors", "floor": "floors"}
         self._drawings_of(floor)
         for kind, p, geometry, _ in self._items(floor):
-            rest = self._rest(floor, p)
+            members = self._rest(floor, p)
             lines = geometry.geom_type == "LineString" and len(geometry.coords) >= 2
             point = geometry.geom_type == "Point" and not geometry.is_empty
             if kind in ("wall", "door") and lines:
-                said = {**mapping(rest.get("says"), kind), "anchors": self._stands(floor, p, geometry, kind)}
-                self._solid(kind, p, said)
-                floor.said.setdefault(sections[kind], {})[self._claim(rest.get("id"))] = said
+                element = {**mapping(members.get("says"), kind), "anchors": self._stands(floor, p, geometry, kind)}
+                self._solid(kind, p, element)
+                floor.said.setdefault(sections[kind], {})[self._claim(members.get("id"))] = element
                 self.lost["bends of walls and doors"] += len(geometry.coords) > 2
             elif kind == "floor" and not geometry.is_empty:
-                self._floors(floor, p, geometry, rest)
+                self._floors(floor, p, geometry, members)
             elif kind == "measurement" and lines:
-                self._measurement(floor, p, geometry, rest)
+                self._measurement(floor, p, geometry, members)
             elif kind == "fiducial" and point:
-                self._fiducial(floor, p, geometry, rest)
+                self._fiducial(floor, p, geometry, members)
             elif kind in ("model", "robot") and point:
-                self._model(floor, kind, p, geometry, rest)
+                self._model(floor, kind, p, geometry, members)
             elif kind != "lift":
                 self.lost["objects that are no part of a site"] += 1
 
@@ -499,8 +511,14 @@ class _Writer:
             def order(k: int, part: Features = part) -> tuple[str, bool, int, int, str]:
                 p = part.properties[k]
                 at = own(p, BUILDING).get("index", own(p, NAV_GRAPH).get("index"))
-                known = isinstance(at, int)
-                return (str(p.get("kind")), not known, at if isinstance(at, int) else 0, len(part.ids[k]), part.ids[k])
+                has_position = isinstance(at, int)
+                return (
+                    str(p.get("kind")),
+                    not has_position,
+                    at if isinstance(at, int) else 0,
+                    len(part.ids[k]),
+                    part.ids[k],
+                )
 
             for k in sorted(range(len(part)), key=order):
                 yield str(part.properties[k].get("kind")), part.properties[k], geometry[k], part.ids[k]
@@ -526,28 +544,28 @@ class _Writer:
         if form is not None and not _near(place(form, category, "anchor"), xy):
             form = None
         spot = _spot(xy)
-        if (found := floor.by_place.get(spot)) is not None and form is None:
-            return int(found)
-        made = self._claim(hint)
-        floor.anchors[made] = form or _rmf_site.said_anchor([*xy, 0.0], None)
-        floor.by_place.setdefault(spot, made)
-        return int(made)
+        if (existing := floor.by_place.get(spot)) is not None and form is None:
+            return int(existing)
+        anchor = self._claim(hint)
+        floor.anchors[anchor] = form or _rmf_site.said_anchor([*xy, 0.0], None)
+        floor.by_place.setdefault(spot, anchor)
+        return int(anchor)
 
-    def _solid(self, kind: str, p: Properties, said: dict[str, Any]) -> None:
+    def _solid(self, kind: str, p: Properties, element: dict[str, Any]) -> None:
         """A door's kind, a wall's texture, and the heights of both."""
         parameters = mapping(own(p, BUILDING).get("parameters"), "parameters")
         if kind == "door":
-            said["name"] = str(p.get("name") or value_of(parameters, "name") or "")
+            element["name"] = str(p.get("name") or value_of(parameters, "name") or "")
             was = str(value_of(parameters, "type", "hinged"))
             self.lost["telescope doors, written as sliding ones"] += was.endswith("telescope")
-            said["kind"] = _rmf_site.door_kind(parameters, said.get("kind"))
-        elif "texture" not in said and (group := _rmf_site.texture_group(parameters, kind)) is not None:
-            said["texture"] = int(self._texture(group))
-        for word, member in (("height", "top"), ("base", "bottom")):
-            now, was_said = p.get(word), said.get(member)
-            fixed = _rmf_site.height(was_said, member)
+            element["kind"] = _rmf_site.door_kind(parameters, element.get("kind"))
+        elif "texture" not in element and (group := _rmf_site.texture_group(parameters, kind)) is not None:
+            element["texture"] = int(self._texture(group))
+        for key, member in (("height", "top"), ("base", "bottom")):
+            now, source_value = p.get(key), element.get(member)
+            fixed = _rmf_site.height(source_value, member)
             if isinstance(now, (int, float)) and not isinstance(now, bool) and now > 0 and now != fixed:
-                said[member] = {"fixed": float(now)}
+                element[member] = {"fixed": float(now)}
 
     def _texture(self, group: dict[str, Any]) -> str:
         key = _key(group)
@@ -556,63 +574,70 @@ class _Writer:
             self.textures[self.texture_ids[key]] = group
         return self.texture_ids[key]
 
-    def _floors(self, floor: _Floor, p: Properties, geometry: Any, rest: Mapping[str, Any]) -> None:
+    def _floors(self, floor: _Floor, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
         pieces = list(geometry.geoms) if geometry.geom_type == "MultiPolygon" else [geometry]
         for k, piece in enumerate(pieces):
             ring = shapely.Polygon(piece.exterior) if piece.geom_type == "Polygon" else piece
             self.lost["holes in floors"] += len(getattr(piece, "interiors", ()))
-            said = {**mapping(rest.get("says"), "floor"), "anchors": self._stands(floor, p, ring, "floor")}
+            element = {**mapping(members.get("says"), "floor"), "anchors": self._stands(floor, p, ring, "floor")}
             parameters = mapping(own(p, BUILDING).get("parameters"), "parameters")
-            if "texture" not in said and (group := _rmf_site.texture_group(parameters, "floor")) is not None:
-                said["texture"] = int(self._texture(group))
-            floor.said.setdefault("floors", {})[self._claim(None if k else rest.get("id"))] = said
+            if "texture" not in element and (group := _rmf_site.texture_group(parameters, "floor")) is not None:
+                element["texture"] = int(self._texture(group))
+            floor.said.setdefault("floors", {})[self._claim(None if k else members.get("id"))] = element
 
     # drawings
 
     def _drawings_of(self, floor: _Floor) -> None:
         """The drawings of the level's source, without what stands on them."""
-        found = {
-            i: {**said, "anchors": dict(mapping(said.get("anchors"), "anchors"))}
-            for i, said in mapping(floor.document.get("drawings"), "drawings").items()
+        drawings = {
+            i: {**drawing, "anchors": dict(mapping(drawing.get("anchors"), "anchors"))}
+            for i, drawing in mapping(floor.document.get("drawings"), "drawings").items()
         }
-        self.claimed.update(_ids_of({"drawings": found}))
+        self.claimed.update(_ids_of({"drawings": drawings}))
         drawing = mapping(mapping(floor.storey.document.get("level"), "level").get("drawing"), "drawing")
         turn = floor.storey.document.get("transform")
         file = drawing.get("filename")
-        if not found and isinstance(file, str) and file and isinstance(turn, list) and len(turn) == 4 and turn[0] > 0:
+        if (
+            not drawings
+            and isinstance(file, str)
+            and file
+            and isinstance(turn, list)
+            and len(turn) == 4
+            and turn[0] > 0
+        ):
             pose = _rmf_site.said_pose([turn[2], turn[3], 0.0, 0.0, 0.0, turn[1]], None)
             properties = {"name": PurePosixPath(file).stem, "source": {"Local": file}, "pose": pose}
             properties["pixels_per_meter"] = 1.0 / turn[0]
             i = self._claim()
-            found[i] = {"properties": properties, "transform": list(turn), "anchors": {}}
+            drawings[i] = {"properties": properties, "transform": list(turn), "anchors": {}}
             floor.said["rankings"] = {"drawings": [int(i)]}
-        if found:
-            floor.said["drawings"] = found
+        if drawings:
+            floor.said["drawings"] = drawings
 
     def _drawings(self, floor: _Floor) -> None:
         """The images that drawings name."""
-        for i, said in mapping(floor.said.get("drawings"), "drawings").items():
-            said.pop("transform", None)
-            where = f"levels.{floor.id}.drawings.{i}.properties.source"
-            properties = mapping(said.get("properties"), where)
-            kind, name = _rmf_site.asset(properties.get("source"), where)
+        for i, drawing in mapping(floor.said.get("drawings"), "drawings").items():
+            drawing.pop("transform", None)
+            location = f"levels.{floor.id}.drawings.{i}.properties.source"
+            properties = mapping(drawing.get("properties"), location)
+            kind, name = _rmf_site.asset(properties.get("source"), location)
             if not name or kind not in ("Local", "Remote"):
                 continue
             file = stored(name, self.resources)
             if file is None:
                 problem = f"the image {name[:200]!r} was not in the upload: it is named and not served"
-                self.context.warn(problem, where=where)
+                self.context.warn(problem, where=location)
                 continue
             self.used[file] = self.resources[file]
             if file != name or kind != "Local":
-                said["properties"] = {**properties, "source": {"Local": file}}
+                drawing["properties"] = {**properties, "source": {"Local": file}}
 
     def _on_drawing(
-        self, floor: _Floor, geometry: Any, rest: Mapping[str, Any]
+        self, floor: _Floor, geometry: Any, members: Mapping[str, Any]
     ) -> tuple[dict[str, Any], list[int]] | None:
         """(drawing, anchors on it) of what is measured in its pixels."""
         drawings = mapping(floor.said.get("drawings"), "drawings")
-        i = str(rest.get("drawing"))
+        i = str(members.get("drawing"))
         i = i if i in drawings else next(iter(drawings), "")
         if i not in drawings:
             self.lost["measurements and fiducials of levels without a drawing"] += 1
@@ -622,120 +647,126 @@ class _Writer:
         c, s = math.cos(turn) / scale, math.sin(turn) / scale
         at = shapely.get_coordinates(geometry) - np.array([x, y])
         pixels = np.column_stack([c * at[:, 0] + s * at[:, 1], -s * at[:, 0] + c * at[:, 1]])
-        hints = rest.get("anchors")
+        hints = members.get("anchors")
         hints = hints if isinstance(hints, list) and len(hints) == len(pixels) else [None] * len(pixels)
         ids = []
         for place_, hint in zip(pixels.tolist(), hints, strict=True):
-            said = {"Translate2D": [metres(v) for v in place_]}
+            anchor = {"Translate2D": [metres(v) for v in place_]}
             key = str(hint)
-            if key not in drawing["anchors"] or drawing["anchors"][key] != said:
+            if key not in drawing["anchors"] or drawing["anchors"][key] != anchor:
                 key = self._claim(hint)
-                drawing["anchors"][key] = said
+                drawing["anchors"][key] = anchor
             ids.append(int(key))
         return drawing, ids
 
-    def _measurement(self, floor: _Floor, p: Properties, geometry: Any, rest: Mapping[str, Any]) -> None:
+    def _measurement(self, floor: _Floor, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
         ends = shapely.LineString([geometry.coords[0][:2], geometry.coords[-1][:2]])
-        found = self._on_drawing(floor, ends, rest)
-        if found is None:
+        placement = self._on_drawing(floor, ends, members)
+        if placement is None:
             return
-        drawing, anchors = found
+        drawing, anchors = placement
         distance = value_of(own(p, BUILDING).get("parameters"), "distance")
-        known = {} if distance is None else {"distance": distance}
-        said = {**mapping(rest.get("says"), "measurement"), "anchors": anchors, **known}
-        drawing.setdefault("measurements", {})[self._claim(rest.get("id"))] = said
+        length = {} if distance is None else {"distance": distance}
+        element = {**mapping(members.get("says"), "measurement"), "anchors": anchors, **length}
+        drawing.setdefault("measurements", {})[self._claim(members.get("id"))] = element
 
-    def _fiducial(self, floor: _Floor, p: Properties, geometry: Any, rest: Mapping[str, Any]) -> None:
-        found = self._on_drawing(floor, geometry, rest)
-        if found is None:
+    def _fiducial(self, floor: _Floor, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
+        placement = self._on_drawing(floor, geometry, members)
+        if placement is None:
             return
-        drawing, (anchor,) = found
-        said = {**mapping(rest.get("says"), "fiducial"), "anchor": anchor}
+        drawing, (anchor,) = placement
+        element = {**mapping(members.get("says"), "fiducial"), "anchor": anchor}
         name = str(p.get("name") or "")
-        if self.groups.get(str(said.get("affiliation")), {}).get("name", "") != name:
-            said.pop("affiliation", None)
+        if self.groups.get(str(element.get("affiliation")), {}).get("name", "") != name:
+            element.pop("affiliation", None)
             if name:
-                said["affiliation"] = int(self._named(self.groups, self.group_ids, name))
-        drawing.setdefault("fiducials", {})[self._claim(rest.get("id"))] = said
+                element["affiliation"] = int(self._named(self.groups, self.group_ids, name))
+        drawing.setdefault("fiducials", {})[self._claim(members.get("id"))] = element
 
     # models
 
-    def _model(self, floor: _Floor, kind: str, p: Properties, geometry: Any, rest: Mapping[str, Any]) -> None:
-        said = mapping(rest.get("says"), "model")
+    def _model(self, floor: _Floor, kind: str, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
+        element = mapping(members.get("says"), "model")
         building = mapping(own(p, BUILDING).get("says"), "model")
         pose = _rmf.pose_of(p) or [0.0, 0.0, floor.elevation, 0.0, 0.0, float(building.get("yaw") or 0.0)]
         now = [geometry.x, geometry.y, metres(pose[2] - floor.elevation), *pose[3:]]
         name = str(p.get("name") or "")
         static = building.get("static") is True
-        self._instance(floor, name, now, said, rest.get("id"), str(building.get("model_name") or name), static, kind)
+        self._instance(
+            floor, name, now, element, members.get("id"), str(building.get("model_name") or name), static, kind
+        )
 
     def _instance(
         self,
         floor: _Floor,
         name: str,
         now: Sequence[float],
-        said: Mapping[str, Any],
-        wanted: Any,
+        element: Mapping[str, Any],
+        hint: Any,
         model: str,
         static: bool,
         kind: str,
     ) -> None:
         """A model in its place, and its description where the site has none."""
-        known = str(said.get("description"))
-        if known not in self.descriptions:
-            source = said.get("source", {"Search": model})
-            is_static = said.get("is_static", static) is True
-            known = self._description(source, is_static, said.get("scale"), model, robot=kind == "robot")
-        i = self._claim(wanted)
-        pose = _rmf_site.said_pose(now, said.get("pose"))
+        description = str(element.get("description"))
+        if description not in self.descriptions:
+            source = element.get("source", {"Search": model})
+            is_static = element.get("is_static", static) is True
+            description = self._description(source, is_static, element.get("scale"), model, robot=kind == "robot")
+        i = self._claim(hint)
+        pose = _rmf_site.said_pose(now, element.get("pose"))
         older = ("source", "is_static", "scale")
         self.instances[i] = {
-            **{k: v for k, v in said.items() if k not in older},
-            **{"parent": int(floor.id), "name": name, "pose": pose, "description": int(known)},
+            **{k: v for k, v in element.items() if k not in older},
+            **{"parent": int(floor.id), "name": name, "pose": pose, "description": int(description)},
         }
-        if not said or "source" in said:  # older releases have no scenarios, later ones hide what none includes
+        if not element or "source" in element:  # older releases have no scenarios, later ones hide what none includes
             self.fresh.append(i)
-        elif pose != said.get("pose"):
-            self.moved[i] = (said.get("pose"), pose)
+        elif pose != element.get("pose"):
+            self.moved[i] = (element.get("pose"), pose)
 
     def _description(self, source: Any, static: bool, scale: Any, model: str, *, robot: bool) -> str:
-        said = {"name": PurePosixPath(model).name or model, "source": source}
-        said |= {"is_static": True} if static else {}
-        said |= {} if scale is None else {"scale": scale}
-        key = _key([said, robot])
+        description = {"name": PurePosixPath(model).name or model, "source": source}
+        description |= {"is_static": True} if static else {}
+        description |= {} if scale is None else {"scale": scale}
+        key = _key([description, robot])
         if key not in self.description_ids:
-            found = self.description_ids[key] = self._claim()
-            self.descriptions[found] = said
+            description_id = self.description_ids[key] = self._claim()
+            self.descriptions[description_id] = description
             if robot:
-                self.robot_types[found] = {"properties": {}}
+                self.robot_types[description_id] = {"properties": {}}
         return self.description_ids[key]
 
-    def _robot(self, floor: _Floor, words: Mapping[str, Any], rest: Mapping[str, Any], xyz: Sequence[float]) -> None:
+    def _robot(
+        self, floor: _Floor, parameters: Mapping[str, Any], members: Mapping[str, Any], xyz: Sequence[float]
+    ) -> None:
         """The robot that starts at a node."""
-        name, model = words.get(_rmf.ROBOT), words.get(_rmf.ROBOT_TYPE)
+        name, model = parameters.get(_rmf.ROBOT), parameters.get(_rmf.ROBOT_TYPE)
         if not name or not model:
             self.lost["robots without a name or a type"] += bool(name or model)
             return
-        known = mapping(rest.get("robot"), "robot")
-        said = mapping(known.get("says"), "robot") if known.get("name") == name else {}
+        robot = mapping(members.get("robot"), "robot")
+        element = mapping(robot.get("says"), "robot") if robot.get("name") == name else {}
         now = [xyz[0], xyz[1], 0.0, 0.0, 0.0, 0.0]
-        if said:
-            was = _rmf_site.pose(said.get("pose"), "robot.pose")
+        if element:
+            was = _rmf_site.pose(element.get("pose"), "robot.pose")
             near = math.dist(was[:2], xyz[:2]) <= 1e-3
             now = was if near else [*xyz[:2], *was[2:]]
-        self._instance(floor, str(name), now, said, known.get("id") if said else None, str(model), False, "robot")
+        self._instance(floor, str(name), now, element, robot.get("id") if element else None, str(model), False, "robot")
 
     def _scenarios(self, instances: Mapping[str, Any]) -> dict[str, Any]:
         """The scenarios without the models that are gone, with those that are new in each that starts anew."""
         out: dict[str, Any] = dict(mapping(self.known.get("scenarios"), "scenarios"))
-        gone = {str(i) for i in self.known.get("models") or ()} - instances.keys()
+        removed_ids = {str(i) for i in self.known.get("models") or ()} - instances.keys()
         if self.fresh and not out:
             out[self._claim()] = {"instances": {}, "name": "Default Scenario", "parent_scenario": None}
         for i, scenario in out.items():
-            said = scenario.get("instances")
-            if not isinstance(said, dict) and not self.fresh:
+            modifiers = scenario.get("instances")
+            if not isinstance(modifiers, dict) and not self.fresh:
                 continue
-            listed = {k: self._modifier(k, v) for k, v in mapping(said, "instances").items() if k not in gone}
+            listed = {
+                k: self._modifier(k, v) for k, v in mapping(modifiers, "instances").items() if k not in removed_ids
+            }
             if scenario.get("parent_scenario") is None:
                 for k in self.fresh:
                     one = instances[k]
@@ -743,16 +774,16 @@ class _Writer:
             out[i] = {**scenario, "instances": listed}
         return out
 
-    def _modifier(self, i: str, said: Any) -> Any:
+    def _modifier(self, i: str, modifier: Any) -> Any:
         old, new = self.moved.get(i, (None, None))
-        moves = isinstance(said, dict) and new is not None and said.get("pose") == old
-        return {**said, "pose": new} if moves else said
+        moves = isinstance(modifier, dict) and new is not None and modifier.get("pose") == old
+        return {**modifier, "pose": new} if moves else modifier
 
     # lifts
 
     def _lifts(self) -> None:
         """The lifts of all levels, in the order of their file."""
-        found = []
+        lifts = []
         for floor in self.floors:
             for kind, p, geometry, i in self._items(floor):
                 if kind != "lift":
@@ -761,26 +792,26 @@ class _Writer:
                     self.lost["lifts without a point"] += 1
                     continue
                 at = own(p, BUILDING).get("index")
-                found.append((not isinstance(at, int), at if isinstance(at, int) else 0, i, floor, p, geometry))
-        for _, _, i, floor, p, geometry in sorted(found, key=lambda item: item[:3]):
+                lifts.append((not isinstance(at, int), at if isinstance(at, int) else 0, i, floor, p, geometry))
+        for _, _, i, floor, p, geometry in sorted(lifts, key=lambda item: item[:3]):
             self.lifts.setdefault(str(p.get("name") or i), self._lift(floor, p, geometry, i))
 
     def _lift(self, floor: _Floor, p: Properties, geometry: Any, i: str) -> _Lift:
-        rest = self._rest(floor, p)
+        members = self._rest(floor, p)
         building = mapping(own(p, BUILDING).get("says"), "lift")
         pose = _rmf.pose_of(p)
         yaw = pose[5] if pose is not None else float(building.get("yaw") or 0.0)
         depth, width = _rmf.size_of(p) or (1.0, 1.0)
-        said = dict(mapping(rest.get("says"), "lift"))
-        was = rest.get("was")
+        lift = dict(mapping(members.get("says"), "lift"))
+        was = members.get("was")
         now = [geometry.x, geometry.y, yaw, depth, width]
-        self.claimed.update(_ids_of(said))
-        cabin_anchors: dict[str, Any] = dict(mapping(said.get("cabin_anchors"), "cabin_anchors"))
-        properties = dict(mapping(said.get("properties"), "properties"))
-        rect = dict(_rmf_site.rectangle(properties, "cabin")) if said else {}
+        self.claimed.update(_ids_of(lift))
+        cabin_anchors: dict[str, Any] = dict(mapping(lift.get("cabin_anchors"), "cabin_anchors"))
+        properties = dict(mapping(lift.get("properties"), "properties"))
+        rect = dict(_rmf_site.rectangle(properties, "cabin")) if lift else {}
         rect |= {"depth": depth, "width": width}
-        cabin_doors = said.get("cabin_doors")
-        if not said:
+        cabin_doors = lift.get("cabin_doors")
+        if not lift:
             cabin_doors = self._cabin_doors(rect, cabin_anchors, building)
             start = next((f for f in self.floors if f.storey.name == building.get("initial_floor_name")), None)
             properties |= {"is_static": building.get("plugins") is False}
@@ -795,7 +826,7 @@ class _Writer:
             for key, at in zip(keys, cabin.ends(), strict=True):
                 self.anchors[key] = _rmf_site.said_anchor(at, None)
             properties["reference_anchors"] = [int(key) for key in keys]
-        element = {**said, "cabin_doors": cabin_doors, "properties": properties, "id": self._claim(rest.get("id"))}
+        element = {**lift, "cabin_doors": cabin_doors, "properties": properties, "id": self._claim(members.get("id"))}
         return _Lift(cabin, element, cabin_anchors)
 
     def _cabin_doors(
@@ -823,8 +854,8 @@ class _Writer:
     # the report
 
     def _report(self) -> None:
-        for what, count in sorted(self.lost.items()):
-            self.context.drop(what, count, "a site has no place for it")
+        for noun, count in sorted(self.lost.items()):
+            self.context.drop(noun, count, "a site has no place for it")
         if self.made["lanes"]:
             why = f"{self.made['lanes']} edges come from another format"
             self.context.fill("lanes: graphs", self.options.graph, why, "graph")
@@ -838,7 +869,7 @@ class _Writer:
 
 def _by_name(groups: Mapping[str, Any]) -> dict[str, str]:
     """The id of the first group of each name."""
-    return {str(said.get("name")): i for i, said in reversed(list(groups.items()))}
+    return {str(group.get("name")): i for i, group in reversed(list(groups.items()))}
 
 
 def _near(a: Sequence[float], b: Sequence[float]) -> bool:
@@ -858,8 +889,8 @@ def _words(p: Properties) -> dict[str, Any]:
 
 def _document(storey: Storey) -> dict[str, Any]:
     """What the level's parts say as parts of a site."""
-    found = (part.document.get(NAME) for part in (*storey.objects, *storey.networks))
-    return next((said for said in found if isinstance(said, dict)), {})
+    documents = (part.document.get(NAME) for part in (*storey.objects, *storey.networks))
+    return next((document for document in documents if isinstance(document, dict)), {})
 
 
 def _nodes_of(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Properties]]:
@@ -874,8 +905,8 @@ def _ids_of(value: Any) -> set[str]:
     """The ids of the elements in mappings, wherever they stand; a scenario's are those of models elsewhere."""
     if not isinstance(value, dict):
         return set()
-    found = {k for k in value if k.isascii() and k.isdigit()}
-    return found.union(*(_ids_of(v) for k, v in value.items() if k not in ("extensions", "tasks", "instances")))
+    ids = {k for k in value if k.isascii() and k.isdigit()}
+    return ids.union(*(_ids_of(v) for k, v in value.items() if k not in ("extensions", "tasks", "instances")))
 
 
 def _ids(documents: Iterable[Mapping[str, Any]], storeys: Iterable[Storey], same: set[str]) -> set[str]:
@@ -889,9 +920,14 @@ def _ids(documents: Iterable[Mapping[str, Any]], storeys: Iterable[Storey], same
             continue
         for part in (*storey.objects, *storey.networks):
             for p in part.properties:
-                rest = own(p, NAME)
-                listed = rest.get("anchors")
-                ids = [rest.get("id"), rest.get("lane"), rest.get("anchor"), mapping(rest.get("robot"), "").get("id")]
+                members = own(p, NAME)
+                listed = members.get("anchors")
+                ids = [
+                    members.get("id"),
+                    members.get("lane"),
+                    members.get("anchor"),
+                    mapping(members.get("robot"), "").get("id"),
+                ]
                 out.update(str(i) for i in [*ids, *(listed if isinstance(listed, list) else ())] if i is not None)
-                out |= _ids_of({k: v for k, v in rest.items() if k in ("locations", "says")})
+                out |= _ids_of({k: v for k, v in members.items() if k in ("locations", "says")})
     return out

@@ -70,8 +70,8 @@ class _Parser:
     def document(self) -> Any:
         """The only value of the text."""
         self._space()
-        while found := _ATTRIBUTE.match(self._text, self._at):
-            self._at = found.end()
+        while match := _ATTRIBUTE.match(self._text, self._at):
+            self._at = match.end()
             self._space()
         self._next()
         out = self._any(0)
@@ -81,15 +81,15 @@ class _Parser:
 
     def _fail(self, reason: str) -> NoReturn:
         line = self._text.count("\n", 0, self._start) + 1
-        said = f"not RON: {reason}"
-        raise UnreadableFile(f"line {line}: {said}", [Problem(said, line=line)])
+        problem = f"not RON: {reason}"
+        raise UnreadableFile(f"line {line}: {problem}", [Problem(problem, line=line)])
 
     def _space(self) -> None:
         """Skip blanks and comments; those between ``/*`` and ``*/`` may be nested."""
-        while (found := _TOKEN.match(self._text, self._at)) and found.lastgroup in ("space", "comment"):
-            self._at = found.end()
-            if found.lastgroup == "comment":
-                self._start, depth = found.start(), 1
+        while (match := _TOKEN.match(self._text, self._at)) and match.lastgroup in ("space", "comment"):
+            self._at = match.end()
+            if match.lastgroup == "comment":
+                self._start, depth = match.start(), 1
                 for mark in _COMMENT.finditer(self._text, self._at):
                     depth += 1 if mark.group() == "/*" else -1
                     if not depth:
@@ -104,12 +104,12 @@ class _Parser:
         if self._at >= len(self._text):
             self._kind, self._value = "end", ""
             return
-        found = _TOKEN.match(self._text, self._at)
-        if found is None:
+        match = _TOKEN.match(self._text, self._at)
+        if match is None:
             self._fail(f"{self._text[self._at : self._at + 20]!r} is no part of a value")
-        self._kind, self._value, self._at = str(found.lastgroup), found.group(), found.end()
-        if found["raw"] is not None:
-            closing = '"' + found["hashes"]
+        self._kind, self._value, self._at = str(match.lastgroup), match.group(), match.end()
+        if match["raw"] is not None:
+            closing = '"' + match["hashes"]
             end = self._text.find(closing, self._at)
             if end < 0:
                 self._fail("a raw text does not end")
@@ -148,8 +148,8 @@ class _Parser:
         self._next()
         return out
 
-    def _number(self, said: str) -> int | float:
-        bare = said if said[:3].lower().lstrip("+-").startswith("0x") else _SUFFIX.sub("", said)
+    def _number(self, literal: str) -> int | float:
+        bare = literal if literal[:3].lower().lstrip("+-").startswith("0x") else _SUFFIX.sub("", literal)
         bare = bare.replace("_", "")
         try:
             out: int | float = int(bare, 0) if re.fullmatch(r"[-+]?(?:0[xXbBoO].+|\d{1,20})", bare) else float(bare)
@@ -157,30 +157,30 @@ class _Parser:
             try:
                 out = int(bare, 10)
             except ValueError:
-                self._fail(f"{said[:40]!r} is no number")
+                self._fail(f"{literal[:40]!r} is no number")
         if not math.isfinite(out):
-            self._fail(f"the number {said[:40]!r} is not finite")
+            self._fail(f"the number {literal[:40]!r} is not finite")
         return float(out) if isinstance(out, int) and not -(2**63) <= out < 2**63 else out
 
-    def _unescaped(self, said: str) -> str:
-        said = said.removeprefix("b")[1:-1]
-        if "\\" not in said:
-            return said
+    def _unescaped(self, literal: str) -> str:
+        literal = literal.removeprefix("b")[1:-1]
+        if "\\" not in literal:
+            return literal
 
-        def one(found: re.Match[str]) -> str:
-            code = found[1] or found[2]
+        def one(match: re.Match[str]) -> str:
+            code = match[1] or match[2]
             if code is not None:
                 point = int(code, 16)
                 if point > 0x10FFFF or 0xD800 <= point <= 0xDFFF:
-                    self._fail(f"{found.group()!r} is no character")
+                    self._fail(f"{match.group()!r} is no character")
                 return chr(point)
-            if found[3] is not None:
+            if match[3] is not None:
                 return ""
-            if found[4] not in _PLAIN:
-                self._fail(f"unknown escape {found.group()!r}")
-            return _PLAIN[found[4]]
+            if match[4] not in _PLAIN:
+                self._fail(f"unknown escape {match.group()!r}")
+            return _PLAIN[match[4]]
 
-        return _ESCAPE.sub(one, said)
+        return _ESCAPE.sub(one, literal)
 
     def _word(self, depth: int) -> Any:
         """A word of the language, or a variant or struct with what belongs to it."""
@@ -276,35 +276,35 @@ def dump(value: Any, shape: Shape) -> bytes:
 
 def _written(value: Any, member: str, shape: Shape, depth: int, left: int | None) -> Iterator[str]:
     """The pieces of one value. member: the name it stands under; left: mappings until all is plain JSON, if at all."""
-    known = left != 0
+    in_shape = left != 0
     if isinstance(value, dict):
         yield from _mapping(value, member, shape, depth, shape.free.get(member) if left is None else left)
     elif isinstance(value, (list, tuple)):
-        as_tuple = known and member in shape.tuples and len(value) > 1
+        as_tuple = in_shape and member in shape.tuples and len(value) > 1
         yield "(" if as_tuple else "["
         for k, item in enumerate(value):
             yield ", " if k else ""
             yield from _written(item, member, shape, depth, left)
         yield ")" if as_tuple else "]"
-    elif known and isinstance(value, str) and value in shape.units.get(member, ()):
+    elif in_shape and isinstance(value, str) and value in shape.units.get(member, ()):
         yield value
     else:
         yield _scalar(value)
 
 
 def _mapping(value: Mapping[str, Any], member: str, shape: Shape, depth: int, left: int | None) -> Iterator[str]:
-    known = left != 0
-    if known and len(value) == 1 and (name := next(iter(value))) in shape.variants:
+    in_shape = left != 0
+    if in_shape and len(value) == 1 and (name := next(iter(value))) in shape.variants:
         yield f"{name}("
         yield from _written(value[name], name, shape, depth, left)
         yield ")"
         return
-    named = known and bool(value) and all(_IDENTIFIER.fullmatch(k) and k not in _WORDS for k in value)
+    named = in_shape and bool(value) and all(_IDENTIFIER.fullmatch(k) and k not in _WORDS for k in value)
     struct = named and member not in shape.maps
     begin = "\n" + "  " * (depth + 1)
     yield "(" if struct else "{"
     for key, item in value.items():
-        yield f"{begin}{key if named or (known and _WHOLE.fullmatch(key)) else _scalar(key)}: "
+        yield f"{begin}{key if named or (in_shape and _WHOLE.fullmatch(key)) else _scalar(key)}: "
         yield from _written(item, key, shape, depth + 1, left - 1 if left else left)
         yield ","
     if value:

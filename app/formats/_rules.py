@@ -54,9 +54,9 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def numbers(value: Any, least: int, most: int | None = None) -> bool:
+def numbers(value: Any, minimum: int, maximum: int | None = None) -> bool:
     """A list of that many finite numbers."""
-    return isinstance(value, list) and least <= len(value) <= (most or len(value)) and all(map(is_number, value))
+    return isinstance(value, list) and minimum <= len(value) <= (maximum or len(value)) and all(map(is_number, value))
 
 
 _CPP = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*\Z", re.ASCII)
@@ -100,6 +100,6 @@ def repeated(items: Iterable[Any]) -> list[Any]:
     return [item for item, count in Counter(items).items() if count > 1]
 
 
-def missing(said: Any, keys: Iterable[str]) -> list[str]:
+def missing(members: Any, keys: Iterable[str]) -> list[str]:
     """Which of the keys a mapping lacks."""
-    return [key for key in keys if not isinstance(said, dict) or said.get(key) is None]
+    return [key for key in keys if not isinstance(members, dict) or members.get(key) is None]

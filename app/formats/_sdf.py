@@ -87,8 +87,8 @@ def without_comments(data: bytes) -> bytes:
 def wrong(reason: str, element: etree._Element | None = None, where: str | None = None) -> UnreadableFile:
     """The error for something that cannot be used, with the element's line."""
     line = None if element is None else element.sourceline
-    place = where or (None if element is None else place_of(element))
-    return UnreadableFile(reason, [Problem(reason, line=line, where=place)])
+    location = where or (None if element is None else place_of(element))
+    return UnreadableFile(reason, [Problem(reason, line=line, where=location)])
 
 
 def place_of(element: etree._Element) -> str:
@@ -124,20 +124,20 @@ def warn_of_values(root: etree._Element, context: ReadContext) -> None:
             doubts.setdefault("a <pose> turned by more than 2π: are its angles in radians?", []).append(pose)
     for name in _EXTENTS:
         for extent in root.iter(name):
-            words = text_of(extent).split()
+            tokens = text_of(extent).split()
             if (
-                words
+                tokens
                 and "geometry" in {a.tag for a in extent.iterancestors()}
-                and not any(_FLOAT.match(w) is None or float(w) for w in words)
+                and not any(_FLOAT.match(w) is None or float(w) for w in tokens)
             ):
                 doubts.setdefault(f"a <{name}> of 0: the shape has no extent", []).append(extent)
     for name in _BOOLEANS:
         for flag in root.iter(name):
             if text_of(flag).lower() not in ("0", "1", "true", "false"):
                 doubts.setdefault(f"<{name}> is {text_of(flag)[:40]!r}, which is taken for false", []).append(flag)
-    for reason, found in doubts.items():
-        often = f" ({len(found)} times)" if len(found) > 1 else ""
-        context.warn(f"{reason}{often}", line=found[0].sourceline, where=place_of(found[0]))
+    for reason, elements in doubts.items():
+        often = f" ({len(elements)} times)" if len(elements) > 1 else ""
+        context.warn(f"{reason}{often}", line=elements[0].sourceline, where=place_of(elements[0]))
 
 
 _FLOAT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\Z", re.ASCII)
@@ -155,16 +155,16 @@ def is_true(text: str) -> bool:
     return text.strip().lower() in ("1", "true")
 
 
-def numbers(text: str, element: etree._Element, most: float = MAX_METRES) -> list[float]:
+def numbers(text: str, element: etree._Element, maximum: float = MAX_METRES) -> list[float]:
     """The numbers of a text. Raises UnreadableFile where there is anything else, or one is not finite or too large."""
     out = []
-    for word in text.split():
+    for token in text.split():
         try:
-            value = float(word) if word.isascii() and "_" not in word else math.nan
+            value = float(token) if token.isascii() and "_" not in token else math.nan
         except ValueError:
             value = math.nan
-        if not abs(value) <= most:
-            raise wrong(f"{word[:40]!r} is no finite number within ±{most:g}", element)
+        if not abs(value) <= maximum:
+            raise wrong(f"{token[:40]!r} is no finite number within ±{maximum:g}", element)
         out.append(value + 0.0)
     return out
 
@@ -174,10 +174,10 @@ def vector(element: etree._Element | None, tag: str, count: int, default: Sequen
     child = None if element is None else element.find(tag)
     if child is None or not text_of(child):
         return list(default)
-    found = numbers(text_of(child), child)
-    if len(found) != count:
-        raise wrong(f"<{tag}> must have {count} numbers, it has {len(found)}", child)
-    return found
+    values = numbers(text_of(child), child)
+    if len(values) != count:
+        raise wrong(f"<{tag}> must have {count} numbers, it has {len(values)}", child)
+    return values
 
 
 # --- poses -------------------------------------------------------------------------------------------------------
@@ -205,7 +205,7 @@ def pose_of(parent: etree._Element) -> Pose | None:
     if element is None:
         return None
     values = numbers(text_of(element), element)
-    said = {k: v for k, v in _xml.attributes(element).items() if v and k != "degrees"}
+    attributes = {k: v for k, v in _xml.attributes(element).items() if v and k != "degrees"}
     if element.get("rotation_format") == "quat_xyzw":
         if len(values) not in (0, 7):
             raise wrong(f"a pose with a quaternion must have 7 numbers, it has {len(values)}", element)
@@ -217,7 +217,7 @@ def pose_of(parent: etree._Element) -> Pose | None:
         if is_true(element.get("degrees", "")):
             values[3:] = [math.radians(v) for v in values[3:]]
     relative = element.get("relative_to") or element.get("frame") or ""
-    return Pose(tuple(values), relative, not said and not len(element))
+    return Pose(tuple(values), relative, not attributes and not len(element))
 
 
 def _angles_of(quaternion: Sequence[float], element: etree._Element) -> list[float]:
@@ -287,8 +287,8 @@ class Library:
             if beside is not None and (beside in self.files or self._is_folder(beside)):
                 return beside
         if path.startswith(f"{MODELS}/") and reference.lower().startswith("file://"):
-            found = self._nearest(path, folder)
-            return found or self._nearest(path[len(MODELS) + 1 :], folder)
+            nearest = self._nearest(path, folder)
+            return nearest or self._nearest(path[len(MODELS) + 1 :], folder)
         return self._nearest(path, folder)
 
     def _is_folder(self, path: str) -> bool:
@@ -296,16 +296,16 @@ class Library:
 
     def _nearest(self, path: str, folder: str) -> str | None:
         base = path.rpartition("/")[2]
-        known = [*self._by_base.get(base, ()), *self._folders.get(base, ())]
-        fitting = [name for name in known if name == path or name.endswith("/" + path)]
+        candidates = [*self._by_base.get(base, ()), *self._folders.get(base, ())]
+        fitting = [name for name in candidates if name == path or name.endswith("/" + path)]
         return min(fitting, key=lambda name: (-_shared(name, folder), name.count("/"), name), default=None)
 
-    def root_of(self, reference: str, found: str) -> str:
+    def root_of(self, reference: str, file: str) -> str:
         """The folder around the model that a reference begins with: ``a/b`` for ``model://NAME/x`` in a/b/NAME/x."""
         path = plain_path(reference) or ""
         if reference.lower().startswith("file://") and path.startswith(f"{MODELS}/"):
             path = path[len(MODELS) + 1 :]
-        return found[: -len(path)].rstrip("/") if path and found.endswith(path) else found.rpartition("/")[0]
+        return file[: -len(path)].rstrip("/") if path and file.endswith(path) else file.rpartition("/")[0]
 
     def inside(self, folder: str) -> list[str]:
         """The files of a folder and of those in it, sorted."""
@@ -323,17 +323,17 @@ class Library:
     def model_file(self, folder: str) -> str | None:
         """The SDF file of a model's folder: the newest version that ``model.config`` names, else ``model.sdf``."""
         config = self.files.get(f"{folder}/model.config") or self.files.get(f"{folder}/manifest.xml") or b""
-        found: list[tuple[tuple[int, int], str]] = []
+        candidates: list[tuple[tuple[int, int], str]] = []
         for version, name in _CONFIG.findall(without_comments(config)):
             path = _joined(folder, name.decode("utf-8", "replace").strip())
             if path in self.files and path is not None:
-                said = version_of(version.decode("ascii", "replace"))
-                found.append((said or (0, 0), path))
-        known = [f for f in found if f[0] <= NEWEST] or found
-        if known:
-            return max(known, key=lambda f: f[0])[1]
-        usual = f"{folder}/model.sdf"
-        return usual if usual in self.files else None
+                sdf_version = version_of(version.decode("ascii", "replace"))
+                candidates.append((sdf_version or (0, 0), path))
+        usable = [f for f in candidates if f[0] <= NEWEST] or candidates
+        if usable:
+            return max(usable, key=lambda f: f[0])[1]
+        default_path = f"{folder}/model.sdf"
+        return default_path if default_path in self.files else None
 
 
 _CONFIG = re.compile(rb"<sdf(?:\s+version\s*=\s*[\"']([^\"'<>]{0,20})[\"'])?[^<>]*>([^<>]{1,512})</sdf>")
@@ -369,14 +369,14 @@ def references(data: bytes) -> list[str]:
 
     Also in comments: a model that stands in one for the time being goes along with its world.
     """
-    found: dict[str, None] = {}
+    out: dict[str, None] = {}
     for _, text in _REFERENCE.findall(data):
-        said = text.decode("utf-8", "replace").strip()
+        reference = text.decode("utf-8", "replace").strip()
         for a, b in (("&amp;", "&"), ("&lt;", "<"), ("&gt;", ">"), ("&quot;", '"'), ("&apos;", "'")):
-            said = said.replace(a, b)
-        if ("/" in said or "." in said) and re.search("[A-Za-z]", said):
-            found[said] = None
-    return list(found)
+            reference = reference.replace(a, b)
+        if ("/" in reference or "." in reference) and re.search("[A-Za-z]", reference):
+            out[reference] = None
+    return list(out)
 
 
 def needed(library: Library, main: str, more: Iterable[str] = ()) -> dict[str, str]:
@@ -393,26 +393,26 @@ def needed(library: Library, main: str, more: Iterable[str] = ()) -> dict[str, s
         if name in seen:
             continue
         seen.add(name)
-        said = references(library.files[name]) + extra
+        paths = references(library.files[name]) + extra
         extra = []
-        for reference in said:
-            found = library.find(reference, name)
-            if found is None:
+        for reference in paths:
+            file = library.find(reference, name)
+            if file is None:
                 continue
-            own = name == main and "://" not in reference and found == _joined(main.rpartition("/")[0], reference)
-            root = main.rpartition("/")[0] if own else library.root_of(reference, found)
-            below = found[len(root) + 1 :] if root else found
-            whole = found if own else (root + "/" if root else "") + below.split("/")[0]
-            whole = found if whole in library.files or not library.inside(whole) else whole
-            if not any(whole.startswith(known + "/") for known in roots):
-                roots.setdefault(whole, (root, "" if own else MODELS + "/"))
-            inside = [whole] if whole in library.files else library.inside(whole)
+            is_beside = name == main and "://" not in reference and file == _joined(main.rpartition("/")[0], reference)
+            root = main.rpartition("/")[0] if is_beside else library.root_of(reference, file)
+            below = file[len(root) + 1 :] if root else file
+            entry = file if is_beside else (root + "/" if root else "") + below.split("/")[0]
+            entry = file if entry in library.files or not library.inside(entry) else entry
+            if not any(entry.startswith(prefix + "/") for prefix in roots):
+                roots.setdefault(entry, (root, "" if is_beside else MODELS + "/"))
+            inside = [entry] if entry in library.files else library.inside(entry)
             todo += [n for n in inside if n.lower().endswith(".sdf") and n not in seen]
     out: dict[str, str] = {}
     taken = {"world.sdf"}
-    for whole in sorted(roots, key=lambda w: (w.count("/"), w)):
-        root, folder = roots[whole]
-        for name in library.beside(whole) if whole in library.files else library.inside(whole):
+    for entry in sorted(roots, key=lambda w: (w.count("/"), w)):
+        root, folder = roots[entry]
+        for name in library.beside(entry) if entry in library.files else library.inside(entry):
             path = folder + (name[len(root) + 1 :] if root else name)
             if name == main or name in out or path in taken:
                 continue
@@ -524,20 +524,20 @@ class Unfolder:
                 if inside is None:
                     absent.append(child)
                     continue
-                said = pose_of(child) if child.tag == "include" else inside.pose
+                include_pose = pose_of(child) if child.tag == "include" else inside.pose
                 name = (text_of(child, "name") if child.tag == "include" else name) or inside.name
-                frames.add_model(name, said or inside.pose or ZERO, inside, placement(child, inside), child)
+                frames.add_model(name, include_pose or inside.pose or ZERO, inside, placement(child, inside), child)
                 inner.append((name, inside))
         for link in model.iterchildren("link"):
             at = frames.place(link.get("name", ""))
-            for tag, found in (("collision", out.collisions), ("visual", out.visuals)):
+            for tag, target in (("collision", out.collisions), ("visual", out.visuals)):
                 for part in link.iterchildren(tag):
-                    place = frames.within(pose_of(part), at, part)
+                    pose = frames.within(pose_of(part), at, part)
                     shapes = self.geometry(part.find("geometry"), file)
-                    found += [Shape(words, place) for words in shapes if tag == "collision" or not is_absent(words)]
+                    target += [Shape(shape, pose) for shape in shapes if tag == "collision" or not is_absent(shape)]
         for child in absent:
-            place = frames.within(pose_of(child), np.eye(4), child)
-            out.collisions += [Shape(words, place) for words in absent_model(child)]
+            pose = frames.within(pose_of(child), np.eye(4), child)
+            out.collisions += [Shape(shape, pose) for shape in absent_model(child)]
         for name, inside in inner:
             at = frames.place(name)
             out.collisions += [Shape(s.words, at @ s.place) for s in inside.collisions]
@@ -556,10 +556,10 @@ class Unfolder:
     def include(self, element: etree._Element, file: str) -> Body | None:
         """The model that an ``<include>`` names; None, noted as missing, where the upload does not have it."""
         reference = text_of(element, "uri")
-        found = self.library.find(reference, file) if reference else None
+        target = self.library.find(reference, file) if reference else None
         path = None
-        if found is not None:
-            path = found if found in self.library.files else self.library.model_file(found)
+        if target is not None:
+            path = target if target in self.library.files else self.library.model_file(target)
         if path is None or not is_sdf(self.library.files[path]):
             self.missing(reference)
             return None
@@ -627,8 +627,8 @@ class Unfolder:
             return {"type": tag, "normal": vector(e, "normal", 3, (0.0, 0.0, 1.0)), "size": size}
         if tag in ("mesh", "heightmap"):
             reference = text_of(e, "uri") or text_of(e, "filename")
-            found = self.library.find(reference, file) if reference else None
-            path = self.served.get(found) if found is not None and found in self.library.files else None
+            target = self.library.find(reference, file) if reference else None
+            path = self.served.get(target) if target is not None and target in self.library.files else None
             if path is None:
                 self.missing(reference)
                 return {"type": tag, "uri": reference}
@@ -678,10 +678,10 @@ def _in(error: UnreadableFile | TooLarge, path: str) -> UnreadableFile | TooLarg
 
 
 def _pair(point: etree._Element) -> list[float]:
-    found = numbers(text_of(point), point)
-    if len(found) != 2:
-        raise wrong(f"a point must have 2 numbers, it has {len(found)}", point)
-    return found
+    values = numbers(text_of(point), point)
+    if len(values) != 2:
+        raise wrong(f"a point must have 2 numbers, it has {len(values)}", point)
+    return values
 
 
 def placement(element: etree._Element, inside: Body) -> Matrix | None:
@@ -733,16 +733,18 @@ class _Frames:
             return self._placed[name]
         if name in ("", "__model__", "world", "__root__"):
             return np.eye(4)
-        outer, _, rest = name.partition("::")
-        if rest and outer in self._inner and outer not in chain:
-            found = self._inner[outer].frame(rest)
-            if found is not None:
-                return np.asarray(self.place(outer) @ found, np.float64)
+        outer, _, inner_name = name.partition("::")
+        if inner_name and outer in self._inner and outer not in chain:
+            frame = self._inner[outer].frame(inner_name)
+            if frame is not None:
+                return np.asarray(self.place(outer) @ frame, np.float64)
         element = self._said[chain[-1]][3] if chain else None
         circle = "goes round in a circle" if name in chain else "is not known"
         line = None if element is None else element.sourceline
-        where = None if element is None else place_of(element)
-        self.unfolder.context.warn(f"the frame {name[:80]!r} {circle}: its parent's is taken", line=line, where=where)
+        location = None if element is None else place_of(element)
+        self.unfolder.context.warn(
+            f"the frame {name[:80]!r} {circle}: its parent's is taken", line=line, where=location
+        )
         return np.eye(4)
 
     def within(self, pose: Pose | None, parent: Matrix, element: etree._Element) -> Matrix:
@@ -764,8 +766,8 @@ class _Frames:
         """A frame of this model or, as ``model::frame``, of one in it; None where there is none."""
         if name in self._said:
             return self.place(name)
-        outer, _, rest = name.partition("::")
-        inside = self._inner[outer].frame(rest) if rest and outer in self._inner else None
+        outer, _, inner_name = name.partition("::")
+        inside = self._inner[outer].frame(inner_name) if inner_name and outer in self._inner else None
         return None if inside is None else np.asarray(self.place(outer) @ inside, np.float64)
 
 
@@ -799,9 +801,9 @@ def geometry_element(shape: Mapping[str, Any], uri: str | None) -> etree._Elemen
     element = child(out, kind)
     if kind in ("mesh", "heightmap"):
         child(element, "uri", uri)
-    for word, tag in _WORDS[kind]:
-        if word in shape:
-            value = shape[word]
+    for key, tag in _WORDS[kind]:
+        if key in shape:
+            value = shape[key]
             child(element, tag, words(value if isinstance(value, (list, tuple)) else [value]))
     if kind == "mesh" and shape.get("submesh"):
         part = child(element, "submesh")

@@ -152,8 +152,8 @@ def sun(name: str) -> etree._Element:
 class Bodies:
     """Makes models, collects the files they need, and tells what was made up and what was left out."""
 
-    def __init__(self, context: WriteContext, resources: Mapping[str, bytes], usual: Usual) -> None:
-        self.context, self.resources, self.usual = context, resources, usual
+    def __init__(self, context: WriteContext, resources: Mapping[str, bytes], defaults: Usual) -> None:
+        self.context, self.resources, self.usual = context, resources, defaults
         self.files: dict[str, bytes] = {}
         self.newest = (1, 4)
         self.hilly = False  # whether a height map is the ground
@@ -163,27 +163,27 @@ class Bodies:
 
     def report(self) -> None:
         """Declare what was filled in and dropped so far."""
-        for what, value, why, option in sorted(self._filled, key=lambda told: (told[0], told[2])):
-            self.context.fill(what, list(value) if isinstance(value, tuple) else value, why, option or None)
-        for (what, why), count in sorted(self._lost.items()):
-            self.context.drop(what, count, why)
+        for noun, value, why, option in sorted(self._filled, key=lambda item: (item[0], item[2])):
+            self.context.fill(noun, list(value) if isinstance(value, tuple) else value, why, option or None)
+        for (noun, why), count in sorted(self._lost.items()):
+            self.context.drop(noun, count, why)
         self._filled.clear()
         self._lost.clear()
 
     def model(self, one: Feature, elevation: float, taken: set[str]) -> etree._Element | None:
         """A static model of an object in local metres, or None where it has no body. elevation: metres, its level's."""
-        said = one.properties
-        kind = str(said.get("kind"))
+        properties = one.properties
+        kind = str(properties.get("kind"))
         try:
-            shapes = [dict(s) for s in solids.shapes_of(said)]
-            pose = list(solids.pose_of(said))
+            shapes = [dict(s) for s in solids.shapes_of(properties)]
+            pose = list(solids.pose_of(properties))
         except Invalid as error:
             self._lost[f"objects of kind {kind}", error.detail[:200]] += 1
             return None
         try:
             if shapes:
                 shapes = self._with_files(shapes, kind)
-                if obstacles.role_of(said) == "mark":
+                if obstacles.role_of(properties) == "mark":
                     shapes = [{**shape, "visual": True} for shape in shapes]
             else:
                 shapes, pose = self._from_geometry(one, kind, elevation)
@@ -193,17 +193,17 @@ class Bodies:
         if not shapes:
             self._lost[f"objects of kind {kind}", "no solid is known: supply a height, shapes or a model"] += 1
             return None
-        name = said.get("name")
+        name = properties.get("name")
         name = free_name(name if isinstance(name, str) and name else one.id, taken)
         self._measure(one.geometry)
         self.hilly = self.hilly or any(shape.get("type") == "heightmap" for shape in shapes)
-        return self._static(name, pose, shapes, COLOURS.get(kind), said.get("gazebo"))
+        return self._static(name, pose, shapes, COLOURS.get(kind), properties.get("gazebo"))
 
-    def _taken(self, what: str, option: str, why: str = "the objects tell none", *, otherwise: float = 0.0) -> float:
+    def _taken(self, noun: str, option: str, why: str = "the objects tell none", *, otherwise: float = 0.0) -> float:
         """A measure that the options say, else the other one; it is declared."""
-        chosen = getattr(self.usual, option)
-        value = float(otherwise if chosen is None else chosen)
-        self._filled.add((what, value, why, option))
+        setting = getattr(self.usual, option)
+        value = float(otherwise if setting is None else setting)
+        self._filled.add((noun, value, why, option))
         return value
 
     def _measure(self, geometry: Any) -> None:
@@ -228,9 +228,9 @@ class Bodies:
                 if file not in self.resources:
                     self._lost[f"meshes of objects of kind {kind}", f"{file[:200]} is not stored: upload it"] += 1
                     continue
-                place = file if file.startswith(f"{_sdf.MODELS}/") else f"{_sdf.MODELS}/{file}"
-                self.files[place] = self.resources[file]
-                shape["uri"] = "model://" + place[len(_sdf.MODELS) + 1 :]
+                path = file if file.startswith(f"{_sdf.MODELS}/") else f"{_sdf.MODELS}/{file}"
+                self.files[path] = self.resources[file]
+                shape["uri"] = "model://" + path[len(_sdf.MODELS) + 1 :]
             if shape["type"] in ("capsule", "ellipsoid"):
                 self.newest = max(self.newest, (1, 8))
             try:
@@ -244,37 +244,39 @@ class Bodies:
     def _from_geometry(self, one: Feature, kind: str, elevation: float) -> tuple[list[dict[str, Any]], list[float]]:
         """Shapes and pose of an outline in local metres, as ``app.model.obstacles`` has it; none where no height is
         known. What stands in no way is seen, and nothing collides with it."""
-        said, geometry = one.properties, one.geometry
+        properties, geometry = one.properties, one.geometry
         if shapely.is_empty(geometry):
             return [], []
-        role = obstacles.role_of(said)
-        body = obstacles.body_of(said, geometry, self._width(one)) if role == "outline" or kind == "lift" else None
-        base, top = obstacles.heights_of(said, geometry) if body is None else (body.base, body.top)
+        role = obstacles.role_of(properties)
+        body = (
+            obstacles.body_of(properties, geometry, self._width(one)) if role == "outline" or kind == "lift" else None
+        )
+        base, top = obstacles.heights_of(properties, geometry) if body is None else (body.base, body.top)
         base = base if math.isfinite(base) else 0.0
         middle = np.round(shapely.get_coordinates(shapely.centroid(geometry))[0], 3) + 0.0
         shapes: list[dict[str, Any]] = []
-        if role == "ground" and (area := obstacles.ground_of(said, geometry)) is not None:
-            height = _positive(said.get("height"), 0.0) if kind == "floor" else 0.0
+        if role == "ground" and (area := obstacles.ground_of(properties, geometry)) is not None:
+            height = _positive(properties.get("height"), 0.0) if kind == "floor" else 0.0
             height = height or self._taken(f"thickness of {kind}", "floor_thickness")
             shapes += _lowered(_areas(_around(area, middle), height), height)
         if body is not None:
             height = top - base if math.isfinite(top) else self._height(kind)
             if shapely.get_type_id(geometry) in (1, 5):
-                width, square = self._width(one) or obstacles.width_of(said) or 0.0, kind in obstacles.SQUARE
+                width, square = self._width(one) or obstacles.width_of(properties) or 0.0, kind in obstacles.SQUARE
                 for line in shapely.get_parts(_around(geometry, middle)):
                     shapes += _segments(line, height, width, square=square)
-            elif shapely.get_type_id(geometry) in (0, 4) and obstacles.size_of(said) is None:
-                radius = (self._width(one) or obstacles.width_of(said) or 0.0) / 2
+            elif shapely.get_type_id(geometry) in (0, 4) and obstacles.size_of(properties) is None:
+                radius = (self._width(one) or obstacles.width_of(properties) or 0.0) / 2
                 for x, y in shapely.get_coordinates(_around(geometry, middle)).tolist():
                     pose = [x, y, height / 2, 0.0, 0.0, 0.0]
                     shapes.append({"type": "cylinder", "radius": radius, "length": height, "pose": pose})
             else:
                 shapes += _areas(_around(body.area, middle), height)
         elif role == "mark":
-            shapes += self._drawn(said, kind, _around(geometry, middle), top - base)
+            shapes += self._drawn(properties, kind, _around(geometry, middle), top - base)
         return shapes, [float(middle[0]), float(middle[1]), round(elevation + base, 9) + 0.0, 0.0, 0.0, 0.0]
 
-    def _drawn(self, said: Mapping[str, Any], kind: str, flat: Any, height: float) -> list[dict[str, Any]]:
+    def _drawn(self, properties: Mapping[str, Any], kind: str, flat: Any, height: float) -> list[dict[str, Any]]:
         """What is seen of an outline that stands in no way: as high as it says, a door as it stands open, else a plate
         on the ground; none of a kind that is not drawn and says no height."""
         if not (math.isfinite(height) and height > 0.0):
@@ -291,7 +293,7 @@ class Bodies:
             if shapely.get_dimensions(part) == 2:
                 shapes += _areas(part, height)
             elif shapely.get_dimensions(part) == 1:
-                width = _positive(said.get("width"), 0.0)
+                width = _positive(properties.get("width"), 0.0)
                 width = width or self._taken(f"width of {kind}", "wall_thickness", otherwise=WALL)
                 shapes += _segments(part, height, width, square=False)
         return [{**shape, "visual": True} for shape in shapes]
@@ -317,7 +319,12 @@ class Bodies:
         return 2.0 * self._taken(f"radius of {kind}", "pole_radius", otherwise=default / 2)
 
     def _static(
-        self, name: str, pose: Sequence[float], shapes: Sequence[Mapping[str, Any]], colour: str | None, own: Any
+        self,
+        name: str,
+        pose: Sequence[float],
+        shapes: Sequence[Mapping[str, Any]],
+        colour: str | None,
+        source_properties: Any,
     ) -> etree._Element:
         """A static model with a collision and a visual for each shape, or what of both it has.
 
@@ -328,7 +335,7 @@ class Bodies:
             model.append(_sdf.pose_element(pose))
         _sdf.child(model, "static", "true")
         link = _sdf.child(model, "link", name="link")
-        material = own.get("material") if isinstance(own, Mapping) else None
+        material = source_properties.get("material") if isinstance(source_properties, Mapping) else None
         for k, shape in enumerate(shapes):
             for tag in ("collision", "visual"):
                 if shape.get("visual" if tag == "collision" else "unseen") is True:
@@ -347,8 +354,8 @@ class Bodies:
     def _tinted(self, option: str) -> str:
         """A colour that the options say; it is declared."""
         value: Colour = getattr(self.usual, option)
-        what = next((kind for kind, name in COLOURS.items() if name == option), option.removesuffix("_colour"))
-        self._filled.add((f"colour of {what}", value, "no source tells one", option))
+        noun = next((kind for kind, name in COLOURS.items() if name == option), option.removesuffix("_colour"))
+        self._filled.add((f"colour of {noun}", value, "no source tells one", option))
         return f"{value[0]:g} {value[1]:g} {value[2]:g} 1"
 
     # --- ground and walls ----------------------------------------------------------------------------------------
@@ -391,12 +398,12 @@ class Bodies:
 
 def _colour(shape: Mapping[str, Any]) -> str | None:
     """The colour that a shape tells: three or four numbers from 0 to 1, as Gazebo reads them."""
-    said = shape.get("colour")
-    if not isinstance(said, (list, tuple)) or len(said) not in (3, 4):
+    colour = shape.get("colour")
+    if not isinstance(colour, (list, tuple)) or len(colour) not in (3, 4):
         return None
-    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and 0.0 <= v <= 1.0 for v in said):
+    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and 0.0 <= v <= 1.0 for v in colour):
         return None
-    return _sdf.words([*said, 1.0][:4])
+    return _sdf.words([*colour, 1.0][:4])
 
 
 def _is_script(material: Any) -> bool:
@@ -422,8 +429,8 @@ def _material(visual: etree._Element, colour: str | None, script: Any) -> None:
 
 def _positive(value: Any, otherwise: float) -> float:
     """A number of metres; the other one where there is none. A base may be negative."""
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if good else otherwise
+    usable = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if usable else otherwise
 
 
 def _around(geometry: Any, middle: NDArray[np.float64]) -> Any:

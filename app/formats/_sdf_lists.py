@@ -58,11 +58,11 @@ def detect(name: str, data: bytes) -> bool:
 
 def _custom(library: _sdf.Library, reference: str, near: str) -> str | None:
     """The list or model that a reference names: in ``custom_models`` beside the list first."""
-    for said in (f"custom_models/{reference}", reference):
+    for path in (f"custom_models/{reference}", reference):
         for ending in ("", ".yaml", ".yml"):
-            found = library.find(f"model://{said}{ending}", near)
-            if found is not None and (found in library.files or library.model_file(found) is not None):
-                return found
+            file = library.find(f"model://{path}{ending}", near)
+            if file is not None and (file in library.files or library.model_file(file) is not None):
+                return file
     return None
 
 
@@ -73,15 +73,15 @@ def needed(library: _sdf.Library, main: str) -> list[str]:
     while todo:
         name = todo.pop()
         data = library.files[name]
-        said = [t.decode("utf-8", "replace") for p in (_CUSTOM, _TYPE) for t in p.findall(data)]
-        for reference in dict.fromkeys(said):
-            found = _custom(library, reference, name)
-            if found is None or found in out or found == main:
+        references = [t.decode("utf-8", "replace") for p in (_CUSTOM, _TYPE) for t in p.findall(data)]
+        for reference in dict.fromkeys(references):
+            file = _custom(library, reference, name)
+            if file is None or file in out or file == main:
                 continue
-            if found in library.files:
-                out[found] = None
-                if detect(found, library.files[found]):
-                    todo.append(found)
+            if file in library.files:
+                out[file] = None
+                if detect(file, library.files[file]):
+                    todo.append(file)
             else:
                 out.update(dict.fromkeys(_sdf.needed(library, main, [f"model://{reference}"])))
         meshes = [t.decode("utf-8", "replace") for t in _MESH.findall(data)]
@@ -108,60 +108,64 @@ def read(library: _sdf.Library, main: str, context: ReadContext) -> Found:
     reader = _Reader(library, main, context)
     if isinstance(data, Mapping) and "components" in data:
         reader.components(data["components"])
-        known = {"components"}
+        section_names = {"components"}
     elif isinstance(data, Mapping) and "models" in data:
         reader.models(data["models"], data.get("ground"))
-        known = {"models", "ground"}
+        section_names = {"models", "ground"}
     elif isinstance(data, (list, Mapping)):
         reader.rows(data)
-        known = set(data) if isinstance(data, Mapping) else set()
+        section_names = set(data) if isinstance(data, Mapping) else set()
     else:
         raise _refused("it must be a list of objects", "")
     if isinstance(data, Mapping):
-        reader.found.rest = {"rest": rest} if (rest := {str(k): v for k, v in data.items() if k not in known}) else {}
+        reader.found.rest = (
+            {"rest": extra_members}
+            if (extra_members := {str(k): v for k, v in data.items() if k not in section_names})
+            else {}
+        )
     reader.unfolder.report()
     return reader.found
 
 
-def _refused(reason: str, where: str) -> UnreadableFile:
-    return UnreadableFile(f"{where}: {reason}" if where else reason, [Problem(reason, where=where or None)])
+def _refused(reason: str, location: str) -> UnreadableFile:
+    return UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, where=location or None)])
 
 
-def _number(value: Any, where: str, most: float = MAX_METRES) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
-        raise _refused(f"must be a finite number within ±{most:g}, got {str(value)[:40]!r}", where)
+def _number(value: Any, location: str, maximum: float = MAX_METRES) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= maximum:
+        raise _refused(f"must be a finite number within ±{maximum:g}, got {str(value)[:40]!r}", location)
     return float(value) + 0.0
 
 
-def _members(said: Any, names: Sequence[str], where: str, default: float = 0.0) -> list[float]:
+def _members(members: Any, names: Sequence[str], location: str, default: float = 0.0) -> list[float]:
     """Numbers of a mapping (``{x: …, y: …}``), the default where one is not there."""
-    if said is None:
-        said = {}
-    if not isinstance(said, Mapping):
-        raise _refused(f"must be a mapping with {', '.join(names)}", where)
-    return [_number(said.get(name, default), f"{where}.{name}") for name in names]
+    if members is None:
+        members = {}
+    if not isinstance(members, Mapping):
+        raise _refused(f"must be a mapping with {', '.join(names)}", location)
+    return [_number(members.get(name, default), f"{location}.{name}") for name in names]
 
 
-def _pose(said: Mapping[str, Any], where: str) -> Place:
+def _pose(members: Mapping[str, Any], location: str) -> Place:
     """[x, y, z, roll, pitch, yaw] of ``position`` and ``orientation``."""
-    position = _members(said.get("position"), ("x", "y", "z"), f"{where}.position")
-    turned = _members(said.get("orientation"), ("roll", "pitch", "yaw"), f"{where}.orientation")
+    position = _members(members.get("position"), ("x", "y", "z"), f"{location}.position")
+    turned = _members(members.get("orientation"), ("roll", "pitch", "yaw"), f"{location}.orientation")
     return (*position, *turned)
 
 
-def _text(value: Any, where: str) -> str:
+def _text(value: Any, location: str) -> str:
     text = str(value)
     if isinstance(value, (Mapping, list)) or not text or len(text) > 256 or not is_writable(text):
-        raise _refused("must be a name of 1 to 256 characters without control characters", where)
+        raise _refused("must be a name of 1 to 256 characters without control characters", location)
     return text
 
 
-def _list(said: Any, where: str) -> list[Mapping[str, Any]]:
-    if said is None:
+def _list(items: Any, location: str) -> list[Mapping[str, Any]]:
+    if items is None:
         return []
-    if not isinstance(said, list) or not all(isinstance(item, Mapping) for item in said):
-        raise _refused("must be a list of mappings", where)
-    return said
+    if not isinstance(items, list) or not all(isinstance(item, Mapping) for item in items):
+        raise _refused("must be a list of mappings", location)
+    return items
 
 
 class _Reader:
@@ -174,48 +178,50 @@ class _Reader:
         self._lists: dict[str, list[Mapping[str, Any]]] = {}
         self._count = 0
 
-    def _add(self, name: str, said: dict[str, Any]) -> None:
-        self.found.objects.append((name, said))
+    def _add(self, name: str, properties: dict[str, Any]) -> None:
+        self.found.objects.append((name, properties))
         if len(self.found.objects) > self.context.limits.features:
             raise TooLarge(f"the list has more than {self.context.limits.features} objects")
 
     # components
 
-    def components(self, said: Any) -> None:
+    def components(self, items: Any) -> None:
         """One object for each component of the list itself."""
-        for k, item in enumerate(_list(said, "components")):
-            where = f"components[{k}]"
-            kind, reference = self._type(item, where)
-            anchor = self._anchor(item, where)
-            name = _text(item.get("name", reference.rpartition(".")[0] or reference), f"{where}.name")
-            own = {str(a): b for a, b in item.items() if a not in ("name", "anchor", "position", "orientation", "type")}
-            own["type"] = item["type"]
+        for k, item in enumerate(_list(items, "components")):
+            location = f"components[{k}]"
+            kind, reference = self._type(item, location)
+            anchor = self._anchor(item, location)
+            name = _text(item.get("name", reference.rpartition(".")[0] or reference), f"{location}.name")
+            source_properties = {
+                str(a): b for a, b in item.items() if a not in ("name", "anchor", "position", "orientation", "type")
+            }
+            source_properties["type"] = item["type"]
             if kind == "custom":
-                shapes = list(self._custom(reference, self.main, where, ()))
+                shapes = list(self._custom(reference, self.main, location, ()))
                 pose = list(anchor)
             else:
-                shapes = [self._shape(item, reference, self.main, where)]
-                pose = _sdf.six(matrix(anchor) @ matrix(_pose(item, where)))
-            properties: dict[str, Any] = {"kind": "model", "name": name, "pose": pose, OWN: own}
+                shapes = [self._shape(item, reference, self.main, location)]
+                pose = _sdf.six(matrix(anchor) @ matrix(_pose(item, location)))
+            properties: dict[str, Any] = {"kind": "model", "name": name, "pose": pose, OWN: source_properties}
             if shapes:
                 properties["shapes"] = shapes
             self._add(name, properties)
 
-    def _type(self, item: Mapping[str, Any], where: str) -> tuple[str, str]:
-        said = item.get("type")
-        if not isinstance(said, Mapping) or "reference" not in said:
-            raise _refused("must say {object: custom or primitive, reference: what}", f"{where}.type")
-        return str(said.get("object", "")), _text(said["reference"], f"{where}.type.reference")
+    def _type(self, item: Mapping[str, Any], location: str) -> tuple[str, str]:
+        members = item.get("type")
+        if not isinstance(members, Mapping) or "reference" not in members:
+            raise _refused("must say {object: custom or primitive, reference: what}", f"{location}.type")
+        return str(members.get("object", "")), _text(members["reference"], f"{location}.type.reference")
 
-    def _anchor(self, item: Mapping[str, Any], where: str) -> Place:
-        said = item.get("anchor")
-        if said is None:
+    def _anchor(self, item: Mapping[str, Any], location: str) -> Place:
+        anchor = item.get("anchor")
+        if anchor is None:
             return (0.0,) * 6
-        if not isinstance(said, Mapping):
-            raise _refused("must be a mapping with position and orientation", f"{where}.anchor")
-        return _pose(said, f"{where}.anchor")
+        if not isinstance(anchor, Mapping):
+            raise _refused("must be a mapping with position and orientation", f"{location}.anchor")
+        return _pose(anchor, f"{location}.anchor")
 
-    def _custom(self, reference: str, near: str, where: str, above: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+    def _custom(self, reference: str, near: str, location: str, above: tuple[str, ...]) -> Iterator[dict[str, Any]]:
         """The shapes of a custom object in its own frame."""
         path = _custom(self.library, reference, near)
         if path is None or path not in self.library.files or not detect(path, self.library.files[path]):
@@ -226,19 +232,23 @@ class _Reader:
                 yield {"type": "model", "uri": f"custom_models/{reference}"}
             return
         if path in above or len(above) >= DEEPEST:
-            raise _refused(f"custom object {reference} includes itself, or is nested more than {DEEPEST} deep", where)
+            raise _refused(
+                f"custom object {reference} includes itself, or is nested more than {DEEPEST} deep", location
+            )
         if path not in self._lists:
-            said = _yaml.load(self.library.files[path], self.context.limits)
-            self._lists[path] = _list(said.get("components") if isinstance(said, Mapping) else None, path)
+            document = _yaml.load(self.library.files[path], self.context.limits)
+            self._lists[path] = _list(document.get("components") if isinstance(document, Mapping) else None, path)
         for k, item in enumerate(self._lists[path]):
-            place = f"{reference}: components[{k}]"
-            kind, inner = self._type(item, place)
-            anchor = matrix(self._anchor(item, place))
+            item_location = f"{reference}: components[{k}]"
+            kind, inner = self._type(item, item_location)
+            anchor = matrix(self._anchor(item, item_location))
             if kind == "custom":
-                for shape in self._custom(inner, path, place, (*above, path)):
+                for shape in self._custom(inner, path, item_location, (*above, path)):
                     yield self._placed(shape, anchor @ matrix(shape.get("pose", (0.0,) * 6)))
             else:
-                yield self._placed(self._shape(item, inner, path, place), anchor @ matrix(_pose(item, place)))
+                yield self._placed(
+                    self._shape(item, inner, path, item_location), anchor @ matrix(_pose(item, item_location))
+                )
 
     def _placed(self, shape: Mapping[str, Any], at: _sdf.Matrix) -> dict[str, Any]:
         self._count += 1
@@ -248,21 +258,21 @@ class _Reader:
         pose = _sdf.six(at)
         return out | {"pose": pose} if any(pose) else out
 
-    def _shape(self, item: Mapping[str, Any], reference: str, near: str, where: str) -> dict[str, Any]:
+    def _shape(self, item: Mapping[str, Any], reference: str, near: str, location: str) -> dict[str, Any]:
         """A primitive without its pose; ``visual`` where it says no ``collision``. See ``_sdf.is_absent``."""
         out: dict[str, Any]
         if reference == "sphere":
-            out = {"type": reference, "radius": _number(item.get("radius"), f"{where}.radius")}
+            out = {"type": reference, "radius": _number(item.get("radius"), f"{location}.radius")}
         elif reference == "cylinder":
-            out = {"type": reference, "radius": _number(item.get("radius"), f"{where}.radius")}
-            out["length"] = _number(item.get("length"), f"{where}.length")
+            out = {"type": reference, "radius": _number(item.get("radius"), f"{location}.radius")}
+            out["length"] = _number(item.get("length"), f"{location}.length")
         elif reference == "box":
-            out = {"type": reference, "size": _members(item.get("size"), ("x", "y", "z"), f"{where}.size", 1.0)}
+            out = {"type": reference, "size": _members(item.get("size"), ("x", "y", "z"), f"{location}.size", 1.0)}
         elif reference == "plane":
-            size = [_number(item.get(word), f"{where}.{word}") for word in ("width", "length")]
+            size = [_number(item.get(key), f"{location}.{key}") for key in ("width", "length")]
             out = {"type": reference, "normal": [0.0, 0.0, 1.0], "size": size}
         elif reference == "mesh":
-            uri = _text(item.get("dae"), f"{where}.dae")
+            uri = _text(item.get("dae"), f"{location}.dae")
             self.found.served.update(_sdf.needed(self.library, near, [uri]))
             file = self.library.find(uri, near)
             path = self.found.served.get(file) if file is not None else None
@@ -278,32 +288,38 @@ class _Reader:
 
     # models
 
-    def models(self, said: Any, ground: Any) -> None:
+    def models(self, models: Any, ground: Any) -> None:
         """Instances of models, and the ground."""
         if isinstance(ground, Mapping) and ground.get("flat") is True:
-            size = [_number(ground.get(word), f"ground.{word}") for word in ("width", "height")]
+            size = [_number(ground.get(key), f"ground.{key}") for key in ("width", "height")]
             plane = {"type": "plane", "normal": [0.0, 0.0, 1.0], "size": size}
             pose = [0.0] * 6
-            own = {"ground": dict(ground)}
+            source_properties = {"ground": dict(ground)}
             self._add(
-                "ground_plane", {"kind": "model", "name": "ground_plane", "pose": pose, "shapes": [plane], OWN: own}
+                "ground_plane",
+                {"kind": "model", "name": "ground_plane", "pose": pose, "shapes": [plane], OWN: source_properties},
             )
         elif ground is not None:
             self.found.rest["ground"] = ground
         items: list[tuple[Any, Any]]
-        if isinstance(said, Mapping):
-            items = [(name, item) for name, item in said.items()]
+        if isinstance(models, Mapping):
+            items = [(name, item) for name, item in models.items()]
         else:
-            items = [(item.get("name"), item) for item in _list(said, "models")]
+            items = [(item.get("name"), item) for item in _list(models, "models")]
         for k, (called, item) in enumerate(items):
-            where = f"models[{k}]"
+            location = f"models[{k}]"
             if not isinstance(item, Mapping):
-                raise _refused("must be a mapping with type, position and orientation", where)
-            name = _text(called, f"{where}.name")
-            kind = _text(item.get("type"), f"{where}.type")
-            own = {str(a): b for a, b in item.items() if a not in ("name", "position", "orientation")}
-            properties: dict[str, Any] = {"kind": "model", "name": name, "pose": list(_pose(item, where)), OWN: own}
-            if shapes := list(self._custom(kind, self.main, where, ())):
+                raise _refused("must be a mapping with type, position and orientation", location)
+            name = _text(called, f"{location}.name")
+            kind = _text(item.get("type"), f"{location}.type")
+            source_properties = {str(a): b for a, b in item.items() if a not in ("name", "position", "orientation")}
+            properties: dict[str, Any] = {
+                "kind": "model",
+                "name": name,
+                "pose": list(_pose(item, location)),
+                OWN: source_properties,
+            }
+            if shapes := list(self._custom(kind, self.main, location, ())):
                 properties["shapes"] = shapes
             self._add(name, properties)
 
@@ -315,32 +331,32 @@ class _Reader:
         if body is None:
             self.unfolder.missing(f"custom_models/{reference}")
             return [{"type": "model", "uri": f"custom_models/{reference}"}]
-        own = _sdf.ZERO if body.pose is None else body.pose
-        return [self._placed(s, own.matrix @ matrix(s.get("pose", (0.0,) * 6))) for s in body.shapes()]
+        body_pose = _sdf.ZERO if body.pose is None else body.pose
+        return [self._placed(s, body_pose.matrix @ matrix(s.get("pose", (0.0,) * 6))) for s in body.shapes()]
 
     # rows
 
-    def rows(self, said: Any, path: tuple[str, ...] = ()) -> None:
+    def rows(self, node: Any, path: tuple[str, ...] = ()) -> None:
         """Obstacles: every mapping with ``coordinates``, however deep, called by the names above it."""
-        if isinstance(said, Mapping):
-            if isinstance(said.get("coordinates"), list):
-                self._row(said, path)
+        if isinstance(node, Mapping):
+            if isinstance(node.get("coordinates"), list):
+                self._row(node, path)
                 return
-            for name, inner in said.items():
+            for name, inner in node.items():
                 self.rows(inner, (*path, str(name)))
-        elif isinstance(said, list):
-            for inner in said:
+        elif isinstance(node, list):
+            for inner in node:
                 self.rows(inner, path)
-        elif said is not None:
-            raise _refused(f"must be rows with coordinates, got {str(said)[:40]!r}", "/".join(path))
+        elif node is not None:
+            raise _refused(f"must be rows with coordinates, got {str(node)[:40]!r}", "/".join(path))
 
-    def _row(self, said: Mapping[str, Any], path: tuple[str, ...]) -> None:
-        where = "/".join(path)
-        yaw = math.remainder(_number(said.get("orientation", 0.0), f"{where}.orientation"), math.tau)
-        own = {str(k): v for k, v in said.items() if k not in ("coordinates", "orientation")}
-        own["row"] = where
-        for k, item in enumerate(said["coordinates"]):
-            position = _members(item, ("x", "y", "z"), f"{where}[{k}]")
-            name = _text(f"{where}/{k}".strip("/"), where)
+    def _row(self, row: Mapping[str, Any], path: tuple[str, ...]) -> None:
+        location = "/".join(path)
+        yaw = math.remainder(_number(row.get("orientation", 0.0), f"{location}.orientation"), math.tau)
+        source_properties = {str(k): v for k, v in row.items() if k not in ("coordinates", "orientation")}
+        source_properties["row"] = location
+        for k, item in enumerate(row["coordinates"]):
+            position = _members(item, ("x", "y", "z"), f"{location}[{k}]")
+            name = _text(f"{location}/{k}".strip("/"), location)
             pose = [*position, 0.0, 0.0, yaw]
-            self._add(name, {"kind": "obstacle", "name": name, "pose": pose, OWN: own})
+            self._add(name, {"kind": "obstacle", "name": name, "pose": pose, OWN: source_properties})

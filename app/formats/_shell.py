@@ -89,50 +89,50 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
         reason = f"not UTF-8 text (byte 0x{error.object[error.start]:02x}); save the file as UTF-8"
         line = error.object.count(b"\n", 0, error.start) + 1
         raise UnreadableFile(f"line {line}: {reason}", [Problem(reason, line=line)]) from error
-    known: dict[str, str] = {}
+    variables: dict[str, str] = {}
     warnings: list[str] = []
-    others: list[int] = []
-    told: set[str] = set()
+    other_lines: list[int] = []
+    names_with_warning: set[str] = set()
     at, line, depth = 0, 1, 0
     while at < len(text):
-        found = _literals(text, at) if depth == 0 else None
-        if found is not None:
-            values, end = found
+        literals = _literals(text, at) if depth == 0 else None
+        if literals is not None:
+            values, end = literals
             for name, value in values.items():
-                reason = _unfit(name, value, known)
+                reason = _unfit(name, value, variables)
                 if reason:
-                    known.pop(name, None)
+                    variables.pop(name, None)
                     warnings.append(f"line {line}: {name} is left out: {reason}")
                 else:
-                    known[name] = value
+                    variables[name] = value
         else:
             end, depth, touched, leaves = _command(text, at, depth)
             for name in touched:
-                known.pop(name, None)
-                if name not in told:
+                variables.pop(name, None)
+                if name not in names_with_warning:
                     warnings.append(f"line {line}: {name} is left out: only a shell could say what it is")
-                told.add(name)
+                names_with_warning.add(name)
             if not touched:
-                others.append(line)
+                other_lines.append(line)
             if leaves and end < len(text):
                 warnings.append(f"line {line}: the file ends here, what follows is never reached")
                 break
         line += text.count("\n", at, end)
         at = end
-    if others:
-        many = f"{len(others)} commands are" if len(others) > 1 else "a command is"
-        warnings.append(f"line {others[0]}: {many} not an assignment of a literal and left out")
+    if other_lines:
+        many = f"{len(other_lines)} commands are" if len(other_lines) > 1 else "a command is"
+        warnings.append(f"line {other_lines[0]}: {many} not an assignment of a literal and left out")
     if len(warnings) > MAX_WARNINGS:
         warnings = [*warnings[:MAX_WARNINGS], f"and {len(warnings) - MAX_WARNINGS} more like these"]
-    return known, warnings
+    return variables, warnings
 
 
 def handed_on(variables: object) -> tuple[dict[str, str], list[str], list[str]]:
     """Stored variables that robots may source; the names that say where files are; why others are left out."""
-    given = variables.items() if isinstance(variables, Mapping) else ()
+    items = variables.items() if isinstance(variables, Mapping) else ()
     out: dict[str, str] = {}
     of_files, reasons = [], []
-    for name, value in given:
+    for name, value in items:
         if not isinstance(name, str) or not isinstance(value, str):
             continue
         if name in OF_FILES:
@@ -159,7 +159,7 @@ def exports(values: Mapping[str, str]) -> bytes:
     return "".join(lines).encode()
 
 
-def _unfit(name: str, value: str, known: Mapping[str, str]) -> str:
+def _unfit(name: str, value: str, variables: Mapping[str, str]) -> str:
     """Why this variable is not handed on, or an empty text."""
     if _DANGEROUS.fullmatch(name):
         return "the variable decides how programs run"
@@ -167,7 +167,7 @@ def _unfit(name: str, value: str, known: Mapping[str, str]) -> str:
         return "its value has control characters"
     if len(value) > MAX_VALUE:
         return f"its value has more than {MAX_VALUE} characters"
-    if len(known) >= MAX_VARIABLES and name not in known:
+    if len(variables) >= MAX_VARIABLES and name not in variables:
         return f"the file has more than {MAX_VARIABLES} variables"
     return ""
 
@@ -224,22 +224,24 @@ def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], bool]
         if piece is None:  # every character matches the last alternative
             break
         at = piece.end()
-        word, sign = piece["word"], piece["sign"]
+        token, sign = piece["word"], piece["sign"]
         if piece["here"]:
             heres.append(piece["here"])
         if sign in ("{", "}") and begins:
-            word = sign
-        if word:
-            assigned = _NAME.match(word)
-            if assigned and word[assigned.end() : assigned.end() + 2].startswith(("=", "+=", "[")):
+            token = sign
+        if token:
+            assigned = _NAME.match(token)
+            if assigned and token[assigned.end() : assigned.end() + 2].startswith(("=", "+=", "[")):
                 touched[assigned.group()] = None
-            elif assigned and assigned.end() == len(word) and first in ("unset", "read", "readarray", "mapfile", "for"):
-                touched[word] = None
+            elif (
+                assigned and assigned.end() == len(token) and first in ("unset", "read", "readarray", "mapfile", "for")
+            ):
+                touched[token] = None
             if begins:
-                leaves = leaves or (depth == 0 and word in ("return", "exit", "exec"))
-                depth += (word in _OPENS) - (word in _CLOSES)
-                first = word
-            begins = (begins and word in _LEADS | {"{"}) or word in ("then", "do", "else")
+                leaves = leaves or (depth == 0 and token in ("return", "exit", "exec"))
+                depth += (token in _OPENS) - (token in _CLOSES)
+                first = token
+            begins = (begins and token in _LEADS | {"{"}) or token in ("then", "do", "else")
         elif sign == "\n":
             break
         elif sign:
@@ -247,11 +249,11 @@ def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], bool]
         elif piece.group().strip() and not piece.group().startswith("#"):
             begins = False
     for end in heres:
-        found = re.compile(rf"^\t*{re.escape(end)}$", re.MULTILINE).search(text, at)
-        at = len(text) if found is None else min(len(text), found.end() + 1)
+        match = re.compile(rf"^\t*{re.escape(end)}$", re.MULTILINE).search(text, at)
+        at = len(text) if match is None else min(len(text), match.end() + 1)
     return at, max(depth, 0), list(touched), leaves
 
 
 def _past(pattern: re.Pattern[str], text: str, at: int) -> int:
-    found = pattern.match(text, at)
-    return found.end() if found else at
+    match = pattern.match(text, at)
+    return match.end() if match else at

@@ -205,9 +205,9 @@ def read(files: Files, context: ReadContext) -> Layers:
     names = [_name(node.get("name"), k, context) for k, node in enumerate(nodes)]
     ids = unique_ids(map(_identifier, names))
     _warn_names(names, context)
-    place = {name: k for k, name in reversed(list(enumerate(names)))}
+    index_by_name = {name: k for k, name in reversed(list(enumerate(names)))}
 
-    rows, dangling = _edges(nodes, names, place, context)
+    rows, dangling = _edges(nodes, names, index_by_name, context)
     common = {"map": document.get("metric_map"), "pointset": document.get("pointset")}
     xyz, orientations = _poses(nodes, names)
     _fields.check(top, _ENTRIES if legacy else SHAPE, context)
@@ -216,64 +216,64 @@ def read(files: Files, context: ReadContext) -> Layers:
     kind = "node" if has_edges or not nodes else "poi"
     properties: list[Properties] = []
     for k, (entry, node, name) in enumerate(zip(entries, nodes, names, strict=True)):
-        said: dict[str, Any] = {"kind": kind, "name": name}
+        node_properties: dict[str, Any] = {"kind": kind, "name": name}
         if orientations[k] is not None:
-            said["orientation"] = orientations[k]
-        said[NAME] = own = _node_rest(entry, node, name, common)
+            node_properties["orientation"] = orientations[k]
+        node_properties[NAME] = source_properties = _node_rest(entry, node, name, common)
         if name != ids[k]:
-            own["node"]["name"] = name
+            source_properties["node"]["name"] = name
         if k in dangling:
-            own["node"]["edges"] = dangling[k]
-        _lift(said, own["node"])
-        properties.append(said)
+            source_properties["node"]["edges"] = dangling[k]
+        _lift(node_properties, source_properties["node"])
+        properties.append(node_properties)
     geometry = _node_points(xyz)
     meta = document.get("meta")
     credit = [
         text for key in ("attribution", "license", "copyright") if isinstance(meta, dict) and (text := meta.get(key))
     ]
     credit = [text for text in credit if isinstance(text, str)]
-    whole: dict[str, Any] = {"attribution": credit} if credit else {}
-    whole |= {NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
+    collection_document: dict[str, Any] = {"attribution": credit} if credit else {}
+    collection_document |= {NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
     if kind == "poi":
         context.warn(f"no node has an edge: the {len(nodes)} nodes are taken as points of interest")
         key = PartKey("objects", context.level, NAME)
-        return Layers({key: from_columns(ids, geometry, properties, "local", whole)})
+        return Layers({key: from_columns(ids, geometry, properties, "local", collection_document)})
 
     sources = np.array([r[0] for r in rows], np.intp)
     targets = np.array([r[1] for r in rows], np.intp)
     _warn_lonely(names, sources, targets, dangling, context)
     edge_ids = unique_ids((_identifier(r[2]) for r in rows), set(ids))
     repeated = []
-    for (source, target, said_id, edge), edge_id in zip(rows, edge_ids, strict=True):
-        rest = {key: value for key, value in edge.items() if key not in EDGE_WORDS}
-        line: dict[str, Any] = {"kind": "edge", "source": ids[source], "target": ids[target], NAME: rest}
+    for (source, target, source_id, edge), edge_id in zip(rows, edge_ids, strict=True):
+        extra_members = {key: value for key, value in edge.items() if key not in EDGE_WORDS}
+        line: dict[str, Any] = {"kind": "edge", "source": ids[source], "target": ids[target], NAME: extra_members}
         if "action" in edge:
             if isinstance(edge["action"], str):
                 line["action"] = edge["action"]
             else:
-                rest["action"] = edge["action"]
-        if said_id != edge_id:
-            rest["edge_id"] = said_id
-            repeated.append(said_id)
-        if "properties" in rest:
-            _lift(line, rest)
+                extra_members["action"] = edge["action"]
+        if source_id != edge_id:
+            extra_members["edge_id"] = source_id
+            repeated.append(source_id)
+        if "properties" in extra_members:
+            _lift(line, extra_members)
         properties.append(line)
     if repeated:
         context.warn(f"{len(repeated)} edge ids stand for several things: {_some(repeated)}; all are kept")
     both = np.concatenate([geometry, _edge_lines(xyz, sources, targets)])
     key = PartKey("topology", context.level, NETWORK)
-    return Layers({key: from_columns([*ids, *edge_ids], both, properties, "local", whole)})
+    return Layers({key: from_columns([*ids, *edge_ids], both, properties, "local", collection_document)})
 
 
 def _top(top: Any, context: ReadContext) -> tuple[list[Any], dict[str, Any]]:
     """(entries of the nodes, everything else of the top level)."""
     if isinstance(top, list):
         document: dict[str, Any] = {}
-        for key, word in (("metric_map", "map"), ("pointset", "pointset"), ("name", "pointset")):
-            metas = (e["meta"].get(word) for e in top if isinstance(e, dict) and isinstance(e.get("meta"), dict))
-            most = Counter(m for m in metas if isinstance(m, str)).most_common(1)
-            if most:
-                document[key] = most[0][0]
+        for key, meta_key in (("metric_map", "map"), ("pointset", "pointset"), ("name", "pointset")):
+            metas = (e["meta"].get(meta_key) for e in top if isinstance(e, dict) and isinstance(e.get("meta"), dict))
+            most_common = Counter(m for m in metas if isinstance(m, str)).most_common(1)
+            if most_common:
+                document[key] = most_common[0][0]
         return top, document
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
         raise UnreadableFile("there is no list of nodes: not a topological map", [Problem("no list", where="nodes")])
@@ -292,28 +292,30 @@ def _entry(entry: Any, k: int) -> dict[str, Any]:
         raise UnreadableFile(f"nodes[{k}] has no mapping 'node'", [Problem("no mapping 'node'", where=f"nodes[{k}]")])
     edges = node.get("edges")
     if edges is not None and not (isinstance(edges, list) and all(isinstance(e, dict) for e in edges)):
-        where = f"nodes[{k}].node.edges"
+        location = f"nodes[{k}].node.edges"
         raise UnreadableFile(
-            f"{where} must be a list of mappings", [Problem("must be a list of mappings", where=where)]
+            f"{location} must be a list of mappings", [Problem("must be a list of mappings", where=location)]
         )
     if not isinstance(entry.get("meta", {}), (dict, type(None))):
         raise UnreadableFile(f"nodes[{k}].meta must be a mapping", [Problem("not a mapping", where=f"nodes[{k}].meta")])
     return node
 
 
-def _name(said: Any, k: int, context: ReadContext) -> str:
-    where = f"nodes[{k}].node.name"
-    name = said if isinstance(said, str) else ""
-    if not isinstance(said, str):
-        if said is None or isinstance(said, (dict, list)):
-            raise UnreadableFile(f"{where}: a node must have a name", [Problem("a node must have a name", where=where)])
-        context.warn(f"the name {said!r} is no text; it is served as one", where=where)
-        name = _yaml.text(said)
+def _name(raw_name: Any, k: int, context: ReadContext) -> str:
+    location = f"nodes[{k}].node.name"
+    name = raw_name if isinstance(raw_name, str) else ""
+    if not isinstance(raw_name, str):
+        if raw_name is None or isinstance(raw_name, (dict, list)):
+            raise UnreadableFile(
+                f"{location}: a node must have a name", [Problem("a node must have a name", where=location)]
+            )
+        context.warn(f"the name {raw_name!r} is no text; it is served as one", where=location)
+        name = _yaml.text(raw_name)
     if not 0 < len(name) <= MAX_NAME or (
         not name.isprintable() and any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in name)
     ):
         reason = f"a name must have 1 to {MAX_NAME} characters and no control characters"
-        raise UnreadableFile(f"{where}: {reason}", [Problem(f"{reason}, got {name[:60]!r}", where=where)])
+        raise UnreadableFile(f"{location}: {reason}", [Problem(f"{reason}, got {name[:60]!r}", where=location)])
     return name
 
 
@@ -347,7 +349,7 @@ Row = tuple[int, int, str, dict[str, Any]]
 
 
 def _edges(
-    nodes: Sequence[dict[str, Any]], names: Sequence[str], place: Mapping[str, int], context: ReadContext
+    nodes: Sequence[dict[str, Any]], names: Sequence[str], index_by_name: Mapping[str, int], context: ReadContext
 ) -> tuple[list[Row], dict[int, list[Any]]]:
     """((source, target, edge id, mapping) of each edge between nodes; the edges to nowhere by node)."""
     rows: list[Row] = []
@@ -358,19 +360,21 @@ def _edges(
             to = edge.get("node")
             if not isinstance(to, str) and to is not None and not isinstance(to, (dict, list)):
                 to = _yaml.text(to)
-            target = place.get(to) if isinstance(to, str) else None
-            said = edge.get("edge_id")
-            if not isinstance(said, str):
-                said = f"{names[k]}_{to}" if said is None or isinstance(said, (dict, list)) else _yaml.text(said)
+            target = index_by_name.get(to) if isinstance(to, str) else None
+            edge_id = edge.get("edge_id")
+            if not isinstance(edge_id, str):
+                edge_id = (
+                    f"{names[k]}_{to}" if edge_id is None or isinstance(edge_id, (dict, list)) else _yaml.text(edge_id)
+                )
             if target is None:
                 dangling.setdefault(k, []).append(edge)
                 context.warn(
-                    f"the edge {said!r} leads to {to!r}, which is no node; it is kept with its node", where=names[k]
+                    f"the edge {edge_id!r} leads to {to!r}, which is no node; it is kept with its node", where=names[k]
                 )
                 continue
             if target == k:
-                loops.append(said)
-            rows.append((k, target, said or f"{names[k]}_{to}", edge))
+                loops.append(edge_id)
+            rows.append((k, target, edge_id or f"{names[k]}_{to}", edge))
     if loops:
         context.warn(f"{len(loops)} edges lead from a node to itself: {_some(loops)}")
     return rows, dangling
@@ -404,30 +408,30 @@ def _poses(nodes: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[Array
             reason = f"the node {name!r} needs pose.position with x and y, and x, y, z, w in its orientation, if any"
             raise UnreadableFile(reason, [Problem(reason, where=f"{name}.pose")]) from error
     xyz = _numbers(positions, 3, names, "position")
-    given = [k for k, o in enumerate(orientations) if o is not None]
-    turned = _numbers([tuple(orientations[k] or ()) for k in given], 4, [names[k] for k in given], "orientation")
-    for k, row in zip(given, turned.tolist(), strict=True):
+    indices = [k for k, o in enumerate(orientations) if o is not None]
+    turned = _numbers([tuple(orientations[k] or ()) for k in indices], 4, [names[k] for k in indices], "orientation")
+    for k, row in zip(indices, turned.tolist(), strict=True):
         orientations[k] = row
     return xyz, orientations
 
 
-def _numbers(rows: Sequence[tuple[Any, ...]], width: int, names: Sequence[str], what: str) -> Array:
+def _numbers(rows: Sequence[tuple[Any, ...]], width: int, names: Sequence[str], member: str) -> Array:
     """float64 [n, width]; a number that stands in quotes is one too."""
     flat = [v for row in rows for v in row]
     if not all(map((float, int).__contains__, map(type, flat))):
         for k, value in enumerate(flat):
-            flat[k] = _number(value, f"{names[k // width]}.pose.{what}")
+            flat[k] = _number(value, f"{names[k // width]}.pose.{member}")
     return np.array(flat, np.float64).reshape(-1, width)
 
 
-def _number(value: Any, where: str) -> float:
+def _number(value: Any, location: str) -> float:
     try:
         number = _yaml.scalar(value) if isinstance(value, str) else value
     except ValueError:
         number = None
     if isinstance(number, bool) or not isinstance(number, (int, float)):
         raise UnreadableFile(
-            f"{where}: {value!r} is not a number", [Problem(f"{value!r} is not a number", where=where)]
+            f"{location}: {value!r} is not a number", [Problem(f"{value!r} is not a number", where=location)]
         )
     return float(number)
 
@@ -436,16 +440,16 @@ def _node_rest(
     entry: Mapping[str, Any], node: Mapping[str, Any], name: str, common: Mapping[str, Any]
 ) -> dict[str, Any]:
     """What of a node's entry is neither canonical nor said by the document."""
-    rest = {key: value for key, value in node.items() if key not in NODE_WORDS}
+    extra_members = {key: value for key, value in node.items() if key not in NODE_WORDS}
     pose = node["pose"]
     if len(pose) > 2 or len(pose["position"]) > 3 or len(pose.get("orientation") or ()) not in (0, 4):
         more = {key: value for key, value in pose.items() if key not in ("position", "orientation")}
-        for word, axes in (("position", "xyz"), ("orientation", "xyzw")):
-            extra = {key: value for key, value in (pose.get(word) or {}).items() if key not in axes}
-            more |= {word: extra} if extra else {}
+        for member, axes in (("position", "xyz"), ("orientation", "xyzw")):
+            extra = {key: value for key, value in (pose.get(member) or {}).items() if key not in axes}
+            more |= {member: extra} if extra else {}
         if more:
-            rest["pose"] = more
-    out: dict[str, Any] = {"node": rest}
+            extra_members["pose"] = more
+    out: dict[str, Any] = {"node": extra_members}
     if len(entry) > 2:
         out |= {key: value for key, value in entry.items() if key not in ("meta", "node")}
     meta = {
@@ -458,23 +462,23 @@ def _node_rest(
     return out
 
 
-def _lift(said: dict[str, Any], rest: dict[str, Any]) -> None:
+def _lift(properties: dict[str, Any], extra_members: dict[str, Any]) -> None:
     """Bring canonical words and other formats' knowledge from an item's ``properties`` to where they belong."""
-    own = rest.get("properties")
-    if not isinstance(own, dict):
+    inner_properties = extra_members.get("properties")
+    if not isinstance(inner_properties, dict):
         return
     lifted = {
         key: value
-        for key, value in own.items()
+        for key, value in inner_properties.items()
         if (key in NUMERIC_WORDS and isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0)
-        or (key == "name" and isinstance(value, str) and value not in ("", said.get("name")))
+        or (key == "name" and isinstance(value, str) and value not in ("", properties.get("name")))
         or (isinstance(value, dict) and key in _families() and key != NAME)
     }
     if lifted:
-        said.update(lifted)
-        rest["properties"] = {key: value for key, value in own.items() if key not in lifted}
-        if not rest["properties"]:
-            del rest["properties"]
+        properties.update(lifted)
+        extra_members["properties"] = {key: value for key, value in inner_properties.items() if key not in lifted}
+        if not extra_members["properties"]:
+            del extra_members["properties"]
 
 
 @cache
@@ -529,24 +533,28 @@ class _Turn:
 
 def _turn(document: Mapping[str, Any]) -> _Turn | None:
     """The file's transformation, where there is one that changes anything."""
-    said = document.get("transformation")
-    if not isinstance(said, dict) or not isinstance(said.get("child"), str) or said["child"] == said.get("parent"):
+    transformation = document.get("transformation")
+    if (
+        not isinstance(transformation, dict)
+        or not isinstance(transformation.get("child"), str)
+        or transformation["child"] == transformation.get("parent")
+    ):
         return None
-    rotation, translation = said.get("rotation") or {}, said.get("translation") or {}
+    rotation, translation = transformation.get("rotation") or {}, transformation.get("translation") or {}
     if not isinstance(rotation, dict) or not isinstance(translation, dict):
         return None
-    where = "transformation"
-    x, y, z = (_number(rotation.get(key, 0.0), f"{where}.rotation.{key}") for key in "xyz")
-    w = _number(rotation.get("w", 1.0), f"{where}.rotation.w")
-    shift = np.array([_number(translation.get(key, 0.0), f"{where}.translation.{key}") for key in "xyz"])
+    location = "transformation"
+    x, y, z = (_number(rotation.get(key, 0.0), f"{location}.rotation.{key}") for key in "xyz")
+    w = _number(rotation.get("w", 1.0), f"{location}.rotation.w")
+    shift = np.array([_number(translation.get(key, 0.0), f"{location}.translation.{key}") for key in "xyz"])
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if not math.isfinite(length) or length < 1e-9:
         raise UnreadableFile(
-            "transformation.rotation is no rotation", [Problem("no rotation", where=f"{where}.rotation")]
+            "transformation.rotation is no rotation", [Problem("no rotation", where=f"{location}.rotation")]
         )
     if x == y == z == 0.0 and not shift.any():
         return None
-    return _Turn(said["child"], (x / length, y / length, z / length, w / length), shift)
+    return _Turn(transformation["child"], (x / length, y / length, z / length, w / length), shift)
 
 
 def _times(a: Sequence[float], b: Sequence[float]) -> list[float]:
@@ -620,12 +628,12 @@ class _Writer:
 
     def _document(self) -> dict[str, Any]:
         """The top level without the nodes: as the source says, completed."""
-        known = list(self.layers.vector("topology").values())
-        known += [part for key, part in self.layers.vector("objects").items() if key.name == NAME]
-        said: Any = next((p.document[NAME] for p in known if isinstance(p.document.get(NAME), Mapping)), {})
-        document = {key: value for key, value in said.items() if key != "nodes"}
-        usual = next((document[key] for key in ("pointset", "name", "metric_map") if document.get(key)), None)
-        title = usual if isinstance(usual, str) else self.context.title
+        parts = list(self.layers.vector("topology").values())
+        parts += [part for key, part in self.layers.vector("objects").items() if key.name == NAME]
+        source_document: Any = next((p.document[NAME] for p in parts if isinstance(p.document.get(NAME), Mapping)), {})
+        document = {key: value for key, value in source_document.items() if key != "nodes"}
+        default_name = next((document[key] for key in ("pointset", "name", "metric_map") if document.get(key)), None)
+        title = default_name if isinstance(default_name, str) else self.context.title
         if self.listed:
             more = [key for key in document if key not in ("metric_map", "pointset")]
             if document.get("name") == document.get("pointset"):
@@ -687,67 +695,67 @@ class _Writer:
         kinds = [p.get("kind") for p in part.properties]
         places = [k for k, point in enumerate(is_point.tolist()) if point and kinds[k] == "node"]
         names = self._names(part, places, taken)
-        said = {i: _yaml.text(name) for i, name in names.items()}
-        edges = self._edges(part, kinds, said)
+        name_texts = {i: _yaml.text(name) for i, name in names.items()}
+        edges = self._edges(part, kinds, name_texts)
         coordinates = self._positions(part, places, 0.0 if level == GROUND else self.layers.elevation(level))
         out = []
         plain = self._plain_node()
-        for place, at in zip(places, coordinates, strict=True):
-            i, p = part.ids[place], part.properties[place]
+        for index, at in zip(places, coordinates, strict=True):
+            i, p = part.ids[index], part.properties[index]
             name = names[i]
             if self._is_plain(p, self.plain_node) and "orientation" not in p and p.get("name", name) == name:
                 self.filled["nodes"] += 1
                 self.filled["orientations"] += 1
                 self.filled["any yaw"] += 1
-                text = plain(said[i], _listed(edges.pop(i)), at)
+                text = plain(name_texts[i], _listed(edges.pop(i)), at)
             else:
-                text = self._node(p, name, said[i], at, edges.pop(i))
+                text = self._node(p, name, name_texts[i], at, edges.pop(i))
             out.append((len(name), name, text))
         return out
 
-    def _is_plain(self, p: Properties, words: frozenset[str]) -> bool:
+    def _is_plain(self, p: Properties, keys: frozenset[str]) -> bool:
         """Whether an item comes from another format and has nothing for its own ``properties``."""
-        return NAME not in p and not self.legacy and p.keys() <= words
+        return NAME not in p and not self.legacy and p.keys() <= keys
 
     def _plain_node(self) -> Callable[[str, str, tuple[str, str, str]], str]:
         """The quick way for nodes that have only a name and a place: (name, edges, position) as texts -> entry."""
-        a, b, c, d, e = self._node_template({}, {}, None, known=False, fill=True)
+        a, b, c, d, e = self._node_template({}, {}, None, has_yaw=False, fill=True)
         d += self._pose(None, ("\0", "\0", "\0"), [0.0, 0.0, 0.0, 1.0], turned=False)
         d, y, z, end = d.split("\0")
         e = end + e
 
-        def plain(said: str, listed: str, at: tuple[str, str, str]) -> str:
-            return f"{a} {said}\n{b}{listed}{c} {said}\n{d}{at[0]}{y}{at[1]}{z}{at[2]}{e}"
+        def plain(name_text: str, listed: str, at: tuple[str, str, str]) -> str:
+            return f"{a} {name_text}\n{b}{listed}{c} {name_text}\n{d}{at[0]}{y}{at[1]}{z}{at[2]}{e}"
 
         return plain
 
     def _names(self, part: Features, places: Sequence[int], taken: set[str]) -> dict[str, str]:
         """What each node is called in the file, by id. Names repeat where they did so in their source."""
-        wanted = []
+        names = []
         for k in places:
-            own = part.properties[k].get(NAME)
-            node = own.get("node") if isinstance(own, dict) else None
-            said = node.get("name") if isinstance(node, dict) else None
-            wanted.append(said if isinstance(said, str) and said else part.ids[k])
-        clashing = sorted({name for name in wanted if name in taken})
+            source_properties = part.properties[k].get(NAME)
+            node = source_properties.get("node") if isinstance(source_properties, dict) else None
+            node_name = node.get("name") if isinstance(node, dict) else None
+            names.append(node_name if isinstance(node_name, str) and node_name else part.ids[k])
+        clashing = sorted({name for name in names if name in taken})
         if clashing:
-            renamed = dict(zip(clashing, unique_ids(clashing, taken | set(wanted)), strict=True))
-            wanted = [renamed.get(name, name) for name in wanted]
+            renamed = dict(zip(clashing, unique_ids(clashing, taken | set(names)), strict=True))
+            names = [renamed.get(name, name) for name in names]
             self.context.warn(f"{len(clashing)} names stand in several networks and got a number: {_some(clashing)}")
-        taken.update(wanted)
-        return {part.ids[k]: name for k, name in zip(places, wanted, strict=True)}
+        taken.update(names)
+        return {part.ids[k]: name for k, name in zip(places, names, strict=True)}
 
-    def _edges(self, part: Features, kinds: Sequence[Any], said: Mapping[str, str]) -> dict[str, Lines]:
+    def _edges(self, part: Features, kinds: Sequence[Any], name_texts: Mapping[str, str]) -> dict[str, Lines]:
         """The edges by the id of the node that they start at. said: each node's name as YAML, by id."""
-        edges: dict[str, Lines] = {i: [] for i in said}
+        edges: dict[str, Lines] = {i: [] for i in name_texts}
         a, b, c = self._edge_template({}, None, None, fill=True)
-        plain = lost = 0
+        plain = dropped_count = 0
         for i, p, kind in zip(part.ids, part.properties, kinds, strict=True):
             source, target = p.get("source"), p.get("target")
-            if not (kind == "edge" and isinstance(source, str) and isinstance(target, str) and source in said):
-                lost += kind != "node"
+            if not (kind == "edge" and isinstance(source, str) and isinstance(target, str) and source in name_texts):
+                dropped_count += kind != "node"
                 continue
-            to = said.get(target) or _yaml.text(target)
+            to = name_texts.get(target) or _yaml.text(target)
             if self._is_plain(p, self.plain_edge) and "action" not in p:
                 plain += 1
                 text = f"{a} {_yaml.text(i)}\n{b} {to}\n{c}"
@@ -755,46 +763,46 @@ class _Writer:
                 i, text = self._edge(p, i, to)  # noqa: PLW2901  by the id that is written: read again, the order stays
             edges[source].append((len(i), i, text))
         self.filled["edges"] += plain
-        self.dropped["items that are neither a node nor an edge from a node"] += lost
-        self.dropped["nodes without a point"] += kinds.count("node") - len(said)
+        self.dropped["items that are neither a node nor an edge from a node"] += dropped_count
+        self.dropped["nodes without a point"] += kinds.count("node") - len(name_texts)
         return edges
 
     def _positions(self, part: Features, places: Sequence[int], elevation: float) -> list[tuple[str, str, str]]:
         """x, y, z as texts: metres in the frame that each node's parent_frame names."""
-        chosen = part.take(places)
-        xyz: Array = shapely.get_coordinates(chosen.in_local(self.layers.frame), include_z=True).reshape(-1, 3)
+        nodes = part.take(places)
+        xyz: Array = shapely.get_coordinates(nodes.in_local(self.layers.frame), include_z=True).reshape(-1, 3)
         xyz[np.isnan(xyz[:, 2]), 2] = elevation
         if self.turn is not None:
-            inside = [k for k, p in enumerate(chosen.properties) if self._turned(p)]
+            inside = [k for k, p in enumerate(nodes.properties) if self._turned(p)]
             xyz[inside] = (xyz[inside] - self.turn.shift) @ self.turn.matrix()
-        said = list(map(_yaml.decimal, numbers(xyz.ravel(), METRES)))
-        return list(zip(said[::3], said[1::3], said[2::3], strict=True))
+        texts = list(map(_yaml.decimal, numbers(xyz.ravel(), METRES)))
+        return list(zip(texts[::3], texts[1::3], texts[2::3], strict=True))
 
     def _turned(self, p: Properties) -> bool:
         """Whether a node's pose stands in the child frame of the transformation."""
-        own = p.get(NAME)
-        node = own.get("node") if isinstance(own, dict) else None
+        source_properties = p.get(NAME)
+        node = source_properties.get("node") if isinstance(source_properties, dict) else None
         return self.turn is not None and isinstance(node, dict) and node.get("parent_frame") == self.turn.child
 
     def _edge(self, p: Properties, i: str, target: str) -> tuple[str, str]:
         """The id as it is written, and the text of an edge. target: its target's name as YAML."""
-        own, action = p.get(NAME), p.get("action")
-        rest: dict[str, Any] = own if isinstance(own, dict) else {}
-        if "edge_id" in rest:
-            i = str(rest["edge_id"])
-            rest = {key: value for key, value in rest.items() if key != "edge_id"}
+        source_properties, action = p.get(NAME), p.get("action")
+        extra_members: dict[str, Any] = source_properties if isinstance(source_properties, dict) else {}
+        if "edge_id" in extra_members:
+            i = str(extra_members["edge_id"])
+            extra_members = {key: value for key, value in extra_members.items() if key != "edge_id"}
         more = None if p.keys() <= self.plain_edge else self._more(p, CANONICAL_EDGE)
-        fill = own is None or self.legacy
-        self.filled["edges"] += own is None if self.listed else fill
+        fill = source_properties is None or self.legacy
+        self.filled["edges"] += source_properties is None if self.listed else fill
         # Edges alike but for their id and target share their text.
-        key = orjson.dumps((action, rest, more, fill)).decode() if rest or more or action else fill
+        key = orjson.dumps((action, extra_members, more, fill)).decode() if extra_members or more or action else fill
         pieces = self.templates.get(key)
         if pieces is None:
-            pieces = self.templates[key] = self._edge_template(rest, action, more, fill=fill)
+            pieces = self.templates[key] = self._edge_template(extra_members, action, more, fill=fill)
         return i, f"{pieces[0]} {_yaml.text(i)}\n{pieces[1]} {target}\n{pieces[2]}"
 
     def _edge_template(
-        self, rest: Mapping[str, Any], action: Any, more: dict[str, Any] | None, *, fill: bool
+        self, extra_members: Mapping[str, Any], action: Any, more: dict[str, Any] | None, *, fill: bool
     ) -> list[str]:
         """The text of an edge in three pieces, around its id and its target."""
         if isinstance(self.options, ListOptions):
@@ -806,15 +814,15 @@ class _Writer:
                 "inflation_radius": self.options.inflation_radius,
                 "recovery_behaviours_config": self.options.recovery,
             }
-            out = {**fixed, **rest}
+            out = {**fixed, **extra_members}
         else:
-            out = {**EDGE_TEMPLATE, **self._usual_edge(self.options), **rest} if fill else dict(rest)
+            out = {**EDGE_TEMPLATE, **self._usual_edge(self.options), **extra_members} if fill else dict(extra_members)
         if action is not None:
             out["action"] = action
         if fill or self.listed:
             out.setdefault("action", self.options.action)
         if more:
-            out["properties"] = {**_mapping_of(rest.get("properties")), **more}
+            out["properties"] = {**_mapping_of(extra_members.get("properties")), **more}
         pieces = _split({**out, "edge_id": None, "node": None}, 6, "edge_id", "node")
         pieces[0] = f"    - {pieces[0][6:]}"
         return pieces
@@ -841,11 +849,11 @@ class _Writer:
             "restrictions_runtime": self.options.restrictions,
         }
 
-    def _node(self, p: Properties, name: str, said: str, at: tuple[str, str, str], edges: Lines) -> str:
+    def _node(self, p: Properties, name: str, name_text: str, at: tuple[str, str, str], edges: Lines) -> str:
         """The text of a node's entry. said: its name as YAML. at: its position as texts."""
-        own = p.get(NAME)
-        rest: dict[str, Any] = own if isinstance(own, dict) else {}
-        node = _mapping_of(rest.get("node"))
+        source_properties = p.get(NAME)
+        extra_members: dict[str, Any] = source_properties if isinstance(source_properties, dict) else {}
+        node = _mapping_of(extra_members.get("node"))
         more = None
         if not p.keys() <= self.plain_node or p.get("name", name) != name:
             more = self._more(p, CANONICAL_NODE)
@@ -855,24 +863,29 @@ class _Writer:
             dangling = [e for e in node.get("edges") or () if isinstance(e, dict)]
             edges = edges + [_dangling(e, name) for e in dangling]
             node = {key: value for key, value in node.items() if key not in ("name", "edges")}
-            rest = {**rest, "node": node}
+            extra_members = {**extra_members, "node": node}
         quaternion = _quaternion(p.get("orientation"))
         self.filled["orientations"] += quaternion is None
-        fill = own is None or self.legacy
-        self.filled["nodes"] += own is None if self.listed else fill
+        fill = source_properties is None or self.legacy
+        self.filled["nodes"] += source_properties is None if self.listed else fill
         if fill or self.listed:
-            known = {**({} if self.listed else node), **_mapping_of(node.get("properties"))}
-            self.filled["any yaw" if quaternion is None else "yaw"] += "yaw_goal_tolerance" not in known
-        key = ("node", quaternion is None, fill, orjson.dumps((rest, more)).decode() if rest or more else None)
+            node_members = {**({} if self.listed else node), **_mapping_of(node.get("properties"))}
+            self.filled["any yaw" if quaternion is None else "yaw"] += "yaw_goal_tolerance" not in node_members
+        key = (
+            "node",
+            quaternion is None,
+            fill,
+            orjson.dumps((extra_members, more)).decode() if extra_members or more else None,
+        )
         pieces = self.templates.get(key)
         if pieces is None:
             pieces = self.templates[key] = self._node_template(
-                rest, node, more, known=quaternion is not None, fill=fill
+                extra_members, node, more, has_yaw=quaternion is not None, fill=fill
             )
-        meta = rest.get("meta")
-        called = _yaml.text(str(meta["node"])) if isinstance(meta, dict) and "node" in meta else said
+        meta = extra_members.get("meta")
+        called = _yaml.text(str(meta["node"])) if isinstance(meta, dict) and "node" in meta else name_text
         pose = self._pose(node.get("pose"), at, quaternion or [0.0, 0.0, 0.0, 1.0], turned=self._turned(p))
-        return f"{pieces[0]} {called}\n{pieces[1]}{_listed(edges)}{pieces[2]} {said}\n{pieces[3]}{pose}{pieces[4]}"
+        return f"{pieces[0]} {called}\n{pieces[1]}{_listed(edges)}{pieces[2]} {name_text}\n{pieces[3]}{pose}{pieces[4]}"
 
     def _pose(self, extra: Any, at: tuple[str, str, str], quaternion: list[float], *, turned: bool) -> str:
         """What stands behind ``pose:``."""
@@ -889,25 +902,31 @@ class _Writer:
             f"      position:\n        x: {at[0]}\n        y: {at[1]}\n        z: {at[2]}\n"
         )
 
-    def _tolerances(self, known: bool) -> dict[str, float]:
+    def _tolerances(self, has_yaw: bool) -> dict[str, float]:
         """Of a node that has none. known: whether it has an orientation."""
-        yaw = self.options.yaw_goal_tolerance if known else ANY_YAW
+        yaw = self.options.yaw_goal_tolerance if has_yaw else ANY_YAW
         return {"xy_goal_tolerance": self.options.xy_goal_tolerance, "yaw_goal_tolerance": yaw}
 
     def _node_template(
-        self, rest: Mapping[str, Any], node: Mapping[str, Any], more: dict[str, Any] | None, *, known: bool, fill: bool
+        self,
+        extra_members: Mapping[str, Any],
+        node: Mapping[str, Any],
+        more: dict[str, Any] | None,
+        *,
+        has_yaw: bool,
+        fill: bool,
     ) -> list[str]:
         """The text of a node's entry in five pieces, around meta.node, edges, name and pose."""
         inner = dict(node)
         if self.listed:
-            own = _mapping_of(inner.get("properties"))
-            tolerances = {key: own.get(key, value) for key, value in self._tolerances(known).items()}
+            inner_properties = _mapping_of(inner.get("properties"))
+            tolerances = {key: inner_properties.get(key, value) for key, value in self._tolerances(has_yaw).items()}
             fixed = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
             fixed |= {"localise_by_topic": self.options.localise_by_topic}
             inner = {"verts": self.ring, **fixed, **tolerances, **inner}
         elif fill:
             inner = {**self._usual_node(), "verts": self.ring, **inner}
-            tolerances = self._tolerances(known)
+            tolerances = self._tolerances(has_yaw)
             # The older layout has its tolerances beside the name.
             tolerances = {key: inner.get(key, value) for key, value in tolerances.items()}
             inner["properties"] = {**tolerances, **_mapping_of(inner.get("properties"))}
@@ -916,10 +935,10 @@ class _Writer:
         if more:
             inner["properties"] = {**_mapping_of(inner.get("properties")), **more}
         meta = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
-        meta = {**meta, **_mapping_of(rest.get("meta")), "node": None}
+        meta = {**meta, **_mapping_of(extra_members.get("meta")), "node": None}
         head, middle = _split(meta, 4, "node")
         pieces = _split({**inner, "edges": None, "name": None, "pose": None}, 4, "edges", "name", "pose")
-        before, between, after = _split({**rest, "meta": None, "node": None}, 2, "meta", "node")
+        before, between, after = _split({**extra_members, "meta": None, "node": None}, 2, "meta", "node")
         opening = f"{before}\n{head}"
         return [f"- {opening[2:]}", f"{middle}{between}\n{pieces[0]}", pieces[1], pieces[2], pieces[3] + after]
 
@@ -931,14 +950,14 @@ class _Writer:
         fill, filled, options = self.context.fill, self.filled, self.options
         if filled["edges"]:
             why = f"{filled['edges']} edges come from a format that does not say it"
-            where = f"{why}, where they name none"
-            fill("edges: action", options.action, where, "action")
+            reason = f"{why}, where they name none"
+            fill("edges: action", options.action, reason, "action")
             if isinstance(options, ListOptions):
                 fill("edges: top_vel", options.top_vel, f"{why}, where they have no speed limit", "top_vel")
                 fill("edges: inflation_radius", options.inflation_radius, why, "inflation_radius")
                 fill("edges: map_2d", self.document["metric_map"], why)
             else:
-                fill("edges: action_type", options.action_type, where, "action_type")
+                fill("edges: action_type", options.action_type, reason, "action_type")
                 fill("edges: fail_policy", options.fail_policy, why, "fail_policy")
                 fill("edges: fluid_navigation", options.fluid_navigation, why, "fluid_navigation")
                 fill("edges: restrictions", options.restrictions, why, "restrictions")
@@ -946,9 +965,9 @@ class _Writer:
             fill("edges: recovery_behaviours_config", options.recovery, why, "recovery")
         if filled["nodes"]:
             why = f"{filled['nodes']} nodes come from a format that does not say it"
-            where = f"{why}, where they have none"
-            fill("nodes: verts", f"an octagon of {options.verts_radius:g} m", where, "verts_radius")
-            fill("nodes: xy_goal_tolerance", options.xy_goal_tolerance, where, "xy_goal_tolerance")
+            reason = f"{why}, where they have none"
+            fill("nodes: verts", f"an octagon of {options.verts_radius:g} m", reason, "verts_radius")
+            fill("nodes: xy_goal_tolerance", options.xy_goal_tolerance, reason, "xy_goal_tolerance")
             fill("nodes: localise_by_topic", options.localise_by_topic, why, "localise_by_topic")
             if isinstance(options, WriteOptions):
                 fill("nodes: parent_frame", options.parent_frame, why, "parent_frame")
@@ -963,8 +982,8 @@ class _Writer:
             fill("nodes without an orientation: yaw_goal_tolerance", ANY_YAW, why)
         if filled["orientations"]:
             fill("nodes: pose.orientation", [0.0, 0.0, 0.0, 1.0], f"{filled['orientations']} nodes have none")
-        for what, count in sorted(self.dropped.items()):
-            self.context.drop(what, count, "the format has no place for it")
+        for noun, count in sorted(self.dropped.items()):
+            self.context.drop(noun, count, "the format has no place for it")
         for family in sorted(BULKY & self.unwritten):
             items = [p for part in self.layers.vector("topology").values() for p in part.properties if family in p]
             self.context.drop(f"{family} tags and attributes", len(items), f"left out for size; ask with {family}=true")
@@ -990,8 +1009,14 @@ def _quaternion(value: Any) -> list[float] | None:
 
 def _dangling(edge: Mapping[str, Any], name: str) -> tuple[int, str, str]:
     """An edge to nowhere as it was, with the id that the schema asks for."""
-    said = edge.get("edge_id")
-    i = said if isinstance(said, str) and said else f"{name}_{edge.get('node')}" if said is None else str(said)
+    edge_id = edge.get("edge_id")
+    i = (
+        edge_id
+        if isinstance(edge_id, str) and edge_id
+        else f"{name}_{edge.get('node')}"
+        if edge_id is None
+        else str(edge_id)
+    )
     return len(i), i, f"    - {_yaml.mapping({**edge, 'edge_id': i}, 6)[6:]}"
 
 

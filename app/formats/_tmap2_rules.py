@@ -47,11 +47,11 @@ def check(files: Files) -> Iterator[Problem]:
         if not _is_dated(data[:HEAD]):
             yield refused("must be a text like 2024-05-01_10-00-00", main, where="meta.last_updated")
         return
-    found = _regular(data)
-    if found is None:
-        found = ([], [])
-        yield from _whole(_yaml.load(data, LIMITS), main, *found)
-    yield from _network(*found, main)
+    network = _regular(data)
+    if network is None:
+        network = ([], [])
+        yield from _whole(_yaml.load(data, LIMITS), main, *network)
+    yield from _network(*network, main)
 
 
 def _regular(data: bytes) -> tuple[list[str], Edges] | None:
@@ -111,45 +111,47 @@ def _whole(top: Any, main: str, nodes: list[str], edges: Edges) -> Iterator[Prob
             yield refused(f"must be a list, is {shown(rows)}", main, where="nodes")
         return
     for k, row in enumerate(rows):
-        where = f"nodes[{k}]"
+        location = f"nodes[{k}]"
         meta, node = (row.get("meta"), row.get("node")) if isinstance(row, dict) else (None, None)
-        if lost := missing(meta, META):
-            yield refused(f"the schema requires {', '.join(lost)}", main, where=f"{where}.meta")
-        if lost := missing(node, NODE):
-            yield refused(f"the schema requires {', '.join(lost)}", main, where=f"{where}.node")
+        if absent := missing(meta, META):
+            yield refused(f"the schema requires {', '.join(absent)}", main, where=f"{location}.meta")
+        if absent := missing(node, NODE):
+            yield refused(f"the schema requires {', '.join(absent)}", main, where=f"{location}.node")
         if not isinstance(node, dict):
             continue
         if missing(node.get("pose"), ("orientation", "position")):
-            yield refused("localisation reads the pose of each node", main, where=f"{where}.node.pose")
+            yield refused("localisation reads the pose of each node", main, where=f"{location}.node.pose")
         for key in ("name", "parent_frame"):
             if node.get(key) is not None and not isinstance(node[key], str):
-                yield refused(f"must be a text, is {shown(node[key])}", main, where=f"{where}.node.{key}")
+                yield refused(f"must be a text, is {shown(node[key])}", main, where=f"{location}.node.{key}")
         name = str(node.get("name"))
         if isinstance(meta, dict) and meta.get("node") not in (None, node.get("name")):
             yield doubted(
-                f"is {shown(meta['node'])}, and the node is called {name!r}", main, where=f"{where}.meta.node"
+                f"is {shown(meta['node'])}, and the node is called {name!r}", main, where=f"{location}.meta.node"
             )
         nodes.append(name)
         listed = node.get("edges")
         if listed is not None and not isinstance(listed, list):
-            yield refused(f"must be a list, is {shown(listed)}", main, where=f"{where}.node.edges")
+            yield refused(f"must be a list, is {shown(listed)}", main, where=f"{location}.node.edges")
             continue
         for j, edge in enumerate(listed or ()):
-            if lost := missing(edge, EDGE):
-                yield refused(f"the schema requires {', '.join(lost)}", main, where=f"{where}.node.edges[{j}]")
+            if absent := missing(edge, EDGE):
+                yield refused(f"the schema requires {', '.join(absent)}", main, where=f"{location}.node.edges[{j}]")
                 continue
             edges.append((name, str(edge["edge_id"]), str(edge["node"])))
 
 
 def _network(nodes: list[str], edges: Edges, main: str) -> Iterator[Problem]:
-    known = set(nodes)
-    if again := repeated(nodes):
-        yield doubted(f"{len(again)} nodes share a name, and edges lead to names: {names(again)}", main, where="nodes")
-    if lost := [i for _, i, target in edges if target not in known]:
-        reason = f"{len(lost)} edges lead to a node that is not there: {names(lost)}"
+    node_names = set(nodes)
+    if repeats := repeated(nodes):
+        yield doubted(
+            f"{len(repeats)} nodes share a name, and edges lead to names: {names(repeats)}", main, where="nodes"
+        )
+    if dangling := [i for _, i, target in edges if target not in node_names]:
+        reason = f"{len(dangling)} edges lead to a node that is not there: {names(dangling)}"
         yield refused(reason, main, where="nodes")
-    if again := repeated(i for _, i, _ in edges):
-        reason = f"{len(again)} edges share an edge_id, by which the map manager finds them: {names(again)}"
+    if repeats := repeated(i for _, i, _ in edges):
+        reason = f"{len(repeats)} edges share an edge_id, by which the map manager finds them: {names(repeats)}"
         yield doubted(reason, main, where="nodes")
     if other := [i for source, i, target in edges if i != f"{source}_{target}"]:
         reason = f"{len(other)} edges are not called <from>_<to>, as the map manager calls them: {names(other)}"

@@ -33,16 +33,16 @@ class Line:
     said: dict[str, Any]
 
 
-def canonical(words: Iterable[str], said: dict[str, Any]) -> dict[str, Any]:
+def canonical(keys: Iterable[str], members: dict[str, Any]) -> dict[str, Any]:
     """The canonical words among what an item says, where their values are of the right type."""
     out: dict[str, Any] = {}
-    for word in words:
-        value = said.get(word)
-        if word in ("speed_limit", "width"):
+    for key in keys:
+        value = members.get(key)
+        if key in ("speed_limit", "width"):
             if isinstance(value, (int, float)) and not isinstance(value, bool):
-                out[word] = value
+                out[key] = value
         elif isinstance(value, str) and value:
-            out[word] = value
+            out[key] = value
     return out
 
 
@@ -53,20 +53,27 @@ def edges(
     rows: list[tuple[int, int]] = []
     properties: list[Properties] = []
     for k, line in enumerate(lines):
-        words = canonical(WORDS, line.said)
-        rest = {key: value for key, value in line.said.items() if key not in words}
-        oneway = rest.get(ONEWAY) is True
+        canonical_members = canonical(WORDS, line.said)
+        extra_members = {key: value for key, value in line.said.items() if key not in canonical_members}
+        oneway = extra_members.get(ONEWAY) is True
         if oneway:
-            del rest[ONEWAY]
+            del extra_members[ONEWAY]
         ends = {"source": ids[line.a], "target": ids[line.b]}
-        properties.append({"kind": "edge", **ends, **words, name: {**({"more": rest} if rest else {}), "line": k}})
+        properties.append(
+            {
+                "kind": "edge",
+                **ends,
+                **canonical_members,
+                name: {**({"more": extra_members} if extra_members else {}), "line": k},
+            }
+        )
         rows.append((line.a, line.b))
         if not oneway and line.a != line.b:
             back = {"source": ids[line.b], "target": ids[line.a]}
-            properties.append({"kind": "edge", **back, **words, name: {"line": k, "backward": True}})
+            properties.append({"kind": "edge", **back, **canonical_members, name: {"line": k, "backward": True}})
             rows.append((line.b, line.a))
-    made = unique_ids((f"{p['source']}-{p['target']}" for p in properties), set(ids))
-    return made, list(edge_lines(xyz, [a for a, _ in rows], [b for _, b in rows])), properties
+    edge_ids = unique_ids((f"{p['source']}-{p['target']}" for p in properties), set(ids))
+    return edge_ids, list(edge_lines(xyz, [a for a, _ in rows], [b for _, b in rows])), properties
 
 
 def lines(net: Net, context: WriteContext, name: str) -> list[Line]:
@@ -89,20 +96,20 @@ def lines(net: Net, context: WriteContext, name: str) -> list[Line]:
         done = {id(e) for pair in closed for e in pair}
         waiting = [e for e in waiting if id(e) not in done]
     pairs += [(edge, None) for edge in waiting]
-    lost = differing = oneway = 0
+    dropped_count = differing = oneway = 0
     out = []
     for edge, back in pairs:
-        lost += bool(edge.properties.keys() - EDGE_CANONICAL - {name})
-        words = canonical(WORDS, dict(edge.properties))
+        dropped_count += bool(edge.properties.keys() - EDGE_CANONICAL - {name})
+        canonical_members = canonical(WORDS, dict(edge.properties))
         if back is not None:
-            differing += words != canonical(WORDS, dict(back.properties))
+            differing += canonical_members != canonical(WORDS, dict(back.properties))
         more = own(edge.properties, name).get("more")
-        said = {**(more if isinstance(more, dict) else {}), **words}
+        members = {**(more if isinstance(more, dict) else {}), **canonical_members}
         if back is None and edge.source != edge.target:
-            said[ONEWAY] = True
+            members[ONEWAY] = True
             oneway += 1
-        out.append(Line(edge.source, edge.target, said))
-    context.drop("attributes of edges", lost, "the format has no place for them")
+        out.append(Line(edge.source, edge.target, members))
+    context.drop("attributes of edges", dropped_count, "the format has no place for them")
     context.drop("attributes of the way back", differing, "a line says the same of both directions")
     if oneway:
         reason = f"{oneway} edges lead one way only, which the format cannot say: they are marked {ONEWAY}: true"

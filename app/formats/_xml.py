@@ -64,48 +64,54 @@ def warn_of_active_content(data: bytes, context: ReadContext, *, has_scripts: bo
     low = data.lower()
     if b"\0" in low[:4]:  # UTF-16 or UTF-32: the words are ASCII
         low = low.replace(b"\0", b"")
-    if not any(word in low[5:] for word in _ACTIVE_WORDS):
+    if not any(marker in low[5:] for marker in _ACTIVE_WORDS):
         return
-    for what, pattern in _ACTIVE:
-        found = [m.start() for m in pattern.finditer(low)] if not (has_scripts and what == _SCRIPT) else []
-        if found:
-            shown = pattern.match(low, found[0])
+    for noun, pattern in _ACTIVE:
+        positions = [m.start() for m in pattern.finditer(low)] if not (has_scripts and noun == _SCRIPT) else []
+        if positions:
+            shown = pattern.match(low, positions[0])
             name = "" if shown is None else f" {shown.group()[:60].decode('latin-1').strip()!r}"
-            often = f" ({len(found)} times)" if len(found) > 1 else ""
-            line = low.count(b"\n", 0, found[0]) + 1
-            context.warn(f"{what}{name}{often}: it is not run or followed here; a viewer may do so", line=line)
+            often = f" ({len(positions)} times)" if len(positions) > 1 else ""
+            line = low.count(b"\n", 0, positions[0]) + 1
+            context.warn(f"{noun}{name}{often}: it is not run or followed here; a viewer may do so", line=line)
 
 
 def warn_of_unknown(
-    data: bytes, root: etree._Element, known: Set[str], context: ReadContext, *, free: Set[str], namespace: str = ""
+    data: bytes,
+    root: etree._Element,
+    format_names: Set[str],
+    context: ReadContext,
+    *,
+    free: Set[str],
+    namespace: str = "",
 ) -> None:
     """Report elements that a format does not know by name, with how often, in one warning.
 
     Args:
         data: the text of ``root``.
-        known: names of the format's elements, without a namespace.
+        format_names: names of the format's elements, without a namespace.
         free: names of elements in which anything may stand.
         namespace: what the format's own namespaces have in common; elements of others are extensions. Empty: the
             format has none.
     """
     plain = data.replace(b"\0", b"") if b"\0" in data[:4] else data  # UTF-16 or UTF-32
     names = {name.decode("utf-8", "replace").rpartition(":")[2] for name in set(_TAG.findall(plain))}
-    found: dict[str, list[etree._Element]] = {}
-    for name in sorted(names - known):
+    elements_by_name: dict[str, list[etree._Element]] = {}
+    for name in sorted(names - format_names):
         for element in root.iter("{*}" + name) if _NAME.fullmatch(name) else ():
             space = etree.QName(element).namespace
             ours = space is None or bool(namespace and namespace in space)
             if ours and not any(etree.QName(above).localname in free for above in element.iterancestors()):
-                found.setdefault(name, []).append(element)
-    if not found:
+                elements_by_name.setdefault(name, []).append(element)
+    if not elements_by_name:
         return
-    first = min((elements[0] for elements in found.values()), key=lambda e: e.sourceline or 0)
-    told = [
-        f"<{name[:80]}>{did_you_mean(name, known)}{f' ({len(elements)} times)' if len(elements) > 1 else ''}"
-        for name, elements in list(found.items())[:_SHOWN]
+    first = min((elements[0] for elements in elements_by_name.values()), key=lambda e: e.sourceline or 0)
+    texts = [
+        f"<{name[:80]}>{did_you_mean(name, format_names)}{f' ({len(elements)} times)' if len(elements) > 1 else ''}"
+        for name, elements in list(elements_by_name.items())[:_SHOWN]
     ]
-    told += [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
-    context.warn(f"unknown elements, kept without effect: {', '.join(told)}", line=first.sourceline)
+    texts += [f"and {len(elements_by_name) - _SHOWN} more"] if len(elements_by_name) > _SHOWN else []
+    context.warn(f"unknown elements, kept without effect: {', '.join(texts)}", line=first.sourceline)
 
 
 _TAG = re.compile(rb"<([^\s<>/!?=\"']+)")
@@ -136,11 +142,11 @@ def check_bounds(root: etree._Element, limits: Limits, data: bytes | None = None
         raise UnreadableFile(reason, [Problem(reason, line=long.getparent().sourceline, where=long.attrname)])
 
 
-def _long_quote(data: bytes, most: int) -> bool:
+def _long_quote(data: bytes, limit: int) -> bool:
     """Whether an attribute value of more than this many bytes may stand in it (``=``, a quote, no such quote for long).
 
     An entity or a longer encoding makes the bytes more than the characters, never fewer.
     """
-    if len(data) <= most:
+    if len(data) <= limit:
         return False
-    return re.search(rb"""=\s*(?:"[^"]{%d}|'[^']{%d})""" % (most, most), data) is not None
+    return re.search(rb"""=\s*(?:"[^"]{%d}|'[^']{%d})""" % (limit, limit), data) is not None

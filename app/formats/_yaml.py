@@ -142,9 +142,9 @@ def text(value: str | float | None) -> str:
     return "null" if value is None else str(value).lower()
 
 
-def decimal(said: str) -> str:
+def decimal(literal: str) -> str:
     """A float's shortest text as YAML 1.1 wants it: PyYAML takes ``1e-09`` for a text, ``1.0e-09`` for the number."""
-    return said.replace("e", ".0e") if "e" in said and "." not in said else said
+    return literal.replace("e", ".0e") if "e" in literal and "." not in literal else literal
 
 
 def block(value: Any, column: int) -> str:
@@ -209,10 +209,10 @@ def _tagged(tag: str, text: str) -> Any:
         return text
     value = scalar(text)
     kind: dict[str, Any] = {"int": int, "float": (int, float), "bool": bool, "null": type(None)}
-    wanted = kind.get(tag.removeprefix(TAG)) if tag.startswith(TAG) else None
-    if wanted is None:
+    expected_type = kind.get(tag.removeprefix(TAG)) if tag.startswith(TAG) else None
+    if expected_type is None:
         raise ValueError(f"the tag {tag[:80]} is not supported")
-    if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
+    if not isinstance(value, expected_type) or (isinstance(value, bool) and expected_type is not bool):
         raise ValueError(f"{text[:80]!r} does not fit its tag {tag}")
     return float(value) if tag == TAG + "float" else value
 
@@ -233,46 +233,46 @@ def _load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed
             event = loader.get_event()
             kind = type(event)
             weight = 0
-            held: list[tuple[Any, int]] | None = None
+            anchor_slot: list[tuple[Any, int]] | None = None
             if kind is yaml.ScalarEvent:
                 nodes += 1
                 if event.anchor is not None:
-                    held = anchors[event.anchor] = []
-                said: str = event.value
+                    anchor_slot = anchors[event.anchor] = []
+                literal: str = event.value
                 top = stack[-1]
                 as_key = top[2] and top[1] is None
                 plain = event.implicit[0]
                 if as_key and (event.tag is None or event.tag == "!"):
-                    if plain and said == "<<":
+                    if plain and literal == "<<":
                         raise ValueError("merge keys (<<) are not supported; write the keys out")
-                    value: Any = said
+                    value: Any = literal
                 elif event.tag is not None:
-                    value = _tagged(event.tag, said)
+                    value = _tagged(event.tag, literal)
                 elif typed:
-                    value = scalar(said) if plain else said
+                    value = scalar(literal) if plain else literal
                 else:
-                    value = Plain(said) if plain else said
-                weight = 8 + len(said)
+                    value = Plain(literal) if plain else literal
+                weight = 8 + len(literal)
             elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
                 nodes += 1
                 mapping = kind is yaml.MappingStartEvent
-                own = None
+                tag = None
                 if event.tag not in (None, "!", TAG + ("map" if mapping else "seq")):
                     if not event.tag.startswith(tags):
                         raise ValueError(f"the tag {event.tag[:80]} is not supported")
-                    own = event.tag
+                    tag = event.tag
                 if stack[-1][2] and stack[-1][1] is None:
                     raise ValueError("a key must be a text, not a collection")
                 if len(stack) > limits.yaml_depth:
                     raise ValueError(f"nested deeper than {limits.yaml_depth} levels")
                 if event.anchor is not None:
-                    held = anchors[event.anchor] = []
-                stack.append([{} if mapping else [], None, mapping, 8, held, own])
+                    anchor_slot = anchors[event.anchor] = []
+                stack.append([{} if mapping else [], None, mapping, 8, anchor_slot, tag])
                 continue
             elif kind is yaml.MappingEndEvent or kind is yaml.SequenceEndEvent:
-                value, _, _, weight, held, own = stack.pop()
-                if own is not None:
-                    value = Tagged(own, value)
+                value, _, _, weight, anchor_slot, tag = stack.pop()
+                if tag is not None:
+                    value = Tagged(tag, value)
             elif kind is yaml.AliasEvent:
                 if event.anchor not in anchors:
                     raise ValueError(f"the alias *{event.anchor[:80]} has no anchor before it")
@@ -296,8 +296,8 @@ def _load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed
                 continue
             if nodes > limits.yaml_nodes:
                 raise _refuse(f"more than {limits.yaml_nodes} nodes", event.start_mark.line, TooLarge)
-            if held is not None:
-                held.append((value, weight))
+            if anchor_slot is not None:
+                anchor_slot.append((value, weight))
             top = stack[-1]
             top[3] += weight
             if not top[2]:
@@ -415,20 +415,20 @@ class _Flows:
     def row(self, x: str, y: str, tail: str) -> list[Any]:
         """The value of ``[x, y, tail``, x and y being plain decimals."""
         out: list[Any] = [float(x) if "." in x else int(x), float(y) if "." in y else int(y)]
-        place = _PLACE.match(tail)
-        if place:
-            third, name = place.groups()
+        match = _PLACE.match(tail)
+        if match:
+            third, name = match.groups()
             out += (float(third) if "." in third else int(third), CONSTANTS.get(name, name) if name else "")
             self._count(5, 1)
         else:
-            rest, nodes, depth = self._collection(tail, 0, "]", 1)
-            out += rest
+            extra, nodes, depth = self._collection(tail, 0, "]", 1)
+            out += extra
             self._count(nodes + 2, depth)
         return out
 
-    def value(self, said: str) -> Any:
+    def value(self, flow: str) -> Any:
         """The value of a collection."""
-        value, nodes, depth = self._collection(said, 1, "]" if said[0] == "[" else "}", 1)
+        value, nodes, depth = self._collection(flow, 1, "]" if flow[0] == "[" else "}", 1)
         self._count(nodes, depth)
         return value
 
@@ -438,24 +438,24 @@ class _Flows:
         if self.nodes > self._limits.yaml_nodes:
             raise _NotSimpleError
 
-    def _collection(self, said: str, at: int, end: str, depth: int) -> tuple[Any, int, int]:
+    def _collection(self, flow: str, at: int, end: str, depth: int) -> tuple[Any, int, int]:
         """(value, nodes, depth) of the collection whose content begins here and which ends the text."""
-        value, after, nodes, deepest = self._content(said, at, end, depth)
-        if after != len(said):
+        value, after, nodes, deepest = self._content(flow, at, end, depth)
+        if after != len(flow):
             raise _NotSimpleError
         return value, nodes, deepest
 
-    def _content(self, said: str, at: int, end: str, depth: int) -> tuple[Any, int, int, int]:
+    def _content(self, flow: str, at: int, end: str, depth: int) -> tuple[Any, int, int, int]:
         """(value, where it ends, nodes, depth) of a collection whose content begins here; end: its bracket."""
         if depth > self._limits.yaml_depth:
             raise _NotSimpleError
         out: Any = [] if end == "]" else {}
         nodes, deepest = 1, depth
-        if said.startswith(end, at):
+        if flow.startswith(end, at):
             return out, at + 1, nodes, deepest
         while True:
             key = None
-            m = _FLOW.match(said, at)
+            m = _FLOW.match(flow, at)
             if m and end == "}":
                 key = m["key"]
                 if key is None:
@@ -466,12 +466,12 @@ class _Flows:
                     key = key[1:-1]
                 if key in out:
                     raise _NotSimpleError
-                m = _FLOW.match(said, at)
+                m = _FLOW.match(flow, at)
             if m is None or m["key"] is not None:
                 raise _NotSimpleError
             kind, at = m.lastgroup, m.end()
             if kind == "open":
-                value, at, more, below = self._inner(said, at, depth + 1)
+                value, at, more, below = self._inner(flow, at, depth + 1)
                 nodes += more
                 deepest = max(deepest, below)
             else:
@@ -488,25 +488,25 @@ class _Flows:
                 out.append(value)
             else:
                 out[sys.intern(key)] = value
-            if said.startswith(end, at):
+            if flow.startswith(end, at):
                 return out, at + 1, nodes, deepest
-            if not said.startswith(", ", at):
+            if not flow.startswith(", ", at):
                 raise _NotSimpleError
             at += 2
 
-    def _inner(self, said: str, at: int, depth: int) -> tuple[Any, int, int, int]:
+    def _inner(self, flow: str, at: int, depth: int) -> tuple[Any, int, int, int]:
         """As ``_content``, for a collection inside another; a mapping that ends a row is known again."""
-        end = "]" if said[at - 1] == "[" else "}"
-        if end == "]" or depth != 2 or said[-2:] != "}]" or said.find("}", at) != len(said) - 2:
-            return self._content(said, at, end, depth)
-        rest = said[at:]
-        known = self._known.get(rest)
-        if known is None:
-            value, after, nodes, deepest = self._content(said, at, end, depth)
-            if after != len(said) - 1:
+        end = "]" if flow[at - 1] == "[" else "}"
+        if end == "]" or depth != 2 or flow[-2:] != "}]" or flow.find("}", at) != len(flow) - 2:
+            return self._content(flow, at, end, depth)
+        remainder = flow[at:]
+        cached = self._known.get(remainder)
+        if cached is None:
+            value, after, nodes, deepest = self._content(flow, at, end, depth)
+            if after != len(flow) - 1:
                 return value, after, nodes, deepest
-            known = self._known[rest] = (value, nodes, deepest)
-        return known[0], len(said) - 1, known[1], known[2]
+            cached = self._known[remainder] = (value, nodes, deepest)
+        return cached[0], len(flow) - 1, cached[1], cached[2]
 
 
 class _Lines(dict[str, _Line]):
@@ -528,19 +528,19 @@ class _Lines(dict[str, _Line]):
                 first, key = len(flow["indent"]), flow["key"]
                 dashed = (flow["dash"] or flow["dashed"]) is not None
                 value = self.flows.value(flow["flow"])
-                where = -2 if key is None else -10 - first if dashed else first
-                return (where, key, value, (first, dashed, first + 2 * dashed, None))
+                position = -2 if key is None else -10 - first if dashed else first
+                return (position, key, value, (first, dashed, first + 2 * dashed, None))
         return self._block(line)
 
     def _block(self, line: str) -> _Line:
-        usual = _USUAL.match(line)
-        if usual:
-            spaces, key, decimal, word = usual.groups()
+        match = _USUAL.match(line)
+        if match:
+            spaces, key, decimal, literal = match.groups()
             first = len(spaces)
-            value: Any = CONSTANTS.get(word, word) if decimal is None else float(decimal)
-            known: _Line = (first, key, value, (first, False, first, None))
+            value: Any = CONSTANTS.get(literal, literal) if decimal is None else float(decimal)
+            entry: _Line = (first, key, value, (first, False, first, None))
         elif _BLANK.match(line):
-            known = (-3, None, None, (0, False, 0, None))
+            entry = (-3, None, None, (0, False, 0, None))
         else:
             m = _LINE.match(line)
             if not m:
@@ -567,12 +567,12 @@ class _Lines(dict[str, _Line]):
                 key = key[1:-1]
             first = len(indent)
             column = first + len(dash or "")
-            where = -2
+            position = -2
             if key is not None and alias is None and anchor is None:
-                where = first if dash is None else -10 - first
-            known = (where, key, value, (first, dash is not None, column, anchor))
-        self[line] = known
-        return known
+                position = first if dash is None else -10 - first
+            entry = (position, key, value, (first, dash is not None, column, anchor))
+        self[line] = entry
+        return entry
 
 
 def _load_lines(text: str, limits: Limits) -> Any:
@@ -590,57 +590,57 @@ def _load_lines(text: str, limits: Limits) -> Any:
     anchors: dict[str, Any] = {}
     weights: dict[str, int] = {}
     budget = UNFOLD_FREE + UNFOLD_TIMES * len(text)
-    here: Any = root  # the innermost collection
+    current: Any = root  # the innermost collection
     at = -1  # its column, where it is a mapping and no key waits for its value
     item = -1  # -10 - the column of the dash, where the mapping is an item of a list and no key waits
     waiting = True  # the last key or dash has no value yet
     key: str | None = None
     anchor: str | None = None  # of what is waited for
-    known = _Lines(limits)
-    flows = known.flows
-    for where, name, value, rest in map(known.__getitem__, lines):
-        if where == at:
-            if name in here:
+    line_cache = _Lines(limits)
+    flows = line_cache.flows
+    for position, name, value, layout in map(line_cache.__getitem__, lines):
+        if position == at:
+            if name in current:
                 raise _NotSimpleError
             key = name
             if value is _OPEN:
                 waiting, at, item = True, -1, -1
             else:
-                here[key] = value
+                current[key] = value
             continue
-        if where == item and value is not _OPEN:
-            here = {name: value}
-            at = rest[2]
-            stack[-1] = (at, here, False)
-            stack[-2][1].append(here)
+        if position == item and value is not _OPEN:
+            current = {name: value}
+            at = layout[2]
+            stack[-1] = (at, current, False)
+            stack[-2][1].append(current)
             continue
-        if where == -3:
+        if position == -3:
             continue
-        first, dash, inner, its_anchor = rest
+        first, dash, inner, its_anchor = layout
         opened = stack[-1][0]
-        if waiting and (first > opened or (first == opened and dash and type(here) is dict)):
+        if waiting and (first > opened or (first == opened and dash and type(current) is dict)):
             new: Any = [] if dash else {}
-            _put(here, key, new)
+            _put(current, key, new)
             if anchor is not None:
                 anchors[anchor] = new
             stack.append((first, new, anchor is not None))
-            here = new
+            current = new
         else:
             if waiting:
                 if anchor is not None:
                     raise _NotSimpleError
-                _put(here, key, None)
-            while first < stack[-1][0] or (first == stack[-1][0] and not dash and type(here) is list):
+                _put(current, key, None)
+            while first < stack[-1][0] or (first == stack[-1][0] and not dash and type(current) is list):
                 stack.pop()
-                here = stack[-1][1]
-            if first != stack[-1][0] or dash != (type(here) is list):
+                current = stack[-1][1]
+            if first != stack[-1][0] or dash != (type(current) is list):
                 raise _NotSimpleError
         if dash and name is not None:
             new = {}
-            here.append(new)
+            current.append(new)
             stack.append((inner, new, False))
-            here = new
-        if len(stack) - 1 + flows.depth > limits.yaml_depth or (name is not None and name in here):
+            current = new
+        if len(stack) - 1 + flows.depth > limits.yaml_depth or (name is not None and name in current):
             raise _NotSimpleError
         key, anchor = name, its_anchor
         if anchor is not None and anchor in anchors:
@@ -655,15 +655,15 @@ def _load_lines(text: str, limits: Limits) -> Any:
             budget -= weights[value]
             if budget < 0:
                 raise _NotSimpleError
-            _put(here, key, anchors[value])
+            _put(current, key, anchors[value])
         elif not waiting:
-            _put(here, key, value)
-        at = stack[-1][0] if type(here) is dict and not waiting else -1
+            _put(current, key, value)
+        at = stack[-1][0] if type(current) is dict and not waiting else -1
         item = -10 - first if dash and name is not None and not waiting else -1
     if waiting:
         if anchor is not None:
             raise _NotSimpleError
-        _put(here, key, None)
+        _put(current, key, None)
     if 4 * len(lines) + flows.nodes > limits.yaml_nodes:
         raise _NotSimpleError
     return root[0]

@@ -151,20 +151,20 @@ def _check_place(latitude: float, longitude: float, ring: NDArray[np.float64] | 
         context.warn("the datum is at 0, 0, in the sea: set the site's own place", where="datum_latitude")
     if ring is None:
         return
-    where = "gnss_fence.gnss_fence_coords"
+    location = "gnss_fence.gnss_fence_coords"
     far = [k for k, (x, y) in enumerate(ring.tolist()) if distance((longitude, latitude), (x, y)) > FAR_METRES]
     if far:
         reason = f"{len(far)} of {len(ring)} points are more than {FAR_METRES / 1000:g} km from the datum"
-        context.warn(f"{reason}: are latitude and longitude swapped?", where=f"{where}[{far[0]}]")
+        context.warn(f"{reason}: are latitude and longitude swapped?", where=f"{location}[{far[0]}]")
     if not shapely.Polygon(ring).is_valid:
-        context.warn("the fence crosses itself: what is inside of it is not defined", where=where)
+        context.warn("the fence crosses itself: what is inside of it is not defined", where=location)
 
 
-def _refuse(reason: str, where: str) -> UnreadableFile:
-    return UnreadableFile(f"{where}: {reason}" if where else reason, [Problem(reason, where=where or None)])
+def _refuse(reason: str, location: str) -> UnreadableFile:
+    return UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, where=location or None)])
 
 
-def _number(value: Any, where: str) -> float:
+def _number(value: Any, location: str) -> float:
     """A finite number, also one in quotes."""
     if isinstance(value, str):
         try:
@@ -172,30 +172,30 @@ def _number(value: Any, where: str) -> float:
         except ValueError:
             value = None
     if value is None or isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _refuse("must be a number", where)
+        raise _refuse("must be a number", location)
     return float(value)
 
 
-def _degrees(value: Any, where: str, bound: float) -> float:
+def _degrees(value: Any, location: str, bound: float) -> float:
     if value is None:
-        raise _refuse("is missing: the datum needs datum_latitude and datum_longitude in degrees", where)
-    degrees = _number(value, where)
+        raise _refuse("is missing: the datum needs datum_latitude and datum_longitude in degrees", location)
+    degrees = _number(value, location)
     if not -bound <= degrees <= bound:
-        raise _refuse(f"must be between {-bound:g} and {bound:g} degrees, got {degrees:g}", where)
+        raise _refuse(f"must be between {-bound:g} and {bound:g} degrees, got {degrees:g}", location)
     return degrees
 
 
 def _yaw(navsat: Mapping[str, Any], latitude: float, longitude: float, context: ReadContext) -> float:
     """Radians counter-clockwise from east to the local +x axis."""
-    where = "navsat_transform_node.datum"
-    said = navsat.get("datum")
-    if said is None:
+    location = "navsat_transform_node.datum"
+    raw_datum = navsat.get("datum")
+    if raw_datum is None:
         return 0.0
-    if not isinstance(said, list) or len(said) < 2:
-        raise _refuse("must be [latitude, longitude, yaw in radians]", where)
-    other = [_number(v, f"{where}[{k}]") for k, v in enumerate(said[:3])]
+    if not isinstance(raw_datum, list) or len(raw_datum) < 2:
+        raise _refuse("must be [latitude, longitude, yaw in radians]", location)
+    other = [_number(v, f"{location}[{k}]") for k, v in enumerate(raw_datum[:3])]
     if abs(other[0] - latitude) > 1e-9 or abs(other[1] - longitude) > 1e-9:
-        context.warn("differs from datum_latitude and datum_longitude, which count", where=where)
+        context.warn("differs from datum_latitude and datum_longitude, which count", where=location)
     for key in ("yaw_offset", "magnetic_declination_radians"):
         value = navsat.get(key, 0.0)
         if isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0:
@@ -211,25 +211,27 @@ def _heading(yaw: float) -> float:
     return math.degrees(-math.remainder(yaw, 2 * math.pi)) + 0.0
 
 
-def _fence(said: Any, context: ReadContext) -> NDArray[np.float64] | None:
+def _fence(members: Any, context: ReadContext) -> NDArray[np.float64] | None:
     """float64 [n, 2] (longitude, latitude) as the file lists them, or None where there is no fence."""
-    where = "gnss_fence.gnss_fence_coords"
-    if said is not None and not isinstance(said, dict):
+    location = "gnss_fence.gnss_fence_coords"
+    if members is not None and not isinstance(members, dict):
         raise _refuse("must be a mapping with gnss_fence_coords", "gnss_fence")
-    listed = (said or {}).get("gnss_fence_coords")
+    listed = (members or {}).get("gnss_fence_coords")
     if listed is None or listed == []:
-        context.warn("is missing: the environment has a datum but no fence", where=where)
+        context.warn("is missing: the environment has a datum but no fence", where=location)
         return None
     if not isinstance(listed, list):
-        raise _refuse("must be a list of [latitude, longitude]", where)
+        raise _refuse("must be a list of [latitude, longitude]", location)
     ring = np.empty((len(listed), 2))
     for k, pair in enumerate(listed):
-        at = f"{where}[{k}]"
+        at = f"{location}[{k}]"
         if not isinstance(pair, list) or len(pair) != 2:
             raise _refuse("must be [latitude, longitude]", at)
         ring[k] = _degrees(pair[1], f"{at}[1]", 180.0), _degrees(pair[0], f"{at}[0]", 90.0)
     if len(np.unique(ring, axis=0)) < 3:
-        raise _refuse(f"a fence needs at least 3 different points, this one has {len(np.unique(ring, axis=0))}", where)
+        raise _refuse(
+            f"a fence needs at least 3 different points, this one has {len(np.unique(ring, axis=0))}", location
+        )
     return ring
 
 
@@ -262,9 +264,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     old = (document.get("datum_latitude"), document.get("datum_longitude"))
     out.append("\nmapviz_initialize_origin:" + _mapviz(document, datum, old, context))
     out.append("\nnavsat_transform_node:\n" + _navsat(document, datum, context))
-    rest = {key: value for key, value in document.items() if key not in _KNOWN}
-    if rest:
-        out.append("\n" + _yaml.mapping(rest, 0))
+    extra_members = {key: value for key, value in document.items() if key not in _KNOWN}
+    if extra_members:
+        out.append("\n" + _yaml.mapping(extra_members, 0))
     return {"datum.yaml": "".join(out).encode()}
 
 
@@ -275,36 +277,36 @@ _KNOWN = frozenset(
 
 def _chosen(layers: Layers, context: WriteContext) -> tuple[Any, dict[str, Any], bool]:
     """(the fence as a polygon in degrees or None, the source's other keys, whether its first point was repeated)."""
-    known: dict[str, Any] = {}
-    found: list[tuple[bool, float, str, Any, bool]] = []
-    lost = 0
+    source_document: dict[str, Any] = {}
+    candidates: list[tuple[bool, float, str, Any, bool]] = []
+    dropped_count = 0
     for key, part in sorted(layers.vector("location").items(), key=lambda item: item[0].level != GROUND):
-        said = part.document.get(NAME)
-        if isinstance(said, dict) and not known:
-            known = dict(said)
+        document = part.document.get(NAME)
+        if isinstance(document, dict) and not source_document:
+            source_document = dict(document)
         places = part.in_wgs84(layers.frame)
         if part.local.any():
             # Computed degrees are rounded, so that every machine prints the same; given ones are written as given.
             places = places.copy()
             places[part.local] = shapely.transform(places[part.local], lambda xy: np.round(xy, DEGREES) + 0.0)
-        for feature, place in zip(part, places, strict=True):
-            own = feature.properties.get(NAME)
-            closed = isinstance(own, dict) and own.get("closed") is True
-            pieces = list(place.geoms) if place.geom_type == "MultiPolygon" else [place]
+        for feature, geometry in zip(part, places, strict=True):
+            source_properties = feature.properties.get(NAME)
+            closed = isinstance(source_properties, dict) and source_properties.get("closed") is True
+            pieces = list(geometry.geoms) if geometry.geom_type == "MultiPolygon" else [geometry]
             for k, piece in enumerate(pieces):
                 if piece.geom_type == "Polygon" and not piece.is_empty:
                     is_fence = feature.properties.get("kind") == FENCE
-                    found.append((not is_fence, -piece.area, f"{key.level}/{feature.id}/{k}", piece, closed))
+                    candidates.append((not is_fence, -piece.area, f"{key.level}/{feature.id}/{k}", piece, closed))
                 else:
-                    lost += 1
-    context.drop("location items that are no polygons", lost, "datum.yaml has room for one fence")
-    if not found:
-        return None, known, False
-    found.sort(key=lambda row: row[:3])
-    context.drop("further location polygons", len(found) - 1, "datum.yaml has room for one fence")
-    fence = found[0][3]
+                    dropped_count += 1
+    context.drop("location items that are no polygons", dropped_count, "datum.yaml has room for one fence")
+    if not candidates:
+        return None, source_document, False
+    candidates.sort(key=lambda row: row[:3])
+    context.drop("further location polygons", len(candidates) - 1, "datum.yaml has room for one fence")
+    fence = candidates[0][3]
     context.drop("holes of the fence", len(fence.interiors), "a fence in datum.yaml is one ring")
-    return fence, known, found[0][4]
+    return fence, source_document, candidates[0][4]
 
 
 def _options(context: WriteContext) -> WriteOptions:
@@ -313,8 +315,8 @@ def _options(context: WriteContext) -> WriteOptions:
 
 def _size(document: Mapping[str, Any], layers: Layers, ring: Any, context: WriteContext) -> dict[str, Any]:
     """gmapping as the source has it, with what it lacks from the extent of fence and data, in whole metres."""
-    said = document.get("gmapping")
-    size = dict(said) if isinstance(said, dict) else {}
+    gmapping = document.get("gmapping")
+    size = dict(gmapping) if isinstance(gmapping, dict) else {}
     lacking = [key for key in ("xmin", "xmax", "ymin", "ymax") if key not in size]
     if not lacking:
         return size
@@ -325,9 +327,9 @@ def _size(document: Mapping[str, Any], layers: Layers, ring: Any, context: Write
     else:
         why, option = "the extent of the fence and the data, whole metres", None
     west, south, east, north = extent
-    made = {"xmin": math.floor(west), "xmax": math.ceil(east), "ymin": math.floor(south), "ymax": math.ceil(north)}
+    bounds = {"xmin": math.floor(west), "xmax": math.ceil(east), "ymin": math.floor(south), "ymax": math.ceil(north)}
     for key in lacking:
-        size[key] = made[key]
+        size[key] = bounds[key]
     context.fill("gmapping", {key: size[key] for key in lacking}, why, option)
     return size
 
@@ -353,33 +355,33 @@ def _extent(layers: Layers, ring: Any) -> tuple[float, float, float, float] | No
 
 def _mapviz(document: Mapping[str, Any], datum: Datum, old: tuple[Any, Any], context: WriteContext) -> str:
     """mapviz' origins: those that stood at the source's datum stand at the datum."""
-    said = document.get("mapviz_initialize_origin")
-    if said is None:
-        made: dict[str, Any] = {"name": "dont_change_this", "latitude": None, "longitude": None}
-        made |= {"altitude": MAPVIZ_ALTITUDE, "heading": 0.0}
-        said = {"local_xy_origins": [made]}
+    mapviz = document.get("mapviz_initialize_origin")
+    if mapviz is None:
+        new_origin: dict[str, Any] = {"name": "dont_change_this", "latitude": None, "longitude": None}
+        new_origin |= {"altitude": MAPVIZ_ALTITUDE, "heading": 0.0}
+        mapviz = {"local_xy_origins": [new_origin]}
         context.fill("mapviz_initialize_origin", "one origin at the datum", "no source has it")
         old = (None, None)
-    origins = said.get("local_xy_origins") if isinstance(said, dict) else None
-    if not isinstance(said, dict) or not isinstance(origins, list):
-        return _yaml.block(said, 0)
+    origins = mapviz.get("local_xy_origins") if isinstance(mapviz, dict) else None
+    if not isinstance(mapviz, dict) or not isinstance(origins, list):
+        return _yaml.block(mapviz, 0)
     moved = []
     for origin in origins:
         if isinstance(origin, dict) and (origin.get("latitude"), origin.get("longitude")) == old:
             moved.append({**origin, "latitude": datum.latitude, "longitude": datum.longitude})
         else:
             moved.append(origin)
-    return _yaml.block({**said, "local_xy_origins": moved}, 0)
+    return _yaml.block({**mapviz, "local_xy_origins": moved}, 0)
 
 
 def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) -> str:
     """navsat_transform_node's parameters, its datum made from ours."""
-    said = document.get("navsat_transform_node")
-    navsat = dict(said) if isinstance(said, dict) else {}
-    usual = {key: getattr(_options(context), key) for key in NAVSAT}
+    members = document.get("navsat_transform_node")
+    navsat = dict(members) if isinstance(members, dict) else {}
+    defaults = {key: getattr(_options(context), key) for key in NAVSAT}
     for key in NAVSAT:
         if key not in navsat:
-            context.fill(f"navsat_transform_node: {key}", usual[key], "no source has it", key)
+            context.fill(f"navsat_transform_node: {key}", defaults[key], "no source has it", key)
     listed = navsat.pop("datum", None)
     yaw: Any = listed[2] if isinstance(listed, list) and len(listed) > 2 else None
     more = listed[3:] if isinstance(listed, list) else []
@@ -387,14 +389,14 @@ def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) ->
     if isinstance(yaw, bool) or not isinstance(yaw, (int, float)) or _heading(yaw) != datum.heading:
         yaw = -math.radians(datum.heading) + 0.0
     values = [_yaml.text(datum.latitude), _yaml.text(datum.longitude), *map(_yaml.text, [yaw, *more])]
-    return _ordered({**usual, **navsat}, 2, NAVSAT) + f"  datum: [{', '.join(values)}]\n"
+    return _ordered({**defaults, **navsat}, 2, NAVSAT) + f"  datum: [{', '.join(values)}]\n"
 
 
 def _ordered(values: Mapping[str, Any], column: int, first: Sequence[str]) -> str:
     """A mapping's text: these keys in this order, then the others sorted."""
     out = [_yaml.mapping({key: values[key]}, column) for key in first if key in values]
-    rest = {key: value for key, value in values.items() if key not in first}
-    return "".join(out) + (_yaml.mapping(rest, column) if rest else "")
+    extra_members = {key: value for key, value in values.items() if key not in first}
+    return "".join(out) + (_yaml.mapping(extra_members, column) if extra_members else "")
 
 
 _KEY = re.compile(rb"(?m)^datum_latitude\s*:")

@@ -181,8 +181,8 @@ class _Writer:
 
     def only(self, *layers: Layer) -> Layers:
         """The stored parts of these layers."""
-        kept = {k: p for k, p in self.layers.parts.items() if k.layer in layers and not is_empty(p)}
-        return Layers(kept, self.layers.datum, self.layers.levels)
+        parts = {k: p for k, p in self.layers.parts.items() if k.layer in layers and not is_empty(p)}
+        return Layers(parts, self.layers.datum, self.layers.levels)
 
     def with_parts(self, parts: Mapping[PartKey, Part]) -> Layers:
         return Layers(dict(parts), self.layers.datum, self.layers.levels)
@@ -230,9 +230,9 @@ class _Writer:
             self.told.add(key)
             self.put({n: f"metric/{stem}/{n}" for n in inner.files}, inner)
             names.setdefault(key.name, []).append(f"metric/{stem}/{next(iter(inner.files))}")
-        chosen = names.get(MAP) or ([p for row in names.values() for p in row] if len(grids) == 1 else [])
-        if chosen:
-            self.paths["COSTMAP_YAML_FILE"] = chosen[0]
+        paths = names.get(MAP) or ([p for row in names.values() for p in row] if len(grids) == 1 else [])
+        if paths:
+            self.paths["COSTMAP_YAML_FILE"] = paths[0]
         elif len(names) > 1:
             self.context.warn(f"none of the grids {some(sorted(names))} is called {MAP}: COSTMAP_YAML_FILE is empty")
         for name in NO_GO:
@@ -247,8 +247,12 @@ class _Writer:
             stem = self.stem(key, keys)
             inner = self.made("octomap", self.with_parts({key: part}))
             cloud = PartKey("resources", key.level, cloud_name(key.name))
-            said = part.properties.get("points") if isinstance(part, VoxelMap) else None
-            end = str(said.get("file")).rpartition(".")[2].lower() if isinstance(said, Mapping) else ""
+            source_properties = part.properties.get("points") if isinstance(part, VoxelMap) else None
+            end = (
+                str(source_properties.get("file")).rpartition(".")[2].lower()
+                if isinstance(source_properties, Mapping)
+                else ""
+            )
             made_of = end if cloud in self.layers.parts else ""
             if inner is not None:
                 self.told.add(key)
@@ -278,39 +282,39 @@ class _Writer:
 
     def world(self) -> None:
         """The stored worlds, each under its own name; else one of what is stored, where that is asked for."""
-        mine = {k: p for k, p in self.layers.vector("objects").items() if k.name == "gazebo"}
+        own_parts = {k: p for k, p in self.layers.vector("objects").items() if k.name == "gazebo"}
         worlds: dict[str, dict[str, Any]] = {}
-        for part in mine.values():
-            said = part.document.get("gazebo")
-            stored = said.get("worlds") if isinstance(said, Mapping) else None
+        for part in own_parts.values():
+            source_document = part.document.get("gazebo")
+            stored = source_document.get("worlds") if isinstance(source_document, Mapping) else None
             worlds |= (
                 {str(name): {"world": str(name), "content": "world"} for name in stored}
                 if isinstance(stored, Mapping)
                 else {}
             )
-        if mine and not worlds:
+        if own_parts and not worlds:
             worlds = {"gazebo": {}}
-        if not mine and self.complete:
+        if not own_parts and self.complete:
             worlds = {"gazebo": {}}
         first: list[str] = []
         for name, values in worlds.items():
             source = self.only("objects", "resources", "occupancy")
-            if mine:
-                kept = {k: p for k, p in source.parts.items() if k.name == "gazebo" and k.layer != "occupancy"}
-                source = self.with_parts(kept)
-            inner = self.made("gazebo", source, values, derived=not mine)
+            if own_parts:
+                world_parts = {k: p for k, p in source.parts.items() if k.name == "gazebo" and k.layer != "occupancy"}
+                source = self.with_parts(world_parts)
+            inner = self.made("gazebo", source, values, derived=not own_parts)
             if inner is None:
                 continue
             # What one world lacks of another one stands in that one's file here.
             others_ = {f"ask with world={other}" for other in worlds}
             inner = dataclasses.replace(inner, dropped=tuple(d for d in inner.dropped if d["why"] not in others_))
-            self.told.update(mine)
+            self.told.update(own_parts)
             self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name == "gazebo")
-            main, *others = inner.files
+            main, *companions = inner.files
             path = f"world/{_world_name(name)}"
-            paths = {n: f"world/custom_models/{n.removeprefix('models/')}" for n in others}
+            paths = {n: f"world/custom_models/{n.removeprefix('models/')}" for n in companions}
             first.append(self.put({main: path, **paths}, inner))
-            if others:
+            if companions:
                 self.paths["GAZEBO_CUSTOM_MODELS"] = "world/custom_models/"
         if first:
             # As the template looks for it, else as a folder with one world has it.
@@ -319,8 +323,8 @@ class _Writer:
 
     def points(self) -> None:
         """Points of interest of a topological map: a map of nodes without edges."""
-        mine = {k: p for k, p in self.layers.vector("objects").items() if k.name == "tmap2" and len(p)}
-        for key, part in mine.items():
+        own_parts = {k: p for k, p in self.layers.vector("objects").items() if k.name == "tmap2" and len(p)}
+        for key, part in own_parts.items():
             nodes = tuple({**p, "kind": "node"} for p in part.properties)
             network = Features(part.ids, part.geometry, nodes, part.local, part.document)
             inner = self.made("tmap2", self.with_parts({PartKey("topology", key.level, NETWORK): network}))
@@ -332,7 +336,7 @@ class _Writer:
 
     def objects(self) -> None:
         """Objects by the format they came from; zones, GeoJSON's and those of no format in one GeoJSON file."""
-        rest: dict[PartKey, Part] = {k: p for k, p in self.only("zones").parts.items() if isinstance(p, Features)}
+        remaining: dict[PartKey, Part] = {k: p for k, p in self.only("zones").parts.items() if isinstance(p, Features)}
         families: dict[str, dict[PartKey, Part]] = {}
         for key, part in self.layers.vector("objects").items():
             if len(part) and key not in self.told:
@@ -340,11 +344,11 @@ class _Writer:
         for family, parts in families.items():
             inner = self.family(family, parts) if family != "geojson" else None
             if inner is None:
-                rest |= parts
+                remaining |= parts
                 continue
-            main, *others = inner.files
+            main, *companions = inner.files
             names = {n: f"world/{_plain(family)}/{n}" for n in inner.files}
-            if not others:
+            if not companions:
                 end = _ending(main)
                 plain = end in (f".{family}", ".kmz")
                 names[main] = f"world/objects{end}" if plain else f"world/objects_{_plain(family)}{end}"
@@ -352,11 +356,11 @@ class _Writer:
             self.told.update(parts)
             further = {family, "kmz"} if main.endswith(".kmz") else {family}
             self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name in further)
-        if rest:
-            inner = self.made("geojson", self.with_parts(rest))
+        if remaining:
+            inner = self.made("geojson", self.with_parts(remaining))
             if inner is not None:
                 self.put(dict.fromkeys(inner.files, "world/objects.geojson"), inner)
-                self.told.update(rest)
+                self.told.update(remaining)
 
     def family(self, name: str, parts: Mapping[PartKey, Part]) -> Inner | None:
         """A map of the format that these objects came from; None where they cannot be all of it."""
@@ -381,8 +385,8 @@ class _Writer:
                 continue
             count = len(part) if isinstance(part, Features) else 1
             if count:
-                where = f"{key.layer} {key.level}/{key.name}"
-                self.context.drop(where, count, "no format that could hold it is there, or its map cannot be made")
+                part_name = f"{key.layer} {key.level}/{key.name}"
+                self.context.drop(part_name, count, "no format that could hold it is there, or its map cannot be made")
         levels = {k.level for k in self.told if k.layer in ("occupancy", "voxels", "imagery")} - {GROUND}
         self.context.drop("levels of grids and pictures", len(levels), "the template's folders know one level")
         if self.layers.levels != (Level(),):
@@ -391,23 +395,25 @@ class _Writer:
 
     def stem(self, key: PartKey, all_keys: set[PartKey]) -> str:
         """A part's name as a folder's: on the ground its own, elsewhere with its level; never two alike."""
-        mine: dict[PartKey, str] = {}
+        stems: dict[PartKey, str] = {}
         for k in sorted(all_keys):
             name = _plain(k.name if k.level == GROUND else f"{k.name}_{k.level}")
-            mine[k] = _distinct(name, "", {other.casefold() for other in mine.values()})
-        return mine[key]
+            stems[k] = _distinct(name, "", {other.casefold() for other in stems.values()})
+        return stems[key]
 
     # --- the scripts ---
 
     def variables(self) -> dict[str, str]:
         """Stored variables but for those that say where files are."""
-        said: dict[str, Any] = {}
+        all_variables: dict[str, Any] = {}
         for key, part in self.layers.vector("objects").items():
             stored = part.document.get(NAME) if key.name == NAME else None
             values = stored.get("variables") if isinstance(stored, Mapping) else None
-            said |= values if isinstance(values, Mapping) else {}
-        out, own, reasons = _shell.handed_on(said)
-        self.context.drop("variables that name files", len(own), f"they name those of the package now: {some(own)}")
+            all_variables |= values if isinstance(values, Mapping) else {}
+        out, file_names, reasons = _shell.handed_on(all_variables)
+        self.context.drop(
+            "variables that name files", len(file_names), f"they name those of the package now: {some(file_names)}"
+        )
         for reason in reasons:
             self.context.drop("variables", 1, reason)
         return out
@@ -439,8 +445,8 @@ class _Writer:
         """A line that exports a path inside the package, wherever it lies; an empty one where there is no such file."""
         if path is None:
             return f"export {name}=''"
-        there = path in self.out or path == "properties.sh" or any(n.startswith(path) for n in self.out)
-        if not _PATH.fullmatch(path) or not there:
+        exists = path in self.out or path == "properties.sh" or any(n.startswith(path) for n in self.out)
+        if not _PATH.fullmatch(path) or not exists:
             raise ValueError(f"{name} would name {path!r}, which is no file of the package")
         return f'export {name}="$CONFIG_DIR/{path}"'
 
@@ -451,10 +457,10 @@ def _picture_of(layers: Layers) -> Layers:
     for key, part in layers.parts.items():
         if isinstance(part, Features):
             order = sorted(range(len(part)), key=part.ids.__getitem__)
-            kept = part.take(order)
-            plain = tuple({n: v for n, v in p.items() if not isinstance(v, Mapping)} for p in kept.properties)
-            said = {n: v for n, v in part.document.items() if n == "attribution"}
-            parts[key] = Features(kept.ids, kept.geometry, plain, kept.local, said)
+            features = part.take(order)
+            plain = tuple({n: v for n, v in p.items() if not isinstance(v, Mapping)} for p in features.properties)
+            document = {n: v for n, v in part.document.items() if n == "attribution"}
+            parts[key] = Features(features.ids, features.geometry, plain, features.local, document)
     return Layers(parts, layers.datum, layers.levels)
 
 

@@ -69,30 +69,30 @@ def read(files: Files, context: ReadContext) -> Layers:
         reason = f"an FFR network is a mapping with a list of {POINTS}"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where=POINTS)])
     names, xyz, high, rests = _points(top[POINTS])
-    if again := without_repeats(names):
-        context.warn(f"{len(again)} names stand twice or more: {some(again)}")
-    place: dict[tuple[float, float], int] = {}
+    if repeats := without_repeats(names):
+        context.warn(f"{len(repeats)} names stand twice or more: {some(repeats)}")
+    index_by_spot: dict[tuple[float, float], int] = {}
     crowded = []
     for k, (x, y) in enumerate(xyz[:, :2].tolist()):
-        if place.setdefault(_spot(x, y), k) != k:
+        if index_by_spot.setdefault(_spot(x, y), k) != k:
             crowded.append(names[k])
     if crowded:
         context.warn(f"{len(crowded)} points stand where another one does: {some(crowded)}; lines go to the first")
-    found, dangling = _lines(top.get(LINES), place, context)
+    file_lines, dangling = _lines(top.get(LINES), index_by_spot, context)
     _fields.check(top, SHAPE, context)
-    warn_lonely(len(names), (k for line in found for k in (line.a, line.b)), names, context)
+    warn_lonely(len(names), (k for line in file_lines for k in (line.a, line.b)), names, context)
     ids = unique_ids(map(identifier, names))
     properties: list[Properties] = []
-    for i, name, rest, is_high in zip(ids, names, rests, high, strict=True):
-        said: dict[str, Any] = {"more": rest} if rest else {}
+    for i, name, extra_members, is_high in zip(ids, names, rests, high, strict=True):
+        source_members: dict[str, Any] = {"more": extra_members} if extra_members else {}
         if i != name:
-            said["name"] = name
+            source_members["name"] = name
         if is_high:
-            said["z"] = True
-        properties.append({"kind": "node", "name": name, NAME: said})
-    edge_ids, shapes, edge_properties = edges(found, ids, xyz, NAME)
-    rest = {key: value for key, value in top.items() if key not in (POINTS, LINES)}
-    document = ({"top": rest} if rest else {}) | ({"dangling": dangling} if dangling else {})
+            source_members["z"] = True
+        properties.append({"kind": "node", "name": name, NAME: source_members})
+    edge_ids, shapes, edge_properties = edges(file_lines, ids, xyz, NAME)
+    extra_members = {key: value for key, value in top.items() if key not in (POINTS, LINES)}
+    document = ({"top": extra_members} if extra_members else {}) | ({"dangling": dangling} if dangling else {})
     geometry = np.empty(len(ids) + len(shapes), object)
     geometry[:] = [*node_points(xyz), *shapes]
     part = from_columns([*ids, *edge_ids], geometry, [*properties, *edge_properties], "local", {NAME: document})
@@ -103,60 +103,60 @@ def _spot(x: float, y: float) -> tuple[float, float]:
     return round(x, DECIMALS) + 0.0, round(y, DECIMALS) + 0.0
 
 
-def _points(said: Sequence[Any]) -> tuple[list[str], Array, list[bool], list[dict[str, Any]]]:
+def _points(points: Sequence[Any]) -> tuple[list[str], Array, list[bool], list[dict[str, Any]]]:
     """(names, float64 [n, 3] metres, whether a z stands there, further keys)."""
     names, rows, high, rests = [], [], [], []
-    for k, point in enumerate(said):
-        where = f"{POINTS}[{k}]"
+    for k, point in enumerate(points):
+        location = f"{POINTS}[{k}]"
         if not isinstance(point, dict):
-            refuse("a point is a mapping with name, x and y", where)
+            refuse("a point is a mapping with name, x and y", location)
         name = point.get("name")
         if isinstance(name, bool) or not isinstance(name, (int, float, str)):
-            refuse("a point must have a name", f"{where}.name")
-        names.append(checked_name(name if isinstance(name, str) else _yaml.text(name), f"{where}.name"))
-        rows.append((*_xy(point, where), number(point.get("z", 0.0), f"{where}.z")))
+            refuse("a point must have a name", f"{location}.name")
+        names.append(checked_name(name if isinstance(name, str) else _yaml.text(name), f"{location}.name"))
+        rows.append((*_xy(point, location), number(point.get("z", 0.0), f"{location}.z")))
         high.append("z" in point)
         rests.append({key: value for key, value in point.items() if key not in ("name", *AXES)})
     return names, np.array(rows, np.float64).reshape(-1, 3), high, rests
 
 
-def _xy(said: Any, where: str) -> tuple[float, float]:
-    if not isinstance(said, dict):
-        refuse("must be a mapping with x and y", where)
-    x, y = (number(said.get(axis), f"{where}.{axis}") for axis in "xy")
+def _xy(point: Any, location: str) -> tuple[float, float]:
+    if not isinstance(point, dict):
+        refuse("must be a mapping with x and y", location)
+    x, y = (number(point.get(axis), f"{location}.{axis}") for axis in "xy")
     if max(abs(x), abs(y)) > MAX_METRES:
-        refuse(f"coordinates must lie within ±{MAX_METRES:g} m", where)
+        refuse(f"coordinates must lie within ±{MAX_METRES:g} m", location)
     return x, y
 
 
 def _lines(
-    said: Any, place: Mapping[tuple[float, float], int], context: ReadContext
+    entries: Any, index_by_spot: Mapping[tuple[float, float], int], context: ReadContext
 ) -> tuple[list[Line], list[dict[str, Any]]]:
     """(lines between points; those that end at none, as they stand)."""
-    if said is not None and not isinstance(said, list):
+    if entries is not None and not isinstance(entries, list):
         refuse("must be a list", LINES)
-    found, dangling = [], []
-    for k, line in enumerate(said or ()):
-        where = f"{LINES}[{k}]"
+    file_lines, dangling = [], []
+    for k, line in enumerate(entries or ()):
+        location = f"{LINES}[{k}]"
         if not isinstance(line, dict):
-            refuse("a line is a mapping with start and end", where)
-        ends = [_xy(line.get(word), f"{where}.{word}") for word in ("start", "end")]
-        spots = [place.get(_spot(*end)) for end in ends]
+            refuse("a line is a mapping with start and end", location)
+        ends = [_xy(line.get(end), f"{location}.{end}") for end in ("start", "end")]
+        spots = [index_by_spot.get(_spot(*end)) for end in ends]
         if spots[0] is None or spots[1] is None:
             x, y = ends[0] if spots[0] is None else ends[1]
             reason = f"no point stands at its end x {x:g}, y {y:g}: it is kept, but is no part of the network"
-            context.warn(reason, where=where)
+            context.warn(reason, where=location)
             dangling.append(line)
             continue
         if spots[0] == spots[1]:
-            context.warn("it ends where it starts", where=where)
-        rest = {key: value for key, value in line.items() if key not in ("start", "end")}
-        for word in ("start", "end"):
-            more = {key: value for key, value in line[word].items() if key not in "xy"}
+            context.warn("it ends where it starts", where=location)
+        extra_members = {key: value for key, value in line.items() if key not in ("start", "end")}
+        for end in ("start", "end"):
+            more = {key: value for key, value in line[end].items() if key not in "xy"}
             if more:
-                rest[word] = more
-        found.append(Line(spots[0], spots[1], rest))
-    return found, dangling
+                extra_members[end] = more
+        file_lines.append(Line(spots[0], spots[1], extra_members))
+    return file_lines, dangling
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -171,8 +171,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         context.drop("levels of nodes", len(net.nodes), "all networks are joined into one")
     document = known_document(layers, NAME)
     xy = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
-    said_xy = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
-    at = list(zip(said_xy[::2], said_xy[1::2], strict=True))
+    xy_texts = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
+    at = list(zip(xy_texts[::2], xy_texts[1::2], strict=True))
     spots = [_spot(x, y) for x, y in xy.tolist()]
     if len(set(spots)) < len(spots):
         reason = "nodes stand where another one does: their lines will be taken for the other's"
@@ -181,39 +181,39 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     top = {key: v for key, v in top.items() if key not in (POINTS, LINES)} if isinstance(top, dict) else {}
     out = [_yaml.mapping(top, 0)] if top else []
     out.append(f"{POINTS}:\n" if order else f"{POINTS}: []\n")
-    lost = unnamed = 0
+    dropped_count = unnamed = 0
     for k in order:
         node = net.nodes[k]
         p, its = node.properties, own(node.properties, NAME)
         name = its.get("name")
         name = name if isinstance(name, str) and is_name(name) else node.id
         more = its.get("more")
-        said = {key: v for key, v in more.items() if key not in ("name", *AXES)} if isinstance(more, dict) else {}
+        members = {key: v for key, v in more.items() if key not in ("name", *AXES)} if isinstance(more, dict) else {}
         unnamed += isinstance(p.get("name"), str) and p["name"] not in ("", name)
-        lost += bool(p.keys() - NODE_CANONICAL - {NAME})
+        dropped_count += bool(p.keys() - NODE_CANONICAL - {NAME})
         text = f"- name: {_yaml.text(name)}\n  x: {at[k][0]}\n  y: {at[k][1]}\n"
         if node.z or its.get("z") is True:
             text += f"  z: {_yaml.decimal(numbers([node.z or 0.0], METRES)[0])}\n"
-        out.append(f"{text}{_yaml.mapping(said, 2) if said else ''}")
-    context.drop("attributes of nodes", lost, "the format has no place for them")
+        out.append(f"{text}{_yaml.mapping(members, 2) if members else ''}")
+    context.drop("attributes of nodes", dropped_count, "the format has no place for them")
     context.drop("names of nodes that are not their ids", unnamed, "a point's name is its node's id")
     ranks = {k: rank for rank, k in enumerate(order)}
-    told = []
+    line_texts = []
     for line in sorted(lines(net, context, NAME), key=lambda one: (ranks[one.a], ranks[one.b])):
         ends = (_end("start", line.said, at[line.a]), _end("end", line.said, at[line.b]))
-        rest = {key: value for key, value in line.said.items() if key not in ("start", "end")}
-        told.append(f"- {ends[0]}  {ends[1]}{_yaml.mapping(rest, 2) if rest else ''}")
-    kept = document.get("dangling")
-    kept = [one for one in kept if isinstance(one, dict) and one] if isinstance(kept, list) else []
-    told += [f"- {_yaml.mapping(one, 2)[2:]}" for one in kept]
-    out += [f"{LINES}:\n", *told] if told else [f"{LINES}: []\n"]
+        extra_members = {key: value for key, value in line.said.items() if key not in ("start", "end")}
+        line_texts.append(f"- {ends[0]}  {ends[1]}{_yaml.mapping(extra_members, 2) if extra_members else ''}")
+    dangling = document.get("dangling")
+    dangling = [one for one in dangling if isinstance(one, dict) and one] if isinstance(dangling, list) else []
+    line_texts += [f"- {_yaml.mapping(one, 2)[2:]}" for one in dangling]
+    out += [f"{LINES}:\n", *line_texts] if line_texts else [f"{LINES}: []\n"]
     return {FILE: "".join(out).encode()}
 
 
-def _end(word: str, said: Mapping[str, Any], at: tuple[str, str]) -> str:
-    more = said.get(word)
-    rest = {key: value for key, value in more.items() if key not in "xy"} if isinstance(more, dict) else {}
-    return f"{word}:\n    x: {at[0]}\n    y: {at[1]}\n{_yaml.mapping(rest, 4) if rest else ''}"
+def _end(end: str, members: Mapping[str, Any], at: tuple[str, str]) -> str:
+    more = members.get(end)
+    extra_members = {key: value for key, value in more.items() if key not in "xy"} if isinstance(more, dict) else {}
+    return f"{end}:\n    x: {at[0]}\n    y: {at[1]}\n{_yaml.mapping(extra_members, 4) if extra_members else ''}"
 
 
 # --- telling ---------------------------------------------------------------------------------------------------------

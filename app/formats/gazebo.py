@@ -106,7 +106,7 @@ def sort(files: Files, mains: Sequence[str]) -> dict[str, list[str]]:
     worlds = [n for n in mains if _sdf.is_sdf(files[n]) and _sdf.holds(files[n], b"world")]
     out = {name: list(_sdf.needed(library, name)) for name in worlds}
     parts = {name: _sdf_lists.needed(library, name) for name in lists}
-    inner = {other for name, others in parts.items() for other in others if other != name}
+    inner = {other for name, companions in parts.items() for other in companions if other != name}
     for name in lists:
         if name not in inner or not set(lists) - inner:
             out[name] = parts[name]
@@ -117,15 +117,15 @@ def sort(files: Files, mains: Sequence[str]) -> dict[str, list[str]]:
 
 def _lone_models(library: _sdf.Library, models: Sequence[str]) -> dict[str, list[str]]:
     """Of an upload without a world the models that ``model.config`` chooses and no other model includes."""
-    chosen = []
+    mains = []
     for name in models:
         folder = name.rpartition("/")[0]
         config = f"{folder}/model.config" if folder else "model.config"
         if config not in library.files or library.model_file(folder) in (name, None):
-            chosen.append(name)
-    out = {name: [*_sdf.needed(library, name), *_own_folder(library, name)] for name in chosen}
-    inner = {other for name, others in out.items() for other in others if other != name}
-    free = {name: others for name, others in out.items() if name not in inner}
+            mains.append(name)
+    out = {name: [*_sdf.needed(library, name), *_own_folder(library, name)] for name in mains}
+    inner = {other for name, companions in out.items() for other in companions if other != name}
+    free = {name: companions for name, companions in out.items() if name not in inner}
     # Models that include each other all the way round: one of them tells what is wrong.
     return free or dict(sorted(out.items())[:1])
 
@@ -143,8 +143,8 @@ def read(files: Files, context: ReadContext) -> Layers:
     _sdf.warn_of_values(root, context)
     version = _sdf.version_of(root.get("version"))
     if version is None or not (1, 4) <= version <= _sdf.NEWEST:
-        said = root.get("version")
-        context.warn(f"SDFormat version {said!r} is not one of 1.4 to 1.11: read as 1.7", line=root.sourceline)
+        version_text = root.get("version")
+        context.warn(f"SDFormat version {version_text!r} is not one of 1.4 to 1.11: read as 1.7", line=root.sourceline)
     served = _sdf.needed(library, main)
     reader = _Reader(_sdf.Unfolder(library, served, context), main, {served[n]: files[n] for n in served}, context)
     worlds = root.findall("world")
@@ -200,47 +200,47 @@ class _Reader:
 
     def world(self, world: etree._Element, key: str, version: str, *, alone: bool = False) -> None:
         """Take a world apart."""
-        found = []
+        elements = []
         frames = _sdf.WorldFrames(self.unfolder, self.main)
         for element in world.iterchildren("frame"):
             frames.add(element.get("name", ""), _sdf.pose_of(element), element.get("attached_to", ""), element)
         for element in world.iterchildren(*OBJECTS):
             body = self._body(element)
             name = self._name(element, body)
-            said = _sdf.pose_of(element)
-            own = body.pose if body is not None and element.tag == "include" else None
+            element_pose = _sdf.pose_of(element)
+            body_pose = body.pose if body is not None and element.tag == "include" else None
             back = None if body is None else _sdf.placement(element, body)
-            frames.add_model(name, said or own or _sdf.ZERO, body or _sdf.Body(), back, element)
-            found.append((element, body, name, said, own, back))
+            frames.add_model(name, element_pose or body_pose or _sdf.ZERO, body or _sdf.Body(), back, element)
+            elements.append((element, body, name, element_pose, body_pose, back))
         moved = self._state(world)
         footprints = Footprints(self.resources, self.context)
         seen: set[str] = set()
-        for element, body, name, said, own, back in found:
-            pose_said = said or own or _sdf.ZERO
-            simple = not pose_said.relative and back is None
+        for element, body, name, element_pose, body_pose, back in elements:
+            source_pose = element_pose or body_pose or _sdf.ZERO
+            simple = not source_pose.relative and back is None
             if name in seen:
                 self.context.warn("two objects of the world have this name", line=element.sourceline, where=name[:80])
-            pose = list(pose_said.values) if simple or name in seen else _sdf.six(frames.place(name))
+            pose = list(source_pose.values) if simple or name in seen else _sdf.six(frames.place(name))
             seen.add(name)
-            kept: dict[str, Any] = {"world": key}
-            if not (simple and (said.plain if said is not None else element.tag != "include")):
-                kept["pose"] = pose
+            source_properties: dict[str, Any] = {"world": key}
+            if not (simple and (element_pose.plain if element_pose is not None else element.tag != "include")):
+                source_properties["pose"] = pose
             if element.tag == "include" and not _sdf.text_of(element, "name"):
-                kept["name"] = name
+                source_properties["name"] = name
             if name in moved and not _same_pose(moved[name], pose):
-                kept["state"] = moved[name]
-            self._add(element, body, name, pose, kept, footprints)
-        self._tell_state(moved, key, {name for _, _, name, _, _, _ in found})
-        rest = etree.Element("world", dict(world.attrib))
+                source_properties["state"] = moved[name]
+            self._add(element, body, name, pose, source_properties, footprints)
+        self._tell_state(moved, key, {name for _, _, name, _, _, _ in elements})
+        remainder = etree.Element("world", dict(world.attrib))
         for child in world:
             if child.tag not in (*OBJECTS, "state") and isinstance(child.tag, str):
-                rest.append(child)
-        entry: dict[str, Any] = {"sdf": _sdf.compact(rest), "version": version}
+                remainder.append(child)
+        entry: dict[str, Any] = {"sdf": _sdf.compact(remainder), "version": version}
         if alone:
             entry["alone"] = True
-        place = self._datum(rest.find("spherical_coordinates"))
-        if place is not None:
-            entry["datum"] = [place.latitude, place.longitude, place.altitude, place.heading]
+        datum = self._datum(remainder.find("spherical_coordinates"))
+        if datum is not None:
+            entry["datum"] = [datum.latitude, datum.longitude, datum.altitude, datum.heading]
         self.worlds[key] = entry
 
     def _body(self, element: etree._Element) -> _sdf.Body | None:
@@ -264,24 +264,24 @@ class _Reader:
         body: _sdf.Body | None,
         name: str,
         pose: list[float],
-        kept: dict[str, Any],
+        source_properties: dict[str, Any],
         footprints: Footprints,
     ) -> None:
-        said: dict[str, Any] = {"kind": str(element.tag), "name": name, "pose": pose}
+        properties: dict[str, Any] = {"kind": str(element.tag), "name": name, "pose": pose}
         shapes = _sdf.absent_model(element) if body is None else body.shapes() if body.kind == "model" else []
         if shapes:
-            said["shapes"] = shapes
-        shape, size = footprints.of(said, name)
+            properties["shapes"] = shapes
+        shape, size = footprints.of(properties, name)
         if size is not None:
-            said["size"] = size
-        if "pose" not in kept:
+            properties["size"] = size
+        if "pose" not in source_properties:
             for old in element.findall("pose"):
                 element.remove(old)
         if element.tag != "include" and "name" in element.attrib:
             del element.attrib["name"]
-        kept["sdf"] = _sdf.compact(element)
-        said[NAME] = kept
-        self.rows.append((name, shape, said))
+        source_properties["sdf"] = _sdf.compact(element)
+        properties[NAME] = source_properties
+        self.rows.append((name, shape, properties))
 
     # what the world was saved with
 
@@ -298,52 +298,52 @@ class _Reader:
                 self.context.warn(reason, line=state.sourceline, where="state")
         return out
 
-    def _tell_state(self, moved: Mapping[str, list[float]], key: str, known: set[str]) -> None:
+    def _tell_state(self, moved: Mapping[str, list[float]], key: str, names: set[str]) -> None:
         off = [p["name"] for _, _, p in self.rows if p.get(NAME, {}).get("world") == key and "state" in p[NAME]]
         if off:
             self.context.warn(
-                f"the saved <state> moves {len(off)} of {len(known)} objects ({_some(off)}); it is not kept, the poses "
+                f"the saved <state> moves {len(off)} of {len(names)} objects ({_some(off)}); it is not kept, the poses "
                 "of the world itself are",
                 where="state",
             )
-        strangers = sorted(set(moved) - known)
+        strangers = sorted(set(moved) - names)
         if strangers:
             self.context.warn(
                 f"the <state> names {len(strangers)} that are not there: {_some(strangers)}", where="state"
             )
 
-    def _datum(self, said: etree._Element | None) -> Datum | None:
+    def _datum(self, element: etree._Element | None) -> Datum | None:
         """The datum that spherical coordinates mean; None where they tell no place on earth."""
-        if said is None:
+        if element is None:
             return None
-        surface = _sdf.text_of(said, "surface_model") or "EARTH_WGS84"
-        axes = _sdf.text_of(said, "world_frame_orientation") or "ENU"
+        surface = _sdf.text_of(element, "surface_model") or "EARTH_WGS84"
+        axes = _sdf.text_of(element, "world_frame_orientation") or "ENU"
         if surface != "EARTH_WGS84" or axes != "ENU":
-            self.context.warn(f"a world on {surface} with axes {axes} gives no datum", line=said.sourceline)
+            self.context.warn(f"a world on {surface} with axes {axes} gives no datum", line=element.sourceline)
             return None
         latitude, longitude, elevation, heading = (
-            _sdf.vector(said, tag, 1, (0.0,))[0]
+            _sdf.vector(element, tag, 1, (0.0,))[0]
             for tag in ("latitude_deg", "longitude_deg", "elevation", "heading_deg")
         )
         if latitude == 0.0 and longitude == 0.0:
             return None
         if heading == 180.0:
             reason = "heading_deg 180 is taken as it stands; worlds for old Gazebo versions used it against a bug"
-            self.context.warn(reason, line=said.sourceline, where="heading_deg")
+            self.context.warn(reason, line=element.sourceline, where="heading_deg")
         turned = math.remainder(-heading, 360.0)
-        found = Datum(latitude, longitude, elevation, turned)
-        known = self.context.frame.datum if self.context.frame is not None else None
-        if known is not None and known != found:
+        datum = Datum(latitude, longitude, elevation, turned)
+        current = self.context.frame.datum if self.context.frame is not None else None
+        if current is not None and current != datum:
             self.context.warn(
                 f"its place {latitude!r}, {longitude!r} (heading {turned:g}°) is not the environment's datum "
-                f"{known.latitude!r}, {known.longitude!r} (heading {known.heading:g}°), which stays: change the "
+                f"{current.latitude!r}, {current.longitude!r} (heading {current.heading:g}°), which stays: change the "
                 "environment's datum, or the world",
-                line=said.sourceline,
+                line=element.sourceline,
                 where="spherical_coordinates",
             )
         elif self.datum is None:
-            self.datum = found
-        return found
+            self.datum = datum
+        return datum
 
 
 @dataclass(slots=True)
@@ -357,30 +357,30 @@ class Footprints:
     _known: dict[bytes, tuple[Any, list[float] | None]] = field(default_factory=dict)
     _told: set[str] = field(default_factory=set)
 
-    def of(self, said: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
+    def of(self, properties: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
         """The footprint in local metres (a point where no solid is known) and the size in the object's own frame."""
-        pose = said["pose"]
+        pose = properties["pose"]
         point = shapely.Point(pose[:2])
-        if not said.get("shapes"):
+        if not properties.get("shapes"):
             return point, None
-        key = orjson.dumps([said["shapes"], *(pose[3:5] if any(pose[3:5]) else ())])
+        key = orjson.dumps([properties["shapes"], *(pose[3:5] if any(pose[3:5]) else ())])
         if key not in self._known:
-            self._known[key] = self._worked_out(said, name)
+            self._known[key] = self._worked_out(properties, name)
         area, size = self._known[key]
         if area is None or shapely.is_empty(area):
             return point, size
         c, s = math.cos(pose[5]), math.sin(pose[5])
         turn = np.array([[c, s], [-s, c]])
-        place = np.array(pose[:2])
-        return shapely.transform(area, lambda at: np.round(at @ turn + place, 9) + 0.0), size
+        position = np.array(pose[:2])
+        return shapely.transform(area, lambda at: np.round(at @ turn + position, 9) + 0.0), size
 
-    def _worked_out(self, said: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
+    def _worked_out(self, properties: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
         if self._solid is None or self._flat is None:
             self._solid = solids.Solids(self.resources, planes=False, visuals=True)
             self._flat = solids.Solids(self.resources, planes=True, visuals=True)
-        readable = [shape for shape in said["shapes"] if self._is_readable(shape, name)]
+        readable = [shape for shape in properties["shapes"] if self._is_readable(shape, name)]
         alone = {"shapes": [shape for shape in readable if not shape.get("visual")] or readable}
-        tilted = {**alone, "pose": [0.0, 0.0, 0.0, *said["pose"][3:5], 0.0]}
+        tilted = {**alone, "pose": [0.0, 0.0, 0.0, *properties["pose"][3:5], 0.0]}
         try:
             area = self._solid.footprint(tilted)
             area = self._flat.footprint(tilted) if shapely.is_empty(area) else area
@@ -403,8 +403,8 @@ class Footprints:
     def _tell(self, error: Invalid | TooLarge, name: str) -> None:
         if error.detail not in self._told:
             self._told.add(error.detail)
-            place = error.problems[0].file if error.problems else None
-            self.context.warn(f"its solids are not known: {error.detail}"[:500], file=place, where=name[:80])
+            file = error.problems[0].file if error.problems else None
+            self.context.warn(f"its solids are not known: {error.detail}"[:500], file=file, where=name[:80])
 
 
 def _some(names: Sequence[str]) -> str:
@@ -418,17 +418,17 @@ def _same_pose(a: Sequence[float], b: Sequence[float]) -> bool:
 
 def _read_list(library: _sdf.Library, main: str, context: ReadContext) -> Layers:
     """The generator's list of objects as a world of its own."""
-    found = _sdf_lists.read(library, main, context)
-    resources = {path: library.files[name] for name, path in found.served.items()}
+    listing = _sdf_lists.read(library, main, context)
+    resources = {path: library.files[name] for name, path in listing.served.items()}
     footprints = Footprints(resources, context)
     rows = []
     key = _key(main)
-    for name, said in found.objects:
-        shape, size = footprints.of(said, name)
-        own = {**said.get(NAME, {}), "world": key}
-        rows.append((name, shape, {**said, **({"size": size} if size else {}), NAME: own}))
+    for name, properties in listing.objects:
+        shape, size = footprints.of(properties, name)
+        source_properties = {**properties.get(NAME, {}), "world": key}
+        rows.append((name, shape, {**properties, **({"size": size} if size else {}), NAME: source_properties}))
     ids = unique_ids(name for name, _, _ in rows)
-    document = {NAME: {"worlds": {key: {"list": True, **found.rest}}}}
+    document = {NAME: {"worlds": {key: {"list": True, **listing.rest}}}}
     objects = features([(i, g, p) for i, (_, g, p) in zip(ids, rows, strict=True)], "local", document)
     parts: dict[PartKey, Any] = {PartKey("objects", context.level, NAME): objects}
     if resources and context.wants("resources"):
@@ -442,20 +442,20 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> list[PartKey]:
 
     Objects that were made of a level's grid stand for it, unless it is named.
     """
-    kept = [k for k in keys if k.layer in ("objects", "resources") and options.level in (None, k.level)]
+    matches = [k for k in keys if k.layer in ("objects", "resources") and options.level in (None, k.level)]
     grids = [k for k in keys if k.layer == "occupancy"]
     if options.grid is None:
-        told = {k.level for k in kept if (k.layer, k.name) == ("objects", OF_GRIDS)}
-        grids = [k for k in grids if k.name not in NO_WALLS and k.level not in told]
+        object_levels = {k.level for k in matches if (k.layer, k.name) == ("objects", OF_GRIDS)}
+        grids = [k for k in grids if k.name not in NO_WALLS and k.level not in object_levels]
         names = {k.name for k in grids}
-        if any(k.layer == "objects" for k in kept) and len(names) > 1 and "map" not in names:
-            return kept
+        if any(k.layer == "objects" for k in matches) and len(names) > 1 and "map" not in names:
+            return matches
     if not grids and options.grid is None:
-        if not any(k.layer == "objects" for k in kept):
+        if not any(k.layer == "objects" for k in matches):
             raise MissingLayer("there is nothing to build a world of: supply objects or an occupancy grid")
-        return kept
+        return matches
     supply = "supply a map.yaml with its image, or objects"
-    return kept + the_one(grids, "occupancy", options.grid, options.level, what="grid", option="grid", supply=supply)
+    return matches + the_one(grids, "occupancy", options.grid, options.level, noun="grid", option="grid", supply=supply)
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
@@ -499,15 +499,15 @@ class _Writer:
                 if len(part):
                     self.others.append((key, part))
                 continue
-            said = part.document.get(NAME)
-            worlds = said.get("worlds") if isinstance(said, Mapping) else None
+            source_document = part.document.get(NAME)
+            worlds = source_document.get("worlds") if isinstance(source_document, Mapping) else None
             worlds = (
                 {str(k): w for k, w in worlds.items() if isinstance(w, Mapping)} if isinstance(worlds, Mapping) else {}
             )
             by_world: dict[str, list[Feature]] = {name: [] for name in worlds}
             for one in part:
-                own = one.properties.get(NAME)
-                name = own.get("world") if isinstance(own, Mapping) else None
+                source_properties = one.properties.get(NAME)
+                name = source_properties.get("world") if isinstance(source_properties, Mapping) else None
                 by_world.get(str(name), self.loose).append(one)
             for name, entry in worlds.items():
                 if "sdf" in entry or by_world[name]:
@@ -515,13 +515,13 @@ class _Writer:
         self.stored.sort(key=lambda world: world.rank)
 
     def _chosen(self) -> _Stored | None:
-        wanted = self.options.world
-        if wanted is not None:
-            found = [w for w in self.stored if wanted in (w.key, _sdf.stem(w.key))]
-            if not found:
+        world_name = self.options.world
+        if world_name is not None:
+            matches = [w for w in self.stored if world_name in (w.key, _sdf.stem(w.key))]
+            if not matches:
                 names = ", ".join(w.key for w in self.stored) or "none"
-                raise NotFound(f"there is no world {wanted!r}; there are: {names}")
-            return found[0]
+                raise NotFound(f"there is no world {world_name!r}; there are: {names}")
+            return matches[0]
         if len(self.stored) > 1:
             names = ", ".join(w.key for w in self.stored[1:])
             self.context.warn(f"written is the world {self.stored[0].key}; ask for another one with world=: {names}")
@@ -529,19 +529,19 @@ class _Writer:
 
     def files(self) -> dict[str, bytes]:
         """The world first."""
-        chosen = self._chosen()
+        source_world = self._chosen()
         for other in self.stored:
-            if other is not chosen:
+            if other is not source_world:
                 self.context.drop(
                     f"objects of the world {other.key}", len(other.objects), f"ask with world={other.key}"
                 )
-        world = self._frame(chosen)
-        for one in sorted(chosen.objects if chosen is not None else [], key=lambda o: _natural(o.id)):
+        world = self._frame(source_world)
+        for one in sorted(source_world.objects if source_world is not None else [], key=lambda o: _natural(o.id)):
             self._put_back(one)
         bodies = _sdf_bodies.Bodies(self.context, self.resources, self.options)
         self._make(bodies, [(self.options.level or GROUND, one) for one in self.loose])
         everything = self.options.content == "all" or (
-            self.options.content == "auto" and not (chosen is not None and chosen.is_world)
+            self.options.content == "auto" and not (source_world is not None and source_world.is_world)
         )
         why = "a world is stored: ask for them with content=all"
         if everything:
@@ -556,41 +556,45 @@ class _Writer:
         for key, grid in self.layers.grids().items():
             if masks.NAME in grid.properties and self.options.grid is None:
                 continue  # it tells where robots should go, not what stands there
-            told = any(other.level == key.level for other, _ in self.others)
-            if self.options.grid is None and everything and told and _is_slice(grid):
+            has_objects = any(other.level == key.level for other, _ in self.others)
+            if self.options.grid is None and everything and has_objects and _is_slice(grid):
                 continue  # its walls are these objects
             if everything or self.options.grid is not None:
                 name = _sdf_bodies.free_name(f"walls_{_sdf_bodies.slug(key.name)}", self.taken)
-                made = bodies.walls(grid, name, self.options.threshold, self.layers.elevation(key.level))
-                if made is not None:
-                    self.made.append((name, made))
+                model = bodies.walls(grid, name, self.options.threshold, self.layers.elevation(key.level))
+                if model is not None:
+                    self.made.append((name, model))
             else:
                 self.context.drop(f"walls of the grid {key.name}", 1, why)
-        if chosen is None or not chosen.is_world:
+        if source_world is None or not source_world.is_world:
             self._furnish(bodies)
         bodies.report()
-        self._place(world, chosen)
+        self._place(world, source_world)
         world.extend([element for _, element in sorted(self.made, key=lambda row: _natural(row[0]))])
-        return self._bundle(world, chosen, bodies)
+        return self._bundle(world, source_world, bodies)
 
-    def _frame(self, chosen: _Stored | None) -> etree._Element:
+    def _frame(self, source_world: _Stored | None) -> etree._Element:
         """The world's element with all that is no object."""
-        if chosen is not None and "sdf" in chosen.entry:
-            world = _element(str(chosen.entry["sdf"]), ("world",))
+        if source_world is not None and "sdf" in source_world.entry:
+            world = _element(str(source_world.entry["sdf"]), ("world",))
             if world is not None:
                 if not world.get("name"):
-                    first = next((str(o.properties.get("name") or o.id) for o in chosen.objects), self.context.title)
+                    first = next(
+                        (str(o.properties.get("name") or o.id) for o in source_world.objects), self.context.title
+                    )
                     world.set("name", first)
                 for tag in ("frame", "actor", "joint", "population", "road"):
                     self.taken.update(e.get("name", "") for e in world.iterchildren(tag))
                 return world
-            self.context.warn(f"what was kept of the world {chosen.key} cannot be read: it is left out")
-        return etree.Element("world", name=_sdf_bodies.valid(_sdf.stem(chosen.key) if chosen else self.context.title))
+            self.context.warn(f"what was kept of the world {source_world.key} cannot be read: it is left out")
+        return etree.Element(
+            "world", name=_sdf_bodies.valid(_sdf.stem(source_world.key) if source_world else self.context.title)
+        )
 
     def _put_back(self, one: Feature) -> None:
         """An object of the stored world as it was, under its present name and pose."""
-        own = one.properties.get(NAME, {})
-        text = own.get("sdf")
+        source_properties = one.properties.get(NAME, {})
+        text = source_properties.get("sdf")
         element = _element(text, OBJECTS) if isinstance(text, str) else None
         if element is None:
             if isinstance(text, str):
@@ -600,23 +604,23 @@ class _Writer:
         name = one.properties.get("name")
         name = name if isinstance(name, str) and name else one.id
         if element.tag == "include":
-            known = element.find("name")
-            if known is not None:
-                known.text = name
-            elif own.get("name") != name:
-                known = etree.Element("name")
-                known.text = name
-                element.append(known)
+            name_element = element.find("name")
+            if name_element is not None:
+                name_element.text = name
+            elif source_properties.get("name") != name:
+                name_element = etree.Element("name")
+                name_element.text = name
+                element.append(name_element)
         else:
-            others = _xml.attributes(element)
+            attributes = _xml.attributes(element)
             element.attrib.clear()
-            element.attrib.update({"name": name, **others})
+            element.attrib.update({"name": name, **attributes})
         if name in self.taken:
             self.context.warn("two objects of the world have this name, which Gazebo refuses", where=name)
         self.taken.add(name)
         pose = one.properties.get("pose")
         pose = [float(v) for v in pose] if _is_pose(pose) and pose is not None else [0.0] * 6
-        if own.get("pose") is None or [float(v) for v in own["pose"]] != pose:
+        if source_properties.get("pose") is None or [float(v) for v in source_properties["pose"]] != pose:
             for old in element.findall("pose"):
                 element.remove(old)
             for old in element.findall("placement_frame"):
@@ -629,9 +633,9 @@ class _Writer:
     def _make(self, bodies: _sdf_bodies.Bodies, rows: Iterable[tuple[str, Feature]]) -> None:
         """Static models of objects that no world has told of."""
         for level, one in sorted(rows, key=lambda row: _natural(row[1].id)):
-            made = bodies.model(one, self.layers.elevation(level), self.taken)
-            if made is not None:
-                self.made.append((made.get("name", ""), made))
+            model = bodies.model(one, self.layers.elevation(level), self.taken)
+            if model is not None:
+                self.made.append((model.get("name", ""), model))
 
     def _furnish(self, bodies: _sdf_bodies.Bodies) -> None:
         """A ground to stand on and a light, where a world is made."""
@@ -644,50 +648,52 @@ class _Writer:
             self.made.append((name, _sdf_bodies.sun(name)))
             self.context.fill("sun", "directional light", "no world tells of a light", "sun")
 
-    def _place(self, world: etree._Element, chosen: _Stored | None) -> None:
+    def _place(self, world: etree._Element, source_world: _Stored | None) -> None:
         """The datum as spherical coordinates; what the stored world says stays where it means the same."""
         datum = self.layers.datum
-        said = world.find("spherical_coordinates")
+        old_coordinates = world.find("spherical_coordinates")
         if datum is None:
             return
-        here = [datum.latitude, datum.longitude, datum.altitude, datum.heading]
-        if said is not None:
-            meant = chosen.entry.get("datum") if chosen is not None else None
+        position = [datum.latitude, datum.longitude, datum.altitude, datum.heading]
+        if old_coordinates is not None:
+            meant = source_world.entry.get("datum") if source_world is not None else None
             if meant is None and not self.options.georeference:
                 reason = (
                     "the world's spherical_coordinates are not the environment's datum: georeference=true puts it there"
                 )
                 self.context.warn(reason, where="spherical_coordinates")
                 return
-            if meant is not None and [float(v) for v in meant] == here:
+            if meant is not None and [float(v) for v in meant] == position:
                 return
-            world.remove(said)
-        place = _sdf.child(world, "spherical_coordinates")
-        _sdf.child(place, "surface_model", "EARTH_WGS84")
-        if (_sdf.version_of(self._version(chosen)) or (1, 7)) >= (1, 6):
-            _sdf.child(place, "world_frame_orientation", "ENU")
-        _sdf.child(place, "latitude_deg", number(datum.latitude, DEGREES))
-        _sdf.child(place, "longitude_deg", number(datum.longitude, DEGREES))
-        _sdf.child(place, "elevation", number(datum.altitude))
-        _sdf.child(place, "heading_deg", number(-datum.heading, DEGREES))
+            world.remove(old_coordinates)
+        coordinates = _sdf.child(world, "spherical_coordinates")
+        _sdf.child(coordinates, "surface_model", "EARTH_WGS84")
+        if (_sdf.version_of(self._version(source_world)) or (1, 7)) >= (1, 6):
+            _sdf.child(coordinates, "world_frame_orientation", "ENU")
+        _sdf.child(coordinates, "latitude_deg", number(datum.latitude, DEGREES))
+        _sdf.child(coordinates, "longitude_deg", number(datum.longitude, DEGREES))
+        _sdf.child(coordinates, "elevation", number(datum.altitude))
+        _sdf.child(coordinates, "heading_deg", number(-datum.heading, DEGREES))
 
-    def _version(self, chosen: _Stored | None) -> str:
-        said = str(chosen.entry.get("version") or "") if chosen is not None else ""
-        known = said if said in _sdf.VERSIONS else None
+    def _version(self, source_world: _Stored | None) -> str:
+        source_version = str(source_world.entry.get("version") or "") if source_world is not None else ""
+        valid_version = source_version if source_version in _sdf.VERSIONS else None
         if self.options.version is not None:
-            if known is not None and known != self.options.version:
-                self.context.warn(f"the world was written as SDFormat {known}: its elements are not converted")
+            if valid_version is not None and valid_version != self.options.version:
+                self.context.warn(f"the world was written as SDFormat {valid_version}: its elements are not converted")
             return self.options.version
-        return said or "1.7"
+        return source_version or "1.7"
 
-    def _bundle(self, world: etree._Element, chosen: _Stored | None, bodies: _sdf_bodies.Bodies) -> dict[str, bytes]:
-        version = self._version(chosen)
+    def _bundle(
+        self, world: etree._Element, source_world: _Stored | None, bodies: _sdf_bodies.Bodies
+    ) -> dict[str, bytes]:
+        version = self._version(source_world)
         if bodies.newest > (_sdf.version_of(version) or (1, 7)):
-            wanted = ".".join(map(str, bodies.newest))
-            if self.options.version is None and not (chosen is not None and chosen.is_world):
-                version = wanted
+            needed_version = ".".join(map(str, bodies.newest))
+            if self.options.version is None and not (source_world is not None and source_world.is_world):
+                version = needed_version
             else:
-                self.context.warn(f"some shapes need SDFormat {wanted}")
+                self.context.warn(f"some shapes need SDFormat {needed_version}")
         root = etree.Element("sdf", version=version)
         root.append(world)
         main = _sdf.printed(root)
@@ -695,7 +701,7 @@ class _Writer:
         stored: dict[str, bytes] = {}
         for part in self.layers.of("resources", self.options.level, NAME).values():
             stored.update(part.files if isinstance(part, Resources) else {})
-        if chosen is not None and len(self.stored) == 1:
+        if source_world is not None and len(self.stored) == 1:
             needed = dict(stored)
         else:
             library = _sdf.Library({**stored, MAIN: main})
@@ -707,26 +713,26 @@ class _Writer:
 
 def _natural(text: str) -> tuple[tuple[int, str], ...]:
     """A sort key by which ``pole_10`` comes after ``pole_9``."""
-    out, digits, word = [], "", ""
+    out, digits, letters = [], "", ""
     for letter in text:
         if letter.isascii() and letter.isdigit():
-            if word:
-                out.append((0, word))
-                word = ""
+            if letters:
+                out.append((0, letters))
+                letters = ""
             digits += letter
         else:
             if digits:
                 out.append((len(digits), digits))
                 digits = ""
-            word += letter
-    out.append((len(digits), digits) if digits else (0, word))
+            letters += letter
+    out.append((len(digits), digits) if digits else (0, letters))
     return tuple(out)
 
 
 def _is_slice(grid: OccupancyGrid) -> bool:
     """Whether a grid was made of the objects beside it (``app.generate``)."""
-    said = grid.properties.get("slice")
-    return isinstance(said, Mapping) and said.get("of") == "objects"
+    slice_properties = grid.properties.get("slice")
+    return isinstance(slice_properties, Mapping) and slice_properties.get("of") == "objects"
 
 
 def _is_pose(value: Any) -> bool:

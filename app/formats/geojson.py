@@ -100,8 +100,8 @@ def _marked(p: Any) -> bool:
     )
 
 
-def _refuse(reason: str, line: int | None = None, where: str | None = None) -> NoReturn:
-    raise UnreadableFile(f"{where}: {reason}" if where else reason, [Problem(reason, line=line, where=where)])
+def _refuse(reason: str, line: int | None = None, location: str | None = None) -> NoReturn:
+    raise UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, line=line, where=location)])
 
 
 def _is_box(box: Any) -> bool:
@@ -150,19 +150,19 @@ class _Reader:
 
     def line(self, k: int) -> int | None:
         """The line where feature k begins, as far as the text tells: features seldom hold features."""
-        found = None
+        line_number = None
         for n, match in enumerate(re.finditer(rb'"type"\s*:\s*"Feature"', self.data)):
             if n == k:
-                found = self.data.count(b"\n", 0, match.start()) + 1
-        return found
+                line_number = self.data.count(b"\n", 0, match.start()) + 1
+        return line_number
 
-    def _is_local(self, said: Any) -> bool:
+    def _is_local(self, reference: Any) -> bool:
         """Whether ``coordRefSys`` names a local engineering frame."""
-        if isinstance(said, dict):
-            said = said.get("href")
-        return isinstance(said, str) and said.rstrip("/").rpartition("/")[2] in _METRES
+        if isinstance(reference, dict):
+            reference = reference.get("href")
+        return isinstance(reference, str) and reference.rstrip("/").rpartition("/")[2] in _METRES
 
-    def _check_crs(self, crs: Any, where: str | None) -> None:
+    def _check_crs(self, crs: Any, location: str | None) -> None:
         """The ``crs`` of the 2008 specification: WGS 84 in longitude, latitude or nothing."""
         if crs is None:
             return
@@ -174,25 +174,27 @@ class _Reader:
                 f"its coordinates are in {name[:80]}, but GeoJSON means degrees (WGS 84 longitude, latitude): export "
                 "it again in EPSG:4326 (a Nav2 route graph is the format nav2_route)",
                 1,
-                where or "crs",
+                location or "crs",
             )
 
     # --- features ---
 
     def warn_of_members(self) -> None:
         """Report features without the members that every feature has, and a CRS of places that is not known."""
-        for word in ("geometry", "properties"):
+        for member in ("geometry", "properties"):
             lacking = [
-                k for k, row in enumerate(self.rows) if word not in row and not (word == "geometry" and "place" in row)
+                k
+                for k, row in enumerate(self.rows)
+                if member not in row and not (member == "geometry" and "place" in row)
             ]
             if lacking:
                 reason = (
-                    f"{len(lacking)} features have no member {word!r}: each must have one, null where there is none"
+                    f"{len(lacking)} features have no member {member!r}: each must have one, null where there is none"
                 )
                 self.context.warn(reason, line=self.line(lacking[0]), where=self.name(lacking[0]))
-        said = self.top.get("coordRefSys")
-        if said is not None and not self.local:
-            text = said if isinstance(said, str) else orjson.dumps(said).decode()
+        crs = self.top.get("coordRefSys")
+        if crs is not None and not self.local:
+            text = crs if isinstance(crs, str) else orjson.dumps(crs).decode()
             if not _EARTH.match(text):
                 reason = f"{text[:80]} is unsupported: only `geometry` (WGS 84) is read, `place` is ignored"
                 self.context.warn(reason, where="coordRefSys")
@@ -202,18 +204,18 @@ class _Reader:
 
     def layers(self) -> Layers:
         self.warn_of_members()
-        own = self.top.get(OWN)
-        own = own if isinstance(own, dict) else {}
+        extension = self.top.get(OWN)
+        extension = extension if isinstance(extension, dict) else {}
         network = self._network()
         keys = [self._key(k, network) for k in range(len(self.rows))]
         raw = [self._geometry_of(k, row) for k, row in enumerate(self.rows)]
-        local = np.array([place for place, _ in raw], bool)
+        local = np.array([is_local for is_local, _ in raw], bool)
         shapes, odd = _geometries([g for _, g in raw], lambda k, reason: _refuse(reason, self.line(k), self.name(k)))
         self._check_places(shapes, local)
         groups: dict[PartKey, list[int]] = {}
         for k, key in enumerate(keys):
             groups.setdefault(key, []).append(k)
-        documents = self._documents(own)
+        documents = self._documents(extension)
         parts: dict[PartKey, Part] = {}
         home = PartKey("objects", self.context.level, FAMILY)
         for key in dict.fromkeys([*groups, *documents]):
@@ -221,11 +223,11 @@ class _Reader:
             document = documents.get(key, {})
             if key == home:
                 document = {**document, **self._document()}
-            wanted = [self._wanted_id(k, self.rows[k]) for k in places]
-            ids = unique_ids(wanted)
-            again = [a for a, b in zip(ids, wanted, strict=True) if a != b]
-            if again:
-                self.context.warn(f"{len(again)} ids stand more than once; later ones got #2, #3 …", where=again[0])
+            file_ids = [self._wanted_id(k, self.rows[k]) for k in places]
+            ids = unique_ids(file_ids)
+            repeats = [a for a, b in zip(ids, file_ids, strict=True) if a != b]
+            if repeats:
+                self.context.warn(f"{len(repeats)} ids stand more than once; later ones got #2, #3 …", where=repeats[0])
             rows = [
                 self._properties(
                     k,
@@ -239,8 +241,8 @@ class _Reader:
             parts[key] = Features(tuple(ids), shapes[places], tuple(rows), local[places], document)
         if home not in parts and not parts:
             parts[home] = Features((), np.empty(0, object), (), np.empty(0, bool), self._document())
-        datum = own.get("datum")
-        levels = own.get("levels")
+        datum = extension.get("datum")
+        levels = extension.get("levels")
         return Layers(
             parts,
             Datum(**datum) if isinstance(datum, dict) else None,
@@ -275,13 +277,13 @@ class _Reader:
                 ends += [p.get("source"), p.get("target")]
         if not ends:
             return False
-        lost = [e for e in ends if not isinstance(e, str) or e not in nodes]
-        if lost:
+        stubs = [e for e in ends if not isinstance(e, str) or e not in nodes]
+        if stubs:
             self.context.warn(
-                f"{len(lost)} edges begin or end at nodes that are not there ({str(lost[0])[:80]}): the features are "
+                f"{len(stubs)} edges begin or end at nodes that are not there ({str(stubs[0])[:80]}): the features are "
                 "kept as objects, not as a network"
             )
-        return not lost
+        return not stubs
 
     def _geometry_of(self, k: int, row: dict[str, Any]) -> tuple[bool, Any]:
         """(whether it is in metres, the GeoJSON geometry or None)."""
@@ -289,8 +291,8 @@ class _Reader:
         if "crs" in row:
             self._check_crs(row["crs"], self.name(k))
         if isinstance(place, dict):
-            said = place.get("coordRefSys", row.get("coordRefSys"))
-            if self.local if said is None else self._is_local(said):
+            crs = place.get("coordRefSys", row.get("coordRefSys"))
+            if self.local if crs is None else self._is_local(crs):
                 return True, place
             if row.get("geometry") is None:
                 self.context.warn(
@@ -321,41 +323,41 @@ class _Reader:
             _refuse(reason, self.line(k), self.name(k))
 
     def _wanted_id(self, k: int, row: dict[str, Any]) -> str:
-        said = row.get("id")
-        if said is None and isinstance(row.get("properties"), dict):
-            said = row["properties"].get("name")
-            said = said if isinstance(said, str) else None
-        text = str(said) if isinstance(said, str | int | float) and not isinstance(said, bool) else ""
+        raw_id = row.get("id")
+        if raw_id is None and isinstance(row.get("properties"), dict):
+            raw_id = row["properties"].get("name")
+            raw_id = raw_id if isinstance(raw_id, str) else None
+        text = str(raw_id) if isinstance(raw_id, str | int | float) and not isinstance(raw_id, bool) else ""
         return text if text and len(text) <= MAX_ID and text.isprintable() else f"feature/{k}"
 
     def _properties(self, k: int, i: str, *, foreign: bool, odd: Any, at: tuple[Any, bool]) -> Properties:
         shape, metres = at
         row = self.rows[k]
-        said = row.get("properties")
-        if said is not None and not isinstance(said, dict):
+        file_properties = row.get("properties")
+        if file_properties is not None and not isinstance(file_properties, dict):
             _refuse("properties must be an object or null", self.line(k), self.name(k))
-        out: dict[str, Any] = dict(said or {})
+        out: dict[str, Any] = dict(file_properties or {})
         if not foreign:
             if not self.marks[k]:
                 return out
             more = out.pop("more", None)
-            for word in ("layer", "level", "part"):
-                del out[word]
+            for key in ("layer", "level", "part"):
+                del out[key]
             return {**out, **more} if isinstance(more, dict) else out
-        own: dict[str, Any] = {}
-        kept = {}
-        for word, fits in (("kind", str), ("name", str), (FAMILY, ())):
-            if word in out and not isinstance(out[word], fits):
-                kept[word] = out.pop(word)
+        source_properties: dict[str, Any] = {}
+        misfits = {}
+        for key, fits in (("kind", str), ("name", str), (FAMILY, ())):
+            if key in out and not isinstance(out[key], fits):
+                misfits[key] = out.pop(key)
         if "kind" not in out:
             out["kind"] = ("note", "poi", "path", "region")[int(shapely.get_dimensions(shape)) + 1]
-            own["added"] = ["kind"]
-        if kept:
-            own["kept"] = kept
+            source_properties["added"] = ["kind"]
+        if misfits:
+            source_properties["kept"] = misfits
         if row.get("id") != i or isinstance(row.get("id"), bool):
-            own["id"] = row.get("id")
-        if said is None:
-            own["properties"] = None
+            source_properties["id"] = row.get("id")
+        if file_properties is None:
+            source_properties["properties"] = None
         members = {k: v for k, v in row.items() if k not in ("type", "id", "geometry", "properties")}
         if metres:
             # Written again from the canonical coordinates.
@@ -364,28 +366,28 @@ class _Reader:
         if self.root != "FeatureCollection":
             members = {k: v for k, v in members.items() if k != OWN}
         if members:
-            own["members"] = members
+            source_properties["members"] = members
         if odd is not None:
-            own["geometry"] = odd
-        if own:
-            out[FAMILY] = own
+            source_properties["geometry"] = odd
+        if source_properties:
+            out[FAMILY] = source_properties
         return out
 
     def _document(self) -> dict[str, Any]:
         handled = {"type", "features", OWN} if self.root == "FeatureCollection" else set(self.top)
-        said: dict[str, Any] = {"type": self.root if self.root in ("FeatureCollection", "Feature") else "Geometry"}
+        document: dict[str, Any] = {"type": self.root if self.root in ("FeatureCollection", "Feature") else "Geometry"}
         members = {k: v for k, v in self.top.items() if k not in handled}
         if self.top.get("coordRefSys") is not None and self.local:
             members.pop("coordRefSys", None)
             members.pop("conformsTo", None)
         if members:
-            said["members"] = members
+            document["members"] = members
         texts = [self.top[k] for k in ("attribution", "license", "copyright") if isinstance(self.top.get(k), str)]
-        return {FAMILY: said, "attribution": texts} if texts else {FAMILY: said}
+        return {FAMILY: document, "attribution": texts} if texts else {FAMILY: document}
 
-    def _documents(self, own: dict[str, Any]) -> dict[PartKey, dict[str, Any]]:
+    def _documents(self, extension: dict[str, Any]) -> dict[PartKey, dict[str, Any]]:
         out: dict[PartKey, dict[str, Any]] = {}
-        rows = own.get("documents")
+        rows = extension.get("documents")
         for row in rows if isinstance(rows, list) else []:
             if (
                 isinstance(row, dict)
@@ -553,35 +555,39 @@ class _Writer:
         drawn = {(key.level, i) for key, part in parts.items() if key.layer == "objects" for i in part.ids}
         for key in order:
             part = parts[key]
-            said = {k: v for k, v in part.document.items() if key != home or k not in (FAMILY, "attribution")}
-            if said or (not len(part) and key != home):
-                documents.append({"layer": key.layer, "level": key.level, "part": key.name, "document": said})
+            collection_document = {
+                k: v for k, v in part.document.items() if key != home or k not in (FAMILY, "attribution")
+            }
+            if collection_document or (not len(part) and key != home):
+                documents.append(
+                    {"layer": key.layer, "level": key.level, "part": key.name, "document": collection_document}
+                )
             rows += self.features(key, part, drawn, plain=key == home)
-        own: dict[str, Any] = {}
+        extension: dict[str, Any] = {}
         if self.layers.datum is not None:
-            own["datum"] = self.layers.datum.as_dict()
+            extension["datum"] = self.layers.datum.as_dict()
         if self.layers.levels != (Level(),):
-            own["levels"] = [{"name": v.name, "elevation": v.elevation} for v in self.layers.levels]
+            extension["levels"] = [{"name": v.name, "elevation": v.elevation} for v in self.layers.levels]
         if documents:
-            own["documents"] = documents
+            extension["documents"] = documents
         document = parts[home].document if home in parts else {}
         original = document.get(FAMILY)
         original = original if isinstance(original, Mapping) else {}
         members = original.get("members")
         top: dict[str, Any] = dict(members) if isinstance(members, Mapping) else {}
         root = original.get("type")
-        if root in ("Feature", "Geometry") and len(rows) == 1 and not self.metres and own.keys() <= {"datum"}:
+        if root in ("Feature", "Geometry") and len(rows) == 1 and not self.metres and extension.keys() <= {"datum"}:
             if root == "Feature":
-                return _dump({**rows[0], OWN: own} if own else rows[0])
+                return _dump({**rows[0], OWN: extension} if extension else rows[0])
             if rows[0]["geometry"] is not None:
-                context.drop("datum", len(own), "a geometry alone has no place for it")
+                context.drop("datum", len(extension), "a geometry alone has no place for it")
                 return _dump(rows[0]["geometry"])
         if self.metres:
             top = {"conformsTo": [CONFORMS], **top, "coordRefSys": LOCAL_3D if self.deep else LOCAL_2D}
         if context.attribution and not top.keys() & {"attribution", "license", "copyright"}:
             top["attribution"] = "; ".join(context.attribution)
-        if own:
-            top[OWN] = own
+        if extension:
+            top[OWN] = extension
         top.pop("type", None)
         top.pop("features", None)
         return _dump({"type": "FeatureCollection", **top, "features": rows})
@@ -598,7 +604,7 @@ class _Writer:
             self.metres = True
             self.deep |= bool(shapely.has_z(part.geometry[local]).any())
             metres = dict(zip(local.tolist(), _mappings(part.geometry[local], METRES), strict=True))
-        words = {"layer": key.layer, "level": key.level, "part": key.name}
+        part_members = {"layer": key.layer, "level": key.level, "part": key.name}
         rows = []
         for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
             origin = p.get("drawn_from")
@@ -615,30 +621,32 @@ class _Writer:
                 if k in metres:
                     row["place"] = place
                 more = {w: p[w] for w in WORDS if w in p}
-                rest = {w: v for w, v in p.items() if w not in WORDS} if more else p
-                row["properties"] = {**words, **rest, "more": more} if more else {**words, **rest}
+                remaining = {w: v for w, v in p.items() if w not in WORDS} if more else p
+                row["properties"] = (
+                    {**part_members, **remaining, "more": more} if more else {**part_members, **remaining}
+                )
             rows.append(row)
         return rows
 
     def foreign(self, row: dict[str, Any], p: Properties, shape: Any, geometry: Any, place: Any) -> None:
         """A feature of an uploaded collection, as it was but for what has changed since. place: ... for none."""
-        said = p.get(FAMILY)
-        own: Mapping[str, Any] = said if isinstance(said, Mapping) else {}
-        if "id" in own:
-            if own["id"] is None:
+        source_value = p.get(FAMILY)
+        source_properties: Mapping[str, Any] = source_value if isinstance(source_value, Mapping) else {}
+        if "id" in source_properties:
+            if source_properties["id"] is None:
                 del row["id"]
             else:
-                row["id"] = own["id"]
+                row["id"] = source_properties["id"]
         properties: dict[str, Any] | None = {k: v for k, v in p.items() if k != FAMILY}
-        added = own.get("added")
+        added = source_properties.get("added")
         default = ("note", "poi", "path", "region")[int(shapely.get_dimensions(shape)) + 1]
         if isinstance(added, list) and "kind" in added and p.get("kind") == default and properties is not None:
             del properties["kind"]
-        if isinstance(own.get("kept"), Mapping) and properties is not None:
-            properties |= {k: v for k, v in own["kept"].items() if k not in properties or k == FAMILY}
-        if not properties and "properties" in own and own["properties"] is None:
+        if isinstance(source_properties.get("kept"), Mapping) and properties is not None:
+            properties |= {k: v for k, v in source_properties["kept"].items() if k not in properties or k == FAMILY}
+        if not properties and "properties" in source_properties and source_properties["properties"] is None:
             properties = None
-        odd = own.get("geometry")
+        odd = source_properties.get("geometry")
         if isinstance(odd, dict) and _same_shape(odd, shape):
             if place is ...:
                 geometry = odd
@@ -648,7 +656,7 @@ class _Writer:
         if place is not ...:
             row["place"] = place
         row["properties"] = properties
-        members = own.get("members")
+        members = source_properties.get("members")
         if isinstance(members, Mapping):
             row.update({k: v for k, v in members.items() if k not in row})
 
@@ -669,14 +677,14 @@ def _mappings(geometry: NDArray[np.object_], decimals: int) -> list[Any]:
     types, has_z, empty = shapely.get_type_id(geometry), shapely.has_z(geometry), shapely.is_empty(geometry)
     out: list[Any] = [None] * n
     for deep in (False, True):
-        chosen = np.flatnonzero((has_z == deep) & ~empty)
-        if not len(chosen):
+        indices = np.flatnonzero((has_z == deep) & ~empty)
+        if not len(indices):
             continue
-        at = shapely.get_coordinates(geometry[chosen], include_z=deep)
+        at = shapely.get_coordinates(geometry[indices], include_z=deep)
         rows = (np.round(at, decimals) + 0.0).tolist()
-        ends = np.cumsum(shapely.get_num_coordinates(geometry[chosen])).tolist()
+        ends = np.cumsum(shapely.get_num_coordinates(geometry[indices])).tolist()
         begin = 0
-        for k, kind, end in zip(chosen.tolist(), types[chosen].tolist(), ends, strict=True):
+        for k, kind, end in zip(indices.tolist(), types[indices].tolist(), ends, strict=True):
             if kind == 0:
                 out[k] = {"type": "Point", "coordinates": rows[begin]}
             elif kind == 1:

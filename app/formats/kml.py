@@ -37,7 +37,7 @@ def detect(name: str, data: bytes) -> bool:
     head = data[:4096]
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         head = head.replace(b"\0", b"")
-    return name.lower().endswith(".kml") or (b"<" in head[:16] and any(word in head for word in _HEADS))
+    return name.lower().endswith(".kml") or (b"<" in head[:16] and any(marker in head for marker in _HEADS))
 
 
 def companions(main: str, data: bytes, names: Sequence[str]) -> list[str]:
@@ -45,8 +45,8 @@ def companions(main: str, data: bytes, names: Sequence[str]) -> list[str]:
     if b'"fleetmap"' not in data or b"<GroundOverlay" not in data:
         return []
     folder = main[: main.rfind("/") + 1]
-    wanted = {folder + unescape(href.decode("utf-8", "replace")) for href in _HREF.findall(data)}
-    return [name for name in names if name in wanted]
+    paths = {folder + unescape(href.decode("utf-8", "replace")) for href in _HREF.findall(data)}
+    return [name for name in names if name in paths]
 
 
 def read(files: Files, context: ReadContext) -> Layers:
@@ -62,8 +62,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     files = sum(len(p.files) for k, p in layers.of("resources", name="kmz").items() if hasattr(p, "files"))
     context.drop("resources", files, "images and further files of a drawing travel in KMZ only")
     pictures = isinstance(context.options, WriteOptions) and context.options.pictures
-    made = write_kml(layers, context, with_pictures=pictures, taken=frozenset())
-    return {MAIN: made.kml, **made.pictures}
+    written = write_kml(layers, context, with_pictures=pictures, taken=frozenset())
+    return {MAIN: written.kml, **written.pictures}
 
 
 register(

@@ -38,12 +38,12 @@ def read(files: Files, context: ReadContext) -> Layers:
     """The layers of the main document, and all other entries as resources."""
     entries = archive.unpack(files[context.main], context.limits)
     main = first_kml(entries)
-    others = {name: body for name, body in entries.items() if name != main}
-    layers, used = read_kml(entries[main], context, others, main)
-    kept = {name: body for name, body in others.items() if name not in used}
+    companions = {name: body for name, body in entries.items() if name != main}
+    layers, used = read_kml(entries[main], context, companions, main)
+    resources = {name: body for name, body in companions.items() if name not in used}
     parts: dict[PartKey, Part] = dict(layers.parts)
-    if kept and context.wants("resources"):
-        parts[PartKey("resources", context.level, RESOURCES)] = Resources(kept)
+    if resources and context.wants("resources"):
+        parts[PartKey("resources", context.level, RESOURCES)] = Resources(resources)
     return Layers(parts, layers.datum, layers.levels)
 
 
@@ -59,18 +59,18 @@ def first_kml(entries: Files) -> str:
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """One archive: the main document first, then pictures and the entries that were uploaded, by name."""
-    others: dict[str, bytes] = {}
+    extra_files: dict[str, bytes] = {}
     for part in layers.of("resources", name=RESOURCES).values():
         if isinstance(part, Resources):
             for name, body in part.files.items():
-                if others.setdefault(name, body) != body:
+                if extra_files.setdefault(name, body) != body:
                     context.drop("resources", 1, f"two levels bring another file called {name}")
-    made = write_kml(layers, context, with_pictures=True, taken=frozenset(others))
-    main = made.entry if made.entry and not bad_name(made.entry) else DOCUMENT
+    written = write_kml(layers, context, with_pictures=True, taken=frozenset(extra_files))
+    main = written.entry if written.entry and not bad_name(written.entry) else DOCUMENT
     stem, n = main.removesuffix(".kml"), 2
-    while main in others or main in made.pictures:
+    while main in extra_files or main in written.pictures:
         main, n = f"{stem}-{n}.kml", n + 1
-    return {MAIN: archive.pack({**others, **made.pictures, main: made.kml}, main)}
+    return {MAIN: archive.pack({**extra_files, **written.pictures, main: written.kml}, main)}
 
 
 register(

@@ -175,35 +175,36 @@ def network(lanes: Sequence[Lane], places: Places, document: Properties) -> Feat
             rows.append((lane, a, b, both))
             for pair in (a, b):
                 marks.add(pair, both)
-    known = set(places.names)
-    where: dict[tuple[int, int], str] = {}
+    name_set = set(places.names)
+    id_by_place: dict[tuple[int, int], str] = {}
     for pair in marks.all():
         top = marks.find(pair)
-        if top not in where:
-            where[top] = f"n{top[0]}:{top[1]}"
+        if top not in id_by_place:
+            id_by_place[top] = f"n{top[0]}:{top[1]}"
     # A node that our own tags name stands where it stood; every other one in the middle between its two points.
     used: dict[str, tuple[int, int] | None] = dict.fromkeys(places.names)
     edges: list[tuple[str, Any, Properties]] = []
     for k, (lane, a, b, both) in enumerate(rows):
         names = lane.tags.get(SOURCE, ""), lane.tags.get(TARGET, "")
         source, target = (
-            name if name in known else where[marks.find(pair)] for name, pair in zip(names, (a, b), strict=True)
+            name if name in name_set else id_by_place[marks.find(pair)]
+            for name, pair in zip(names, (a, b), strict=True)
         )
         for name, pair in ((source, a), (target, b)):
-            if name not in known:
+            if name not in name_set:
                 used.setdefault(name, marks.find(pair))
-        said: dict[str, Any] = {"kind": "edge", "source": source, "target": target}
+        edge_properties: dict[str, Any] = {"kind": "edge", "source": source, "target": target}
         if title := lane.tags.get("name") or lane.tags.get("road_name"):
-            said["name"] = title
+            edge_properties["name"] = title
         if widths[k] is not None:
-            said["width"] = widths[k]
+            edge_properties["width"] = widths[k]
         if (speed := speed_of(lane.tags.get("speed_limit"))) is not None:
-            said["speed_limit"] = speed
-        said[NAME] = compact({"lanelet": lane.id, "tags": lane.tags})
-        said = compact(said)
-        edges.append((lane.tags.get(EDGE) or f"l{lane.id}", lines[k], said))
+            edge_properties["speed_limit"] = speed
+        edge_properties[NAME] = compact({"lanelet": lane.id, "tags": lane.tags})
+        edge_properties = compact(edge_properties)
+        edges.append((lane.tags.get(EDGE) or f"l{lane.id}", lines[k], edge_properties))
         if both:
-            back = compact({**said, "source": target, "target": source})
+            back = compact({**edge_properties, "source": target, "target": source})
             edges.append((lane.tags.get(BACK) or f"l{lane.id}:back", shapely.reverse(lines[k]), back))
     for name, pair_ in used.items():
         if pair_ is None:
@@ -244,8 +245,8 @@ def _middles(
     for k, lane in enumerate(lanes):
         if lane.middle is not None:
             rows = [places.row[r] for r in lane.middle]
-            said = values[rows] if high[rows].any() else places.xyz[rows, :2]
-            out[k] = shapely.LineString(said)
+            coordinates = values[rows] if high[rows].any() else places.xyz[rows, :2]
+            out[k] = shapely.LineString(coordinates)
     sides = [
         np.asarray(shapely.linestrings(xy[s.at], indices=s.owner), object).reshape(len(lanes)) for s in (left, right)
     ]
@@ -254,8 +255,8 @@ def _middles(
     for lane, width in zip(lanes, apart, strict=True):
         # Where we made the bounds, the edge's width is in a tag; without one their distance is no information.
         between = round(width, 6) if width >= 0.01 and EDGE not in lane.tags else None
-        said_width = _positive(lane.tags.get("width"))
-        widths.append(between if said_width is None else said_width)
+        tag_width = _positive(lane.tags.get("width"))
+        widths.append(between if tag_width is None else tag_width)
     return out, widths
 
 
@@ -286,21 +287,21 @@ class _Ends:
 
 def two_way(tags: Mapping[str, str]) -> bool:
     """Whether a lanelet may be used both ways (Lanelet2: LaneletAndAreaTagging, "Direction")."""
-    said = _truth(tags.get("one_way"))
-    if said is not None:
-        return not said
+    one_way = _truth(tags.get("one_way"))
+    if one_way is not None:
+        return not one_way
     allowed = {k.removeprefix("participant:") for k, v in tags.items() if k.startswith("participant:") and _truth(v)}
     on_foot = allowed == {"pedestrian"} if allowed else tags.get("subtype") in ON_FOOT
     special = {k.removeprefix("one_way:"): _truth(v) for k, v in tags.items() if k.startswith("one_way:")}
     if on_foot:
         return not special.get("pedestrian", False)
     # One participant's right to go back is not everybody's.
-    return bool(allowed) and all(special.get(who) is False for who in allowed)
+    return bool(allowed) and all(special.get(participant) is False for participant in allowed)
 
 
 def _truth(value: str | None) -> bool | None:
-    word = (value or "").strip().lower()
-    return True if word in ("yes", "true", "1") else False if word in ("no", "false", "0") else None
+    text = (value or "").strip().lower()
+    return True if text in ("yes", "true", "1") else False if text in ("no", "false", "0") else None
 
 
 _SPEED = re.compile(r"\s*(\d{1,9}(?:\.\d{1,20})?)\s*([A-Za-z/]*)\s*", re.ASCII)
@@ -390,13 +391,13 @@ def read(files: Files, context: ReadContext) -> Layers:
     total = len(data.ids) + len(data.ways) + len(data.relations)
     if total > context.limits.features:
         raise TooLarge(f"the file has {total} elements; the limit is {context.limits.features}")
-    for problem, line, where in data.problems:
-        context.warn(problem, line=line, where=where)
-    said: dict[str, Any] = {"attributes": data.root}
+    for problem, line, location in data.problems:
+        context.warn(problem, line=line, where=location)
+    document: dict[str, Any] = {"attributes": data.root}
     if data.bounds:
-        said["bounds"] = data.bounds
+        document["bounds"] = data.bounds
     if data.elements:
-        said["elements"] = data.elements
+        document["elements"] = data.elements
     for relation in data.relations:
         limit = relation.tags.get("speed_limit")
         speed = None if limit is None else speed_of(limit)
@@ -406,16 +407,16 @@ def read(files: Files, context: ReadContext) -> Layers:
     projector = next((n for n in files if n != context.main), None)
     local = _has_only_metres(data)
     if projector is not None:
-        said["projector"] = _projector_text(files[projector], projector)
+        document["projector"] = _projector_text(files[projector], projector)
         local = _projector_type(files[projector], projector, context) == "local" or local
     reader = _Reader(data, context, local)
     parts: dict[PartKey, Part] = {}
     if context.wants("topology"):
-        made = reader.network()
-        if len(made):
-            parts[PartKey("topology", context.level, NETWORK)] = made
+        part = reader.network()
+        if len(part):
+            parts[PartKey("topology", context.level, NETWORK)] = part
     if context.wants("objects") or not parts:
-        parts[PartKey("objects", context.level, NAME)] = reader.objects({NAME: said})
+        parts[PartKey("objects", context.level, NAME)] = reader.objects({NAME: document})
     return Layers(parts)
 
 
@@ -436,13 +437,13 @@ def _projector_text(data: bytes, name: str) -> str:
 
 def _projector_type(data: bytes, name: str, context: ReadContext) -> str:
     try:
-        said = _yaml.load(data, context.limits)
+        document = _yaml.load(data, context.limits)
     except UnreadableFile as error:
         problems = [Problem(p.problem, name, p.line, p.where) for p in error.problems]
         raise UnreadableFile(f"{name}: {error.detail}", problems) from error
-    if isinstance(said, dict):
-        _fields.check(said, PROJECTOR_SHAPE, context, name)
-    kind = said.get("projector_type") if isinstance(said, dict) else None
+    if isinstance(document, dict):
+        _fields.check(document, PROJECTOR_SHAPE, context, name)
+    kind = document.get("projector_type") if isinstance(document, dict) else None
     if not isinstance(kind, str):
         context.warn("it names no projector_type: places on earth are believed", file=name)
         return ""
@@ -456,13 +457,13 @@ class _Reader:
         row = {i: k for k, i in enumerate(data.ids)}
         self.ways = {way.id: way for way in data.ways}
         self.relations = {r.id: r for r in data.relations}
-        for what, distinct, all_ids in (
+        for noun, distinct, all_ids in (
             ("node", row, data.ids),
             ("way", self.ways, data.ways),
             ("relation", self.relations, data.relations),
         ):
             if len(distinct) != len(all_ids):
-                context.warn("ids stand more than once in the file; the last one counts", where=what)
+                context.warn("ids stand more than once in the file; the last one counts", where=noun)
         self.row = row
         xyz = np.full((len(data.ids), 3), np.nan)
         if not local:
@@ -474,16 +475,16 @@ class _Reader:
             if "ele" in tags:
                 xyz[k, 2] = _decimal(tags["ele"])
                 doubts["elevations are no numbers of metres and not believed"] += math.isnan(xyz[k, 2])
-        lost = np.isnan(xyz[:, :2]).any(axis=1)
-        xyz[lost] = np.nan
-        doubts["points have no place; references to them are kept"] += int(lost.sum())
+        absent = np.isnan(xyz[:, :2]).any(axis=1)
+        xyz[absent] = np.nan
+        doubts["points have no place; references to them are kept"] += int(absent.sum())
         for text, times in doubts.items():
             if times:
                 context.warn(f"{times} {text}")
         self.xyz = xyz
         self.known: dict[int, dict[str, Any]] = {}
         self.compact = Compact()
-        self.located = {i: k for i, k in row.items() if not lost[k]}
+        self.located = {i: k for i, k in row.items() if not absent[k]}
 
     def network(self) -> Features:
         relations = ((r.id, r.members, r.tags, r.attributes) for r in self.relations.values())
@@ -521,26 +522,26 @@ class _Reader:
         properties: list[Properties] = []
         for k in lone:
             tags = data.tags.get(k, {})
-            said = self.asked(k)
+            source_members = self.asked(k)
             if children := data.node_children.get(k):
-                said["children"] = children
-            properties.append(self.compact(_properties(said, tags, "point")))
+                source_members["children"] = children
+            properties.append(self.compact(_properties(source_members, tags, "point")))
         special_ids = {data.ids[k] for k in lone}
         deep = ~np.isnan(self.xyz[:, 2])
         for way in self.ways.values():
-            said = self.way(way, special_ids)
+            source_members = self.way(way, special_ids)
             ids.append(f"w{way.id}")
             geometry.append(self.line(way, deep))
-            properties.append(self.compact(_properties(said, way.tags, "line")))
+            properties.append(self.compact(_properties(source_members, way.tags, "line")))
         for r in self.relations.values():
-            said = {"members": [list(m) for m in r.members], "tags": r.tags}
+            source_members = {"members": [list(m) for m in r.members], "tags": r.tags}
             if r.attributes:
-                said["attributes"] = r.attributes
+                source_members["attributes"] = r.attributes
             if r.children:
-                said["children"] = r.children
+                source_members["children"] = r.children
             ids.append(f"r{r.id}")
             geometry.append(NO_GEOMETRY)
-            properties.append(self.compact(_properties(self.compact(said), r.tags, "relation")))
+            properties.append(self.compact(_properties(self.compact(source_members), r.tags, "relation")))
         out = np.empty(len(geometry), object)
         out[:] = geometry
         return from_columns(ids, out, properties, self.anchor, document)
@@ -560,27 +561,27 @@ class _Reader:
         return shapely.LineString(at) if len(rows) > 1 else shapely.Point(*at[0])
 
     def way(self, way: Way, special: set[int]) -> dict[str, Any]:
-        said: dict[str, Any] = {"refs": way.refs, "tags": way.tags}
+        source_members: dict[str, Any] = {"refs": way.refs, "tags": way.tags}
         if way.attributes:
-            said["attributes"] = way.attributes
+            source_members["attributes"] = way.attributes
         if missing := [k for k, r in enumerate(way.refs) if r not in self.located]:
-            said["missing"] = missing
+            source_members["missing"] = missing
         if not way.refs and not _is_gone(way.attributes):
             self.context.warn("the way has no nodes", where=f"way {way.id}")
         bends = [None if r in special or r not in self.row else self.bend(self.row[r]) for r in way.refs]
         mere = [b for b in bends if b is not None]
         if any(mere):
-            said["vertices"] = mere[0] if all(b == mere[0] for b in mere) else bends
+            source_members["vertices"] = mere[0] if all(b == mere[0] for b in mere) else bends
         if way.children:
-            said["children"] = way.children
-        return self.compact(said)
+            source_members["children"] = way.children
+        return self.compact(source_members)
 
     def bend(self, k: int) -> dict[str, Any]:
         """What is known of a point beside its place; one value for all ways that bend there."""
-        known = self.known.get(k)
-        if known is None:
-            known = self.known[k] = self.asked(k)
-        return known
+        cached = self.known.get(k)
+        if cached is None:
+            cached = self.known[k] = self.asked(k)
+        return cached
 
     def asked(self, k: int) -> dict[str, Any]:
         tags = self.data.tags.get(k)
@@ -588,8 +589,8 @@ class _Reader:
         at = None
         if (tags and LOCAL[0] in tags) or self.anchor == "local":
             at = self.data.lonlat[k].tolist()
-        said = {"tags": tags, "attributes": attributes, "at": None if at is None or math.isnan(at[0]) else at}
-        return self.compact({word: value for word, value in said.items() if value})
+        source_members = {"tags": tags, "attributes": attributes, "at": None if at is None or math.isnan(at[0]) else at}
+        return self.compact({key: value for key, value in source_members.items() if value})
 
 
 def _table(
@@ -600,12 +601,12 @@ def _table(
     return Places({i: k for k, i in enumerate(located)}, xyz[rows].reshape(-1, 3), anchor, names, labels)
 
 
-def _properties(said: dict[str, Any], tags: Tags, otherwise: str) -> dict[str, Any]:
+def _properties(source_members: dict[str, Any], tags: Tags, otherwise: str) -> dict[str, Any]:
     kind = tags.get("type") or otherwise
     if otherwise == "relation" and kind == "multipolygon":
         kind = "area"
     name = tags.get("name")
-    return {"kind": kind, "name": name, NAME: said} if name else {"kind": kind, NAME: said}
+    return {"kind": kind, "name": name, NAME: source_members} if name else {"kind": kind, NAME: source_members}
 
 
 # --- writing -----------------------------------------------------------------------------------------------------
@@ -672,16 +673,20 @@ class _Writer:
         self.children: dict[tuple[str, int], Any] = {}
         self.explained: dict[PartKey, set[str]] = {}
         self.moved: dict[PartKey, set[str]] = {}
-        mine = [part for key, part in layers.vector("objects").items() if key.name == NAME]
-        self.documents = [said for part in mine if isinstance(said := part.document.get(NAME), Mapping)]
+        own_parts = [part for key, part in layers.vector("objects").items() if key.name == NAME]
+        self.documents = [
+            source_members for part in own_parts if isinstance(source_members := part.document.get(NAME), Mapping)
+        ]
         self.projector = next((s for d in self.documents if isinstance(s := d.get("projector"), str)), None)
-        self.metric = any(part.local.any() for part in mine)
-        rows = [own(p, NAME) for part in mine for p in part.properties]
-        self.taken = {k[1] for part in mine for i in part.ids if (k := element_id(i))}
-        self.taken.update(chain.from_iterable(integers(said.get("refs")) or () for said in rows))
+        self.metric = any(part.local.any() for part in own_parts)
+        rows = [own(p, NAME) for part in own_parts for p in part.properties]
+        self.taken = {k[1] for part in own_parts for i in part.ids if (k := element_id(i))}
+        self.taken.update(chain.from_iterable(integers(source_members.get("refs")) or () for source_members in rows))
         self.counter = 0
         # In a map whose metres are another frame's, new points say only where on earth they are.
-        self.say_metres = self.metric or not any(LOCAL[0] in as_texts(t) for said in rows for t in _all_tags(said))
+        self.say_metres = self.metric or not any(
+            LOCAL[0] in as_texts(t) for source_members in rows for t in _all_tags(source_members)
+        )
 
     def fresh(self) -> int:
         """A new id; points, ways and relations share one row of numbers."""
@@ -706,72 +711,78 @@ class _Writer:
         geometry = part.in_wgs84(self.layers.frame) if mixed else part.geometry
         local = bool(part.local.all())
         rows = [
-            (known[0], known[1], shape, own(p, NAME))
+            (identity[0], identity[1], shape, own(p, NAME))
             for i, shape, p in zip(part.ids, geometry, part.properties, strict=True)
-            if (known := element_id(i)) and NAME in p
+            if (identity := element_id(i)) and NAME in p
         ]
         self.lost["objects that are no element of a map"] += len(part) - len(rows)
-        for what, i, shape, said in rows:
-            if what == "n":
-                self.point(level, i, shape, said, local, nodes if networks else None)
+        for kind, i, shape, source_members in rows:
+            if kind == "n":
+                self.point(level, i, shape, source_members, local, nodes if networks else None)
         drawn_anew = [
-            (i, shape, said)
-            for what, i, shape, said in rows
-            if what == "w" and not self.way(level, i, shape, said, local)
+            (i, shape, source_members)
+            for kind, i, shape, source_members in rows
+            if kind == "w" and not self.way(level, i, shape, source_members, local)
         ]
-        for i, shape, said in drawn_anew:  # once the points of all others are there to be met
-            refs = integers(said.get("refs")) or []
+        for i, shape, source_members in drawn_anew:  # once the points of all others are there to be met
+            refs = integers(source_members.get("refs")) or []
             points = self.redrawn(level, refs, _course(shape), local)
-            self.ways[level.ways[i]] = (points, as_texts(said.get("tags")), as_texts(said.get("attributes")))
-        relations = [(i, said) for what, i, _, said in rows if what == "r"]
+            self.ways[level.ways[i]] = (
+                points,
+                as_texts(source_members.get("tags")),
+                as_texts(source_members.get("attributes")),
+            )
+        relations = [(i, source_members) for kind, i, _, source_members in rows if kind == "r"]
         for i, _ in relations:
             level.relations[i] = self.fresh() if i in self.relations else i
             self.relations[level.relations[i]] = ([], NOTHING, NOTHING)
-        said_of = self.lanelets(level, part, local, relations, networks)
-        for i, said in relations:
-            self.relation(level, i, said, said_of.get(i, (NOTHING, False)))
+        lane_tags = self.lanelets(level, part, local, relations, networks)
+        for i, source_members in relations:
+            self.relation(level, i, source_members, lane_tags.get(i, (NOTHING, False)))
 
     def point(
-        self, level: _Level, i: int, shape: Any, said: Mapping[str, Any], local: bool, nodes: set[str] | None
+        self, level: _Level, i: int, shape: Any, source_members: Mapping[str, Any], local: bool, nodes: set[str] | None
     ) -> None:
         xyz = _xyz(shape)
         new = self.fresh() if i in self.points else i
-        tags = as_texts(said.get("tags"))
+        tags = as_texts(source_members.get("tags"))
         if nodes is not None and NODE in tags and tags[NODE] not in nodes:
             tags = {k: v for k, v in tags.items() if k != NODE}
-        self.points[new] = _Point(xyz, local, tags, as_texts(said.get("attributes")), _pair(said.get("at")))
+        self.points[new] = _Point(
+            xyz, local, tags, as_texts(source_members.get("attributes")), _pair(source_members.get("at"))
+        )
         level.nodes[i] = new
-        self.unknown("node", new, said)
+        self.unknown("node", new, source_members)
 
-    def way(self, level: _Level, i: int, shape: Any, said: Mapping[str, Any], local: bool) -> bool:
+    def way(self, level: _Level, i: int, shape: Any, source_members: Mapping[str, Any], local: bool) -> bool:
         """Write a way; False where its geometry no longer has the points that it came with."""
-        refs = integers(said.get("refs"))
+        refs = integers(source_members.get("refs"))
         at = _course(shape)
         new = level.ways[i] = self.fresh() if i in self.ways else i
-        self.unknown("way", new, said)
-        tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
-        missing = set(integers(said.get("missing")) or ())
+        self.unknown("way", new, source_members)
+        tags, attributes = as_texts(source_members.get("tags")), as_texts(source_members.get("attributes"))
+        missing = set(integers(source_members.get("missing")) or ())
         if refs is None or len(refs) - len(missing) != len(at):
             self.ways[new] = ([], tags, attributes)
             return False
-        bends = said.get("vertices")
+        bends = source_members.get("vertices")
         rows = bends if isinstance(bends, list) and len(bends) == len(refs) else [bends] * len(refs)
         out, j = [], 0
         for k, ref in enumerate(refs):
             name = level.nodes.get(ref, ref)
             if k not in missing:
-                known = self.points.get(name)
+                point = self.points.get(name)
                 bend: Mapping[str, Any] = row if isinstance(row := rows[k], Mapping) else {}
-                if known is None or (ref not in level.nodes and not _same(known.xyz, at[j])):
+                if point is None or (ref not in level.nodes and not _same(point.xyz, at[j])):
                     # Two ways that no longer agree where their common point is keep their course each.
-                    if known is not None:
+                    if point is not None:
                         name = self.fresh()
-                    tags_, said_ = as_texts(bend.get("tags")), as_texts(bend.get("attributes"))
-                    place = _pair(bend.get("at"))
-                    self.points[name] = _Point(at[j], local, tags_, said_, place, vertex=True)
-                    if known is None:
+                    tags_, attributes_ = as_texts(bend.get("tags")), as_texts(bend.get("attributes"))
+                    position = _pair(bend.get("at"))
+                    self.points[name] = _Point(at[j], local, tags_, attributes_, position, vertex=True)
+                    if point is None:
                         level.nodes[ref] = name
-                elif known.vertex and not _same(known.xyz, at[j]):
+                elif point.vertex and not _same(point.xyz, at[j]):
                     name = self.fresh()
                     self.points[name] = _Point(at[j], local, vertex=True)
                 j += 1
@@ -782,19 +793,19 @@ class _Writer:
     def redrawn(self, level: _Level, refs: list[int], at: list[tuple[float, float, float]], local: bool) -> list[int]:
         """Points for a way whose geometry was edited: its own where one stands at a bend, else new ones."""
         names = (level.nodes.get(r, r) for r in refs)
-        known = {self.points[n].xyz[:2]: n for n in names if n in self.points}
+        point_names = {self.points[n].xyz[:2]: n for n in names if n in self.points}
         out = []
-        for place in at:
-            if place[:2] not in known:
-                known[place[:2]] = new = self.fresh()
-                self.points[new] = _Point(place, local, vertex=True)
-            out.append(known[place[:2]])
+        for position in at:
+            if position[:2] not in point_names:
+                point_names[position[:2]] = new = self.fresh()
+                self.points[new] = _Point(position, local, vertex=True)
+            out.append(point_names[position[:2]])
         return out
 
-    def unknown(self, what: str, number: int, said: Mapping[str, Any]) -> None:
+    def unknown(self, kind: str, number: int, source_members: Mapping[str, Any]) -> None:
         """Keep the elements inside an element that OSM does not know."""
-        if said.get("children"):
-            self.children[what, number] = said["children"]
+        if source_members.get("children"):
+            self.children[kind, number] = source_members["children"]
 
     def lanelets(
         self,
@@ -815,20 +826,20 @@ class _Writer:
         labels: dict[str, str] = {}
         sizes = shapely.get_num_coordinates(part.geometry).tolist()
         for i, size, p in zip(part.ids, sizes, part.properties, strict=True):
-            known, said = element_id(i), own(p, NAME)
+            identity, source_members = element_id(i), own(p, NAME)
             refs: list[int] = []
-            if known and known[0] == "n" and size:
-                refs = [known[1]]
-                tags = as_texts(said.get("tags"))
+            if identity and identity[0] == "n" and size:
+                refs = [identity[1]]
+                tags = as_texts(source_members.get("tags"))
                 if tags.get(NODE):
-                    names.setdefault(tags[NODE], known[1])
+                    names.setdefault(tags[NODE], identity[1])
                     labels.setdefault(tags[NODE], tags.get("name", ""))
-            elif known and known[0] == "w":
-                missing = set(integers(said.get("missing")) or ())
-                refs = [r for k, r in enumerate(integers(said.get("refs")) or ()) if k not in missing]
+            elif identity and identity[0] == "w":
+                missing = set(integers(source_members.get("missing")) or ())
+                refs = [r for k, r in enumerate(integers(source_members.get("refs")) or ()) if k not in missing]
                 if len(refs) != size:  # redrawn: its points are not those that it came with
                     continue
-                ways[known[1]] = (refs, as_texts(said.get("attributes")))
+                ways[identity[1]] = (refs, as_texts(source_members.get("attributes")))
             if any(r not in level.nodes for r in refs):
                 continue  # a point that it refers to is not among them: somebody has changed it
             for r in refs:
@@ -836,7 +847,13 @@ class _Writer:
                     row[r] = len(xyz)
                     xyz.append(self.points[level.nodes[r]].xyz)
         rows = (
-            (i, _members(said), as_texts(said.get("tags")), as_texts(said.get("attributes"))) for i, said in relations
+            (
+                i,
+                _members(source_members),
+                as_texts(source_members.get("tags")),
+                as_texts(source_members.get("attributes")),
+            )
+            for i, source_members in relations
         )
         lanes, broken = lanes_of(rows, ways, row)
         table = Places(row, np.array(xyz, np.float64).reshape(-1, 3), "local" if local else "wgs84", names, labels)
@@ -855,16 +872,16 @@ class _Writer:
         self, lanes: Sequence[Lane], drawn: Features, networks: Mapping[PartKey, Features]
     ) -> dict[int, tuple[Mapping[str, str], bool] | None]:
         """Lanelets as the networks have them now. drawn: the network that the lanelets make by themselves."""
-        place = drawn.index()
-        there: dict[str, Properties] = {}
+        index_by_id = drawn.index()
+        net_properties: dict[str, Properties] = {}
         for key, net in networks.items():
             near = SAME_PLACE["local" if bool(drawn.local.all()) else "wgs84"]
-            own_rows = [(k, place[i]) for k, i in enumerate(net.ids) if i in place]
+            own_rows = [(k, index_by_id[i]) for k, i in enumerate(net.ids) if i in index_by_id]
             now, then = [k for k, _ in own_rows], [k for _, k in own_rows]
             same = shapely.equals_exact(net.geometry[now], drawn.geometry[then], tolerance=near) if now else []
             still = {net.ids[k] for k, ok in zip(now, same, strict=True) if ok and net.local[k] == drawn.local[0]}
             self.moved[key] = {net.ids[k] for k in now} - still
-            known = self.explained.setdefault(key, set())
+            explained_ids = self.explained.setdefault(key, set())
             for k, j in own_rows:
                 p, q = net.properties[k], drawn.properties[j]
                 ends = (p.get("source"), p.get("target"))
@@ -873,8 +890,8 @@ class _Writer:
                     and ends == (q.get("source"), q.get("target"))
                     and still >= {*ends, net.ids[k]}
                 ):
-                    there[net.ids[k]] = p
-                    known.add(net.ids[k])
+                    net_properties[net.ids[k]] = p
+                    explained_ids.add(net.ids[k])
         expected: dict[int, list[int]] = {}
         for k, p in enumerate(drawn.properties):
             if p["kind"] == "edge":
@@ -882,15 +899,15 @@ class _Writer:
         out: dict[int, tuple[Mapping[str, str], bool] | None] = {}
         for lane in lanes:
             edges = expected[lane.id]
-            found = [k for k in edges if drawn.ids[k] in there]
-            if not found:
+            matches = [k for k in edges if drawn.ids[k] in net_properties]
+            if not matches:
                 out[lane.id] = None
                 self.lost["lanelets whose edges are no longer in the network"] += 1
                 continue
-            tags = self.edited(lane, drawn.properties[found[0]], there[drawn.ids[found[0]]])
-            if len(found) < len(edges):
+            tags = self.edited(lane, drawn.properties[matches[0]], net_properties[drawn.ids[matches[0]]])
+            if len(matches) < len(edges):
                 tags = {**{k: v for k, v in tags.items() if not k.startswith("one_way:")}, "one_way": "yes"}
-            out[lane.id] = (tags, found[0] != edges[0])
+            out[lane.id] = (tags, matches[0] != edges[0])
         return out
 
     def edited(self, lane: Lane, drawn: Properties, now: Properties) -> dict[str, str]:
@@ -910,24 +927,24 @@ class _Writer:
         return tags
 
     def relation(
-        self, level: _Level, i: int, said: Mapping[str, Any], about: tuple[Mapping[str, str], bool] | None
+        self, level: _Level, i: int, source_members: Mapping[str, Any], about: tuple[Mapping[str, str], bool] | None
     ) -> None:
         if about is None:
             del self.relations[level.relations[i]]
             return
         tags, turned = about
         members = []
-        for kind, ref, role in _members(said):
+        for kind, ref, role in _members(source_members):
             names = {"node": level.nodes, "way": level.ways, "relation": level.relations}.get(kind, {})
             other = {"left": "right", "right": "left"}.get(role) if turned else None
             members.append((kind, names.get(ref, ref), other or role))
-        stated = said.get("members")
+        stated = source_members.get("members")
         self.lost["relation members that are not [type, id, role]"] += (
             len(stated) - len(members) if isinstance(stated, list) else 0
         )
-        self.unknown("relation", level.relations[i], said)
-        tags = tags or as_texts(said.get("tags"))
-        self.relations[level.relations[i]] = (members, tags, as_texts(said.get("attributes")))
+        self.unknown("relation", level.relations[i], source_members)
+        tags = tags or as_texts(source_members.get("tags"))
+        self.relations[level.relations[i]] = (members, tags, as_texts(source_members.get("attributes")))
 
     # --- what came from elsewhere ---
 
@@ -935,9 +952,9 @@ class _Writer:
         """Lanelets for all edges that none explains, and points for nodes."""
         parts: dict[PartKey, Part] = {}
         for key, part in self.layers.vector("topology").items():
-            known = self.explained.get(key, set())
-            keep = [k for k, i in enumerate(part.ids) if i not in known]
-            if any(part.properties[k].get("kind") == "edge" for k in keep) or not known:
+            explained_ids = self.explained.get(key, set())
+            keep = [k for k, i in enumerate(part.ids) if i not in explained_ids]
+            if any(part.properties[k].get("kind") == "edge" for k in keep) or not explained_ids:
                 parts[key] = part.take(keep)
         if not parts:
             return
@@ -1011,14 +1028,14 @@ class _Writer:
         as they came need none unless a new lanelet begins there."""
         out = {}
         for k, node in enumerate(net.nodes):
-            said = own(node.properties, NAME)
-            stored = said.get("point")
+            source_members = own(node.properties, NAME)
+            stored = source_members.get("point")
             level = self.levels.get(node.level, _Level())
             if type(stored) is int and stored in level.nodes and self.points[level.nodes[stored]].tags.get(NODE):
                 new = level.nodes[stored]
                 if not _same(self.points[new].xyz, self.placed(node.x, node.y, node.z, self.points[new].local)):
                     new = -1
-            elif k not in used and isinstance(said.get("points"), list):
+            elif k not in used and isinstance(source_members.get("points"), list):
                 continue
             else:
                 new = -1
@@ -1041,12 +1058,12 @@ class _Writer:
 
     def new_point(self, x: float, y: float, z: float, tags: Mapping[str, str] = NOTHING) -> int:
         new = self.fresh()
-        said = dict(tags)
+        point_tags = dict(tags)
         if self.say_metres:
-            said |= {LOCAL[0]: number(x), LOCAL[1]: number(y)}
+            point_tags |= {LOCAL[0]: number(x), LOCAL[1]: number(y)}
         if not math.isnan(z):
-            said["ele"] = number(z)
-        self.points[new] = _Point((x, y, z), True, said, stored=False)
+            point_tags["ele"] = number(z)
+        self.points[new] = _Point((x, y, z), True, point_tags, stored=False)
         return new
 
     def bounds(self, net: Net, new: Sequence[_New], centres: Mapping[int, int]) -> None:
@@ -1063,16 +1080,16 @@ class _Writer:
         borders: dict[int, Border] = {}
         shared: dict[int, list[int]] = {}
         joins: dict[tuple[int, bool], tuple[int, bool]] = {}
-        for node, there in sorted(arms.items()):
+        for node, node_arms in sorted(arms.items()):
             at = net.nodes[node]
             stored = self.stored_border(net, node)
-            found = stored[0] if stored else _lanes.border((at.x, at.y), there)
-            if found is None:
+            border = stored[0] if stored else _lanes.border((at.x, at.y), node_arms)
+            if border is None:
                 continue
-            borders[node] = found
+            borders[node] = border
             if stored:
                 shared[node] = list(stored[1])
-            joins |= {(arm.lane, arm.far): (node, found.along(arm)) for arm in there if found.shared_by(arm)}
+            joins |= {(arm.lane, arm.far): (node, border.along(arm)) for arm in node_arms if border.shared_by(arm)}
         narrow = 0
         for k, lane in enumerate(new):
             left, right, squeezed = self.sides(k, lane, joins, borders)
@@ -1088,21 +1105,21 @@ class _Writer:
                         continue
                     node, straight = join
                     if node not in shared:
-                        found = borders[node]
-                        shared[node] = [self.new_point(*p, z) for p in (found.left, found.right)]
+                        border = borders[node]
+                        shared[node] = [self.new_point(*p, z) for p in (border.left, border.right)]
                     names.append(shared[node][side if straight else 1 - side])
                 sides.append(names)
             self.emit(net, lane, sides, centres)
         if narrow:
             self.context.warn(f"{narrow} lanes are narrower than their edges say, so that their bounds do not cross")
         possible = sum(map(_lanes.ways, arms.values()))
-        made = 0
-        for node, there in arms.items():
-            across = [_lanes.across(arm, borders[node]) if (arm.lane, arm.far) in joins else 0.0 for arm in there]
-            made += _lanes.through(there, across)
-        if lost := possible - made:
+        connection_count = 0
+        for node, node_arms in arms.items():
+            across = [_lanes.across(arm, borders[node]) if (arm.lane, arm.far) in joins else 0.0 for arm in node_arms]
+            connection_count += _lanes.through(node_arms, across)
+        if breaks := possible - connection_count:
             self.context.warn(
-                f"{lost} of {possible} ways from one lane into the next are no connection in Lanelet2's sense: their "
+                f"{breaks} of {possible} ways from one lane into the next are no connection in Lanelet2's sense: their "
                 "turns are too sharp for bounds to be shared"
             )
 
@@ -1142,16 +1159,16 @@ class _Writer:
             return *_lanes.beside(lane.middle[:, :2], half), False
         for attempt in range(8):
             left, right = _lanes.beside(lane.middle[:, :2], half)
-            for kept in ((False, True), (True,), (False,), ()):
+            for far_ends in ((False, True), (True,), (False,), ()):
                 a, b = left.copy(), right.copy()
-                for far in kept:
+                for far in far_ends:
                     if (k, far) in joins:
                         node, straight = joins[k, far]
-                        found = borders[node]
-                        ends = (found.left, found.right) if straight else (found.right, found.left)
+                        border = borders[node]
+                        ends = (border.left, border.right) if straight else (border.right, border.left)
                         a[-1 if far else 0], b[-1 if far else 0] = ends
                 if _lanes.is_sound(a, b):
-                    for far in {False, True} - set(kept):
+                    for far in {False, True} - set(far_ends):
                         joins.pop((k, far), None)
                     return a, b, attempt > 0
             half /= 2.0
@@ -1170,13 +1187,13 @@ class _Writer:
             kind = "virtual" if role == "centerline" else self.options.bounds
             self.ways[new] = (refs, {"type": kind}, NOTHING)
             members.append(("way", new, role))
-        known = own(edge.properties, NAME).get("tags")
+        source_tags = own(edge.properties, NAME).get("tags")
         tags = {"type": "lanelet", "subtype": self.subtype(edge), "location": self.options.location}
-        stated = as_texts(known) if isinstance(known, Mapping) else NOTHING
+        stated = as_texts(source_tags) if isinstance(source_tags, Mapping) else NOTHING
         tags |= {k: v for k, v in stated.items() if k != "one_way" and not k.startswith(("one_way:", "fleetmap:"))}
         tags["one_way"] = "yes" if lane.back is None else "no"
-        for word in ("name", "speed_limit", "width"):
-            tags.pop(word, None)
+        for key in ("name", "speed_limit", "width"):
+            tags.pop(key, None)
         name = edge.properties.get("name")
         if isinstance(name, str) and name != edge.id:
             tags["name"] = name
@@ -1191,18 +1208,18 @@ class _Writer:
 
     def subtype(self, edge: Edge) -> str:
         """What its source calls it, in Lanelet2's words."""
-        known = as_texts(own(edge.properties, NAME).get("tags")).get("subtype")
+        source_subtype = as_texts(own(edge.properties, NAME).get("tags")).get("subtype")
         highway = as_texts(own(edge.properties, "osm").get("tags")).get("highway")
-        if known:
-            return known
+        if source_subtype:
+            return source_subtype
         return SUBTYPES.get(highway, "road") if highway else self.options.subtype
 
     # --- XML ---
 
     def text(self) -> bytes:
         nodes = self.placed_nodes()
-        for what, times in sorted(self.lost.items()):
-            self.context.drop(what, times, "a Lanelet2 map has no place for them")
+        for item, times in sorted(self.lost.items()):
+            self.context.drop(item, times, "a Lanelet2 map has no place for them")
         if self.layers.datum is not None:
             self.context.drop("datum", 1, "a Lanelet2 map stands on earth and has no local frame of its own")
         return _osm_text.document(self.head(), nodes, self.ways, self.relations, self.children)
@@ -1235,8 +1252,8 @@ class _Writer:
         elif not point.local and LOCAL[0] in tags and (point.at is None or point.at != (x, y)):
             tags = {k: v for k, v in tags.items() if k not in LOCAL}
             self.lost["local_x and local_y of moved points"] += 1
-        said = _decimal(tags["ele"]) if "ele" in tags else 0.0
-        if not math.isnan(z) and z != said and not (math.isnan(said) and z == 0.0):
+        elevation = _decimal(tags["ele"]) if "ele" in tags else 0.0
+        if not math.isnan(z) and z != elevation and not (math.isnan(elevation) and z == 0.0):
             tags = {**tags, "ele": number(z)}
         return tags
 
@@ -1255,11 +1272,11 @@ class _Writer:
         return lines
 
 
-def _all_tags(said: Mapping[str, Any]) -> Iterable[Any]:
+def _all_tags(source_members: Mapping[str, Any]) -> Iterable[Any]:
     """The tags of a stored point or of a way's bends."""
-    bends = said.get("vertices")
+    bends = source_members.get("vertices")
     rows = bends if isinstance(bends, list) else [bends]
-    return [said.get("tags"), *(row.get("tags") for row in rows if isinstance(row, Mapping))]
+    return [source_members.get("tags"), *(row.get("tags") for row in rows if isinstance(row, Mapping))]
 
 
 def _xyz(shape: Any) -> tuple[float, float, float]:
@@ -1283,12 +1300,12 @@ def _same(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
 def _pair(value: Any) -> tuple[float, float] | None:
     if not isinstance(value, list | tuple) or len(value) != 2:
         return None
-    good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
-    return (float(value[0]), float(value[1])) if good else None
+    valid = all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    return (float(value[0]), float(value[1])) if valid else None
 
 
-def _members(said: Mapping[str, Any]) -> list[tuple[str, int, str]]:
-    rows = said.get("members")
+def _members(source_members: Mapping[str, Any]) -> list[tuple[str, int, str]]:
+    rows = source_members.get("members")
     return [
         (str(row[0]), row[1], str(row[2]))
         for row in (rows if isinstance(rows, list) else [])
@@ -1298,8 +1315,8 @@ def _members(said: Mapping[str, Any]) -> list[tuple[str, int, str]]:
 
 def _metres_per_second(properties: Properties) -> float | None:
     value = properties.get("speed_limit")
-    good = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < 1e9
-    return float(value) if good and value is not None else None
+    valid = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < 1e9
+    return float(value) if valid and value is not None else None
 
 
 def _kmh(speed: float) -> str:
@@ -1309,8 +1326,8 @@ def _kmh(speed: float) -> str:
 
 def _same_road(a: Edge, b: Edge) -> bool:
     """Whether two edges, there and back, can be one lanelet."""
-    words = ("speed_limit", "width", "name")
-    return all(a.properties.get(w) == b.properties.get(w) for w in words) and a.level == b.level
+    keys = ("speed_limit", "width", "name")
+    return all(a.properties.get(w) == b.properties.get(w) for w in keys) and a.level == b.level
 
 
 def _middle_of(edge: Edge, net: Net) -> Array | None:

@@ -43,18 +43,18 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     Raises MissingLayer, NotFound, Ambiguous or Invalid.
     """
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    wanted = _points.source(layers, context, options.name, options.level, options.frame, ENDINGS, PARSERS)
-    kind = options.kind or (wanted.form if wanted.form in ENDINGS else "las")
+    source = _points.source(layers, context, options.name, options.level, options.frame, ENDINGS, PARSERS)
+    kind = options.kind or (source.form if source.form in ENDINGS else "las")
     name = _points.file_name(options.name, kind)
-    if wanted.data is not None:
-        return {name: wanted.data if kind == wanted.form else _las.again(wanted.data, kind == "laz")}
-    cloud = wanted.cloud()
-    if wanted.form not in ENDINGS:
+    if source.data is not None:
+        return {name: source.data if kind == source.form else _las.again(source.data, kind == "laz")}
+    cloud = source.cloud()
+    if source.form not in ENDINGS:
         if cloud.height > 1:
             context.drop("rows and columns of the cloud", 1, "LAS points are one list: ask for pcd")
         context.drop("viewpoint", int(cloud.viewpoint != _points.UNTURNED), "LAS has no place for it: ask for pcd")
-        for what, count in cloud.further.items():
-            context.drop(what, count, "LAS has points only")
+        for noun, count in cloud.further.items():
+            context.drop(noun, count, "LAS has points only")
     return {name: _las.pack(_points.plain(cloud), context, kind == "laz")}
 
 

@@ -217,8 +217,8 @@ class _Reader:
             "layouts": self.heads,
         }
         self.version()
-        for row, where in self.layouts():
-            self.layout(row, where)
+        for row, location in self.layouts():
+            self.layout(row, location)
         total = sum(map(len, self.found.values()))
         if total > context.limits.features:
             raise TooLarge(f"the file has {total} items; the limit is {context.limits.features}")
@@ -226,13 +226,13 @@ class _Reader:
     def version(self) -> None:
         """Report a version that is not known, or missing."""
         meta = self.top.get("metaInformation")
-        said = meta.get("lifVersion") if isinstance(meta, dict) else None
-        if not isinstance(said, str):
+        version = meta.get("lifVersion") if isinstance(meta, dict) else None
+        if not isinstance(version, str):
             self.context.warn("is missing; it is read as version 1.0", where="metaInformation.lifVersion")
-        elif said.split(".")[0] not in ("0", "1"):
+        elif version.split(".")[0] not in ("0", "1"):
             self.is_first = False
             self.context.warn(
-                f"version {said[:40]} is a draft, read as far as it is known; it is served as it came",
+                f"version {version[:40]} is a draft, read as far as it is known; it is served as it came",
                 where="metaInformation.lifVersion",
             )
 
@@ -246,40 +246,40 @@ class _Reader:
         if len(origins) > 1:
             self.context.warn("origins need not fit together: all are taken for the local one", where="origins")
         for k, origin in enumerate(origins):
-            where = f"origins[{k}]"
+            location = f"origins[{k}]"
             if not isinstance(origin, dict):
-                refuse("must be an object", where)
+                refuse("must be an object", location)
             first = len(self.heads)
-            for j, row in enumerate(self._list(origin, "layouts", where)):
-                yield row, f"{where}.layouts[{j}]"
-            said = [head["layoutId"] for head in self.heads[first:]]
-            heads.append({"head": {w: v for w, v in origin.items() if w != "layouts"}, "layouts": said})
+            for j, row in enumerate(self._list(origin, "layouts", location)):
+                yield row, f"{location}.layouts[{j}]"
+            layout_ids = [head["layoutId"] for head in self.heads[first:]]
+            heads.append({"head": {w: v for w, v in origin.items() if w != "layouts"}, "layouts": layout_ids})
 
-    def _list(self, of: Mapping[str, Any], word: str, where: str) -> list[Any]:
-        said = of.get(word)
-        if not isinstance(said, (list, type(None))):
-            refuse("must be an array", f"{where}.{word}".lstrip("."))
-        return said or []
+    def _list(self, of: Mapping[str, Any], key: str, location: str) -> list[Any]:
+        value = of.get(key)
+        if not isinstance(value, (list, type(None))):
+            refuse("must be an array", f"{location}.{key}".lstrip("."))
+        return value or []
 
-    def layout(self, row: Any, where: str) -> None:
+    def layout(self, row: Any, location: str) -> None:
         """Take in a layout's items."""
         if not isinstance(row, dict):
-            refuse("must be an object", where)
-        said = row.get("layoutId")
-        if not isinstance(said, str) or not is_name(said):
-            refuse("a layout needs an id, a text", f"{where}.layoutId")
-        if any(head["layoutId"] == said for head in self.heads):
-            refuse(f"the layout {said!r} stands twice: give layouts different ids", f"{where}.layoutId")
+            refuse("must be an object", location)
+        layout_id = row.get("layoutId")
+        if not isinstance(layout_id, str) or not is_name(layout_id):
+            refuse("a layout needs an id, a text", f"{location}.layoutId")
+        if any(head["layoutId"] == layout_id for head in self.heads):
+            refuse(f"the layout {layout_id!r} stands twice: give layouts different ids", f"{location}.layoutId")
         self.heads.append({w: v for w, v in row.items() if w not in LISTS})
         level = row.get("layoutLevelId")
         if level is None or level == "":
             level = self.context.level
         elif not isinstance(level, str):
-            refuse("must be a text", f"{where}.layoutLevelId")
-        level = checked_name(level, f"{where}.layoutLevelId")
+            refuse("must be a text", f"{location}.layoutLevelId")
+        level = checked_name(level, f"{location}.layoutLevelId")
         for kind, items in self.found.items():
-            for at, item in enumerate(self._list(row, f"{kind}s", where)):
-                spot = f"{where}.{kind}s[{at}]"
+            for at, item in enumerate(self._list(row, f"{kind}s", location)):
+                spot = f"{location}.{kind}s[{at}]"
                 if not isinstance(item, dict):
                     refuse("must be an object", spot)
                 name = item.get(f"{kind}Id")
@@ -288,7 +288,7 @@ class _Reader:
                     name = str(name)
                 if not isinstance(name, str):
                     refuse("needs an id, a text", f"{spot}.{kind}Id")
-                items.append(_Item(item, spot, checked_name(name, f"{spot}.{kind}Id"), said, at, level))
+                items.append(_Item(item, spot, checked_name(name, f"{spot}.{kind}Id"), layout_id, at, level))
 
     def layers(self) -> Layers:
         nodes, edges, stations = self.found["node"], self.found["edge"], self.found["station"]
@@ -297,11 +297,11 @@ class _Reader:
             for item, i in zip(items, unique_ids((identifier(item.name) for item in items), taken), strict=True):
                 item.id = i
                 taken.add(i)
-            if again := without_repeats([item.name for item in items]):
-                self.context.warn(f"{len(again)} {kind} share an id: {some(again)}; references mean the first one")
+            if repeats := without_repeats([item.name for item in items]):
+                self.context.warn(f"{len(repeats)} {kind} share an id: {some(repeats)}; references mean the first one")
         for item, i in zip(stations, unique_ids(identifier(s.name) for s in stations), strict=True):
             item.id = i
-        place = {item.name: k for k, item in reversed(list(enumerate(nodes)))}
+        index_by_name = {item.name: k for k, item in reversed(list(enumerate(nodes)))}
         xyz: Array = np.array([self.position(n.said.get("nodePosition"), n.where, "node") for n in nodes], np.float64)
         xyz = xyz.reshape(-1, 3)
         levels: dict[str, _Level] = {}
@@ -309,9 +309,9 @@ class _Reader:
             levels.setdefault(node.level, _Level()).nodes.append(k)
         properties = [self.node(node) for node in nodes]
         for edge in edges:
-            self.join(edge, place, properties, levels)
+            self.join(edge, index_by_name, properties, levels)
         for station in stations:
-            self.check_station(station, place)
+            self.check_station(station, index_by_name)
             levels.setdefault(station.level, _Level()).stations.append(station)
         parts: dict[PartKey, Part] = {}
         for level, content in levels.items():
@@ -322,30 +322,30 @@ class _Reader:
         if not parts:
             empty = Features((), np.empty(0, object), (), np.empty(0, bool), {NAME: self.document})
             parts[PartKey("topology", self.context.level, NETWORK)] = empty
-        for what, n in sorted(self.doubts.items()):
-            self.context.warn(f"{n} {what}")
+        for noun, n in sorted(self.doubts.items()):
+            self.context.warn(f"{n} {noun}")
         return Layers(parts)  # LIF does not say how high its levels are
 
-    def position(self, said: Any, where: str, kind: str) -> tuple[float, float, float]:
+    def position(self, value: Any, location: str, kind: str) -> tuple[float, float, float]:
         """x, y in metres, and 0."""
-        where = f"{where}.{kind}Position"
-        if not isinstance(said, dict) or "x" not in said or "y" not in said:
-            refuse("must be an object with x and y", where)
-        return number(said["x"], f"{where}.x"), number(said["y"], f"{where}.y"), 0.0
+        location = f"{location}.{kind}Position"
+        if not isinstance(value, dict) or "x" not in value or "y" not in value:
+            refuse("must be an object with x and y", location)
+        return number(value["x"], f"{location}.x"), number(value["y"], f"{location}.y"), 0.0
 
-    def mine(self, item: _Item, kind: str, *known: str) -> dict[str, Any]:
-        """What only this format knows of an item; ``known`` members are canonical."""
+    def mine(self, item: _Item, kind: str, *keys: str) -> dict[str, Any]:
+        """What only this format knows of an item; ``keys`` members are canonical."""
         position = item.said.get(f"{kind}Position")
-        rest = {w: v for w, v in item.said.items() if w not in (f"{kind}Id", *known)}
+        extra_members = {w: v for w, v in item.said.items() if w not in (f"{kind}Id", *keys)}
         if isinstance(position, dict):
-            rest.pop(f"{kind}Position", None)
+            extra_members.pop(f"{kind}Position", None)
             if more := {w: v for w, v in position.items() if w not in ("x", "y")}:
-                rest[f"{kind}Position"] = more
+                extra_members[f"{kind}Position"] = more
         out: dict[str, Any] = {"id": item.name, "layout": item.layout, "at": item.at}
-        name = rest.get(f"{kind}Name")
+        name = extra_members.get(f"{kind}Name")
         if isinstance(name, str) and is_name(name) and name != item.name:
-            del rest[f"{kind}Name"]
-        out["item"] = rest
+            del extra_members[f"{kind}Name"]
+        out["item"] = extra_members
         return out
 
     def named(self, item: _Item, kind: str) -> dict[str, Any]:
@@ -353,9 +353,9 @@ class _Reader:
         return {"name": name} if isinstance(name, str) and is_name(name) else {}
 
     def node(self, item: _Item) -> dict[str, Any]:
-        mine = self.mine(item, "node")
+        source_properties = self.mine(item, "node")
         out: dict[str, Any] = {"kind": "node", "name": item.name, **self.named(item, "node")}
-        entries = _entries(mine["item"], "node")
+        entries = _entries(source_properties["item"], "node")
         if not entries:
             self.doubts["nodes name no type of vehicle, so that none may use them"] += 1
         theta = _shared(entries, "theta")
@@ -364,15 +364,19 @@ class _Reader:
         far = sum(_is_number(e.get("theta")) and abs(e["theta"]) > math.pi + SAME_ANGLE for e in entries)
         if far:
             self.doubts["values of theta are beyond ±π: radians are meant; they are kept, but not believed"] += far
-        out[NAME] = mine
+        out[NAME] = source_properties
         return out
 
     def join(
-        self, edge: _Item, place: Mapping[str, int], properties: Sequence[dict[str, Any]], levels: dict[str, _Level]
+        self,
+        edge: _Item,
+        index_by_name: Mapping[str, int],
+        properties: Sequence[dict[str, Any]],
+        levels: dict[str, _Level],
     ) -> None:
         """Put an edge on its level; one to nowhere stays with the node it knows, else with its layout."""
         ends = [edge.said.get("startNodeId"), edge.said.get("endNodeId")]
-        a, b = (place.get(str(e)) if isinstance(e, (str, int)) else None for e in ends)
+        a, b = (index_by_name.get(str(e)) if isinstance(e, (str, int)) else None for e in ends)
         if a is not None and b is not None:
             if a == b:
                 self.context.warn(f"the edge {edge.name} leads from a node to itself", where=edge.where)
@@ -380,17 +384,17 @@ class _Reader:
             return
         missing = str(ends[0] if a is None else ends[1])[:60]
         self.context.warn(f"the edge {edge.name} leads to {missing!r}, which is no node; it is kept", where=edge.where)
-        kept = {"layout": edge.layout, "at": edge.at, "item": edge.said}
+        dangling_edge = {"layout": edge.layout, "at": edge.at, "item": edge.said}
         home = next((k for k in (a, b) if k is not None), None)
         of = self.document if home is None else properties[home][NAME]
-        of.setdefault("dangling", []).append(kept)
+        of.setdefault("dangling", []).append(dangling_edge)
 
-    def check_station(self, station: _Item, place: Mapping[str, int]) -> None:
-        said = station.said.get("interactionNodeIds")
-        if not isinstance(said, list) or not all(isinstance(i, str) for i in said):
+    def check_station(self, station: _Item, index_by_name: Mapping[str, int]) -> None:
+        node_ids = station.said.get("interactionNodeIds")
+        if not isinstance(node_ids, list) or not all(isinstance(i, str) for i in node_ids):
             self.context.warn("needs an array of the nodes where it is reached", where=station.where)
             return
-        unknown = [i for i in said if i not in place]
+        unknown = [i for i in node_ids if i not in index_by_name]
         if unknown:
             self.context.warn(f"the station is reached at {some(unknown)}, which is no node", where=station.where)
 
@@ -402,20 +406,20 @@ class _Reader:
         lines = edge_lines(xyz, sources, targets)
         rows: list[Properties] = [properties[k] for k in content.nodes]
         for j, (edge, a, b) in enumerate(content.edges):
-            mine = self.mine(edge, "edge", "startNodeId", "endNodeId")
-            entries = _entries(mine["item"], "edge")
+            source_properties = self.mine(edge, "edge", "startNodeId", "endNodeId")
+            entries = _entries(source_properties["item"], "edge")
             if not entries:
                 self.doubts["edges name no type of vehicle, so that none may use them"] += 1
             out = {"kind": "edge", "source": nodes[a].id, "target": nodes[b].id, **self.named(edge, "edge")}
             speed = _shared(entries, "maxSpeed")
             if speed is not None and speed >= 0:
                 out["speed_limit"] = speed
-                mine["item"] = _without(mine["item"], "edge", "maxSpeed")
+                source_properties["item"] = _without(source_properties["item"], "edge", "maxSpeed")
             bends = _polyline(entries)
             if bends is not None:
                 lines[j] = shapely.LineString(bends)
-                mine["item"] = _without(mine["item"], "edge", "trajectory")
-            rows.append({**out, NAME: mine})
+                source_properties["item"] = _without(source_properties["item"], "edge", "trajectory")
+            rows.append({**out, NAME: source_properties})
         ids = [nodes[k].id for k in content.nodes] + [edge.id for edge, _, _ in content.edges]
         geometry = np.concatenate([node_points(xyz[content.nodes]), lines])
         return from_columns(ids, geometry, rows, "local", {NAME: self.document})
@@ -425,12 +429,14 @@ class _Reader:
         geometry: NDArray[np.object_] = np.empty(len(items), object)
         rows: list[Properties] = []
         for k, item in enumerate(items):
-            said = item.said.get("stationPosition")
-            geometry[k] = NO_GEOMETRY if said is None else shapely.Point(self.position(said, item.where, "station")[:2])
-            mine = self.mine(item, "station")
-            if said is None and "stationPosition" in mine["item"]:
-                del mine["item"]["stationPosition"]
-            rows.append({"kind": "station", "name": item.name, **self.named(item, "station"), NAME: mine})
+            position = item.said.get("stationPosition")
+            geometry[k] = (
+                NO_GEOMETRY if position is None else shapely.Point(self.position(position, item.where, "station")[:2])
+            )
+            source_properties = self.mine(item, "station")
+            if position is None and "stationPosition" in source_properties["item"]:
+                del source_properties["item"]["stationPosition"]
+            rows.append({"kind": "station", "name": item.name, **self.named(item, "station"), NAME: source_properties})
         return from_columns([item.id for item in items], geometry, rows, "local", {NAME: {}})
 
 
@@ -440,30 +446,30 @@ def _is_number(value: Any) -> bool:
 
 def _word(item: Mapping[str, Any], kind: str) -> str | None:
     """The member that holds what types of vehicle have of their own."""
-    words = (getattr(FIRST, kind), getattr(SECOND, kind))
-    return next((w for w in words if isinstance(item.get(w), list)), None)
+    keys = (getattr(FIRST, kind), getattr(SECOND, kind))
+    return next((w for w in keys if isinstance(item.get(w), list)), None)
 
 
 def _entries(item: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
     """What types of vehicle have of their own at an item; nothing where an entry is no object."""
-    word = _word(item, kind)
-    entries = item[word] if word else []
+    key = _word(item, kind)
+    entries = item[key] if key else []
     return entries if all(isinstance(e, dict) for e in entries) else []
 
 
-def _shared(entries: Sequence[Mapping[str, Any]], word: str) -> Any:
+def _shared(entries: Sequence[Mapping[str, Any]], key: str) -> Any:
     """The number that all entries have in common, else None."""
-    values = [e.get(word) for e in entries]
+    values = [e.get(key) for e in entries]
     same = values and all(_is_number(v) and v == values[0] and type(v) is type(values[0]) for v in values)
     return values[0] if same else None
 
 
-def _without(item: Mapping[str, Any], kind: str, word: str) -> dict[str, Any]:
+def _without(item: Mapping[str, Any], kind: str, key: str) -> dict[str, Any]:
     """The item, its entries without a word."""
     list_word = _word(item, kind)
     if list_word is None:
         return dict(item)
-    return {**item, list_word: [{w: v for w, v in e.items() if w != word} for e in item[list_word]]}
+    return {**item, list_word: [{w: v for w, v in e.items() if w != key} for e in item[list_word]]}
 
 
 def _trajectory(line: Sequence[Sequence[float]]) -> dict[str, Any]:
@@ -476,16 +482,16 @@ def _trajectory(line: Sequence[Sequence[float]]) -> dict[str, Any]:
 
 def _polyline(entries: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]] | None:
     """The positions of a trajectory that all entries share, where it is one that ``_trajectory`` writes."""
-    said = entries[0].get("trajectory") if entries else None
-    points = said.get("controlPoints") if isinstance(said, dict) else None
-    if not isinstance(points, list) or len(points) < 3 or any(e.get("trajectory") != said for e in entries):
+    trajectory = entries[0].get("trajectory") if entries else None
+    points = trajectory.get("controlPoints") if isinstance(trajectory, dict) else None
+    if not isinstance(points, list) or len(points) < 3 or any(e.get("trajectory") != trajectory for e in entries):
         return None
     line = []
     for p in points:
         if not isinstance(p, dict) or not _is_number(p.get("x")) or not _is_number(p.get("y")):
             return None
         line.append((float(p["x"]), float(p["y"])))
-    return line if _trajectory(line) == said else None
+    return line if _trajectory(line) == trajectory else None
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -524,18 +530,18 @@ class _Writer:
         self.origins: list[dict[str, Any]] = []
         for document in self.documents:
             for head in _objects(document.get("layouts")):
-                said = head.get("layoutId")
-                if isinstance(said, str) and is_name(said) and said not in self.layouts:
-                    self.layouts[said] = _Layout({w: v for w, v in head.items() if w not in LISTS})
+                layout_id = head.get("layoutId")
+                if isinstance(layout_id, str) and is_name(layout_id) and layout_id not in self.layouts:
+                    self.layouts[layout_id] = _Layout({w: v for w, v in head.items() if w not in LISTS})
         self.dialect = self._dialect()
 
     def _dialect(self) -> Dialect:
         """The one that the source's items speak."""
-        known = [n.properties for n in self.net.nodes] + [e.properties for e in self.net.edges]
-        for p in known:
-            said = own(own(p, NAME), "item")
+        property_sets = [n.properties for n in self.net.nodes] + [e.properties for e in self.net.edges]
+        for p in property_sets:
+            source_members = own(own(p, NAME), "item")
             for kind in ("node", "edge"):
-                for entry in _entries(said, kind):
+                for entry in _entries(source_members, kind):
                     spoken = next((d for d in (FIRST, SECOND, THIRD) if d.type in entry), None)
                     if spoken is not None:
                         return spoken
@@ -552,12 +558,12 @@ class _Writer:
         self._dangling()
         out = self._top()
         inside = self._origins()
-        placed = {i for _, said in inside for i in said}
+        placed = {i for _, layout_ids in inside for i in layout_ids}
         if inside:
-            out["origins"] = [{**head, "layouts": [self._layout(i) for i in said]} for head, said in inside]
-        rest = [self._layout(i) for i in self.layouts if i not in placed]
-        if rest or not inside:
-            out["layouts"] = rest
+            out["origins"] = [{**head, "layouts": [self._layout(i) for i in layout_ids]} for head, layout_ids in inside]
+        free_layouts = [self._layout(i) for i in self.layouts if i not in placed]
+        if free_layouts or not inside:
+            out["layouts"] = free_layouts
         self._report()
         return orjson.dumps(_json.ordered(out, ORDER), option=orjson.OPT_INDENT_2) + b"\n"
 
@@ -569,76 +575,80 @@ class _Writer:
         meta = dict(own(top, "metaInformation"))
         if "lifId" not in meta and "projectIdentification" not in meta:
             meta["projectIdentification"] = self.options.project or self.context.title
-            said = meta["projectIdentification"]
-            self.context.fill("metaInformation.projectIdentification", said, "no source names it", "project")
-        for word, value in (("creator", self.options.creator), ("exportTimestamp", EPOCH), ("lifVersion", VERSION)):
-            if word not in meta:
-                meta[word] = value
-                option = word if word == "creator" else None
-                self.context.fill(f"metaInformation.{word}", value, "no source names it", option)
+            project = meta["projectIdentification"]
+            self.context.fill("metaInformation.projectIdentification", project, "no source names it", "project")
+        for key, value in (("creator", self.options.creator), ("exportTimestamp", EPOCH), ("lifVersion", VERSION)):
+            if key not in meta:
+                meta[key] = value
+                option = key if key == "creator" else None
+                self.context.fill(f"metaInformation.{key}", value, "no source names it", option)
         return {**top, "metaInformation": meta}
 
     def _origins(self) -> list[tuple[dict[str, Any], list[str]]]:
         """(head, ids of its layouts) of the origins that the source has; other layouts join the first one."""
-        found: list[tuple[dict[str, Any], list[str]]] = []
+        origins: list[tuple[dict[str, Any], list[str]]] = []
         placed: set[str] = set()
         for document in self.documents:
             for origin in _objects(document.get("origins")):
                 head = {w: v for w, v in own(origin, "head").items() if w != "layouts"}
-                if any(head == known for known, _ in found):
+                if any(head == other for other, _ in origins):
                     continue
                 ids = origin.get("layouts")
-                said = [i for i in ids if isinstance(i, str)] if isinstance(ids, list) else []
-                said = [i for i in dict.fromkeys(said) if i in self.layouts and i not in placed]
-                placed |= set(said)
-                found.append((head, said))
-        if found:
-            found[0][1].extend(i for i in self.layouts if i not in placed)
-        return found
+                layout_ids = [i for i in ids if isinstance(i, str)] if isinstance(ids, list) else []
+                layout_ids = [i for i in dict.fromkeys(layout_ids) if i in self.layouts and i not in placed]
+                placed |= set(layout_ids)
+                origins.append((head, layout_ids))
+        if origins:
+            origins[0][1].extend(i for i in self.layouts if i not in placed)
+        return origins
 
     def _layout(self, i: str) -> dict[str, Any]:
         layout = self.layouts[i]
         out = dict(layout.head)
-        for word, items in layout.items.items():
-            if items or word != "stations":
-                out[word] = [item for _, item in sorted(items, key=lambda t: t[0])]
+        for section, items in layout.items.items():
+            if items or section != "stations":
+                out[section] = [item for _, item in sorted(items, key=lambda t: t[0])]
         return out
 
-    def _put(self, word: str, p: Properties, level: str, name: str, item: dict[str, Any]) -> None:
+    def _put(self, section: str, p: Properties, level: str, name: str, item: dict[str, Any]) -> None:
         """Put an item into its layout: the one its source says, the first of its level, or a new one."""
-        mine = own(p, NAME)
-        said, at = mine.get("layout"), mine.get("at")
-        if not isinstance(said, str) or said not in self.layouts:
+        source_members = own(p, NAME)
+        layout_id, at = source_members.get("layout"), source_members.get("at")
+        if not isinstance(layout_id, str) or layout_id not in self.layouts:
             of_level = (i for i, v in self.layouts.items() if v.head.get("layoutLevelId", GROUND) == level)
-            said = next(of_level, None)
-        if said is None:
-            said = unique_ids([level], set(self.layouts))[0]
+            layout_id = next(of_level, None)
+        if layout_id is None:
+            layout_id = unique_ids([level], set(self.layouts))[0]
             version = self.options.layout_version
-            head = {"layoutId": said, "layoutVersion": version, **({} if level == GROUND else {"layoutLevelId": level})}
-            self.layouts[said] = _Layout(head)
+            head = {
+                "layoutId": layout_id,
+                "layoutVersion": version,
+                **({} if level == GROUND else {"layoutLevelId": level}),
+            }
+            self.layouts[layout_id] = _Layout(head)
             self.filled["layouts"] += 1
-        known = isinstance(at, int) and not isinstance(at, bool)
-        key = (not known, at if isinstance(at, int) else 0, natural(name))
-        self.layouts[said].items[word].append((key, item))
+        has_index = isinstance(at, int) and not isinstance(at, bool)
+        key = (not has_index, at if isinstance(at, int) else 0, natural(name))
+        self.layouts[layout_id].items[section].append((key, item))
 
     def _names(self, items: Sequence[Node | Edge]) -> list[str]:
         """The ids of the file: those of the sources, where they are distinct."""
-        wanted = []
+        names = []
         for item in items:
-            said = own(item.properties, NAME).get("id")
-            wanted.append(said if isinstance(said, str) and is_name(said) else item.id)
-        out = unique_ids(wanted)
-        if again := [a for a, b in zip(wanted, out, strict=True) if a != b]:
-            self.context.warn(f"{len(again)} ids stood for several items and got a number: {some(again)}")
+            source_id = own(item.properties, NAME).get("id")
+            names.append(source_id if isinstance(source_id, str) and is_name(source_id) else item.id)
+        out = unique_ids(names)
+        if repeats := [a for a, b in zip(names, out, strict=True) if a != b]:
+            self.context.warn(f"{len(repeats)} ids stood for several items and got a number: {some(repeats)}")
         return out
 
     def _base(self, p: Properties, kind: str, name: str) -> dict[str, Any]:
         """The members of an item's source, with its id and its name."""
         item = {w: v for w, v in own(own(p, NAME), "item").items() if w != f"{kind}Id"}
         out: dict[str, Any] = {f"{kind}Id": name, **item}
-        said = p.get("name")
-        if isinstance(said, str) and said not in ("", name):
-            out[f"{kind}Name"] = said
+        title = p.get("name")
+        if isinstance(title, str) and title not in ("", name):
+            out[f"{kind}Name"] = title
         return out
 
     def _vehicles(
@@ -648,17 +658,17 @@ class _Writer:
 
         An item of a LIF file without entries stays so: no vehicle may use it.
         """
-        word = _word(out, kind)
+        key = _word(out, kind)
         entries = [dict(e) for e in _entries(out, kind)]
-        if word is None:
+        if key is None:
             if NAME in p:
                 return []
-            word = str(getattr(self.dialect, kind))
+            key = str(getattr(self.dialect, kind))
             entries = [{**self.dialect.type_of(self.options.vehicle_type), **template}]
             self.filled[f"{kind}s"] += 1
-        elif len(entries) != count(out[word]):
+        elif len(entries) != count(out[key]):
             return []
-        out[word] = entries
+        out[key] = entries
         return entries
 
     def _node(self, node: Node, name: str) -> dict[str, Any]:
@@ -680,11 +690,11 @@ class _Writer:
         p = edge.properties
         out = self._base(p, "edge", name)
         out |= {"startNodeId": names[edge.source], "endNodeId": names[edge.target]}
-        usual: dict[str, Any] = {"orientationType": self.options.orientation_type}
+        defaults: dict[str, Any] = {"orientationType": self.options.orientation_type}
         if self.dialect == FIRST:
             turn = {"vehicleOrientation": self.options.vehicle_orientation}
-            usual = {**turn, **usual, "rotationAllowed": self.options.rotation_allowed}
-        entries = self._vehicles(p, out, "edge", usual)
+            defaults = {**turn, **defaults, "rotationAllowed": self.options.rotation_allowed}
+        entries = self._vehicles(p, out, "edge", defaults)
         speed = p.get("speed_limit")
         at = (np.round(shapely.get_coordinates(edge.geometry), METRES) + 0.0).tolist()
         for entry in entries:
@@ -704,13 +714,13 @@ class _Writer:
                 if p.get("kind") != "station":
                     self.lost["objects that are no stations"] += 1
                     continue
-                said = own(p, NAME).get("id")
-                name = said if isinstance(said, str) and is_name(said) else i
+                source_id = own(p, NAME).get("id")
+                name = source_id if isinstance(source_id, str) and is_name(source_id) else i
                 out = self._base(p, "station", name)
                 if not shape.is_empty:
                     at = shapely.centroid(shape)
-                    place = {"x": _metres(at.x), "y": _metres(at.y)}
-                    out["stationPosition"] = {**own(out, "stationPosition"), **place}
+                    position = {"x": _metres(at.x), "y": _metres(at.y)}
+                    out["stationPosition"] = {**own(out, "stationPosition"), **position}
                 if not isinstance(out.get("interactionNodeIds"), list):
                     out["interactionNodeIds"] = []
                     self.filled["stations"] += 1
@@ -722,7 +732,7 @@ class _Writer:
         lists = [own(node.properties, NAME).get("dangling") for node in self.net.nodes]
         lists += [document.get("dangling") for document in self.documents]
         seen = set()
-        for edge in (e for said in lists for e in _objects(said)):
+        for edge in (e for entries in lists for e in _objects(entries)):
             item, key = own(edge, "item"), orjson.dumps(edge, option=orjson.OPT_SORT_KEYS).decode()
             if isinstance(item.get("edgeId"), str) and key not in seen:
                 seen.add(key)
@@ -736,12 +746,12 @@ class _Writer:
                 reason = f"{self.filled[kind]} {kind}: {why}"
                 context.fill(f"{kind}: type of vehicle", self.options.vehicle_type, reason, "vehicle_type")
         if self.filled["edges"]:
-            words = {"orientationType": "orientation_type"}
+            option_names = {"orientationType": "orientation_type"}
             if self.dialect == FIRST:
-                words |= {"vehicleOrientation": "vehicle_orientation", "rotationAllowed": "rotation_allowed"}
-            for word, option in words.items():
+                option_names |= {"vehicleOrientation": "vehicle_orientation", "rotationAllowed": "rotation_allowed"}
+            for key, option in option_names.items():
                 reason = f"{self.filled['edges']} edges do not say it"
-                context.fill(f"edges: {word}", getattr(self.options, option), reason, option)
+                context.fill(f"edges: {key}", getattr(self.options, option), reason, option)
         if self.filled["layouts"]:
             context.fill(
                 "layouts", f"{self.filled['layouts']}, one for each level", "no source has a layout of the level"
@@ -749,13 +759,13 @@ class _Writer:
             context.fill("layouts: layoutVersion", self.options.layout_version, "no source has it", "layout_version")
         if self.filled["stations"]:
             context.fill("stations: interactionNodeIds", [], f"{self.filled['stations']} stations name no nodes")
-        for what, n in sorted(self.lost.items()):
-            context.drop(what, n, "LIF has no place for it")
+        for noun, n in sorted(self.lost.items()):
+            context.drop(noun, n, "LIF has no place for it")
 
 
-def _objects(said: Any) -> list[dict[str, Any]]:
+def _objects(value: Any) -> list[dict[str, Any]]:
     """The objects of a list."""
-    return [v for v in said if isinstance(v, dict)] if isinstance(said, list) else []
+    return [v for v in value if isinstance(v, dict)] if isinstance(value, list) else []
 
 
 def _metres(value: float) -> float:

@@ -138,39 +138,43 @@ class _Reader:
         self.dangling: list[dict[str, Any]] = []
         self.whole: Counter[str] = Counter()
         for k, row in enumerate(rows):
-            where = f"features[{k}]"
+            location = f"features[{k}]"
             geometry = row.get("geometry") if isinstance(row, dict) else None
             if not isinstance(row, dict) or not isinstance(geometry, (dict, type(None))):
-                refuse("must be a GeoJSON feature with a geometry", where)
+                refuse("must be a GeoJSON feature with a geometry", location)
             kind = geometry.get("type") if geometry else None
             if kind == "Point":
                 self.nodes.append(k)
             elif kind in LINES:
                 self.edges.append(k)
             else:
-                context.warn("is neither a point nor a line: the route server ignores it; it is kept", where=where)
+                context.warn("is neither a point nor a line: the route server ignores it; it is kept", where=location)
                 self.ignored.append(row)
         if not self.nodes or not self.edges:
-            what = "point (node)" if not self.nodes else "line (edge)"
-            reason = f"there is no {what}: the route server takes graphs with one node and one edge at least"
+            noun = "point (node)" if not self.nodes else "line (edge)"
+            reason = f"there is no {noun}: the route server takes graphs with one node and one edge at least"
             raise UnreadableFile(reason, [Problem(reason, where="features")])
 
     def layers(self) -> Layers:
         numbers = [self.id_of(k) for k in self.nodes]
         ids = unique_ids(map(str, numbers))
-        if again := without_repeats(list(map(str, numbers))):
-            self.context.warn(f"{len(again)} nodes share an id: {some(again)}; edges go to the last one, as in Nav2")
-        place = {n: k for k, n in enumerate(numbers)}
+        if repeats := without_repeats(list(map(str, numbers))):
+            self.context.warn(
+                f"{len(repeats)} nodes share an id: {some(repeats)}; edges go to the last one, as in Nav2"
+            )
+        index_by_number = {n: k for k, n in enumerate(numbers)}
         xyz: Array = np.array([self.position(k) for k in self.nodes], np.float64).reshape(-1, 3)
         properties: list[dict[str, Any]] = [
             {"kind": "node", "name": str(n), **self.canonical(k, n)} for k, n in zip(self.nodes, numbers, strict=True)
         ]
-        kept, numbers, sources, targets = self.ends(place, properties)
+        indices, numbers, sources, targets = self.ends(index_by_number, properties)
         edges = unique_ids(map(str, numbers), set(ids))
-        if again := without_repeats(list(map(str, numbers))):
-            self.context.warn(f"{len(again)} edges share an id: {some(again)}; later ones are served with a new one")
+        if repeats := without_repeats(list(map(str, numbers))):
+            self.context.warn(
+                f"{len(repeats)} edges share an id: {some(repeats)}; later ones are served with a new one"
+            )
         lines = edge_lines(xyz, sources, targets)
-        for j, (k, n) in enumerate(zip(kept, numbers, strict=True)):
+        for j, (k, n) in enumerate(zip(indices, numbers, strict=True)):
             p = {"kind": "edge", "source": ids[sources[j]], "target": ids[targets[j]], **self.canonical(k, n)}
             lines[j] = self.shape(k, lines[j], p[NAME])
             properties.append(p)
@@ -184,47 +188,47 @@ class _Reader:
         document |= {"ignored": self.ignored} if self.ignored else {}
         document |= {"dangling": self.dangling} if self.dangling else {}
         geometry = np.concatenate([node_points(xyz), lines])
-        said = {NAME: document, "attribution": credit} if credit else {NAME: document}
-        part = from_columns([*ids, *edges], geometry, properties, "local", said)
+        collection_document = {NAME: document, "attribution": credit} if credit else {NAME: document}
+        part = from_columns([*ids, *edges], geometry, properties, "local", collection_document)
         return Layers({PartKey("topology", self.context.level, NETWORK): part})
 
     def said(self, k: int) -> dict[str, Any]:
         """The properties of a feature."""
-        said = self.rows[k].get("properties")
-        if not isinstance(said, dict):
+        properties = self.rows[k].get("properties")
+        if not isinstance(properties, dict):
             refuse("needs properties with an id", f"features[{k}]")
-        return said
+        return properties
 
-    def id_of(self, k: int, word: str = "id") -> int:
+    def id_of(self, k: int, key: str = "id") -> int:
         """A node's or edge's number."""
-        value = self.said(k).get(word)
+        value = self.said(k).get(key)
         if isinstance(value, float) and value.is_integer():
             value = int(value)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
             shown = "is missing" if value is None else f"is {str(value)[:40]!r}"
-            refuse(f"{shown}; it must be a whole number from 0 to {MAX_ID}", f"features[{k}].properties.{word}")
+            refuse(f"{shown}; it must be a whole number from 0 to {MAX_ID}", f"features[{k}].properties.{key}")
         return value
 
     def position(self, k: int) -> tuple[float, float, float]:
         """x, y, z in metres."""
-        where = f"features[{k}].geometry.coordinates"
+        location = f"features[{k}].geometry.coordinates"
         at = self.rows[k]["geometry"].get("coordinates")
         if not isinstance(at, list) or len(at) < 2:
-            refuse("a node needs two coordinates [x, y]", where)
-        x, y, z = (number(v, where) for v in [*at[:3], 0.0][:3])
+            refuse("a node needs two coordinates [x, y]", location)
+        x, y, z = (number(v, location) for v in [*at[:3], 0.0][:3])
         frame = self.said(k).get("frame", FRAME)
         if frame != FRAME:
-            self.context.warn(f"its frame is {str(frame)[:60]!r}: its coordinates are taken as local", where=where)
+            self.context.warn(f"its frame is {str(frame)[:60]!r}: its coordinates are taken as local", where=location)
         return x, y, z
 
     def ends(
-        self, place: Mapping[int, int], properties: list[dict[str, Any]]
+        self, index_by_number: Mapping[int, int], properties: list[dict[str, Any]]
     ) -> tuple[list[int], list[int], list[int], list[int]]:
         """(features of edges between nodes, their numbers, the places of their ends); others are kept with a node."""
-        kept, numbers, sources, targets = [], [], [], []
+        indices, numbers, sources, targets = [], [], [], []
         for k in self.edges:
             n, start, end = self.id_of(k), self.id_of(k, "startid"), self.id_of(k, "endid")
-            a, b = place.get(start), place.get(end)
+            a, b = index_by_number.get(start), index_by_number.get(end)
             if a is None or b is None:
                 missing = start if a is None else end
                 self.context.warn(
@@ -232,8 +236,8 @@ class _Reader:
                     "kept, but not served",
                     where=f"features[{k}]",
                 )
-                said = {w: v for w, v in self.said(k).items() if w not in ("id", "startid", "endid")}
-                edge = {"id": n, "from": start, "to": end, "properties": said}
+                edge_properties = {w: v for w, v in self.said(k).items() if w not in ("id", "startid", "endid")}
+                edge = {"id": n, "from": start, "to": end, "properties": edge_properties}
                 home = next((j for j in (a, b) if j is not None), None)
                 if home is None:
                     self.dangling.append(edge)
@@ -242,64 +246,64 @@ class _Reader:
                 continue
             if a == b:
                 self.context.warn(f"the edge {n} leads from a node to itself", where=f"features[{k}]")
-            kept.append(k)
+            indices.append(k)
             numbers.append(n)
             sources.append(a)
             targets.append(b)
-        return kept, numbers, sources, targets
+        return indices, numbers, sources, targets
 
     def canonical(self, k: int, n: int) -> dict[str, Any]:
         """The properties of an item that come from its feature."""
         row = self.rows[k]
-        rest = {w: v for w, v in self.said(k).items() if w not in ("id", "startid", "endid")}
+        extra_members = {w: v for w, v in self.said(k).items() if w not in ("id", "startid", "endid")}
         out: dict[str, Any] = {}
-        metadata = rest.get("metadata")
+        metadata = extra_members.get("metadata")
         if isinstance(metadata, dict):
             self.whole["integers"] += _integers(metadata)
             out = {LIFTED[w]: v for w, v in metadata.items() if _fits(w, v) and (w, v) != ("name", str(n))}
             left = {w: v for w, v in metadata.items() if LIFTED.get(w) not in out}
-            rest["metadata"] = left
+            extra_members["metadata"] = left
             if not left and metadata:
-                del rest["metadata"]
-        self.whole["integers"] += _integers(rest.get("operations"))
-        for reason in _doubts(rest):
+                del extra_members["metadata"]
+        self.whole["integers"] += _integers(extra_members.get("operations"))
+        for reason in _doubts(extra_members):
             self.context.warn(reason, where=f"features[{k}].properties")
-        mine: dict[str, Any] = {"id": n}
-        if rest:
-            mine["properties"] = rest
+        source_properties: dict[str, Any] = {"id": n}
+        if extra_members:
+            source_properties["properties"] = extra_members
         members = {w: v for w, v in row.items() if w not in ("type", "properties", "geometry")}
         if members:
-            mine["members"] = members
-        return {**out, NAME: mine}
+            source_properties["members"] = members
+        return {**out, NAME: source_properties}
 
-    def shape(self, k: int, straight: Any, mine: dict[str, Any]) -> Any:
+    def shape(self, k: int, straight: Any, source_properties: dict[str, Any]) -> Any:
         """An edge's line: as drawn where that is one line of its own, else from node to node."""
         geometry = self.rows[k]["geometry"]
         parts = geometry.get("coordinates")
         if geometry["type"] == "LineString":
-            mine["line"] = True
+            source_properties["line"] = True
             parts = [parts]
         drawn = _line(parts[0]) if isinstance(parts, list) and len(parts) == 1 else None
         if len(geometry) > 2 or drawn is None:
             if len(geometry) > 2 or parts not in (None, []):
-                mine["geometry"] = {w: v for w, v in geometry.items() if w != "type"}
+                source_properties["geometry"] = {w: v for w, v in geometry.items() if w != "type"}
             return straight
         return straight if drawn == _line(shapely.get_coordinates(straight).tolist()) else shapely.LineString(drawn)
 
 
-def _fits(word: str, value: Any) -> bool:
+def _fits(key: str, value: Any) -> bool:
     """Whether a metadata word stands for a canonical one, with a value of its type."""
-    if word in TEXTS:
+    if key in TEXTS:
         return isinstance(value, str) and value != ""
-    return word in NUMBERS and isinstance(value, (int, float)) and not isinstance(value, bool)
+    return key in NUMBERS and isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _line(said: Any) -> list[tuple[float, ...]] | None:
+def _line(coordinates: Any) -> list[tuple[float, ...]] | None:
     """Two positions or more, two-dimensional where all heights are 0; None where it is no line."""
-    if not isinstance(said, list) or len(said) < 2:
+    if not isinstance(coordinates, list) or len(coordinates) < 2:
         return None
     out: list[tuple[float, ...]] = []
-    for at in said:
+    for at in coordinates:
         if not isinstance(at, list) or len(at) not in (2, 3):
             return None
         if not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in at):
@@ -309,8 +313,8 @@ def _line(said: Any) -> list[tuple[float, ...]] | None:
     return out if deep else [at[:2] for at in out]
 
 
-def _is_integer(word: str, value: Any) -> bool:
-    return word in FLOATS and isinstance(value, int) and not isinstance(value, bool)
+def _is_integer(key: str, value: Any) -> bool:
+    return key in FLOATS and isinstance(value, int) and not isinstance(value, bool)
 
 
 def _integers(value: Any) -> int:
@@ -331,10 +335,10 @@ def _floats(value: Any) -> Any:
     return {w: float(v) if _is_integer(w, v) else _floats(v) for w, v in value.items()}
 
 
-def _doubts(said: Mapping[str, Any]) -> Iterator[str]:
+def _doubts(properties: Mapping[str, Any]) -> Iterator[str]:
     """What the route server's loader would throw at in a feature's properties."""
-    metadata, operations = said.get("metadata"), said.get("operations")
-    if "metadata" in said:
+    metadata, operations = properties.get("metadata"), properties.get("operations")
+    if "metadata" in properties:
         yield from _metadata_doubts(metadata, "metadata")
     if isinstance(operations, (dict, list)):
         for name, one in operations.items() if isinstance(operations, dict) else enumerate(operations):
@@ -342,26 +346,26 @@ def _doubts(said: Mapping[str, Any]) -> Iterator[str]:
                 yield f"the operation {str(name)[:60]!r} needs a type and a trigger, one of {', '.join(TRIGGERS)}"
             elif "metadata" in one:
                 yield from _metadata_doubts(one["metadata"], f"the metadata of the operation {str(name)[:60]!r}")
-    elif "operations" in said:
+    elif "operations" in properties:
         yield "operations must be an object of operations"
-    cost = said.get("cost", 0.0)
+    cost = properties.get("cost", 0.0)
     if isinstance(cost, bool) or not isinstance(cost, (int, float)):
         yield f"cost must be a number, got {str(cost)[:40]!r}"
-    if not isinstance(said.get("overridable", True), bool):
-        yield f"overridable must be true or false, got {str(said['overridable'])[:40]!r}"
-    if not isinstance(said.get("frame", ""), str):
-        yield f"frame must be a text, got {str(said['frame'])[:40]!r}"
+    if not isinstance(properties.get("overridable", True), bool):
+        yield f"overridable must be true or false, got {str(properties['overridable'])[:40]!r}"
+    if not isinstance(properties.get("frame", ""), str):
+        yield f"frame must be a text, got {str(properties['frame'])[:40]!r}"
 
 
-def _metadata_doubts(value: Any, where: str) -> Iterator[str]:
+def _metadata_doubts(value: Any, location: str) -> Iterator[str]:
     if not isinstance(value, dict):
-        yield f"{where} must be an object"
+        yield f"{location} must be an object"
         return
-    for word, inner in value.items():
+    for key, inner in value.items():
         if isinstance(inner, dict):
-            yield from _metadata_doubts(inner, f"{where}.{word[:60]}")
+            yield from _metadata_doubts(inner, f"{location}.{key[:60]}")
         elif any(v is None or isinstance(v, (dict, list)) for v in (inner if isinstance(inner, list) else [inner])):
-            yield f"{where}.{word[:60]}: Nav2 reads numbers, texts, booleans and lists of these only"
+            yield f"{location}.{key[:60]}: Nav2 reads numbers, texts, booleans and lists of these only"
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -392,8 +396,8 @@ class _Writer:
         self.document = known_document(layers, NAME)
         self.net: Net = joined(layers, context)
         if not self.net.nodes or not self.net.edges:
-            what = "no node" if not self.net.nodes else "no edge between its nodes"
-            raise CannotConvert(f"the network has {what}; the route server needs both: supply a network with edges")
+            noun = "no node" if not self.net.nodes else "no edge between its nodes"
+            raise CannotConvert(f"the network has {noun}; the route server needs both: supply a network with edges")
         self.nodes, self.edges = self._numbers()
         self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
         self.framed = 0
@@ -407,10 +411,12 @@ class _Writer:
         apart = len(net.nodes) + len(net.edges) <= MAX_USED_ID // 2
         nodes = _numbered(net.nodes, nodes, own_nodes | own_edges if apart else own_nodes)
         edges = _numbered(net.edges, edges, {*own_edges, *nodes.values()} if apart else own_edges)
-        again = sum(_claim(n) not in (None, nodes[k]) for k, n in enumerate(net.nodes))
-        again += sum(_claim(e) not in (None, edges[k]) for k, e in enumerate(net.edges))
-        if again:
-            context.warn(f"{again} numbers stood for several items, which Nav2 would mix up: the others got new ones")
+        duplicate_count = sum(_claim(n) not in (None, nodes[k]) for k, n in enumerate(net.nodes))
+        duplicate_count += sum(_claim(e) not in (None, edges[k]) for k, e in enumerate(net.edges))
+        if duplicate_count:
+            context.warn(
+                f"{duplicate_count} numbers stood for several items, which Nav2 would mix up: the others got new ones"
+            )
         return [nodes[k] for k in range(len(nodes))], [edges[k] for k in range(len(edges))]
 
     def data(self) -> bytes:
@@ -419,8 +425,8 @@ class _Writer:
         at = np.array([(n.x, n.y, 0.0 if n.z is None else n.z) for n in net.nodes], np.float64)
         places = (np.round(at, METRES) + 0.0).tolist()
         rows = [
-            self._feature(node, n, {"type": "Point", "coordinates": place if place[2] else place[:2]}, {})
-            for n, node, place in sorted(zip(self.nodes, net.nodes, places, strict=True), key=lambda t: t[0])
+            self._feature(node, n, {"type": "Point", "coordinates": position if position[2] else position[:2]}, {})
+            for n, node, position in sorted(zip(self.nodes, net.nodes, places, strict=True), key=lambda t: t[0])
         ]
         for n, edge in sorted(zip(self.edges, net.edges, strict=True), key=lambda t: t[0]):
             ends = {"startid": self.nodes[edge.source], "endid": self.nodes[edge.target]}
@@ -448,26 +454,26 @@ class _Writer:
     def _feature(self, item: Node | Edge, n: int, geometry: dict[str, Any], ends: dict[str, int]) -> bytes:
         """One line of the file."""
         p = item.properties
-        mine = own(p, NAME)
-        said = mine.get("properties")
+        source_members = own(p, NAME)
+        extra_properties = source_members.get("properties")
         properties: dict[str, Any] = {"id": n, **ends}
         if NAME not in p and not ends:
             properties["frame"] = self.options.frame_id
             self.framed += 1
-        if isinstance(said, dict):
-            properties |= {w: v for w, v in said.items() if w not in properties}
+        if isinstance(extra_properties, dict):
+            properties |= {w: v for w, v in extra_properties.items() if w not in properties}
         metadata = properties.get("metadata")
         more = self._metadata(p, str(n))
         if more and isinstance(metadata, (dict, type(None))):
             properties["metadata"] = {**(metadata or {}), **more}
-        for word in ("metadata", "operations"):
-            if word in properties:
-                properties[word] = _floats(properties[word])
+        for key in ("metadata", "operations"):
+            if key in properties:
+                properties[key] = _floats(properties[key])
         for reason in _doubts(properties):
             self.context.warn(reason, where=str(n))
         self.lost["attributes"] += bool(p.keys() - (CANONICAL_EDGE if ends else CANONICAL_NODE))
-        self.lost["dangling"] += count(mine.get("dangling"))
-        members = mine.get("members")
+        self.lost["dangling"] += count(source_members.get("dangling"))
+        members = source_members.get("members")
         row = {"type": "Feature", "properties": properties, "geometry": geometry}
         if isinstance(members, dict):
             row |= {w: v for w, v in members.items() if w not in row}
@@ -476,10 +482,10 @@ class _Writer:
     def _metadata(self, p: Properties, number: str) -> dict[str, Any]:
         """The canonical words among the metadata."""
         out: dict[str, Any] = {}
-        for word, canonical in LIFTED.items():
+        for key, canonical in LIFTED.items():
             value: Any = p.get(canonical)
-            if _fits(word, value):
-                out[word] = float(value) if word in NUMBERS else value
+            if _fits(key, value):
+                out[key] = float(value) if key in NUMBERS else value
         if out.get("name") == number:
             del out["name"]
         if p.get("blocked") is True:
@@ -487,9 +493,9 @@ class _Writer:
         return out
 
     def _shape(self, edge: Edge) -> dict[str, Any]:
-        mine = own(edge.properties, NAME)
-        kind = "LineString" if mine.get("line") is True else "MultiLineString"
-        odd = mine.get("geometry")
+        source_members = own(edge.properties, NAME)
+        kind = "LineString" if source_members.get("line") is True else "MultiLineString"
+        odd = source_members.get("geometry")
         if isinstance(odd, dict):
             return {"type": kind, **{w: v for w, v in odd.items() if w != "type"}}
         if edge.geometry is None or shapely.get_num_coordinates(edge.geometry) < 2:
@@ -501,7 +507,7 @@ class _Writer:
         return {"type": kind, "coordinates": coordinates if kind == "LineString" else [coordinates]}
 
     def _report(self) -> None:
-        net, context, lost = self.net, self.context, self.lost
+        net, context, counts = self.net, self.context, self.lost
         if len(set(net.levels)) > 1:
             context.drop("levels of nodes", len(net.nodes), "all networks are joined into one graph")
         foreign = sum(NAME not in n.properties for n in net.nodes) + sum(NAME not in e.properties for e in net.edges)
@@ -510,14 +516,18 @@ class _Writer:
         if foreign:
             context.fill("id", "a number made from each id", f"{foreign} nodes and edges have no number of their own")
         context.drop(
-            "items with attributes that Nav2 has no word for", lost["attributes"], "other formats' own knowledge"
+            "items with attributes that Nav2 has no word for", counts["attributes"], "other formats' own knowledge"
         )
 
 
 def _claim(item: Node | Edge) -> int | None:
     """The number that an item has from its source."""
-    said = own(item.properties, NAME).get("id")
-    return said if isinstance(said, int) and not isinstance(said, bool) and 0 <= said <= MAX_ID else None
+    source_id = own(item.properties, NAME).get("id")
+    return (
+        source_id
+        if isinstance(source_id, int) and not isinstance(source_id, bool) and 0 <= source_id <= MAX_ID
+        else None
+    )
 
 
 def _own_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
@@ -530,16 +540,16 @@ def _own_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
     return {min(rivals, key=lambda k: (items[k].id != str(n), items[k].id)): n for n, rivals in claims.items()}
 
 
-def _numbered(items: Sequence[Node | Edge], known: Mapping[int, int], taken: set[int]) -> dict[int, int]:
+def _numbered(items: Sequence[Node | Edge], claims: Mapping[int, int], taken: set[int]) -> dict[int, int]:
     """Place -> number of all items; ``taken`` grows. Ids that are numbers come before those that one is made from."""
-    out = dict(known)
-    rest = sorted((k for k in range(len(items)) if k not in out), key=lambda k: items[k].id)
-    for k in rest:
+    out = dict(claims)
+    remaining = sorted((k for k in range(len(items)) if k not in out), key=lambda k: items[k].id)
+    for k in remaining:
         if _is_number(items[k].id) and int(items[k].id) not in taken:
             out[k] = int(items[k].id)
             taken.add(out[k])
     size = 2**16 if len(items) <= MAX_USED_ID // 2 else 2**32
-    for k in rest:
+    for k in remaining:
         if k not in out:
             out[k] = next(n for n in _candidates(items[k].id, size) if n not in taken)
             taken.add(out[k])

@@ -116,19 +116,23 @@ def read(files: Files, context: ReadContext) -> Layers:
     _fields.check(top, SHAPE, context)
     names = [node.name for node in nodes]
     ids = unique_ids(map(identifier, names))
-    if again := without_repeats(names):
-        context.warn(f"{len(again)} names stand twice or more: {some(again)}; Fawkes refuses that; the first is meant")
-    place = {name: k for k, name in reversed(list(enumerate(names)))}
-    rows, dangling = _connections(top.get("connections"), place, context)
+    if repeats := without_repeats(names):
+        context.warn(
+            f"{len(repeats)} names stand twice or more: {some(repeats)}; Fawkes refuses that; the first is meant"
+        )
+    index_by_name = {name: k for k, name in reversed(list(enumerate(names)))}
+    rows, dangling = _connections(top.get("connections"), index_by_name, context)
     xyz: Array = np.array([(*node.at, 0.0) for node in nodes], np.float64).reshape(-1, 3)
     properties: list[Properties] = []
     for k, (node, i) in enumerate(zip(nodes, ids, strict=True)):
-        said = node.canonical(i)
+        node_properties = node.canonical(i)
         if k in dangling:
-            said[NAME]["dangling"] = dangling[k]
-        properties.append(said)
+            node_properties[NAME]["dangling"] = dangling[k]
+        properties.append(node_properties)
     edges = unique_ids((identifier(f"{ids[a]}_{ids[b]}") for a, b, _ in rows), set(ids))
-    properties += [{"kind": "edge", "source": ids[a], "target": ids[b], NAME: rest} for a, b, rest in rows]
+    properties += [
+        {"kind": "edge", "source": ids[a], "target": ids[b], NAME: extra_members} for a, b, extra_members in rows
+    ]
     geometry = np.concatenate([node_points(xyz), edge_lines(xyz, [r[0] for r in rows], [r[1] for r in rows])])
     document = {NAME: _document(top, set(names), context)}
     if -1 in dangling:
@@ -141,13 +145,13 @@ class _Read:
     """One node of the file."""
 
     def __init__(self, item: Any, k: int, context: ReadContext) -> None:
-        where = f"nodes[{k}]"
-        self.tag, entry = _untag(item, where, context)
+        location = f"nodes[{k}]"
+        self.tag, entry = _untag(item, location, context)
         if not isinstance(entry, dict):
-            refuse("a node must be a mapping with a name and a pos", where)
+            refuse("a node must be a mapping with a name and a pos", location)
         if "name" not in entry:
-            refuse("a node must have a name", where)
-        self.name = checked_name(_name(entry["name"], f"{where}.name"), f"{where}.name")
+            refuse("a node must have a name", location)
+        self.name = checked_name(_name(entry["name"], f"{location}.name"), f"{location}.name")
         self.where = self.name
         if self.tag not in (None, UNCONNECTED):
             context.warn(f"Fawkes does not know the tag !{self.tag} of a node", where=self.where)
@@ -155,160 +159,160 @@ class _Read:
         if not isinstance(at, list) or len(at) != 2:
             refuse("pos must be [x, y]", f"{self.where}.pos")
         self.at = tuple(number(_plain(v, f"{self.where}.pos"), f"{self.where}.pos") for v in at)
-        said = entry.get("properties")
-        self.properties, self.words = _properties(said, f"{self.where}.properties", context)
+        properties = entry.get("properties")
+        self.properties, self.words = _properties(properties, f"{self.where}.properties", context)
         self.more = {key: _plain(value, f"{self.where}.{key}") for key, value in entry.items() if key not in NODE_KEYS}
 
     def canonical(self, i: str) -> dict[str, Any]:
         """Its properties in the canonical layer."""
-        rest: dict[str, Any] = {}
-        out: dict[str, Any] = {"kind": "node", "name": self.name, NAME: rest}
+        source_properties: dict[str, Any] = {}
+        out: dict[str, Any] = {"kind": "node", "name": self.name, NAME: source_properties}
         properties = dict(self.properties)
         display = properties.get("name")
         if isinstance(display, str) and display not in ("", self.name) and "name" not in self.words:
             out["name"] = display
-            rest["name"] = self.name  # also where the item is found again under another id
+            source_properties["name"] = self.name  # also where the item is found again under another id
             del properties["name"]
         turned = properties.get("orientation")
         if isinstance(turned, (int, float)) and not isinstance(turned, bool):
             out["orientation"] = quaternion(float(turned))
         if self.name != i:
-            rest["name"] = self.name
-        kept = {"tag": self.tag, "properties": properties, "words": self.words, "more": self.more}
-        rest |= {key: value for key, value in kept.items() if value}
+            source_properties["name"] = self.name
+        members = {"tag": self.tag, "properties": properties, "words": self.words, "more": self.more}
+        source_properties |= {key: value for key, value in members.items() if value}
         return out
 
 
-def _untag(item: Any, where: str, context: ReadContext) -> tuple[str | None, Any]:
+def _untag(item: Any, location: str, context: ReadContext) -> tuple[str | None, Any]:
     """(the tag's own name, the value)."""
     if not isinstance(item, _yaml.Tagged):
         return None, item
     tag = item.tag.removeprefix(PREFIX) if item.tag.startswith(PREFIX) else item.tag[1:]
     if not _WORD.match(tag):
-        refuse(f"{item.tag[:80]!r} cannot be a tag: letters, digits, - and _ can", where)
+        refuse(f"{item.tag[:80]!r} cannot be a tag: letters, digits, - and _ can", location)
     if not item.tag.startswith(PREFIX):
-        context.warn(f"the tag !{tag} needs the line '%TAG ! {PREFIX}' for Fawkes to know it", where=where)
+        context.warn(f"the tag !{tag} needs the line '%TAG ! {PREFIX}' for Fawkes to know it", where=location)
     return tag, item.value
 
 
-def _name(value: Any, where: str) -> str:
+def _name(value: Any, location: str) -> str:
     """A scalar as the text that it is for Fawkes."""
     if not isinstance(value, str):
-        refuse("must be a text", where)
+        refuse("must be a text", location)
     return str.__str__(value)
 
 
-def _plain(value: Any, where: str) -> Any:
+def _plain(value: Any, location: str) -> Any:
     """A value as JSON-like data; scalars without quotes get their meaning."""
     if isinstance(value, _yaml.Plain):
         try:
             return _yaml.scalar(str.__str__(value))
         except ValueError as error:
-            refuse(str(error), where)
+            refuse(str(error), location)
     if isinstance(value, _yaml.Tagged):
-        refuse(f"the tag {value.tag[:80]} has no meaning here", where)
+        refuse(f"the tag {value.tag[:80]} has no meaning here", location)
     if isinstance(value, dict):
-        return {key: _plain(v, where) for key, v in value.items()}
+        return {key: _plain(v, location) for key, v in value.items()}
     if isinstance(value, list):
-        return [_plain(v, where) for v in value]
+        return [_plain(v, location) for v in value]
     return value
 
 
-def _properties(said: Any, where: str, context: ReadContext) -> tuple[dict[str, Any], list[str]]:
+def _properties(listing: Any, location: str, context: ReadContext) -> tuple[dict[str, Any], list[str]]:
     """(a list of one-key mappings and bare words as a mapping, the bare words, sorted)."""
-    if said is None or said == "":
+    if listing is None or listing == "":
         return {}, []
-    if isinstance(said, dict):
-        context.warn("must be a list of one-key mappings for Fawkes; a list is served", where=where)
-        said = [said]
-    if not isinstance(said, list):
-        refuse("must be a list of words and one-key mappings", where)
+    if isinstance(listing, dict):
+        context.warn("must be a list of one-key mappings for Fawkes; a list is served", where=location)
+        listing = [listing]
+    if not isinstance(listing, list):
+        refuse("must be a list of words and one-key mappings", location)
     out: dict[str, Any] = {}
-    words: set[str] = set()
-    for item in said:
+    flags: set[str] = set()
+    for item in listing:
         if isinstance(item, str):
-            word = _name(item, where)
-            pairs: Sequence[tuple[str, Any]] = [(word, True)]
+            flag = _name(item, location)
+            pairs: Sequence[tuple[str, Any]] = [(flag, True)]
         elif isinstance(item, dict):
-            pairs = [(key, _plain(value, f"{where}.{key}")) for key, value in item.items()]
+            pairs = [(key, _plain(value, f"{location}.{key}")) for key, value in item.items()]
         else:
-            refuse("must be a list of words and one-key mappings", where)
+            refuse("must be a list of words and one-key mappings", location)
         for key, value in pairs:
             if key in out:
-                context.warn("stands twice; the last value counts", where=f"{where}.{key}")
+                context.warn("stands twice; the last value counts", where=f"{location}.{key}")
             if isinstance(value, (dict, list)):
-                context.warn("is no scalar, which Fawkes refuses; it is kept", where=f"{where}.{key}")
+                context.warn("is no scalar, which Fawkes refuses; it is kept", where=f"{location}.{key}")
             out[key] = value
-            words.discard(key)
+            flags.discard(key)
         if isinstance(item, str):
-            words.add(word)
-    return out, sorted(words)
+            flags.add(flag)
+    return out, sorted(flags)
 
 
 Row = tuple[int, int, dict[str, Any]]
 
 
 def _connections(
-    said: Any, place: Mapping[str, int], context: ReadContext
+    entries: Any, index_by_name: Mapping[str, int], context: ReadContext
 ) -> tuple[list[Row], dict[int, list[dict[str, Any]]]]:
     """((source, target, what only this format knows) of each edge; the connections to nowhere by their known node, by
     -1 where both are unknown)."""
-    if said is None or said == "":
+    if entries is None or entries == "":
         return [], {}
-    if not isinstance(said, list):
+    if not isinstance(entries, list):
         refuse("must be a list of pairs", "connections")
     items = []
-    for k, item in enumerate(said):
-        where = f"connections[{k}]"
-        tag, pair = _untag(item, where, context)
+    for k, item in enumerate(entries):
+        location = f"connections[{k}]"
+        tag, pair = _untag(item, location, context)
         if not isinstance(pair, list) or len(pair) != 2:
-            refuse("a connection is a pair of names: [from, to]", where)
-        items.append((tag, _name(pair[0], where), _name(pair[1], where), where))
+            refuse("a connection is a pair of names: [from, to]", location)
+        items.append((tag, _name(pair[0], location), _name(pair[1], location), location))
         if tag is not None and tag not in KNOWN_TAGS:
-            context.warn(f"Fawkes does not know the tag !{tag} of a connection", where=where)
+            context.warn(f"Fawkes does not know the tag !{tag} of a connection", where=location)
     ordered = any(tag in MODES for tag, _, _, _ in items)
     rows: list[Row] = []
     dangling: dict[int, list[dict[str, Any]]] = defaultdict(list)
     seen: set[tuple[str, str]] = set()
-    for k, (tag, a, b, where) in enumerate(items):
-        rest: dict[str, Any] = {"tag": tag} if tag else {}
-        if a not in place or b not in place:
-            missing = a if a not in place else b
-            home = place.get(a, place.get(b))
+    for k, (tag, a, b, location) in enumerate(items):
+        extra_members: dict[str, Any] = {"tag": tag} if tag else {}
+        if a not in index_by_name or b not in index_by_name:
+            missing = a if a not in index_by_name else b
+            home = index_by_name.get(a, index_by_name.get(b))
             reason = f"{a} - {b}: there is no node {missing!r}, which Fawkes refuses; it is kept, but not served"
-            context.warn(reason, where=where)
-            dangling[-1 if home is None else home].append({**rest, "ends": [a, b]})
+            context.warn(reason, where=location)
+            dangling[-1 if home is None else home].append({**extra_members, "ends": [a, b]})
             continue
         if (a, b) in seen:
-            context.warn(f"{a} - {b} stands twice, which Fawkes refuses", where=where)
+            context.warn(f"{a} - {b} stands twice, which Fawkes refuses", where=location)
         seen |= {(a, b)} if tag == DIRECTED else {(a, b), (b, a)}
         if a == b:
-            context.warn(f"{a} is connected with itself", where=where)
+            context.warn(f"{a} is connected with itself", where=location)
         if ordered:
-            rest["order"] = k
-        rows.append((place[a], place[b], rest))
+            extra_members["order"] = k
+        rows.append((index_by_name[a], index_by_name[b], extra_members))
         if tag != DIRECTED and a != b:
-            rows.append((place[b], place[a], {**rest, "backward": True}))
+            rows.append((index_by_name[b], index_by_name[a], {**extra_members, "backward": True}))
     return rows, dangling
 
 
 def _document(top: Mapping[str, Any], names: set[str], context: ReadContext) -> dict[str, Any]:
     """What the file says as a whole."""
-    rest = {
+    extra_members = {
         key: str.__str__(value) if value and isinstance(value, str) and key in NAMED else _plain(value, key)
         for key, value in top.items()
         if key not in TOP_KEYS
     }
-    if "graph-name" not in rest:
+    if "graph-name" not in extra_members:
         context.warn("is missing; Fawkes asks for it", where="graph-name")
-    if isinstance(rest.get("root"), str) and rest["root"] and rest["root"] not in names:
-        context.warn(f"{rest['root']!r} is no node", where="root")
-    out: dict[str, Any] = {"top": rest}
-    defaults, words = _properties(top.get("default-properties"), "default-properties", context)
+    if isinstance(extra_members.get("root"), str) and extra_members["root"] and extra_members["root"] not in names:
+        context.warn(f"{extra_members['root']!r} is no node", where="root")
+    out: dict[str, Any] = {"top": extra_members}
+    defaults, flags = _properties(top.get("default-properties"), "default-properties", context)
     if defaults:
         out["defaults"] = defaults
-    if words:
-        out["words"] = words
+    if flags:
+        out["words"] = flags
     return out
 
 
@@ -351,20 +355,20 @@ class _Writer:
         self.lost: Counter[str] = Counter()
 
     def _name_of(self, node: Node) -> str:
-        said = own(node.properties, NAME).get("name")
-        return said if isinstance(said, str) and is_name(said) else node.id
+        source_name = own(node.properties, NAME).get("name")
+        return source_name if isinstance(source_name, str) and is_name(source_name) else node.id
 
     def file(self) -> str:
         """The whole text."""
-        if again := without_repeats(self.names):
-            self.context.warn(f"{len(again)} names stand twice or more, which Fawkes refuses: {some(again)}")
+        if repeats := without_repeats(self.names):
+            self.context.warn(f"{len(repeats)} names stand twice or more, which Fawkes refuses: {some(repeats)}")
         connections = self._tagged(list(self._connections()))
         order = self._node_order(connections)
         out = [f"%YAML 1.2\n%TAG ! {PREFIX}\n---\n", self._head(), "nodes:" if order else "nodes: []"]
         xy = np.array([(self.net.nodes[k].x, self.net.nodes[k].y) for k in order], np.float64).reshape(-1, 2)
-        said = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
+        texts = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
         linked = {k for c in connections for k in (c.a, c.b)}
-        for k, x, y in zip(order, said[::2], said[1::2], strict=True):
+        for k, x, y in zip(order, texts[::2], texts[1::2], strict=True):
             out.append(self._node(k, x, y, linked=k in linked))
         names = [_yaml.text(name) for name in self.names]
         out.append("\nconnections:\n" if connections else "\nconnections: []\n")
@@ -376,11 +380,11 @@ class _Writer:
 
     def _head(self) -> str:
         """The keys before the nodes."""
-        said = self.document.get("top")
-        top = {w: v for w, v in said.items() if w not in TOP_KEYS} if isinstance(said, dict) else {}
+        source_value = self.document.get("top")
+        top = {w: v for w, v in source_value.items() if w not in TOP_KEYS} if isinstance(source_value, dict) else {}
         if not isinstance(top.get("graph-name"), str) or not top["graph-name"]:
-            said = getattr(self.context.options, "graph_name", None)
-            top["graph-name"] = said or self.context.title
+            source_value = getattr(self.context.options, "graph_name", None)
+            top["graph-name"] = source_value or self.context.title
             self.context.fill("graph-name", top["graph-name"], "no source names it", "graph_name")
         first = {key: top.pop(key) for key in ("graph-name", "root") if key in top}
         out = [_yaml.mapping({key: value}, 0) for key, value in first.items()]
@@ -395,16 +399,16 @@ class _Writer:
         """The text of a node, with the line break before it."""
         node, name = self.net.nodes[k], self.names[k]
         p = node.properties
-        rest = own(p, NAME)
-        tag = _tag(rest)
+        source_members = own(p, NAME)
+        tag = _tag(source_members)
         if NAME not in p and not linked:
             tag = UNCONNECTED
             self.lost["unconnected"] += 1
         elif tag == UNCONNECTED and linked:
             tag = None
             self.context.warn("was !unconnected and is connected now: it is served without the tag", where=name)
-        said = rest.get("properties")
-        properties = dict(said) if isinstance(said, dict) else {}
+        extra_properties = source_members.get("properties")
+        properties = dict(extra_properties) if isinstance(extra_properties, dict) else {}
         turned = said_yaw(properties.get("orientation"), p.get("orientation"))
         if turned is not None:
             properties["orientation"] = turned
@@ -420,11 +424,11 @@ class _Writer:
         body = f"name: {_yaml.text(name)}\n    pos: [{x}, {y}]\n"
         text = f"\n  - !{tag}\n    {body}" if tag else f"\n  - {body}"
         if properties:
-            text += "    properties:\n" + _listed(properties, rest.get("words"), 6)
-        more = rest.get("more")
+            text += "    properties:\n" + _listed(properties, source_members.get("words"), 6)
+        more = source_members.get("more")
         if isinstance(more, dict) and (more := {w: v for w, v in more.items() if w not in NODE_KEYS}):
             text += _yaml.mapping(more, 4)
-        self.lost["dangling"] += count(rest.get("dangling"))
+        self.lost["dangling"] += count(source_members.get("dangling"))
         return text[:-1]
 
     def _connections(self) -> Iterator[_Connection]:
@@ -439,22 +443,22 @@ class _Writer:
                 continue
             covered.add((edge.source, edge.target))
             self.lost["edge attributes"] += bool(edge.properties.keys() - CANONICAL_EDGE)
-            rest = own(edge.properties, NAME)
-            tag = _tag(rest)
-            order = rest.get("order") if isinstance(rest.get("order"), int) else None
+            source_members = own(edge.properties, NAME)
+            tag = _tag(source_members)
+            order = source_members.get("order") if isinstance(source_members.get("order"), int) else None
             back = waiting[(edge.target, edge.source, tag)]
             if tag == DIRECTED or edge.source == edge.target:
                 yield _Connection(tag, edge.source, edge.target, foreign, order)
             elif back:
                 other, its = back.pop(0)
-                first, second = (other, edge) if self._leads(other, its, edge, rest) else (edge, other)
+                first, second = (other, edge) if self._leads(other, its, edge, source_members) else (edge, other)
                 yield _Connection(tag, first.source, second.source, foreign, order)
             else:
-                waiting[(edge.source, edge.target, tag)].append((edge, rest))
+                waiting[(edge.source, edge.target, tag)].append((edge, source_members))
         for (a, b, tag), left in waiting.items():
-            for edge, rest in left:
+            for edge, source_members in left:
                 self.lost["one-way modes"] += tag in MODES
-                order = rest.get("order") if isinstance(rest.get("order"), int) else None
+                order = source_members.get("order") if isinstance(source_members.get("order"), int) else None
                 yield _Connection(DIRECTED, a, b, NAME not in edge.properties, order)
 
     def _leads(self, a: Edge, its: Mapping[str, Any], b: Edge, other: Mapping[str, Any]) -> bool:
@@ -495,14 +499,14 @@ class _Writer:
         ends = np.array([(c.a, c.b) for c in connections], np.intp)
         lines = shapely.linestrings(xy[ends])
         tree = shapely.STRtree(lines)
-        portion, found = max(1, 20_000_000 // n), 0
+        portion, pair_count = max(1, 20_000_000 // n), 0
         for begin in range(0, n, portion):
-            if found > MANY_CROSSINGS * n + 1_000_000:
+            if pair_count > MANY_CROSSINGS * n + 1_000_000:
                 crossing[begin:] = True
                 break
             a, b = tree.query(lines[begin : begin + portion], predicate="intersects")
             a = a + begin
-            found += len(a)
+            pair_count += len(a)
             apart = (ends[a][:, :, None] != ends[b][:, None, :]).all(axis=(1, 2))
             crossing[a[apart]] = True
         return crossing.tolist()
@@ -537,27 +541,31 @@ class _Writer:
         return order
 
     def _report(self) -> None:
-        context, lost = self.context, self.lost
+        context, counts = self.context, self.lost
         only_2d(self.net, context, "Fawkes' nodes are two-dimensional")
-        if lost["unconnected"]:
+        if counts["unconnected"]:
             why = "Fawkes asks for the tag where no connection leads"
-            context.fill("nodes: !unconnected", f"{lost['unconnected']} nodes", why)
+            context.fill("nodes: !unconnected", f"{counts['unconnected']} nodes", why)
         edges = [e for e in self.net.edges if NAME not in e.properties]
         unnamed = sum(e.id != f"{self.net.nodes[e.source].id}_{self.net.nodes[e.target].id}" for e in edges)
         context.drop("ids of edges", unnamed, "a connection has no name; its ends say which one it is")
-        context.drop("edges with attributes (action, speed limit …)", lost["edge attributes"], "connections have none")
-        context.drop("parallel edges", lost["parallel"], "Fawkes refuses a second connection of the same nodes")
-        context.drop("attributes of nodes that are no scalars", lost["node attributes"], "Fawkes' properties are texts")
-        context.drop("tilts of nodes", lost["tilted"], "an orientation is one angle")
-        context.drop("intersection tags", lost["one-way modes"], "the connection is one-way now and has one tag only")
-        lost["dangling"] += count(self.document.get("dangling"))
-        context.drop("connections to nowhere", lost["dangling"], "Fawkes refuses a graph with one")
+        context.drop(
+            "edges with attributes (action, speed limit …)", counts["edge attributes"], "connections have none"
+        )
+        context.drop("parallel edges", counts["parallel"], "Fawkes refuses a second connection of the same nodes")
+        context.drop(
+            "attributes of nodes that are no scalars", counts["node attributes"], "Fawkes' properties are texts"
+        )
+        context.drop("tilts of nodes", counts["tilted"], "an orientation is one angle")
+        context.drop("intersection tags", counts["one-way modes"], "the connection is one-way now and has one tag only")
+        counts["dangling"] += count(self.document.get("dangling"))
+        context.drop("connections to nowhere", counts["dangling"], "Fawkes refuses a graph with one")
 
 
-def _tag(rest: Mapping[str, Any]) -> str | None:
+def _tag(source_members: Mapping[str, Any]) -> str | None:
     """The tag that an item's source gave it, where it can be written."""
-    said = rest.get("tag")
-    return said if isinstance(said, str) and _WORD.match(said) else None
+    tag = source_members.get("tag")
+    return tag if isinstance(tag, str) and _WORD.match(tag) else None
 
 
 def _reach(start: int, onward: Mapping[int, Sequence[int]], seen: set[int]) -> bool:
@@ -574,9 +582,9 @@ def _reach(start: int, onward: Mapping[int, Sequence[int]], seen: set[int]) -> b
     return True
 
 
-def _listed(properties: Mapping[str, Any], words: Any, column: int) -> str:
+def _listed(properties: Mapping[str, Any], flags: Any, column: int) -> str:
     """A mapping as a list of one-key mappings, sorted, and bare words where the value still is true."""
-    bare = frozenset(w for w in words if isinstance(w, str)) if isinstance(words, list) else frozenset()
+    bare = frozenset(w for w in flags if isinstance(w, str)) if isinstance(flags, list) else frozenset()
     pad = " " * column
     out = []
     for key in sorted(properties):

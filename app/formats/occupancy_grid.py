@@ -146,8 +146,8 @@ def detect(name: str, data: bytes) -> bool:
     if b"image" not in head or b"\0" in head:
         return False
     pattern = _FLOW if _FLOW_START.match(head) else _BLOCK
-    found = set(pattern.findall(head.removeprefix(b"\xef\xbb\xbf")))
-    return b"image" in found and len(found) >= 3
+    keys = set(pattern.findall(head.removeprefix(b"\xef\xbb\xbf")))
+    return b"image" in keys and len(keys) >= 3
 
 
 def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
@@ -156,8 +156,8 @@ def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
         stem = main.rpartition(".")[0]
         return [n for n in names if n in (stem + ".yaml", stem + ".yml")]
     try:
-        said = _yaml.load(data, Limits(yaml_nodes=10_000))["image"]
-        return [n for n in [_find_image(str(said), main, names)[0]] if n] + _masks.companions(main, names)
+        image = _yaml.load(data, Limits(yaml_nodes=10_000))["image"]
+        return [n for n in [_find_image(str(image), main, names)[0]] if n] + _masks.companions(main, names)
     except (*BAD_INPUT, FleetMapError):  # the reader says what is wrong with it
         return []
 
@@ -166,7 +166,7 @@ def _is_image(name: str, data: bytes) -> bool:
     return _image.kind_of(data) is not None or name.lower().endswith(IMAGE_ENDS)
 
 
-def _find_image(said: str, main: str, names: Iterable[str]) -> tuple[str | None, str]:
+def _find_image(reference: str, main: str, names: Iterable[str]) -> tuple[str | None, str]:
     """The picture of the upload that a YAML means, and a warning if it is not simply where the YAML says.
 
     Only a plain relative path is followed; of any other one (absolute, with ``..``, a drive, a variable) the base name
@@ -174,25 +174,25 @@ def _find_image(said: str, main: str, names: Iterable[str]) -> tuple[str | None,
     """
     folder = main.rpartition("/")[0]
     beside = f"{folder}/" if folder else ""
-    known = set(names)
-    plain = said.removeprefix("./")
+    name_set = set(names)
+    plain = reference.removeprefix("./")
     parts = plain.split("/")
-    foreign = any(c in said for c in "\\~%$:") or ".." in parts or said.startswith("/") or "" in parts
-    if not foreign and beside + plain in known:
+    foreign = any(c in reference for c in "\\~%$:") or ".." in parts or reference.startswith("/") or "" in parts
+    if not foreign and beside + plain in name_set:
         return beside + plain, ""
-    base = re.split(r"[/\\]", said)[-1]
+    base = re.split(r"[/\\]", reference)[-1]
     if not base or base in (".", ".."):
         return None, ""
-    if beside + base in known:
-        found = beside + base
+    if beside + base in name_set:
+        match = beside + base
     else:
-        same = [n for n in known if n.rpartition("/")[2] == base]
+        same = [n for n in name_set if n.rpartition("/")[2] == base]
         if len(same) != 1:  # of several one would be a guess, and a robot would drive by it
             return None, ""
-        found = same[0]
-    if found == beside + said:
-        return found, ""
-    return found, f"the image {said[:200]!r} is not part of the upload; {found!r} was taken for it"
+        match = same[0]
+    if match == beside + reference:
+        return match, ""
+    return match, f"the image {reference[:200]!r} is not part of the upload; {match!r} was taken for it"
 
 
 # --- reading ------------------------------------------------------------------------------------------------------
@@ -208,7 +208,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if options.resolution is None:
         reason = "a picture alone does not say how large its cells are: add its YAML, or the option resolution"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="resolution")])
-    said = {
+    parameters = {
         "resolution": options.resolution,
         "origin": options.origin,
         "mode": options.mode,
@@ -216,7 +216,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         "free_thresh": options.free_thresh,
         "negate": options.negate,
     }
-    return _layers(said, {}, main, main, files, context)
+    return _layers(parameters, {}, main, main, files, context)
 
 
 def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadContext) -> Layers:
@@ -228,40 +228,42 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
         context.warn("the options of a picture without a YAML are not used: there is a YAML", file=main)
     problems: list[Problem] = []
 
-    def wrong(key: str, reason: str) -> None:
+    def add_problem(key: str, reason: str) -> None:
         problems.append(Problem(reason, main, _line(data, key), key))
 
     missing = [key for key in REQUIRED if document.get(key) is None]
     for key in missing:
-        wrong(key, f"the key {key} is missing")
-    said: dict[str, Any] = {"mode": document.get("mode", "trinary")}
+        add_problem(key, f"the key {key} is missing")
+    parameters: dict[str, Any] = {"mode": document.get("mode", "trinary")}
     for key, low, high in (
         ("resolution", 1e-6, 1e4),
         ("occupied_thresh", 0.0, 1.0),
         ("free_thresh", 0.0, 1.0),
     ):
         if key not in missing:
-            said[key] = number = _number(document[key])
+            parameters[key] = number = _number(document[key])
             if number is None or not low <= number <= high:
-                wrong(key, f"{key} must be a number between {low:g} and {high:g}, got {_shown(document[key])}")
+                add_problem(key, f"{key} must be a number between {low:g} and {high:g}, got {_shown(document[key])}")
     if "origin" not in missing:
         origin = document["origin"]
         numbers = [_number(v) for v in origin] if isinstance(origin, list) else []
         if len(numbers) != 3 or any(v is None or abs(v) > MAX_METRES for v in numbers):
-            wrong("origin", f"origin must be three numbers [x, y, yaw] within ±{MAX_METRES:g}, got {_shown(origin)}")
-        said["origin"] = tuple(numbers)
+            add_problem(
+                "origin", f"origin must be three numbers [x, y, yaw] within ±{MAX_METRES:g}, got {_shown(origin)}"
+            )
+        parameters["origin"] = tuple(numbers)
     if "negate" not in missing:
         negate = document["negate"]
         number = _number(negate)
         if isinstance(negate, bool) or number in (0.0, 1.0):
-            said["negate"] = bool(negate if isinstance(negate, bool) else number)
+            parameters["negate"] = bool(negate if isinstance(negate, bool) else number)
         else:
-            wrong("negate", f"negate must be 0, 1, true or false, got {_shown(negate)}")
-    if said["mode"] not in MODES:
-        wrong("mode", f"mode must be trinary, scale or raw, got {_shown(said['mode'])}")
+            add_problem("negate", f"negate must be 0, 1, true or false, got {_shown(negate)}")
+    if parameters["mode"] not in MODES:
+        add_problem("mode", f"mode must be trinary, scale or raw, got {_shown(parameters['mode'])}")
     image = document.get("image")
     if "image" not in missing and not (isinstance(image, str) and image):
-        wrong("image", f"image must be the name of a picture, got {_shown(image)}")
+        add_problem("image", f"image must be the name of a picture, got {_shown(image)}")
     if problems:
         raise UnreadableFile("; ".join(f"{p.file}: {p.problem}" for p in problems), problems)
     picture, warning = _find_image(str(image), main, files)
@@ -270,34 +272,38 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, _line(data, "image"), "image")])
     if warning:
         context.warn(warning, file=main, line=_line(data, "image"), where="image")
-    if said["free_thresh"] > said["occupied_thresh"]:
+    if parameters["free_thresh"] > parameters["occupied_thresh"]:
         reason = "free_thresh is above occupied_thresh: where both hold a cell is free"
         context.warn(reason, file=main, line=_line(data, "free_thresh"), where="free_thresh")
     _fields.check(document, SHAPE, context)
     extra = {key: value for key, value in document.items() if key not in KEYS}
     if "mode" in document:
-        said["mode"] = document["mode"]
-    return _layers(said, extra, main, picture, files, context)
+        parameters["mode"] = document["mode"]
+    return _layers(parameters, extra, main, picture, files, context)
 
 
 def _layers(
-    said: Mapping[str, Any], extra: Mapping[str, Any], main: str, picture: str, files: Files, context: ReadContext
+    parameters: Mapping[str, Any], extra: Mapping[str, Any], main: str, picture: str, files: Files, context: ReadContext
 ) -> Layers:
     if not context.wants("occupancy"):
         return Layers()
-    yaw = said["origin"][2]
+    yaw = parameters["origin"][2]
     if yaw != 0.0:
         line = _line(files[main], "origin") if main != picture else None
         reason = f"the origin is turned by {yaw:g} rad; Nav2 ignores that: ask for the map with normalize=true"
         context.warn(reason, file=main, line=line, where="origin")
-    told = next((n for n in _masks.companions(main, list(files)) if n != picture), None) if main != picture else None
-    meaning = _masks.read(told, files[told], context) if told else {}
+    mask_file = (
+        next((n for n in _masks.companions(main, list(files)) if n != picture), None) if main != picture else None
+    )
+    meaning = _masks.read(mask_file, files[mask_file], context) if mask_file else {}
     try:
         if context.cells:
             shades = _image.read_grey(files[picture], context.limits)
-            rule = _rule(said["mode"], said["negate"], said["occupied_thresh"], said["free_thresh"])
-            doubtful = _is_doubtful(rule, said["mode"], negate=said["negate"]) and not meaning
-            cells, grey = _cells(shades, rule, said["mode"], SAVED[UNKNOWN] if doubtful else None)
+            rule = _rule(
+                parameters["mode"], parameters["negate"], parameters["occupied_thresh"], parameters["free_thresh"]
+            )
+            doubtful = _is_doubtful(rule, parameters["mode"], negate=parameters["negate"]) and not meaning
+            cells, grey = _cells(shades, rule, parameters["mode"], SAVED[UNKNOWN] if doubtful else None)
             if grey is not None:
                 meaning = {**meaning, UNKNOWN_GREY: packed_cells(grey)}
         else:
@@ -307,12 +313,12 @@ def _layers(
         raise type(error)(f"{picture}: {error.detail}", [Problem(error.detail, picture)]) from error
     grid = OccupancyGrid(
         cells,
-        said["resolution"],
-        said["origin"],
-        said["mode"],
-        said["occupied_thresh"],
-        said["free_thresh"],
-        said["negate"],
+        parameters["resolution"],
+        parameters["origin"],
+        parameters["mode"],
+        parameters["occupied_thresh"],
+        parameters["free_thresh"],
+        parameters["negate"],
         {**({NAME: extra} if extra else {}), **meaning},
     )
     name = context.grid or main.rpartition("/")[2].rpartition(".")[0] or MAP
@@ -325,12 +331,12 @@ def _is_doubtful(rule: Table, mode: Mode, *, negate: bool) -> bool:
 
 
 def _cells(
-    shades: _image.Grey, rule: Table, mode: Mode, wanted: int | None
+    shades: _image.Grey, rule: Table, mode: Mode, shade: int | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """Canonical cells (bottom row first) of a picture, a strip of rows at a time, and which opaque ones have the wanted
     grey; None where there are none."""
     cells = np.empty((shades.height, shades.width), np.uint8)
-    grey = None if wanted is None else np.zeros(cells.shape, bool)
+    grey = None if shade is None else np.zeros(cells.shape, bool)
     table = rule.tobytes()
     for y, block, opaque in shades.strips():
         values = _image.look_up(block, table)
@@ -339,7 +345,7 @@ def _cells(
         top = shades.height - y
         cells[top - len(values) : top] = values[::-1]
         if grey is not None:
-            grey[top - len(values) : top] = ((block == wanted) & (values == FREE))[::-1]
+            grey[top - len(values) : top] = ((block == shade) & (values == FREE))[::-1]
     return cells, grey if grey is not None and grey.any() else None
 
 
@@ -376,8 +382,8 @@ def _shown(value: Any) -> str:
 
 def _line(data: bytes, key: str) -> int | None:
     """The line (from 1) on which a top-level key stands."""
-    found = re.search(rb'^[ \t{]*["\']?' + key.encode() + rb'["\']?[ \t]*:', data, re.MULTILINE)
-    return None if found is None else data.count(b"\n", 0, found.end()) + 1
+    match = re.search(rb'^[ \t{]*["\']?' + key.encode() + rb'["\']?[ \t]*:', data, re.MULTILINE)
+    return None if match is None else data.count(b"\n", 0, match.end()) + 1
 
 
 # --- writing ------------------------------------------------------------------------------------------------------
@@ -400,14 +406,14 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         reason = f"the origin is turned by {grid.origin[2]:g} rad; Nav2 ignores that: ask for normalize=true"
         context.warn(reason, file=stem + ".yaml", where="origin")
     picture = f"{stem}.{kind}"
-    made = {stem + ".yaml": _yaml_text(grid, picture), picture: _picture(grid, pixels, kind)}
-    return made | _masks.write(grid, stem, context)
+    files = {stem + ".yaml": _yaml_text(grid, picture), picture: _picture(grid, pixels, kind)}
+    return files | _masks.write(grid, stem, context)
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named grid; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
     supply = "upload one (a YAML and its image)"
-    return the_one(keys, "occupancy", options.grid, options.level, what="grid", option="grid", supply=supply)
+    return the_one(keys, "occupancy", options.grid, options.level, noun="grid", option="grid", supply=supply)
 
 
 def by_file(name: str) -> dict[str, str]:
@@ -430,20 +436,20 @@ def _encoding(
     """
     present = np.flatnonzero(_present(grid.cells))
     if options.mode is not None:
-        kept = options.mode == grid.mode
+        same_mode = options.mode == grid.mode
         grid = replace(grid, mode=options.mode)
         if options.mode == "trinary":
-            if not kept and _pixels(grid, present) is None:
+            if not same_mode and _pixels(grid, present) is None:
                 grid = replace(grid, occupied_thresh=0.65, free_thresh=0.196)
             grid = _judged(grid, context)
             present = np.flatnonzero(_present(grid.cells))
-        elif options.mode == "scale" and not kept and _pixels(grid, present[present != UNKNOWN]) is None:
+        elif options.mode == "scale" and not same_mode and _pixels(grid, present[present != UNKNOWN]) is None:
             grid = replace(grid, occupied_thresh=1.0, free_thresh=0.0)
     pixels = _pixels(grid, present)
     if pixels is not None:
         return grid, pixels, options.file_type or "pgm"
-    known = present[present != UNKNOWN]
-    pixels = _pixels(grid, known)
+    cell_values = present[present != UNKNOWN]
+    pixels = _pixels(grid, cell_values)
     if pixels is not None and options.file_type != "pgm":
         return grid, pixels, "png"
     if options.mode is not None:
@@ -492,10 +498,10 @@ def _present(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
     rows = max(1, _image.STRIP // cells.shape[1])
     for y in range(0, len(cells), rows):
         block = cells[y : y + rows]
-        usual = {value: int(np.count_nonzero(block == value)) for value in SAVED}
-        for value, count in usual.items():
+        counts = {value: int(np.count_nonzero(block == value)) for value in SAVED}
+        for value, count in counts.items():
             seen[value] |= count > 0
-        if sum(usual.values()) < block.size:
+        if sum(counts.values()) < block.size:
             seen[block] = True
     return seen
 
@@ -511,13 +517,13 @@ def _pixels(grid: OccupancyGrid, values: NDArray[np.intp]) -> Table | None:
         fit = np.flatnonzero(rule == value)
         if not len(fit):
             return None
-        usual = SAVED.get(value, -1)
-        usual = 255 - usual if grid.negate and usual >= 0 else usual
+        pixel = SAVED.get(value, -1)
+        pixel = 255 - pixel if grid.negate and pixel >= 0 else pixel
         black, white = (int(fit[-1]), int(fit[0])) if grid.negate else (int(fit[0]), int(fit[-1]))
         if grid.mode == "raw":
             out[value] = value
-        elif grid.mode == "trinary" and usual in fit:
-            out[value] = usual
+        elif grid.mode == "trinary" and pixel in fit:
+            out[value] = pixel
         else:
             out[value] = {OCCUPIED: black, FREE: white}.get(value, int(fit[len(fit) // 2]))
     return out
@@ -567,7 +573,7 @@ def _text(value: str) -> str:
     if _PLAIN.fullmatch(value) and value not in _yaml.CONSTANTS:
         return value
     quoted = json.dumps(value, ensure_ascii=False)
-    return _ESCAPE.sub(lambda found: f"\\u{ord(found.group()):04x}", quoted)
+    return _ESCAPE.sub(lambda match: f"\\u{ord(match.group()):04x}", quoted)
 
 
 def _value(value: Any) -> str:
@@ -683,11 +689,11 @@ def normalized(grid: OccupancyGrid) -> OccupancyGrid:
     return replace(grid, cells=_image.look_up(ranks, _OF_RANK.tobytes()), origin=origin)
 
 
-def _check_count(count: int, where: str) -> None:
-    most = Limits().pixels
-    if count > most:
-        reason = f"the map would have {count} cells; at most {most} are made: ask for a coarser resolution"
-        raise Invalid(reason, [Problem(reason, where=where)])
+def _check_count(count: int, location: str) -> None:
+    maximum = Limits().pixels
+    if count > maximum:
+        reason = f"the map would have {count} cells; at most {maximum} are made: ask for a coarser resolution"
+        raise Invalid(reason, [Problem(reason, where=location)])
 
 
 register(

@@ -105,8 +105,8 @@ class _Header:
     body: int
 
 
-def _wrong(reason: str, line: int | None = None, where: str | None = None) -> UnreadableFile:
-    return UnreadableFile(reason, [Problem(reason, line=line, where=where)])
+def _wrong(reason: str, line: int | None = None, location: str | None = None) -> UnreadableFile:
+    return UnreadableFile(reason, [Problem(reason, line=line, where=location)])
 
 
 def _header(data: bytes, context: ReadContext) -> _Header:
@@ -115,7 +115,7 @@ def _header(data: bytes, context: ReadContext) -> _Header:
     kind: Kind = "bt" if data.startswith(BINARY_FILE) else "ot"
     if kind == "ot" and not data.startswith(FULL_FILE):
         raise _wrong(f"the first line must be {FULL_FILE.decode()!r} or {BINARY_FILE.decode()!r}", 1)
-    said: dict[str, tuple[str, int]] = {}
+    entries: dict[str, tuple[str, int]] = {}
     comments: list[str] = []
     position, number = data.find(b"\n") + 1, 1
     while True:
@@ -128,15 +128,15 @@ def _header(data: bytes, context: ReadContext) -> _Header:
         while tokens:
             token = tokens.pop(0)
             if token == b"data":
-                return _stated(kind, said, tuple(comments), position, context)
+                return _stated(kind, entries, tuple(comments), position, context)
             if token.startswith(b"#"):
                 comments.append(_decoded(line[line.index(b"#") :]))
                 break
-            word = _decoded(token)
-            if word not in ("id", "res", "size") or not tokens:
-                context.warn(f"unknown word {word[:40]!r} in the header: left out", line=number, where=word[:40])
+            key = _decoded(token)
+            if key not in ("id", "res", "size") or not tokens:
+                context.warn(f"unknown word {key[:40]!r} in the header: left out", line=number, where=key[:40])
                 break
-            said[word] = (_decoded(tokens.pop(0)), number)
+            entries[key] = (_decoded(tokens.pop(0)), number)
 
 
 def _decoded(text: bytes) -> str:
@@ -147,12 +147,12 @@ def _decoded(text: bytes) -> str:
 
 
 def _stated(
-    kind: Kind, said: Mapping[str, tuple[str, int]], comments: tuple[str, ...], body: int, context: ReadContext
+    kind: Kind, entries: Mapping[str, tuple[str, int]], comments: tuple[str, ...], body: int, context: ReadContext
 ) -> _Header:
-    for word in ("id", "size", "res"):
-        if word not in said:
-            raise _wrong(f"the header does not tell the tree's {word}", where=word)
-    name, line = said["id"]
+    for key in ("id", "size", "res"):
+        if key not in entries:
+            raise _wrong(f"the header does not tell the tree's {key}", location=key)
+    name, line = entries["id"]
     if name == "1":
         context.warn("the id 1 is an old one: taken for OcTree", line=line, where="id")
         name = OCTREE
@@ -161,18 +161,18 @@ def _stated(
         raise _wrong(reason, line, "id")
     if not re.fullmatch(r"\w{1,80}", name, re.ASCII):
         raise _wrong(f"the tree's type must be a word, got {name[:80]!r}", line, "id")
-    size, line = said["size"]
+    size, line = entries["size"]
     if not re.fullmatch(r"\d{1,12}", size, re.ASCII):
         raise _wrong(f"size must be the number of nodes, got {size[:40]!r}", line, "size")
-    resolution, line = said["res"]
+    resolution, line = entries["res"]
     if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", resolution, re.ASCII):
         raise _wrong(f"res must be a number of metres, got {resolution[:40]!r}", line, "res")
     _check_resolution(float(resolution), line)
-    usual = comments == COMMENTS
-    kept = () if usual else tuple(c for c in comments if is_writable(c.replace("\t", " ")))
-    if len(kept) < len(comments) and not usual:
+    is_default = comments == COMMENTS
+    user_comments = () if is_default else tuple(c for c in comments if is_writable(c.replace("\t", " ")))
+    if len(user_comments) < len(comments) and not is_default:
         context.warn("comments with control characters are left out")
-    return _Header(kind, name, int(size), float(resolution), kept, body)
+    return _Header(kind, name, int(size), float(resolution), user_comments, body)
 
 
 def _check_resolution(resolution: float, line: int | None = None) -> None:
@@ -209,12 +209,12 @@ def read(files: Files, context: ReadContext) -> Layers:
         depth, code, odds, colour = _read_full(data, header)
     if not len(depth):
         context.warn("the tree holds no voxels")
-    own: dict[str, Any] = {}
+    source_properties: dict[str, Any] = {}
     if header.id != (COLOR_OCTREE if colour is not None else OCTREE):
-        own["id"] = header.id
+        source_properties["id"] = header.id
     if header.comments:
-        own["comments"] = list(header.comments)
-    properties = {NAME: own} if own else {}
+        source_properties["comments"] = list(header.comments)
+    properties = {NAME: source_properties} if source_properties else {}
     voxels = VoxelMap(header.resolution, depth, code, odds, colour, header.kind == "bt", properties)
     name = context.grid or main.rpartition("/")[2].rpartition(".")[0] or MAP
     return Layers({PartKey("voxels", context.level, name): voxels})
@@ -222,20 +222,22 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 def _read_binary(data: bytes, header: _Header) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
     """Depth, code and log-odds of the leaves of a stream of inner nodes."""
-    rest = len(data) - header.body
-    if rest % 2:
-        raise _wrong(f"the tree has {rest} bytes, which is no whole number of 16 bit words", where="data")
-    if rest // 2 > header.size:
-        raise _wrong(f"the header says {header.size} nodes, the data has {rest // 2} inner nodes alone", where="size")
-    words: Words = np.frombuffer(data, "<u2", rest // 2, header.body).astype(np.uint16, copy=False)
-    inner = _packed(words & (words >> np.uint16(1)))
-    leaves = _packed(words ^ (words >> np.uint16(1)))
+    body_size = len(data) - header.body
+    if body_size % 2:
+        raise _wrong(f"the tree has {body_size} bytes, which is no whole number of 16 bit words", location="data")
+    if body_size // 2 > header.size:
+        raise _wrong(
+            f"the header says {header.size} nodes, the data has {body_size // 2} inner nodes alone", location="size"
+        )
+    masks: Words = np.frombuffer(data, "<u2", body_size // 2, header.body).astype(np.uint16, copy=False)
+    inner = _packed(masks & (masks >> np.uint16(1)))
+    leaves = _packed(masks ^ (masks >> np.uint16(1)))
     count = int(np.bitwise_count(leaves).sum(dtype=np.int64))
-    _check_size(len(words) + count, header)
-    occupied = _packed((words & ~(words << np.uint16(1))) >> np.uint16(1))
+    _check_size(len(masks) + count, header)
+    occupied = _packed((masks & ~(masks << np.uint16(1))) >> np.uint16(1))
     at_depth = _by_depth(inner, DEPTH - 1)
-    if len(words) > 1 and bool((words == 0).any()):
-        raise _wrong("an inner node has no children", where="data")
+    if len(masks) > 1 and bool((masks == 0).any()):
+        raise _wrong("an inner node has no children", location="data")
     codes, depths, states = [], [], []
     code = np.zeros(1, np.uint64)
     for depth, rows in enumerate(at_depth):
@@ -264,11 +266,13 @@ def _read_full(
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32], NDArray[np.uint8] | None]:
     """Depth, code, log-odds and colour of the leaves of a stream of all nodes."""
     record = _record(header.id)
-    rest = len(data) - header.body
-    if rest % record.itemsize:
+    body_size = len(data) - header.body
+    if body_size % record.itemsize:
         size = record.itemsize
-        raise _wrong(f"the tree has {rest} bytes; a node of {header.id} takes {size}, which does not go", where="data")
-    nodes = np.frombuffer(data, record, rest // record.itemsize, header.body)
+        raise _wrong(
+            f"the tree has {body_size} bytes; a node of {header.id} takes {size}, which does not go", location="data"
+        )
+    nodes = np.frombuffer(data, record, body_size // record.itemsize, header.body)
     _check_size(len(nodes), header)
     masks: Masks = np.ascontiguousarray(nodes["mask"])
     at_depth = _by_depth(masks, DEPTH)
@@ -284,7 +288,7 @@ def _read_full(
     infinite = np.flatnonzero(~np.isfinite(nodes["odds"]))
     if len(infinite):
         at = int(infinite[0])
-        raise _wrong(f"the log-odds of node {at} are no finite number", where="data")
+        raise _wrong(f"the log-odds of node {at} are no finite number", location="data")
     colour = np.ascontiguousarray(nodes["colour"][leaf]) if header.id == COLOR_OCTREE else None
     if len(nodes) == 1:  # the whole tree is one leaf: its eight octants
         colour = None if colour is None else np.repeat(colour, 8, axis=0)
@@ -300,7 +304,7 @@ def _record(tree: str) -> np.dtype[Any]:
 
 def _check_size(counted: int, header: _Header) -> None:
     if counted != header.size:
-        raise _wrong(f"the header says {header.size} nodes, the data has {counted}", where="size")
+        raise _wrong(f"the header says {header.size} nodes, the data has {counted}", location="size")
 
 
 def _children(masks: Masks) -> tuple[Rows, NDArray[np.uint64]]:
@@ -323,12 +327,12 @@ def _by_depth(masks: Masks, deepest: int) -> list[Rows]:
     waiting -= np.arange(1, n + 1)
     short = waiting < 0
     if not bool(short.any()):
-        raise _wrong("the data ends before the tree does", where="data")
+        raise _wrong("the data ends before the tree does", location="data")
     end = int(np.argmax(short))
     if end != n - 1:
-        raise _wrong(f"the tree ends after {end + 1} nodes, but the data goes on", where="data")
+        raise _wrong(f"the tree ends after {end + 1} nodes, but the data goes on", location="data")
     if n > 1 and int(waiting.max()) > WAITING:
-        raise _wrong(f"the tree is deeper than {DEPTH} levels", where="data")
+        raise _wrong(f"the tree is deeper than {DEPTH} levels", location="data")
     before = np.zeros(n, np.int8)
     before[1:] = waiting[:-1]
     order = np.argsort(before, kind="stable")
@@ -344,7 +348,7 @@ def _by_depth(masks: Masks, deepest: int) -> list[Rows]:
         step -= np.bincount(np.concatenate(ends), minlength=n + 1)
     depth = np.cumsum(step[:n])
     if int(depth.max()) > deepest:
-        raise _wrong(f"the tree is deeper than {DEPTH} levels", where="data")
+        raise _wrong(f"the tree is deeper than {DEPTH} levels", location="data")
     order = np.argsort(depth.astype(np.int8), kind="stable")
     return np.split(order, np.cumsum(np.bincount(depth))[:-1])
 
@@ -386,7 +390,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named voxel map; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
     supply = "upload one (an OctoMap file or a point cloud)"
-    return the_one(keys, "voxels", options.name, options.level, what="voxel map", option="name", supply=supply)
+    return the_one(keys, "voxels", options.name, options.level, noun="voxel map", option="name", supply=supply)
 
 
 def by_file(name: str) -> dict[str, str]:
@@ -398,8 +402,8 @@ def by_file(name: str) -> dict[str, str]:
 
 
 def _tree_type(voxels: VoxelMap) -> str:
-    said = voxels.properties.get(NAME)
-    name = said.get("id") if isinstance(said, Mapping) else None
+    source_properties = voxels.properties.get(NAME)
+    name = source_properties.get("id") if isinstance(source_properties, Mapping) else None
     return name if isinstance(name, str) else OCTREE if voxels.colour is None else COLOR_OCTREE
 
 
@@ -426,8 +430,8 @@ def _pruned(voxels: VoxelMap, deepest: int, kind: Kind, context: WriteContext) -
 
 def _head(kind: Kind, tree: str, size: int, voxels: VoxelMap) -> bytes:
     """The header, as the library prints it: six digits of the resolution, unless it has more."""
-    said = voxels.properties.get(NAME)
-    comments = said.get("comments") if isinstance(said, Mapping) else None
+    source_properties = voxels.properties.get(NAME)
+    comments = source_properties.get("comments") if isinstance(source_properties, Mapping) else None
     shown = f"{voxels.resolution:g}"
     lines = [
         (BINARY_FILE if kind == "bt" else FULL_FILE).decode(),
@@ -445,26 +449,26 @@ def _binary(voxels: VoxelMap) -> tuple[int, bytes]:
     if not len(voxels):
         return 0, b""
     state = np.where(voxels.occupied, np.uint16(2), np.uint16(1))
-    keys, words = [], []
+    keys, masks = [], []
     code, bits = np.empty(0, np.uint64), np.empty(0, np.uint16)
     for depth in range(DEPTH, 0, -1):
-        here = np.flatnonzero(voxels.depth == depth)
-        code = np.concatenate([voxels.code[here], code])
-        bits = np.concatenate([state[here], bits])
+        indices = np.flatnonzero(voxels.depth == depth)
+        code = np.concatenate([voxels.code[indices], code])
+        bits = np.concatenate([state[indices], bits])
         if not len(code):
             continue
-        if len(here) not in (0, len(code)):
+        if len(indices) not in (0, len(code)):
             order = np.argsort(code, kind="stable")  # two ascending runs
             code, bits = code[order], bits[order]
         octant = (code & np.uint64(7)).astype(np.uint16)
         above = code >> np.uint64(3)
         start = np.flatnonzero(np.concatenate([[True], above[1:] != above[:-1]]))
         code = above[start]
-        words.append(np.bitwise_or.reduceat(bits << (octant + octant), start))
+        masks.append(np.bitwise_or.reduceat(bits << (octant + octant), start))
         keys.append(_key(code, depth - 1))
         bits = np.full(len(code), 3, np.uint16)
     order = np.argsort(np.concatenate(keys))
-    stream = np.concatenate(words)[order]
+    stream = np.concatenate(masks)[order]
     return len(voxels) + len(stream), stream.astype("<u2", copy=False).tobytes()
 
 
@@ -477,14 +481,14 @@ def _full(voxels: VoxelMap, coloured: bool) -> tuple[int, bytes]:
     code, odds = np.empty(0, np.uint64), np.empty(0, np.float32)
     colour = None if colours is None else np.empty((0, 3), np.uint8)
     for depth in range(DEPTH, 0, -1):
-        here = np.flatnonzero(voxels.depth == depth)
-        code = np.concatenate([voxels.code[here], code])
-        odds = np.concatenate([voxels.log_odds[here], odds])
+        indices = np.flatnonzero(voxels.depth == depth)
+        code = np.concatenate([voxels.code[indices], code])
+        odds = np.concatenate([voxels.log_odds[indices], odds])
         if colour is not None and colours is not None:
-            colour = np.concatenate([colours[here], colour])
+            colour = np.concatenate([colours[indices], colour])
         if not len(code):
             continue
-        if len(here) not in (0, len(code)):
+        if len(indices) not in (0, len(code)):
             order = np.argsort(code, kind="stable")  # two ascending runs
             code, odds = code[order], odds[order]
             colour = None if colour is None else colour[order]
@@ -508,8 +512,8 @@ def _full(voxels: VoxelMap, coloured: bool) -> tuple[int, bytes]:
     nodes["odds"][~inner] = voxels.log_odds
     nodes["mask"][inner] = np.concatenate(masks)[order]
     if coloured:
-        given = [c for c in colour_of if c is not None]
-        nodes["colour"][inner] = np.concatenate(given)[order] if given else UNSET
+        colour_arrays = [c for c in colour_of if c is not None]
+        nodes["colour"][inner] = np.concatenate(colour_arrays)[order] if colour_arrays else UNSET
         nodes["colour"][~inner] = UNSET if colours is None else colours
     return n, nodes.tobytes()
 
@@ -517,8 +521,8 @@ def _full(voxels: VoxelMap, coloured: bool) -> tuple[int, bytes]:
 def _key(code: NDArray[np.uint64], depth: int | NDArray[np.uint8]) -> NDArray[np.uint64]:
     """What sorts nodes as a depth-first walk meets them: place, then depth."""
     levels = np.asarray(depth, np.uint64)
-    place = code << (np.uint64(3) * (np.uint64(DEPTH) - levels))
-    return place << np.uint64(5) | levels
+    position = code << (np.uint64(3) * (np.uint64(DEPTH) - levels))
+    return position << np.uint64(5) | levels
 
 
 register(

@@ -238,11 +238,11 @@ def transforms(levels: Mapping[str, Scaling], reference: str, warn: Callable[[st
     out = {reference: Transform(scale)}
     for name, level in levels.items():
         if name != reference:
-            found = _by_fiducials(levels[reference].fiducials, level.fiducials, scale)
-            if found is None:
+            transform = _by_fiducials(levels[reference].fiducials, level.fiducials, scale)
+            if transform is None:
                 problem = "shares fewer than two fiducials with the reference level: a pixel is taken as a metre"
                 warn(problem, f"levels.{name}.fiducials")
-            out[name] = found or Transform()
+            out[name] = transform or Transform()
     return out
 
 
@@ -260,11 +260,11 @@ def _by_fiducials(
     first, second = np.triu_indices(len(common), 1)
     with np.errstate(all="ignore"):
         step = common[second] - common[first]
-        here, there = np.hypot(step[:, 0], step[:, 1]), np.hypot(step[:, 2], step[:, 3])
-        good = (here > 0) & (there > 0)
-        if not good.any():
+        reference_lengths, lengths = np.hypot(step[:, 0], step[:, 1]), np.hypot(step[:, 2], step[:, 3])
+        valid = (reference_lengths > 0) & (lengths > 0)
+        if not valid.any():
             return None
-        step, relative = step[good], float(np.mean(there[good] / here[good]))
+        step, relative = step[valid], float(np.mean(lengths[valid] / reference_lengths[valid]))
         turn = np.arctan2(step[:, 3], step[:, 2]) - np.arctan2(step[:, 1], step[:, 0])
         rotation = -math.atan2(float(np.sin(turn).sum()), float(np.cos(turn).sum()))
     if not SMALLEST <= scale / relative <= 1 / SMALLEST:
@@ -328,21 +328,23 @@ def read(files: Files, context: ReadContext) -> Layers:
         refuse("must be a mapping with levels", "")
     _fields.check(top, SHAPE, context)
     _check_crs(top.get("parameters"))
-    said = mapping(top.get("levels"), "levels")
-    if not said:
+    raw_value = mapping(top.get("levels"), "levels")
+    if not raw_value:
         refuse("a building needs at least one level", "levels")
     system = top.get("coordinate_system", IMAGE)
     if system not in SYSTEMS:
         refuse(f"must be one of {', '.join(SYSTEMS)}, got {str(system)[:80]!r}", "coordinate_system")
-    levels = {name: _level(name, k, one) for k, (name, one) in enumerate(said.items())}
+    levels = {name: _level(name, k, one) for k, (name, one) in enumerate(raw_value.items())}
     if context.level != GROUND:
         context.warn(f"its levels have names of their own: level={context.level} is not used", where="levels")
     reference = _reference(top, levels)
     if system == IMAGE:
         scaling = {name: _scaling(level) for name, level in levels.items()}
-        found = transforms(scaling, reference, lambda problem, where: context.warn(problem, where=where))
+        level_transforms = transforms(
+            scaling, reference, lambda problem, location: context.warn(problem, where=location)
+        )
         for name, level in levels.items():
-            level.transform = found[name]
+            level.transform = level_transforms[name]
     taken: set[str] = set()
     for level in levels.values():
         level.at = _to_canonical(system, level.raw, level.transform)
@@ -352,7 +354,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     reader = _Reader(system, context, levels, reference)
     parts: dict[PartKey, Part] = {}
     lifts = reader.lifts(mapping(top.get("lifts"), "lifts"))
-    del top, said  # each level lets go of what has been read of it
+    del top, raw_value  # each level lets go of what has been read of it
     for level in levels.values():
         network = reader.topology(level, taken)
         objects = reader.objects(level, lifts.get(level.name, []))
@@ -363,41 +365,41 @@ def read(files: Files, context: ReadContext) -> Layers:
         for level in levels.values():
             parts[PartKey("topology", level.name, NAME)] = parts[PartKey("topology", level.name, NETWORK)]
     named = [
-        (f"levels.{level.name}.{place}.filename", said)
+        (f"levels.{level.name}.{key}.filename", raw_value)
         for level in levels.values()
-        for place, said in _named(level.said)
+        for key, raw_value in _named(level.said)
     ]
-    found_images = images(files, main, named, context)
-    if found_images and context.wants("resources"):
-        parts[PartKey("resources", GROUND, NAME)] = Resources(found_images)
+    pictures = images(files, main, named, context)
+    if pictures and context.wants("resources"):
+        parts[PartKey("resources", GROUND, NAME)] = Resources(pictures)
     parts = {key: part for key, part in parts.items() if context.wants(key.layer)}
     return Layers(parts, None, tuple(Level(level.name, level.elevation) for level in levels.values()))
 
 
 def _check_crs(parameters: Any) -> None:
     """Refuse a building whose coordinates are said to be of a CRS that does not exist."""
-    said = value_of(parameters, "generate_crs") if isinstance(parameters, dict) else None
-    if said not in (None, ""):
+    crs = value_of(parameters, "generate_crs") if isinstance(parameters, dict) else None
+    if crs not in (None, ""):
         try:
-            check_crs(str(said))
+            check_crs(str(crs))
         except Invalid as error:
             refuse(error.detail, "parameters.generate_crs")
 
 
-def _level(name: str, order: int, said: Any) -> _Level:
-    where = f"levels.{name}"
-    one = dict(mapping(said, where))
-    rows = listing(one.pop("vertices", None), f"{where}.vertices")
-    raw = _rmf.places(rows, f"{where}.vertices")
-    elevation = number(one.get("elevation", 0.0) or 0.0, f"{where}.elevation")
+def _level(name: str, order: int, members: Any) -> _Level:
+    location = f"levels.{name}"
+    one = dict(mapping(members, location))
+    rows = listing(one.pop("vertices", None), f"{location}.vertices")
+    raw = _rmf.places(rows, f"{location}.vertices")
+    elevation = number(one.get("elevation", 0.0) or 0.0, f"{location}.elevation")
     return _Level(name, order, one, raw, rows, elevation)
 
 
 def _reference(top: Mapping[str, Any], levels: Mapping[str, _Level]) -> str:
-    said = top.get("reference_level_name")
-    if said is None or said == "":
+    raw_value = top.get("reference_level_name")
+    if raw_value is None or raw_value == "":
         return next(iter(levels))
-    name = said if isinstance(said, str) else _yaml.text(said)
+    name = raw_value if isinstance(raw_value, str) else _yaml.text(raw_value)
     if name not in levels:
         refuse(f"names the level {name[:80]!r}, which is not there", "reference_level_name")
     return name
@@ -416,12 +418,12 @@ def _scaling(level: _Level) -> Scaling:
     return Scaling(measurements, [(name, x, -y) for name, (x, y) in zip(names, at.tolist(), strict=True)])
 
 
-def _edge(row: Any, where: str) -> tuple[int, int, dict[str, Any], list[Any]]:
+def _edge(row: Any, location: str) -> tuple[int, int, dict[str, Any], list[Any]]:
     """(start, end, parameters, what stands behind them) of a row ``[i, j, {…}]``."""
     if not isinstance(row, list) or len(row) < 2:
-        refuse("must be a list [vertex, vertex, {parameters}]", where)
-    parameters = mapping(row[2] if len(row) > 2 else None, f"{where}[2]")
-    return index(row[0], f"{where}[0]"), index(row[1], f"{where}[1]"), parameters, row[3:]
+        refuse("must be a list [vertex, vertex, {parameters}]", location)
+    parameters = mapping(row[2] if len(row) > 2 else None, f"{location}[2]")
+    return index(row[0], f"{location}[0]"), index(row[1], f"{location}[1]"), parameters, row[3:]
 
 
 def _text(value: Any) -> str:
@@ -429,13 +431,13 @@ def _text(value: Any) -> str:
 
 
 def _node_ids(level: _Level, taken: set[str]) -> list[str]:
-    wanted = []
+    names = []
     for k, row in enumerate(level.rows):
         name = row[3] if len(row) > 3 else ""
         if isinstance(name, (list, dict)):
             refuse("the name of a vertex must be a text", f"{level.where('vertices', k)}[3]")
-        wanted.append(_rmf.short(_text(name)) or f"{_rmf.short(level.name, 200)}/{k}")
-    return unique_ids(wanted, taken)
+        names.append(_rmf.short(_text(name)) or f"{_rmf.short(level.name, 200)}/{k}")
+    return unique_ids(names, taken)
 
 
 class _Reader:
@@ -447,8 +449,8 @@ class _Reader:
 
     def document(self, level: _Level, building: dict[str, Any]) -> dict[str, Any]:
         """What stands in the documents of a level's parts."""
-        rest = {key: value for key, value in level.said.items() if key not in LISTS}
-        out: dict[str, Any] = {"building": building, "level": rest, "order": level.order}
+        extra_members = {key: value for key, value in level.said.items() if key not in LISTS}
+        out: dict[str, Any] = {"building": building, "level": extra_members, "order": level.order}
         if self.system == IMAGE:
             out["transform"] = level.transform.says()
         if level.dangling:
@@ -461,25 +463,25 @@ class _Reader:
         properties: list[Properties] = []
         heights = np.zeros(len(level.rows))
         names = Counter[str]()
-        named, nameless, place = alike("kind", "name", NAME), alike("kind", NAME), alike("index")
+        named, nameless, index_template = alike("kind", "name", NAME), alike("kind", NAME), alike("index")
         for k, row in enumerate(level.rows):
-            said = (named if len(row) > 3 and row[3] != "" else nameless).copy()
-            said["kind"] = "node"
-            rest = place.copy()
-            rest["index"] = k
+            node_properties = (named if len(row) > 3 and row[3] != "" else nameless).copy()
+            node_properties["kind"] = "node"
+            source_properties = index_template.copy()
+            source_properties["index"] = k
             if len(row) > 3 and row[3] != "":
-                said["name"] = _text(row[3])
-                names[said["name"]] += 1
+                node_properties["name"] = _text(row[3])
+                names[node_properties["name"]] += 1
                 if not isinstance(row[3], str):
-                    rest["name"] = row[3]
+                    source_properties["name"] = row[3]
             if len(row) > 2 and row[2] != 0:
                 heights[k] = number(row[2], f"{level.where('vertices', k)}[2]")
             if len(row) > 4 and row[4]:
-                rest["parameters"] = mapping(row[4], f"{level.where('vertices', k)}[4]")
+                source_properties["parameters"] = mapping(row[4], f"{level.where('vertices', k)}[4]")
             if len(row) > 5:
-                rest["more"] = row[5:]
-            said[NAME] = rest
-            properties.append(said)
+                source_properties["more"] = row[5:]
+            node_properties[NAME] = source_properties
+            properties.append(node_properties)
         twice = sorted(name for name, count in names.items() if count > 1)
         if twice:
             self.context.warn(
@@ -491,8 +493,8 @@ class _Reader:
         if high.any():
             geometry[high] = points(np.column_stack([level.at[high], heights[high] + level.elevation]))
         level.rows = []
-        made = (_rmf.short(f"{level.ids[i]}_{level.ids[j]}", 490) for i, j in zip(sources, targets, strict=True))
-        ids = [*level.ids, *unique_ids(made, taken)]
+        edge_names = (_rmf.short(f"{level.ids[i]}_{level.ids[j]}", 490) for i, j in zip(sources, targets, strict=True))
+        ids = [*level.ids, *unique_ids(edge_names, taken)]
         taken.update(islice(ids, len(level.ids), None))
         properties += lanes
         lines = segments(level.at[sources], level.at[targets]) if sources else np.empty(0, object)
@@ -507,40 +509,45 @@ class _Reader:
         out: list[Properties] = []
         unlimited = alike("kind", "source", "target", NAME)
         limited = alike("kind", "source", "target", NAME, "speed_limit")
-        there, back = alike("index", "parameters"), alike("index", "parameters", "reverse")
+        forth, back = alike("index", "parameters"), alike("index", "parameters", "reverse")
 
-        def edge(i: int, j: int, rest: dict[str, Any], limit: float) -> None:
+        def edge(i: int, j: int, source_properties: dict[str, Any], limit: float) -> None:
             sources.append(i)
             targets.append(j)
-            said = (limited if limit else unlimited).copy()
-            said["kind"], said["source"], said["target"], said[NAME] = "edge", level.ids[i], level.ids[j], rest
+            properties = (limited if limit else unlimited).copy()
+            properties["kind"], properties["source"], properties["target"], properties[NAME] = (
+                "edge",
+                level.ids[i],
+                level.ids[j],
+                source_properties,
+            )
             if limit:
-                said["speed_limit"] = limit
-            out.append(said)
+                properties["speed_limit"] = limit
+            out.append(properties)
 
         graphless = loops = 0
         for k, i, j, parameters, more in self._between(level, "lanes"):
-            rest = there.copy()
-            rest["index"], rest["parameters"] = k, parameters
+            source_properties = forth.copy()
+            source_properties["index"], source_properties["parameters"] = k, parameters
             if more:
-                rest["more"] = more
-            said = value_of(parameters, "speed_limit", 0.0)
+                source_properties["more"] = more
+            speed = value_of(parameters, "speed_limit", 0.0)
             limit = 0.0
-            if isinstance(said, (int, float)) and not isinstance(said, bool) and said > 0:
-                limit = float(said)
+            if isinstance(speed, (int, float)) and not isinstance(speed, bool) and speed > 0:
+                limit = float(speed)
             graphless += value_of(parameters, "graph_idx") is None
             loops += i == j
-            edge(i, j, rest, limit)
+            edge(i, j, source_properties, limit)
             if value_of(parameters, "bidirectional") is True:
-                reverse = {**rest, "reverse": True} if more else back.copy()
+                reverse = {**source_properties, "reverse": True} if more else back.copy()
                 reverse["index"], reverse["parameters"], reverse["reverse"] = k, parameters, True
                 edge(j, i, reverse, limit)
-        where = f"levels.{level.name}.lanes"
+        location = f"levels.{level.name}.lanes"
         if loops:
-            self.context.warn(f"{loops} lanes lead from a vertex to itself", where=where)
+            self.context.warn(f"{loops} lanes lead from a vertex to itself", where=location)
         if graphless:
             problem = f"{graphless} lanes have no graph_idx: they are taken as lanes of graph 0"
-            self.context.warn(problem, where=where)
+            self.context.warn(problem, where=location)
         return sources, targets, out
 
     def _between(self, level: _Level, section: str) -> Iterable[tuple[int, int, int, dict[str, Any], list[Any]]]:
@@ -561,39 +568,43 @@ class _Reader:
         """Everything but vertices and lanes."""
         rows: list[tuple[str, Any, Properties]] = []
         prefix = _rmf.short(level.name, 200)
-        place = alike("index", "parameters", "vertices")
+        template = alike("index", "parameters", "vertices")
         for section, kind in LINES.items():
             for k, i, j, parameters, more in self._between(level, section):
-                rest = place.copy()
-                rest["index"], rest["parameters"], rest["vertices"] = k, parameters, [i, j]
+                source_properties = template.copy()
+                source_properties["index"], source_properties["parameters"], source_properties["vertices"] = (
+                    k,
+                    parameters,
+                    [i, j],
+                )
                 if more:
-                    rest["more"] = more
-                said: dict[str, Any] = {"kind": kind, NAME: rest}
+                    source_properties["more"] = more
+                properties: dict[str, Any] = {"kind": kind, NAME: source_properties}
                 name = value_of(parameters, "name")
                 if isinstance(name, str) and name:
-                    said["name"] = name
-                rows.append((f"{prefix}/{kind}/{k}", shapely.LineString(level.at[[i, j]]), said))
+                    properties["name"] = name
+                rows.append((f"{prefix}/{kind}/{k}", shapely.LineString(level.at[[i, j]]), properties))
         for section, kind in RINGS.items():
             for k, one in enumerate(listing(level.said.pop(section, None), f"levels.{level.name}.{section}")):
-                where = level.where(section, k)
-                said = dict(mapping(one, where))
-                corners = listing(said.pop("vertices", None), f"{where}.vertices")
-                ring = [index(v, f"{where}.vertices[{m}]") for m, v in enumerate(corners)]
-                good = [v for v in ring if 0 <= v < len(level.raw)]
-                if len(good) < len(ring):
+                location = level.where(section, k)
+                properties = dict(mapping(one, location))
+                corners = listing(properties.pop("vertices", None), f"{location}.vertices")
+                ring = [index(v, f"{location}.vertices[{m}]") for m, v in enumerate(corners)]
+                valid = [v for v in ring if 0 <= v < len(level.raw)]
+                if len(valid) < len(ring):
                     level.dangling.setdefault(section, []).append(one)
-                    self.context.warn("has vertices that do not exist: kept in the level's document", where=where)
+                    self.context.warn("has vertices that do not exist: kept in the level's document", where=location)
                     continue
-                rest = {"index": k, "vertices": ring, **said}
-                rows.append((f"{prefix}/{kind}/{k}", _ring(level.at[ring]), {"kind": kind, NAME: rest}))
+                source_properties = {"index": k, "vertices": ring, **properties}
+                rows.append((f"{prefix}/{kind}/{k}", _ring(level.at[ring]), {"kind": kind, NAME: source_properties}))
         rows += self._models(level, prefix)
         marks = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
         at = self._at(_rmf.places(marks, f"levels.{level.name}.fiducials"), level)
         for k, row in enumerate(marks):
-            said = {"kind": "fiducial", NAME: {"index": k, **({"more": row[3:]} if len(row) > 3 else {})}}
+            properties = {"kind": "fiducial", NAME: {"index": k, **({"more": row[3:]} if len(row) > 3 else {})}}
             if len(row) > 2:
-                said["name"] = _text(row[2])
-            rows.append((f"{prefix}/fiducial/{k}", shapely.Point(at[k]), said))
+                properties["name"] = _text(row[2])
+            rows.append((f"{prefix}/fiducial/{k}", shapely.Point(at[k]), properties))
         return features([*rows, *lifts], "wgs84" if self.degrees else "local")
 
     def _at(self, raw: Array, level: _Level) -> Array:
@@ -603,45 +614,45 @@ class _Reader:
         listed = listing(level.said.get("models"), f"levels.{level.name}.models")
         raw = np.empty((len(listed), 2))
         for k, one in enumerate(listed):
-            where = level.where("models", k)
-            raw[k] = [number(mapping(one, where).get(axis), f"{where}.{axis}") for axis in "xy"]
+            location = level.where("models", k)
+            raw[k] = [number(mapping(one, location).get(axis), f"{location}.{axis}") for axis in "xy"]
         out: list[tuple[str, Any, Properties]] = []
         for k, (one, (x, y)) in enumerate(zip(listed, self._at(raw, level).tolist(), strict=True)):
-            where = level.where("models", k)
-            rest = {key: value for key, value in one.items() if key not in ("x", "y")}
-            z, yaw = number(rest.get("z", 0.0), f"{where}.z"), number(rest.get("yaw", 0.0), f"{where}.yaw")
-            said: dict[str, Any] = {"kind": "model"}
-            if isinstance(rest.get("name"), str) and rest["name"]:
-                said["name"] = rest.pop("name")
+            location = level.where("models", k)
+            members = {key: value for key, value in one.items() if key not in ("x", "y")}
+            z, yaw = number(members.get("z", 0.0), f"{location}.z"), number(members.get("yaw", 0.0), f"{location}.yaw")
+            properties: dict[str, Any] = {"kind": "model"}
+            if isinstance(members.get("name"), str) and members["name"]:
+                properties["name"] = members.pop("name")
             if not self.degrees:
-                said["pose"] = [x, y, z + level.elevation, 0.0, 0.0, yaw + level.transform.rotation]
-                rest = {key: value for key, value in rest.items() if key != "yaw" and (key != "z" or value == 0)}
-            said[NAME] = {"index": k, "says": rest}
-            out.append((f"{prefix}/model/{k}", shapely.Point(x, y), said))
+                properties["pose"] = [x, y, z + level.elevation, 0.0, 0.0, yaw + level.transform.rotation]
+                members = {key: value for key, value in members.items() if key != "yaw" and (key != "z" or value == 0)}
+            properties[NAME] = {"index": k, "says": members}
+            out.append((f"{prefix}/model/{k}", shapely.Point(x, y), properties))
         return out
 
     def lifts(self, listed: Mapping[str, Any]) -> dict[str, list[tuple[str, Any, Properties]]]:
         """The lifts by the level whose floor plan they are drawn on."""
         out: dict[str, list[tuple[str, Any, Properties]]] = {}
         for k, (name, one) in enumerate(listed.items()):
-            where = f"lifts.{name}"
-            rest = dict(mapping(one, where))
-            floor = _text(rest.get("reference_floor_name")) or self.reference
+            location = f"lifts.{name}"
+            members = dict(mapping(one, location))
+            floor = _text(members.get("reference_floor_name")) or self.reference
             if floor not in self.levels:
                 problem = f"names the level {floor[:80]!r}, which is not there: {self.reference} is taken"
-                self.context.warn(problem, where=f"{where}.reference_floor_name")
+                self.context.warn(problem, where=f"{location}.reference_floor_name")
                 floor = self.reference
-            x, y = (number(rest.pop(axis, None), f"{where}.{axis}") for axis in "xy")
-            yaw = number(rest.get("yaw", 0.0), f"{where}.yaw")
-            width, depth = (number(rest.pop(key, None), f"{where}.{key}") for key in ("width", "depth"))
+            x, y = (number(members.pop(axis, None), f"{location}.{axis}") for axis in "xy")
+            yaw = number(members.get("yaw", 0.0), f"{location}.yaw")
+            width, depth = (number(members.pop(key, None), f"{location}.{key}") for key in ("width", "depth"))
             at = self._at(np.array([[x, y]]), self.levels[floor])[0].tolist()
-            said: dict[str, Any] = {"kind": "lift", "name": name, "size": [width, depth, _rmf.CABIN_HEIGHT]}
+            properties: dict[str, Any] = {"kind": "lift", "name": name, "size": [width, depth, _rmf.CABIN_HEIGHT]}
             if not self.degrees:
                 # The tools take a lift's yaw as it stands, on whatever floor plan it was drawn.
-                said["pose"] = [*at, self.levels[floor].elevation, 0.0, 0.0, yaw]
-                rest.pop("yaw", None)
-            said[NAME] = {"index": k, "says": rest}
-            row = (f"{_rmf.short(floor, 200)}/lift/{_rmf.short(name)}", shapely.Point(at), said)
+                properties["pose"] = [*at, self.levels[floor].elevation, 0.0, 0.0, yaw]
+                members.pop("yaw", None)
+            properties[NAME] = {"index": k, "says": members}
+            row = (f"{_rmf.short(floor, 200)}/lift/{_rmf.short(name)}", shapely.Point(at), properties)
             out.setdefault(floor, []).append(row)
         return out
 
@@ -663,12 +674,12 @@ _FILENAME = re.compile(
 )
 
 
-def _named(said: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+def _named(members: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     """(place, file name) of the images that a level's document names."""
-    drawing = said.get("drawing")
+    drawing = members.get("drawing")
     if isinstance(drawing, dict) and isinstance(drawing.get("filename"), str):
         yield "drawing", drawing["filename"]
-    layers = said.get("layers")
+    layers = members.get("layers")
     for name, layer in layers.items() if isinstance(layers, dict) else ():
         if isinstance(layer, dict) and isinstance(layer.get("filename"), str):
             yield f"layers.{name}", layer["filename"]
@@ -692,23 +703,23 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     resources: dict[str, bytes] = {}
     for part in layers.of("resources", name=NAME).values():
         resources.update(part.files if isinstance(part, Resources) else {})
-    known: list[dict[str, Any]] = []
+    buildings: list[dict[str, Any]] = []
     for storey in storeys:
-        said = storey.document.get("building")
-        if isinstance(said, dict) and said not in known:
-            known.append(said)
-    systems = {said.get("coordinate_system", IMAGE) for said in known}
-    system = systems.pop() if len(systems) == 1 and (len(known) == 1 or systems == {METRIC}) else METRIC
-    why = "the levels come from different buildings" if len(known) > 1 and system == METRIC else ""
+        building = storey.document.get("building")
+        if isinstance(building, dict) and building not in buildings:
+            buildings.append(building)
+    systems = {building.get("coordinate_system", IMAGE) for building in buildings}
+    system = systems.pop() if len(systems) == 1 and (len(buildings) == 1 or systems == {METRIC}) else METRIC
+    why = "the levels come from different buildings" if len(buildings) > 1 and system == METRIC else ""
     draft = WriteContext(context.title, context.options, context.attribution)
     try:
-        files = _Writer(layers, draft, storeys, known[0] if known else {}, system, resources, why).files()
+        files = _Writer(layers, draft, storeys, buildings[0] if buildings else {}, system, resources, why).files()
         context.dropped += draft.dropped
         context.template += draft.template
         context.warnings += draft.warnings
         return files
     except _RewriteError as changed:
-        return _Writer(layers, context, storeys, known[0], METRIC, resources, str(changed)).files()
+        return _Writer(layers, context, storeys, buildings[0], METRIC, resources, str(changed)).files()
 
 
 Sections = dict[str, list[str]]
@@ -733,20 +744,20 @@ class _Vertices:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def at(self, place: tuple[str, str], hint: Any) -> int:
+    def at(self, position: tuple[str, str], hint: Any) -> int:
         """The vertex at this place (x and y as texts): the one it stood on, else any, else a new one."""
-        start = f"[{place[0]}, {place[1]}, "
-        known = self._old.get(hint) if isinstance(hint, int) else None
-        if known is not None and self.rows[known].startswith(start):
-            return known
+        start = f"[{position[0]}, {position[1]}, "
+        old_row = self._old.get(hint) if isinstance(hint, int) else None
+        if old_row is not None and self.rows[old_row].startswith(start):
+            return old_row
         if not self._by_place:  # most maps need it nowhere
             for k, row in enumerate(self.rows):
                 self._by_place.setdefault(", ".join(row.split(", ", 2)[:2]) + ", ", k)
-        found = self._by_place.get(start)
-        if found is None:
-            found = self._by_place[start] = len(self.rows)
+        new_row = self._by_place.get(start)
+        if new_row is None:
+            new_row = self._by_place[start] = len(self.rows)
             self.rows.append(f"{start}0.0, '']")
-        return found
+        return new_row
 
 
 class _Writer:
@@ -777,14 +788,14 @@ class _Writer:
         self.used: dict[str, bytes] = {}
         self.scaling: dict[str, Scaling] = {}
         self.transforms = {s.name: self._transform(s) for s in storeys}
-        said = self.building.get("reference_level_name")
-        self.reference = _text(said) if _text(said) in self.transforms else storeys[0].name
+        reference = self.building.get("reference_level_name")
+        self.reference = _text(reference) if _text(reference) in self.transforms else storeys[0].name
 
     def _transform(self, storey: Storey) -> Transform:
-        said = storey.document.get("transform")
-        if self.system != IMAGE or not isinstance(said, list) or len(said) != 4:
+        values = storey.document.get("transform")
+        if self.system != IMAGE or not isinstance(values, list) or len(values) != 4:
             return Transform()
-        return Transform(said[0], said[1], (said[2], said[3]))
+        return Transform(values[0], values[1], (values[2], values[3]))
 
     def files(self) -> dict[str, bytes]:
         """``building.yaml``, then the images."""
@@ -804,11 +815,11 @@ class _Writer:
     def _top(self) -> dict[str, Any]:
         top = {key: value for key, value in self.building.items() if key not in ("levels", "lifts")}
         if "name" not in top and "building_name" not in top:
-            said = self._graph_name()
-            usual = self.options.building or self.context.title
-            top["name"] = usual if said is None else said
-            if said is None:
-                self.context.fill("name", usual, "no source names the building", "building")
+            name = self._graph_name()
+            default = self.options.building or self.context.title
+            top["name"] = default if name is None else name
+            if name is None:
+                self.context.fill("name", default, "no source names the building", "building")
         if self.system != IMAGE or "coordinate_system" in top:
             top["coordinate_system"] = self.system
         if "reference_level_name" in top and _text(top["reference_level_name"]) not in self.transforms:
@@ -836,110 +847,114 @@ class _Writer:
 
     def _check(self) -> None:
         """Whether a reader of this file places the levels where they are."""
-        found = transforms(self.scaling, self.reference, lambda problem, where: None)
+        level_transforms = transforms(self.scaling, self.reference, lambda problem, location: None)
         for name, transform in self.transforms.items():
-            if not transform.near(found[name]):
+            if not transform.near(level_transforms[name]):
                 raise _RewriteError(f"measurements and fiducials no longer place level {name} where it is")
 
     # places
 
-    def _coordinates(self, part: Features, where: NDArray[np.intp], storey: str) -> tuple[Array, NDArray[np.intp]]:
+    def _coordinates(self, part: Features, indices: NDArray[np.intp], storey: str) -> tuple[Array, NDArray[np.intp]]:
         """The file's x and y of all coordinates of these items, and the item each belongs to."""
-        geometry = part.geometry[where]
-        if (part.local[where] == self.degrees).any():
-            chosen, frame = part.take(where), self.layers.frame
-            geometry = chosen.in_wgs84(frame) if self.degrees else chosen.in_local(frame)
+        geometry = part.geometry[indices]
+        if (part.local[indices] == self.degrees).any():
+            subset, frame = part.take(indices), self.layers.frame
+            geometry = subset.in_wgs84(frame) if self.degrees else subset.in_local(frame)
         at, owner = shapely.get_coordinates(geometry, return_index=True)
         return _to_file(self.system, at, self.transforms[storey]), owner
 
     def _texts(self, raw: Array) -> list[tuple[str, str]]:
-        said = list(map(_yaml.decimal, numbers(raw.ravel(), self.decimals)))
-        return list(zip(said[::2], said[1::2], strict=True))
+        texts = list(map(_yaml.decimal, numbers(raw.ravel(), self.decimals)))
+        return list(zip(texts[::2], texts[1::2], strict=True))
 
     # levels
 
     def _elevation(self, storey: Storey) -> Any:
         """As the level says it, unless the environment knows better."""
-        said = mapping(storey.document.get("level"), "level").get("elevation", 0.0)
-        known = next((level.elevation for level in self.layers.levels if level.name == storey.name), None)
-        return said if known is None or said == known else known
+        source_elevation = mapping(storey.document.get("level"), "level").get("elevation", 0.0)
+        elevation = next((level.elevation for level in self.layers.levels if level.name == storey.name), None)
+        return source_elevation if elevation is None or source_elevation == elevation else elevation
 
     def _level(self, storey: Storey) -> list[str]:
         """The level's lines, in pieces."""
-        rest = dict(mapping(storey.document.get("level"), "level"))
+        members = dict(mapping(storey.document.get("level"), "level"))
         if self.converted:
-            lost = sorted(key for key in rest if key in IN_PIXELS and rest[key])
-            self.lost["what levels say in pixels of their drawing"] += len(lost)
-            rest = {key: value for key, value in rest.items() if key not in IN_PIXELS}
-        rest["elevation"] = self._elevation(storey)
-        self._drawings(rest, storey.name)
+            dropped_keys = sorted(key for key in members if key in IN_PIXELS and members[key])
+            self.lost["what levels say in pixels of their drawing"] += len(dropped_keys)
+            members = {key: value for key, value in members.items() if key not in IN_PIXELS}
+        members["elevation"] = self._elevation(storey)
+        self._drawings(members, storey.name)
         vertices, ids = self._nodes(storey)
         sections: Sections = {"lanes": _lines_of(self._lanes(storey, ids))}
         self._objects(storey, vertices, sections)
         self._dangling(storey, vertices, sections)
         sections["vertices"] = _lines_of(vertices.rows)
         out = [f"  {_yaml.text(storey.name)}:\n"]
-        for key in sorted({*rest, *(k for k, rows in sections.items() if rows)}):
+        for key in sorted({*members, *(k for k, rows in sections.items() if rows)}):
             if key in sections:
                 out.append(f"    {key}:\n")
                 out += sections[key]
             else:
-                out.append(_yaml.mapping({key: rest[key]}, 4))
+                out.append(_yaml.mapping({key: members[key]}, 4))
         return out
 
-    def _drawings(self, rest: dict[str, Any], level: str) -> None:
+    def _drawings(self, members: dict[str, Any], level: str) -> None:
         """Take along the images that the level names, under names that stay below the building's folder."""
-        for place, said in list(_named(rest)):
-            name = stored(said, self.resources)
+        for key, image in list(_named(members)):
+            name = stored(image, self.resources)
             if name is None:
-                if said:
-                    problem = f"the image {said[:200]!r} was not in the upload: it is named and not served"
-                    self.context.warn(problem, where=f"levels.{level}.{place}.filename")
+                if image:
+                    problem = f"the image {image[:200]!r} was not in the upload: it is named and not served"
+                    self.context.warn(problem, where=f"levels.{level}.{key}.filename")
                 continue
             self.used[name] = self.resources[name]
-            if name != said:
-                outer, _, inner = place.partition(".")
+            if name != image:
+                outer, _, inner = key.partition(".")
                 if inner:
-                    rest[outer] = {**rest[outer], inner: {**rest[outer][inner], "filename": name}}
+                    members[outer] = {**members[outer], inner: {**members[outer][inner], "filename": name}}
                 else:
-                    rest[outer] = {**rest[outer], "filename": name}
+                    members[outer] = {**members[outer], "filename": name}
 
     def _nodes(self, storey: Storey) -> tuple[_Vertices, dict[str, int]]:
         """The nodes as vertices in their old order, and each id's place among them."""
         elevation = float(self._elevation(storey))
-        found: list[tuple[tuple[bool, int, int, str], str]] = []
+        nodes: list[tuple[tuple[bool, int, int, str], str]] = []
         for part in storey.networks:
             point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
             node: NDArray[np.bool_] = np.array([p.get("kind") == "node" for p in part.properties], bool)
             self.lost["nodes without a point"] += int((node & ~point).sum())
-            where = np.flatnonzero(node & point)
-            raw, _ = self._coordinates(part, where, storey.name)
-            z = shapely.get_z(part.geometry[where])
-            for k, place, high in zip(where.tolist(), self._texts(raw), z.tolist(), strict=True):
+            indices = np.flatnonzero(node & point)
+            raw, _ = self._coordinates(part, indices, storey.name)
+            z = shapely.get_z(part.geometry[indices])
+            for k, position, high in zip(indices.tolist(), self._texts(raw), z.tolist(), strict=True):
                 p = part.properties[k]
                 at = own(p, NAME).get("index")
-                known = isinstance(at, int)
-                key = (not known, at if isinstance(at, int) else 0, len(part.ids[k]), part.ids[k])
+                has_index = isinstance(at, int)
+                key = (not has_index, at if isinstance(at, int) else 0, len(part.ids[k]), part.ids[k])
                 height = 0.0 if math.isnan(high) else high - elevation
-                row = self._vertex(part.ids[k], p, place, height, self.robots.at(storey.name, part.ids[k]))
-                found.append((key, row))
-        found.sort(key=lambda item: item[0])
+                row = self._vertex(part.ids[k], p, position, height, self.robots.at(storey.name, part.ids[k]))
+                nodes.append((key, row))
+        nodes.sort(key=lambda item: item[0])
         ids: dict[str, int] = {}
         old: dict[int, int] = {}
-        for k, ((unknown, was, _, i), _) in enumerate(found):
+        for k, ((unknown, was, _, i), _) in enumerate(nodes):
             ids.setdefault(i, k)
             if not unknown:
                 old.setdefault(was, k)
-        return _Vertices([row for _, row in found], old), ids
+        return _Vertices([row for _, row in nodes], old), ids
 
-    def _vertex(self, i: str, p: Properties, place: tuple[str, str], z: float, further: Mapping[str, Any]) -> str:
-        rest = own(p, NAME)
-        said = p.get("name")
-        parameters = rest.get("parameters")
+    def _vertex(self, i: str, p: Properties, position: tuple[str, str], z: float, further: Mapping[str, Any]) -> str:
+        source_members = own(p, NAME)
+        title = p.get("name")
+        parameters = source_members.get("parameters")
         if NAME in p:
-            name = rest["name"] if "name" in rest and _text(rest["name"]) == said else said or ""
+            name = (
+                source_members["name"]
+                if "name" in source_members and _text(source_members["name"]) == title
+                else title or ""
+            )
         else:
-            name = said if isinstance(said, str) and (said or NAV_GRAPH in p) else "" if NAV_GRAPH in p else i
+            name = title if isinstance(title, str) and (title or NAV_GRAPH in p) else "" if NAV_GRAPH in p else i
             graph = mapping(own(p, NAV_GRAPH).get("parameters"), "parameters")
             parameters = {key: _rmf.typed(value) for key, value in graph.items() if key not in ("name", "lift")}
             self.lost["nodes' attributes of other formats"] += any(
@@ -948,10 +963,10 @@ class _Writer:
         if further:
             parameters = {**(parameters or {}), **{key: _rmf.typed(value) for key, value in further.items()}}
         self.lost["nodes' orientations"] += p.get("orientation") is not None
-        row = f"[{place[0]}, {place[1]}, {_yaml.text(round(z, METRES) + 0.0)}, {_yaml.text(name)}"
-        if parameters or rest.get("more"):
+        row = f"[{position[0]}, {position[1]}, {_yaml.text(round(z, METRES) + 0.0)}, {_yaml.text(name)}"
+        if parameters or source_members.get("more"):
             row += f", {self.flow(parameters or {})}"
-        return row + "".join(f", {self.flow(v)}" for v in rest.get("more") or ()) + "]"
+        return row + "".join(f", {self.flow(v)}" for v in source_members.get("more") or ()) + "]"
 
     # lanes
 
@@ -980,15 +995,15 @@ class _Writer:
                 continue
             self.lost["edges' actions"] += p.get("action") is not None
             self.lost["edges' widths"] += p.get("width") is not None
-            rest = own(p, NAME)
+            source_members = own(p, NAME)
             if NAME not in p:
                 self.made["lanes"] += NAV_GRAPH not in p
-                rest = {"parameters": _lane_parameters(p, self.options)}
+                source_members = {"parameters": _lane_parameters(p, self.options)}
                 self.lost["edges' attributes of other formats"] += any(
                     isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
                 )
             limit = _rmf.limit(p) or (self.options.speed_limit if NAME not in p and NAV_GRAPH not in p else 0.0)
-            yield _Lane.of(limit, rest, source, target, self.flow)
+            yield _Lane.of(limit, source_members, source, target, self.flow)
 
     def _dangling(self, storey: Storey, vertices: _Vertices, sections: Sections) -> None:
         """Rows to vertices that did not exist come back where they still do not."""
@@ -1006,7 +1021,7 @@ class _Writer:
 
     def _objects(self, storey: Storey, vertices: _Vertices, sections: Sections) -> None:
         sections_of = {kind: section for section, kind in {**LINES, **RINGS}.items()}
-        found: dict[str, list[tuple[tuple[bool, int, str], str]]] = {}
+        rows_by_section: dict[str, list[tuple[tuple[bool, int, str], str]]] = {}
         scaling = Scaling([], [])
         for part in storey.objects:
             everything = np.arange(len(part))
@@ -1018,7 +1033,7 @@ class _Writer:
             for k in order:
                 p = part.properties[k]
                 kind, at = p.get("kind"), texts[first[k] : last[k]]
-                where = raw[first[k] : last[k]]
+                coordinates = raw[first[k] : last[k]]
                 key = _place(part.ids[k], p)
                 if kind == "lift":
                     continue
@@ -1027,47 +1042,47 @@ class _Writer:
                     self.lost["bends of walls, doors and measurements"] += int(len(at) > 2)
                     if kind == "measurement":
                         metres = value_of(parameters, "distance", 0.0)
-                        length = math.dist(where[0], where[-1])
+                        length = math.dist(coordinates[0], coordinates[-1])
                         scaling.measurements.append((length, float(metres)))
-                    found.setdefault(sections_of[str(kind)], []).append((key, row))
+                    rows_by_section.setdefault(sections_of[str(kind)], []).append((key, row))
                 elif kind in RINGS.values() and len(at):
                     rows = [(key, row) for row in self._rings(p, part.geometry[k], vertices, at)]
-                    found.setdefault(sections_of[str(kind)], []).extend(rows)
+                    rows_by_section.setdefault(sections_of[str(kind)], []).extend(rows)
                 elif kind == "model" and len(at) == 1:
-                    found.setdefault("models", []).append((key, self._model(p, at[0], storey)))
+                    rows_by_section.setdefault("models", []).append((key, self._model(p, at[0], storey)))
                 elif kind == "fiducial" and len(at) == 1:
                     name = str(p.get("name") or "")
                     more = own(p, NAME).get("more") or []
                     row = f"[{at[0][0]}, {at[0][1]}, {_yaml.text(name)}{''.join(', ' + self.flow(v) for v in more)}]"
-                    found.setdefault("fiducials", []).append((key, row))
+                    rows_by_section.setdefault("fiducials", []).append((key, row))
                     scaling.fiducials.append((name, float(at[0][0]), -float(at[0][1])))
                 else:
                     self.lost["objects that are no part of a building"] += 1
-        for section, rows_of in found.items():
+        for section, rows_of in rows_by_section.items():
             sections[section] = _lines_of(row for _, row in sorted(rows_of, key=lambda item: item[0]))
         self.scaling[storey.name] = scaling
 
     def _line(self, p: Properties, vertices: _Vertices, ends: list[tuple[str, str]]) -> tuple[str, dict[str, Any]]:
-        rest = own(p, NAME)
-        hints = rest.get("vertices")
+        source_members = own(p, NAME)
+        hints = source_members.get("vertices")
         hints = hints if isinstance(hints, list) and len(hints) == 2 else [None, None]
-        i, j = (vertices.at(place, hint) for place, hint in zip(ends, hints, strict=True))
-        parameters = dict(mapping(rest.get("parameters"), "parameters"))
-        if p.get("kind") == "door" and "parameters" not in rest:
+        i, j = (vertices.at(position, hint) for position, hint in zip(ends, hints, strict=True))
+        parameters = dict(mapping(source_members.get("parameters"), "parameters"))
+        if p.get("kind") == "door" and "parameters" not in source_members:
             parameters = dict(DOOR_TEMPLATE)
             self.made["doors"] += 1
         name = p.get("name")
         if isinstance(name, str) and name and value_of(parameters, "name") != name:
             parameters["name"] = [1, name]
-        more = "".join(f", {self.flow(v)}" for v in rest.get("more") or ())
+        more = "".join(f", {self.flow(v)}" for v in source_members.get("more") or ())
         return f"[{i}, {j}, {self.flow(parameters)}{more}]", parameters
 
     def _rings(self, p: Properties, geometry: Any, vertices: _Vertices, texts: list[tuple[str, str]]) -> Iterable[str]:
-        rest = own(p, NAME)
-        said = {key: value for key, value in rest.items() if key not in ("index", "vertices")}
-        said.setdefault("parameters", {})
-        said_hints = rest.get("vertices")
-        hints: list[Any] = said_hints if isinstance(said_hints, list) else []
+        source_members = own(p, NAME)
+        members = {key: value for key, value in source_members.items() if key not in ("index", "vertices")}
+        members.setdefault("parameters", {})
+        source_hints = source_members.get("vertices")
+        hints: list[Any] = source_hints if isinstance(source_hints, list) else []
         pieces = list(geometry.geoms) if geometry.geom_type == "MultiPolygon" else [geometry]
         done = 0
         for piece in pieces:
@@ -1079,28 +1094,28 @@ class _Writer:
                 ring = ring[: len(piece.exterior.coords)]
                 if len(ring) != len(hints):  # a polygon repeats its first corner, a floor need not
                     ring = ring[:-1]
-            known = hints if len(hints) == len(ring) else [None] * len(ring)
-            corners = [vertices.at(place, hint) for place, hint in zip(ring, known, strict=True)]
-            yield self.flow({**said, "vertices": corners})
+            corner_hints = hints if len(hints) == len(ring) else [None] * len(ring)
+            corners = [vertices.at(position, hint) for position, hint in zip(ring, corner_hints, strict=True)]
+            yield self.flow({**members, "vertices": corners})
 
-    def _model(self, p: Properties, place: tuple[str, str], storey: Storey) -> str:
-        rest = dict(mapping(own(p, NAME).get("says"), "says"))
+    def _model(self, p: Properties, position: tuple[str, str], storey: Storey) -> str:
+        members = dict(mapping(own(p, NAME).get("says"), "says"))
         pose = _rmf.pose_of(p)
         if pose is not None and not self.degrees:
             z = round(pose[2] - float(self._elevation(storey)), METRES) + 0.0
-            if z or "z" not in rest:
-                rest["z"] = z
-            rest["yaw"] = round(pose[5] - self.transforms[storey.name].rotation, DEGREES) + 0.0
+            if z or "z" not in members:
+                members["z"] = z
+            members["yaw"] = round(pose[5] - self.transforms[storey.name].rotation, DEGREES) + 0.0
             self.lost["models' roll and pitch"] += bool(pose[3] or pose[4])
-        rest.setdefault("yaw", 0.0)
+        members.setdefault("yaw", 0.0)
         if isinstance(p.get("name"), str):
-            rest["name"] = p["name"]
-        rest["x"], rest["y"] = (float(v) for v in place)
-        return self.flow(rest)
+            members["name"] = p["name"]
+        members["x"], members["y"] = (float(v) for v in position)
+        return self.flow(members)
 
     def _lifts(self) -> str:
         """The lifts of all levels, in the order of their file."""
-        found: list[tuple[tuple[bool, int, str], str, dict[str, Any]]] = []
+        lifts: list[tuple[tuple[bool, int, str], str, dict[str, Any]]] = []
         for storey in self.storeys:
             for part in storey.objects:
                 for k, p in enumerate(part.properties):
@@ -1109,37 +1124,37 @@ class _Writer:
                     if int(shapely.get_type_id(part.geometry[k])) != 0 or part.geometry[k].is_empty:
                         self.lost["lifts without a point"] += 1
                         continue
-                    rest = dict(mapping(own(p, NAME).get("says"), "says"))
-                    floor = _text(rest.get("reference_floor_name"))
+                    members = dict(mapping(own(p, NAME).get("says"), "says"))
+                    floor = _text(members.get("reference_floor_name"))
                     floor = floor if floor in self.transforms else self.reference
                     raw, _ = self._coordinates(part, np.array([k]), floor)
                     (x, y) = self._texts(raw)[0]
-                    rest["x"], rest["y"] = float(x), float(y)
+                    members["x"], members["y"] = float(x), float(y)
                     size = _rmf.size_of(p) or (1.0, 1.0)
-                    rest["width"], rest["depth"] = size
+                    members["width"], members["depth"] = size
                     pose = _rmf.pose_of(p)
                     if pose is not None and not self.degrees:
-                        rest["yaw"] = round(pose[5], DEGREES) + 0.0
-                    rest.setdefault("yaw", 0.0)
+                        members["yaw"] = round(pose[5], DEGREES) + 0.0
+                    members.setdefault("yaw", 0.0)
                     if NAME not in p:
                         self.made["lifts"] += 1
                         served = self._served(str(p.get("name")))
-                        rest |= {"doors": {}, "level_doors": served, "reference_floor_name": floor, "plugins": True}
-                    found.append((_place(part.ids[k], p), str(p.get("name") or part.ids[k]), rest))
-        found.sort(key=lambda item: item[0])
-        names = unique_ids(name for _, name, _ in found)
-        if not found:
+                        members |= {"doors": {}, "level_doors": served, "reference_floor_name": floor, "plugins": True}
+                    lifts.append((_place(part.ids[k], p), str(p.get("name") or part.ids[k]), members))
+        lifts.sort(key=lambda item: item[0])
+        names = unique_ids(name for _, name, _ in lifts)
+        if not lifts:
             return "lifts: {}\n"
         # The first lift whose shaft holds a vertex is the vertex' lift, so their order is kept.
-        said = zip(names, found, strict=True)
-        return "lifts:\n" + "".join(_yaml.mapping({name: rest}, 2) for name, (_, _, rest) in said)
+        rows = zip(names, lifts, strict=True)
+        return "lifts:\n" + "".join(_yaml.mapping({name: members}, 2) for name, (_, _, members) in rows)
 
     def _report(self) -> None:
         if self.why:
-            what = "cartesian_meters is written instead of the source's coordinates"
-            self.context.warn(f"{self.why}: {what}", file=FILE, where="coordinate_system")
-        for what, count in sorted(self.lost.items()):
-            self.context.drop(what, count, "a building in these coordinates has no place for it")
+            text = "cartesian_meters is written instead of the source's coordinates"
+            self.context.warn(f"{self.why}: {text}", file=FILE, where="coordinate_system")
+        for text, count in sorted(self.lost.items()):
+            self.context.drop(text, count, "a building in these coordinates has no place for it")
         if self.made["lanes"]:
             why = f"{self.made['lanes']} edges come from another format"
             self.context.fill("lanes: graph_idx", self.options.graph, why, "graph")
@@ -1148,8 +1163,10 @@ class _Writer:
             self.context.fill("lanes: orientation", LANE_TEMPLATE["orientation"][1], why)
         self.robots.report(self.context)
         if self.made["doors"]:
-            said = {key: value[1] for key, value in DOOR_TEMPLATE.items()}
-            self.context.fill("doors: parameters", said, f"{self.made['doors']} doors come from a navigation graph")
+            parameters = {key: value[1] for key, value in DOOR_TEMPLATE.items()}
+            self.context.fill(
+                "doors: parameters", parameters, f"{self.made['doors']} doors come from a navigation graph"
+            )
         if self.made["lifts"]:
             why = f"{self.made['lifts']} lifts come from a navigation graph"
             self.context.fill(
@@ -1162,8 +1179,8 @@ class _Writer:
 def _place(i: str, p: Properties) -> tuple[bool, int, str]:
     """The order of items in their list: as in the file, then by id."""
     at = own(p, NAME).get("index", own(p, NAV_GRAPH).get("index"))
-    known = isinstance(at, int)
-    return (not known, at if isinstance(at, int) else 0, i)
+    has_index = isinstance(at, int)
+    return (not has_index, at if isinstance(at, int) else 0, i)
 
 
 def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
@@ -1177,10 +1194,10 @@ def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
 
     def key(item: tuple[str, Properties]) -> tuple[bool, int, bool, int, str]:
         i, p = item
-        rest = own(p, NAME)
-        was = rest.get("index")
-        known = isinstance(was, int)
-        return (not known, was if isinstance(was, int) else 0, rest.get("reverse") is True, len(i), i)
+        source_members = own(p, NAME)
+        was = source_members.get("index")
+        has_index = isinstance(was, int)
+        return (not has_index, was if isinstance(was, int) else 0, source_members.get("reverse") is True, len(i), i)
 
     # As they were read they are in order: then none is held.
     return each() if all(a <= b for a, b in pairwise(map(key, each()))) else sorted(each(), key=key)
@@ -1200,10 +1217,10 @@ def _lane_parameters(p: Properties, options: _rmf.WriteOptions) -> dict[str, Any
     if NAV_GRAPH not in p:
         out["graph_idx"] = [2, options.graph]
     graph = own(p, NAV_GRAPH)
-    said = mapping(graph.get("parameters"), "parameters")
+    graph_parameters = mapping(graph.get("parameters"), "parameters")
     if isinstance(graph.get("graph"), int):
         out["graph_idx"] = [2, graph["graph"]]
-    for key, value in said.items():
+    for key, value in graph_parameters.items():
         if key == "orientation_constraint":
             out["orientation"] = [1, value]
         elif key not in ("door_name", "speed_limit", "is_bidirectional", "dock_name", "undock_name"):
@@ -1226,18 +1243,18 @@ class _Lane:
     both: bool = False
 
     @classmethod
-    def of(cls, limit: float, rest: Mapping[str, Any], source: int, target: int, flow: Flow) -> _Lane:
+    def of(cls, limit: float, source_members: Mapping[str, Any], source: int, target: int, flow: Flow) -> _Lane:
         """The edge with this speed limit (0: none); rest: what is known of its lane."""
-        was = rest.get("index") if isinstance(rest.get("index"), int) else None
-        reverse = rest.get("reverse") is True
-        parameters = mapping(rest.get("parameters"), "parameters")
-        said = value_of(parameters, "speed_limit", 0.0)
-        if (said if isinstance(said, (int, float)) and said > 0 else 0.0) != limit:
+        was = source_members.get("index") if isinstance(source_members.get("index"), int) else None
+        reverse = source_members.get("reverse") is True
+        parameters = mapping(source_members.get("parameters"), "parameters")
+        speed = value_of(parameters, "speed_limit", 0.0)
+        if (speed if isinstance(speed, (int, float)) and speed > 0 else 0.0) != limit:
             parameters = {**parameters, "speed_limit": [3, limit]}
         signature = str(was)
         if was is None:
             signature = flow({k: v for k, v in parameters.items() if k != "orientation"})
-        more = rest.get("more")
+        more = source_members.get("more")
         return cls(source, target, was, reverse, limit, parameters, more if isinstance(more, list) else (), signature)
 
     def _orientation(self) -> Any:
@@ -1245,13 +1262,13 @@ class _Lane:
 
     def says(self) -> Any:
         """Equal for edges that could be one."""
-        kept = self._orientation() if self.was is None else self.reverse
-        return (self.source, self.target, self.limit, self.signature, kept)
+        direction = self._orientation() if self.was is None else self.reverse
+        return (self.source, self.target, self.limit, self.signature, direction)
 
     def partner(self) -> Any:
         """What the edge back says, if both are one two-way lane."""
-        kept = _rmf.turned(self._orientation()) if self.was is None else not self.reverse
-        return (self.target, self.source, self.limit, self.signature, kept)
+        direction = _rmf.turned(self._orientation()) if self.was is None else not self.reverse
+        return (self.target, self.source, self.limit, self.signature, direction)
 
     def row(self, flow: Flow) -> str:
         """The lane's row."""

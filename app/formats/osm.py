@@ -124,12 +124,12 @@ def direction(tags: Mapping[str, Any]) -> Direction:
     ``oneway`` decides. Without it roundabouts and motorways are one-way, their links too: to drive against a link's
     traffic is worse than not to drive there. A reversible way is taken as it was drawn, never in both directions.
     """
-    said = str(tags.get("oneway", "")).strip().lower()
-    if said in _FORWARD:
+    oneway = str(tags.get("oneway", "")).strip().lower()
+    if oneway in _FORWARD:
         return "forward"
-    if said in _BACKWARD:
+    if oneway in _BACKWARD:
         return "backward"
-    if said in _NO:
+    if oneway in _NO:
         return "both"
     implied = tags.get("junction") in ("roundabout", "circular") or tags.get("highway") in ("motorway", "motorway_link")
     return "forward" if implied else "both"
@@ -152,12 +152,12 @@ KINDS: Mapping[str, Mapping[Any, str]] = {
 
 def kind_of(tags: Mapping[str, Any], otherwise: str) -> str:
     """The key of the main tag, or what its value says more plainly."""
-    found = next((key for key in MAIN_TAGS if key in tags and tags[key] != "no"), None)
-    if found is None:
+    main_key = next((key for key in MAIN_TAGS if key in tags and tags[key] != "no"), None)
+    if main_key is None:
         return str(tags["type"]) if otherwise == "relation" and tags.get("type") else otherwise
-    if found in KINDS:
-        return KINDS[found].get(tags[found], found)
-    return "building" if found == "building:part" else found
+    if main_key in KINDS:
+        return KINDS[main_key].get(tags[main_key], main_key)
+    return "building" if main_key == "building:part" else main_key
 
 
 _MEASURES = frozenset({"height", "building:levels", "min_height", "building:min_level", "width", "est_width"})
@@ -176,15 +176,15 @@ def object_words(tags: Mapping[str, Any]) -> dict[str, Any]:
         out["name"] = name
     if "highway" in tags or _MEASURES.isdisjoint(tags):
         return out
-    found = {"height": osm_tags.height(tags), "base": osm_tags.base(tags), "width": osm_tags.width(tags)}
-    return out | {word: value for word, value in found.items() if value is not None}
+    values = {"height": osm_tags.height(tags), "base": osm_tags.base(tags), "width": osm_tags.width(tags)}
+    return out | {key: value for key, value in values.items() if value is not None}
 
 
-def edge_words(tags: Mapping[str, Any], way: Literal["forward", "backward"]) -> dict[str, Any]:
+def edge_words(tags: Mapping[str, Any], heading: Literal["forward", "backward"]) -> dict[str, Any]:
     """The canonical words that a highway's tags say of its edges in one direction."""
     out: dict[str, Any] = {}
     if not _EDGE_TAGS.isdisjoint(tags):
-        if limit := osm_tags.speed_limit(tags, way):
+        if limit := osm_tags.speed_limit(tags, heading):
             out["speed_limit"] = limit
         if width := osm_tags.way_width(tags):
             out["width"] = width
@@ -194,13 +194,13 @@ def edge_words(tags: Mapping[str, Any], way: Literal["forward", "backward"]) -> 
     return out
 
 
-def _differs(now: Any, said: Any) -> bool:
+def _differs(now: Any, source_value: Any) -> bool:
     """Whether a canonical value says something else than the tags; one that is absent says nothing."""
     if isinstance(now, str):
-        return now not in ("", said)
+        return now not in ("", source_value)
     if isinstance(now, bool) or not isinstance(now, int | float) or now <= 0:
         return False
-    return not isinstance(said, int | float) or abs(now - said) > 1e-6 * now
+    return not isinstance(source_value, int | float) or abs(now - source_value) > 1e-6 * now
 
 
 def _number(value: Any) -> str:
@@ -241,14 +241,14 @@ def way_edges(way: int, refs: Sequence[int], tags: Mapping[str, Any], absent: Se
     """The edges that a way means: reader and writer must agree on them, ids included. absent: nodes without a place."""
     out = Edges()
     seen: dict[str, int] = {}
-    which = direction(tags)
+    heading = direction(tags)
     loop = is_loop(refs, tags)
-    forward, backward = loop or which != "backward", not loop and which != "forward"
+    forward, backward = loop or heading != "backward", not loop and heading != "forward"
     for k, (a, b) in enumerate(pairwise(refs)):
         if (a == b and not loop) or (absent and (a in absent or b in absent)):
             continue
-        for wanted, p, q in ((forward, a, b), (backward, b, a)):
-            if wanted:
+        for is_edge, p, q in ((forward, a, b), (backward, b, a)):
+            if is_edge:
                 name = f"w{way}:{p}-{q}"
                 times = seen[name] = seen.get(name, 0) + 1
                 out.segment.append(k)
@@ -263,7 +263,7 @@ def way_edges(way: int, refs: Sequence[int], tags: Mapping[str, Any], absent: Se
 
 def detect(name: str, data: bytes) -> bool:  # noqa: ARG001
     """By content: an ``<osm>`` root (also compressed), or a PBF header."""
-    head = unpack(data[: 2**16], Limits(), most=4096)[:4096] if data[:3] in (b"BZh", *_GZIP) else data[:4096]
+    head = unpack(data[: 2**16], Limits(), limit=4096)[:4096] if data[:3] in (b"BZh", *_GZIP) else data[:4096]
     if is_pbf(head):
         return True
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -287,17 +287,17 @@ def read(files: Files, context: ReadContext) -> Layers:
     topology, objects = context.wants("topology"), context.wants("objects")
     _xml.warn_of_active_content(files[context.main][:PROLOG_BYTES], context, has_scripts=True)
     data = parse(files[context.main], context.limits, highways_only=not objects)
-    for problem, line, where in data.problems:
-        context.warn(problem, line=line, where=where)
+    for problem, line, location in data.problems:
+        context.warn(problem, line=line, where=location)
     _check_version(data, context)
     _warn_of_values(data, context)
     document = _document(data)
     network = _Network(data, context)
     parts: dict[PartKey, Part] = {}
     if topology:
-        made = network.features(document)
-        if len(made):
-            parts[PartKey("topology", context.level, NETWORK)] = made
+        part = network.features(document)
+        if len(part):
+            parts[PartKey("topology", context.level, NETWORK)] = part
     if objects:
         parts[PartKey("objects", context.level, FAMILY)] = _objects(data, network, context, document)
     elif not parts:
@@ -318,12 +318,12 @@ def _check_version(data: Data, context: ReadContext) -> None:
 
 
 def _document(data: Data) -> dict[str, Any]:
-    said: dict[str, Any] = {"attributes": data.root}
+    source_document: dict[str, Any] = {"attributes": data.root}
     if data.bounds:
-        said["bounds"] = data.bounds
+        source_document["bounds"] = data.bounds
     if data.elements:
-        said["elements"] = data.elements
-    document: dict[str, Any] = {"osm": said}
+        source_document["elements"] = data.elements
+    document: dict[str, Any] = {"osm": source_document}
     boxes = [box for box in map(_box, data.bounds) if box is not None]
     if boxes:
         document["bounds"] = list(_around(boxes))
@@ -353,18 +353,18 @@ def _box(attributes: Mapping[str, str]) -> tuple[float, float, float, float] | N
 
 def _warn_of_values(data: Data, context: ReadContext) -> None:
     """Report the values that would say a size or a speed and are none, each with how often; the tags are kept."""
-    found: dict[tuple[str, str], list[Any]] = {}
+    occurrences: dict[tuple[str, str], list[Any]] = {}
     tagged = chain(((f"way {w.id}", w.tags) for w in data.ways), ((k, tags) for k, tags in data.tags.items()))
     for place, tags in tagged:
         for key in osm_tags.READ & tags.keys():
             if key not in _OF_WAYS or "highway" in tags:
-                found.setdefault((key, tags[key]), [place, 0])[1] += 1
-    for (key, value), (place, count) in found.items():
+                occurrences.setdefault((key, tags[key]), [place, 0])[1] += 1
+    for (key, value), (place, count) in occurrences.items():
         if not osm_tags.is_understood(key, value):
-            where = place if isinstance(place, str) else f"node {data.ids[place]}"
+            location = place if isinstance(place, str) else f"node {data.ids[place]}"
             often = f" ({count} times)" if count > 1 else ""
             reason = f"the tag {key}={str(value)[:40]!r} is not understood: kept without effect{often}"
-            context.warn(reason, where=where)
+            context.warn(reason, where=location)
 
 
 _OF_WAYS = frozenset({"lanes", "maxspeed", "maxspeed:forward", "maxspeed:backward"})
@@ -386,11 +386,13 @@ class _Network:
         if len(ways) != len(data.ways):
             _warn_twice("way", [way.id for way in data.ways], context)
         self.ways = list(ways.values())
-        lost = set(np.array(data.ids, np.int64)[np.isnan(data.lonlat[:, 0])].tolist()) if len(data.ids) else set()
-        self.placed = self.place.keys() - lost if lost else self.place.keys()
+        missing_ids = (
+            set(np.array(data.ids, np.int64)[np.isnan(data.lonlat[:, 0])].tolist()) if len(data.ids) else set()
+        )
+        self.placed = self.place.keys() - missing_ids if missing_ids else self.place.keys()
         self.highways: list[tuple[Way, Edges]] = []
         used: dict[int, None] = {}
-        gone: set[int] = set()
+        absent_ids: set[int] = set()
         for way in self.ways:
             if "highway" not in way.tags:
                 continue
@@ -398,53 +400,66 @@ class _Network:
                 context.warn("the way is marked as deleted, so it is no part of the network", where=f"way {way.id}")
                 continue
             self._doubts(way, context)
-            here = [r for r in way.refs if r in self.placed]
-            absent = set(way.refs) - set(here) if len(here) < len(way.refs) else set()
-            used.update(dict.fromkeys(here))
+            present = [r for r in way.refs if r in self.placed]
+            absent = set(way.refs) - set(present) if len(present) < len(way.refs) else set()
+            used.update(dict.fromkeys(present))
             self.highways.append((way, way_edges(way.id, way.refs, way.tags, absent)))
-            gone.update(absent)
+            absent_ids.update(absent)
         self.used = used
-        if gone:
-            some = ", ".join(map(str, sorted(gone)[:5]))
-            context.warn(f"highways use {len(gone)} nodes that have no place in the file ({some}); gaps are left there")
+        if absent_ids:
+            examples = ", ".join(map(str, sorted(absent_ids)[:5]))
+            context.warn(
+                f"highways use {len(absent_ids)} nodes that have no place in the file ({examples}); gaps are left there"
+            )
 
     def _doubts(self, way: Way, context: ReadContext) -> None:
-        where = f"way {way.id}"
+        location = f"way {way.id}"
         if not is_loop(way.refs, way.tags) and any(a == b for a, b in pairwise(way.refs)):
-            context.warn("the way goes from a node to itself; that segment is no edge", where=where)
-        said = str(way.tags.get("oneway", "no")).strip().lower()
-        if said not in _FORWARD and said not in _BACKWARD and said not in _NO:
-            context.warn(f"oneway={said[:40]} is not known; the way is taken as two-way", where=where)
+            context.warn("the way goes from a node to itself; that segment is no edge", where=location)
+        oneway = str(way.tags.get("oneway", "no")).strip().lower()
+        if oneway not in _FORWARD and oneway not in _BACKWARD and oneway not in _NO:
+            context.warn(f"oneway={oneway[:40]} is not known; the way is taken as two-way", where=location)
 
     def features(self, document: Properties) -> Features:
         data = self.data
-        wanted = sorted(self.place[i] for i in self.used)
-        ids = [f"n{data.ids[k]}" for k in wanted]
+        indices = sorted(self.place[i] for i in self.used)
+        ids = [f"n{data.ids[k]}" for k in indices]
         pattern, plain_edge = alike("kind", "osm"), alike("kind", "source", "target", "osm")
         properties: list[Properties] = []
-        for k in wanted:
+        for k in indices:
             node = pattern.copy()
             node["kind"], node["osm"] = "node", _of_node(data, k)
             properties.append(node)
-        name_of = dict(zip((data.ids[k] for k in wanted), ids, strict=True))
+        name_of = dict(zip((data.ids[k] for k in indices), ids, strict=True))
         source: list[int] = []
         target: list[int] = []
         for way, edges in self.highways:
-            said = {"way": way.id, "tags": way.tags}
+            source_properties = {"way": way.id, "tags": way.tags}
             ids += edges.ids
             source += edges.source
             target += edges.target
-            there, back = edge_words(way.tags, "forward"), edge_words(way.tags, "backward")
+            forth, back = edge_words(way.tags, "forward"), edge_words(way.tags, "backward")
             refs = way.refs
             for k, a, b in zip(edges.segment, edges.source, edges.target, strict=True):
-                words = there if there == back or refs[k] == a else back
-                if words:
-                    edge = {"kind": "edge", "source": name_of[a], "target": name_of[b], **words, "osm": said}
+                attributes = forth if forth == back or refs[k] == a else back
+                if attributes:
+                    edge = {
+                        "kind": "edge",
+                        "source": name_of[a],
+                        "target": name_of[b],
+                        **attributes,
+                        "osm": source_properties,
+                    }
                 else:
                     edge = plain_edge.copy()
-                    edge["kind"], edge["source"], edge["target"], edge["osm"] = "edge", name_of[a], name_of[b], said
+                    edge["kind"], edge["source"], edge["target"], edge["osm"] = (
+                        "edge",
+                        name_of[a],
+                        name_of[b],
+                        source_properties,
+                    )
                 properties.append(edge)
-        geometry = points(data.lonlat[wanted]) if wanted else np.empty(0, object)
+        geometry = points(data.lonlat[indices]) if indices else np.empty(0, object)
         if source:
             start = np.fromiter(map(self.place.__getitem__, source), np.intp, len(source))
             end = np.fromiter(map(self.place.__getitem__, target), np.intp, len(target))
@@ -453,11 +468,11 @@ class _Network:
         return from_columns(ids, geometry, properties, "wgs84", about)
 
 
-def _warn_twice(what: str, ids: list[int], context: ReadContext) -> None:
+def _warn_twice(noun: str, ids: list[int], context: ReadContext) -> None:
     seen: set[int] = set()
     for identity in ids:
         if identity in seen:
-            context.warn("the id stands more than once in the file; the last one counts", where=f"{what} {identity}")
+            context.warn("the id stands more than once in the file; the last one counts", where=f"{noun} {identity}")
         seen.add(identity)
 
 
@@ -466,28 +481,28 @@ _ATTRIBUTES_ONLY = alike("attributes")
 
 def _of_node(data: Data, k: int) -> dict[str, Any]:
     tags, attributes = data.tags.get(k), data.attributes(k)
-    said: dict[str, Any]
+    source_properties: dict[str, Any]
     if attributes and not tags:
-        said = _ATTRIBUTES_ONLY.copy()
-        said["attributes"] = attributes
+        source_properties = _ATTRIBUTES_ONLY.copy()
+        source_properties["attributes"] = attributes
     else:
-        said = {"tags": tags} if tags else {}
+        source_properties = {"tags": tags} if tags else {}
         if attributes:
-            said["attributes"] = attributes
+            source_properties["attributes"] = attributes
     if children := data.node_children.get(k):
-        said["children"] = children
-    return said
+        source_properties["children"] = children
+    return source_properties
 
 
-def _properties(said: dict[str, Any], tags: Tags, otherwise: str) -> Properties:
+def _properties(source_properties: dict[str, Any], tags: Tags, otherwise: str) -> Properties:
     if not tags:
-        return {"kind": otherwise, "osm": said}
-    return {"kind": kind_of(tags, otherwise), **object_words(tags), "osm": said}
+        return {"kind": otherwise, "osm": source_properties}
+    return {"kind": kind_of(tags, otherwise), **object_words(tags), "osm": source_properties}
 
 
 def _objects(data: Data, network: _Network, context: ReadContext, document: Properties) -> Features:
     """Tagged and lone nodes, ways and relations as features, in the file's order."""
-    place = network.place
+    index_by_id = network.place
     relations = {r.id: r for r in data.relations}
     if len(relations) != len(data.relations):
         _warn_twice("relation", [r.id for r in data.relations], context)
@@ -495,7 +510,7 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
     bent = set(flat)
     members = {i for r in data.relations for kind, i, _ in r.members if kind == "node"}
     nodes = []
-    for identity, k in place.items():
+    for identity, k in index_by_id.items():
         if identity in network.used:
             continue
         lone = identity not in bent or k in data.tags or identity in members or identity not in network.placed
@@ -508,49 +523,51 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
     properties = [_properties(_of_node(data, k), data.tags.get(k, {}), "point") for k in nodes]
     geometry = np.empty(len(nodes), object)
     at = data.lonlat[nodes] if nodes else np.empty((0, 2))
-    there = ~np.isnan(at[:, 0])
-    geometry[there] = points(at[there])
-    geometry[~there] = NO_GEOMETRY
+    has_position = ~np.isnan(at[:, 0])
+    geometry[has_position] = points(at[has_position])
+    geometry[~has_position] = NO_GEOMETRY
     dangling = 0
-    index = np.fromiter((place.get(r, -1) for r in flat), np.intp, len(flat))
+    index = np.fromiter((index_by_id.get(r, -1) for r in flat), np.intp, len(flat))
     lonlat = np.concatenate([data.lonlat, np.full((1, 2), np.nan)])[index]
     absent = np.isnan(lonlat[:, 0])
     begin = 0
     for way in network.ways:
         end = begin + len(way.refs)
-        said: dict[str, Any] = {"refs": way.refs, "tags": way.tags}
+        source_properties: dict[str, Any] = {"refs": way.refs, "tags": way.tags}
         if way.attributes:
-            said["attributes"] = way.attributes
+            source_properties["attributes"] = way.attributes
         if absent[begin:end].any():
             missing = np.flatnonzero(absent[begin:end]).tolist()
-            said["missing"] = missing
+            source_properties["missing"] = missing
             dangling += len(missing)
         if vertices := _vertices(data, way.refs, index[begin:end].tolist(), features):
-            said["vertices"] = vertices
+            source_properties["vertices"] = vertices
         if way.children:
-            said["children"] = way.children
+            source_properties["children"] = way.children
         if not way.refs:
             context.warn("the way has no nodes", where=f"way {way.id}")
-        properties.append(_properties(said, way.tags, "line"))
+        properties.append(_properties(source_properties, way.tags, "line"))
         begin = end
     if dangling:
         context.warn(f"ways refer {dangling} times to nodes that have no place in the file; the references are kept")
     ids += [f"w{way.id}" for way in network.ways]
     shapes = _way_geometry(network.ways, lonlat, absent)
     for relation in relations.values():
-        said = {"members": [list(m) for m in relation.members], "tags": relation.tags}
+        source_properties = {"members": [list(m) for m in relation.members], "tags": relation.tags}
         if relation.attributes:
-            said["attributes"] = relation.attributes
+            source_properties["attributes"] = relation.attributes
         if relation.children:
-            said["children"] = relation.children
-        properties.append(_properties(said, relation.tags, "relation"))
+            source_properties["children"] = relation.children
+        properties.append(_properties(source_properties, relation.tags, "relation"))
     ids += [f"r{i}" for i in relations]
     nothing = np.full(len(relations), NO_GEOMETRY, object)
     part = from_columns(ids, np.concatenate([geometry, shapes, nothing]), properties, "wgs84", document)
     areas = areas_of(part, range(len(ids) - len(relations), len(ids)))
     if open_ := [part.ids[k][1:] for k, area in areas.items() if area is None]:
-        some = ", ".join(open_[:5]) + (" …" if len(open_) > 5 else "")
-        context.warn(f"{len(open_)} multipolygons have no area, since ways are missing or rings do not close: {some}")
+        examples = ", ".join(open_[:5]) + (" …" if len(open_) > 5 else "")
+        context.warn(
+            f"{len(open_)} multipolygons have no area, since ways are missing or rings do not close: {examples}"
+        )
     with_area = part.geometry.copy()
     for k, area in areas.items():
         with_area[k] = area or NO_GEOMETRY
@@ -560,11 +577,11 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
 def _vertices(data: Data, refs: list[int], index: list[int], features: set[int]) -> Any:
     """The attributes of a way's nodes that are no features: one mapping where all agree, else a list like refs."""
     rows = [None if k < 0 or r in features else data.attributes(k) for r, k in zip(refs, index, strict=True)]
-    own = [row for row in rows if row is not None]
-    if not own or not any(own):
+    entries = [row for row in rows if row is not None]
+    if not entries or not any(entries):
         return None
-    first = own[0]
-    return first if all(row is first or row == first for row in own) else rows
+    first = entries[0]
+    return first if all(row is first or row == first for row in entries) else rows
 
 
 def _way_geometry(ways: list[Way], lonlat: NDArray[np.float64], absent: NDArray[np.bool_]) -> NDArray[np.object_]:
@@ -579,12 +596,12 @@ def _way_geometry(ways: list[Way], lonlat: NDArray[np.float64], absent: NDArray[
     if len(lonlat):
         ends = np.clip(first + size - 1, 0, len(lonlat) - 1)
         closed &= (lonlat[np.clip(first, 0, len(lonlat) - 1)] == lonlat[ends]).all(axis=1)
-    for chosen, make in ((closed, shapely.linearrings), (~closed & (size > 1), shapely.linestrings)):
-        if chosen.any():
-            rows = chosen[owner]
-            number = np.cumsum(chosen) - 1
-            made = make(lonlat[rows], indices=number[owner[rows]])
-            out[chosen] = shapely.polygons(made) if make is shapely.linearrings else made
+    for mask, make in ((closed, shapely.linearrings), (~closed & (size > 1), shapely.linestrings)):
+        if mask.any():
+            rows = mask[owner]
+            number = np.cumsum(mask) - 1
+            shapes = make(lonlat[rows], indices=number[owner[rows]])
+            out[mask] = shapely.polygons(shapes) if make is shapely.linearrings else shapes
     single = np.flatnonzero(size == 1)
     out[single] = points(lonlat[first[single]])
     return out
@@ -635,27 +652,27 @@ class _Writer:
         self.ways: dict[int, tuple[list[int], Mapping[str, str], Mapping[str, str]]] = {}
         self.relations: dict[int, tuple[list[tuple[str, int, str]], Mapping[str, str], Mapping[str, str]]] = {}
         rows = (p for part in layers.vector("objects").values() for p in part.properties)
-        own = [p for p in rows if isinstance(p.get("osm"), Mapping)]
-        refs = [refs for p in own if (refs := integers(p["osm"].get("refs")))]
-        known = [element_id(i) for part in layers.parts.values() if isinstance(part, Features) for i in part.ids]
-        lowest = min(chain([0], (min(r) for r in refs), (k[1] for k in known if k)))
+        own_items = [p for p in rows if isinstance(p.get("osm"), Mapping)]
+        refs = [refs for p in own_items if (refs := integers(p["osm"].get("refs")))]
+        identities = [element_id(i) for part in layers.parts.values() if isinstance(part, Features) for i in part.ids]
+        lowest = min(chain([0], (min(r) for r in refs), (k[1] for k in identities if k)))
         self.next = {"node": lowest - 1, "way": lowest - 1, "relation": lowest - 1}
         self.referenced = set(chain.from_iterable(refs))
         self.lost: dict[str, int] = {}
         self.children: dict[tuple[str, int], Any] = {}
 
-    def fresh(self, what: str) -> int:
-        new = self.next[what]
-        self.next[what] = new - 1
+    def fresh(self, kind: str) -> int:
+        new = self.next[kind]
+        self.next[kind] = new - 1
         return new
 
-    def unknown(self, what: str, number: int, said: Mapping[str, Any]) -> None:
+    def unknown(self, kind: str, number: int, source_properties: Mapping[str, Any]) -> None:
         """Keep the elements inside an element that OSM does not know."""
-        if said.get("children"):
-            self.children[what, number] = said["children"]
+        if source_properties.get("children"):
+            self.children[kind, number] = source_properties["children"]
 
-    def lose(self, what: str, times: int = 1) -> None:
-        self.lost[what] = self.lost.get(what, 0) + times
+    def lose(self, item: str, times: int = 1) -> None:
+        self.lost[item] = self.lost.get(item, 0) + times
 
     # --- one level ---
 
@@ -666,76 +683,81 @@ class _Writer:
         for part in topology:
             self.network_nodes(part, level)
             drawn.update(i for p in part.properties if isinstance(i := p.get("drawn_from"), str))
-        others: list[tuple[str, Any, Properties, bool]] = []
-        mine: list[tuple[str, int, Any, Mapping[str, Any], Mapping[str, Any]]] = []
+        new_items: list[tuple[str, Any, Properties, bool]] = []
+        own_items: list[tuple[str, int, Any, Mapping[str, Any], Mapping[str, Any]]] = []
         for layer in ("objects", "zones"):
             for key, part in self.layers.vector("objects" if layer == "objects" else "zones", name).items():
                 for i, geometry, properties in zip(
                     part.ids, part.in_wgs84(self.layers.frame), part.properties, strict=True
                 ):
-                    number, said = element_id(i), properties.get("osm")
-                    if layer == "objects" and key.name == FAMILY and number and isinstance(said, Mapping):
-                        told = _told(said, properties, i)
-                        mine.append((number[0], number[1], geometry, told, properties))
+                    number, source_properties = element_id(i), properties.get("osm")
+                    if layer == "objects" and key.name == FAMILY and number and isinstance(source_properties, Mapping):
+                        current = _told(source_properties, properties, i)
+                        own_items.append((number[0], number[1], geometry, current, properties))
                     elif i in drawn and shapely.get_type_id(geometry) in (0, 1, 2, 5):
                         # The network made from this drawing is written; the line would lie on it a second time.
                         continue
                     else:
-                        others.append((i, geometry, properties, layer == "zones"))
-        for what, own, geometry, said, _ in mine:
-            if what == "n":
-                self.node(level, own, geometry, said)
-        for what, own, geometry, said, properties in mine:
-            if what == "w" and not self.way(level, own, geometry, said):
-                others.append((f"w{own}", geometry, properties, False))
-        for what, own, _, _, _ in mine:
-            if what == "r":
-                level.relations[own] = self.fresh("relation") if own in self.relations else own
-                self.relations[level.relations[own]] = ([], NOTHING, NOTHING)
-        for what, own, _, said, _ in mine:
-            if what == "r":
-                self.relation(level, own, said)
+                        new_items.append((i, geometry, properties, layer == "zones"))
+        for kind, osm_id, geometry, source_properties, _ in own_items:
+            if kind == "n":
+                self.node(level, osm_id, geometry, source_properties)
+        for kind, osm_id, geometry, source_properties, properties in own_items:
+            if kind == "w" and not self.way(level, osm_id, geometry, source_properties):
+                new_items.append((f"w{osm_id}", geometry, properties, False))
+        for kind, osm_id, _, _, _ in own_items:
+            if kind == "r":
+                level.relations[osm_id] = self.fresh("relation") if osm_id in self.relations else osm_id
+                self.relations[level.relations[osm_id]] = ([], NOTHING, NOTHING)
+        for kind, osm_id, _, source_properties, _ in own_items:
+            if kind == "r":
+                self.relation(level, osm_id, source_properties)
         for part in topology:
             self.new_ways(part, level)
-        for i, geometry, properties, zone in others:
+        for i, geometry, properties, zone in new_items:
             self.other(level, i, geometry, properties, zone)
 
     def network_nodes(self, part: Features, level: _Level) -> None:
         level.has_network = True
         is_node = np.array([p.get("kind") != "edge" for p in part.properties], bool)
-        chosen = np.flatnonzero(is_node)
-        at = part.take(chosen).in_wgs84(self.layers.frame) if len(chosen) else np.empty(0, object)
-        here = (shapely.get_type_id(at) == 0) & ~shapely.is_empty(at)
+        indices = np.flatnonzero(is_node)
+        at = part.take(indices).in_wgs84(self.layers.frame) if len(indices) else np.empty(0, object)
+        has_point = (shapely.get_type_id(at) == 0) & ~shapely.is_empty(at)
         places = np.full((len(at), 2), np.nan)
-        places[here] = shapely.get_coordinates(at[here])
+        places[has_point] = shapely.get_coordinates(at[has_point])
         lon, lat = places.T.tolist()
-        for k, x, y, geometry in zip(chosen.tolist(), lon, lat, at, strict=True):
+        for k, x, y, geometry in zip(indices.tolist(), lon, lat, at, strict=True):
             i, properties = part.ids[k], part.properties[k]
-            said = properties.get("osm")
+            source_properties = properties.get("osm")
             number = element_id(i)
-            own = (
-                number is not None and number[0] == "n" and (isinstance(said, Mapping) or number[1] in self.referenced)
+            is_own = (
+                number is not None
+                and number[0] == "n"
+                and (isinstance(source_properties, Mapping) or number[1] in self.referenced)
             )
-            new = number[1] if own and number is not None else self.fresh("node")
+            new = number[1] if is_own and number is not None else self.fresh("node")
             if new in self.nodes and (self.nodes[new].lon, self.nodes[new].lat) != (x, y):
                 new = self.fresh("node")
-            if isinstance(said, Mapping):
-                tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
-                self.unknown("node", new, said)
+            if isinstance(source_properties, Mapping):
+                tags, attributes = (
+                    as_texts(source_properties.get("tags")),
+                    as_texts(source_properties.get("attributes")),
+                )
+                self.unknown("node", new, source_properties)
             else:
                 # A street node that went through another format is called by its id there: that is no name.
-                nameless = own and properties.get("name", i) == i
+                nameless = is_own and properties.get("name", i) == i
                 tags, attributes = NOTHING if nameless else self.tags(i, properties, ("name",)), NOTHING
             if geometry.has_z and geometry.geom_type == "Point" and not geometry.is_empty and "ele" not in tags:
                 tags = {**tags, "ele": repr(float(geometry.z))}
             self.nodes[new] = Node(x, y, tags, attributes)
             level.nodes[i] = new
-            if own and number is not None:
+            if is_own and number is not None:
                 level.moved[number[1]] = new
         for k in np.flatnonzero(~is_node).tolist():
             p = part.properties[k]
-            said = p.get("osm")
-            tags_ = said.get("tags") if isinstance(said, Mapping) else None
+            source_properties = p.get("osm")
+            tags_ = source_properties.get("tags") if isinstance(source_properties, Mapping) else None
             level.edges[part.ids[k]] = (
                 str(p.get("source")),
                 str(p.get("target")),
@@ -743,39 +765,41 @@ class _Writer:
                 p,
             )
 
-    def node(self, level: _Level, number: int, geometry: Any, said: Mapping[str, Any]) -> None:
+    def node(self, level: _Level, number: int, geometry: Any, source_properties: Mapping[str, Any]) -> None:
         if number in level.moved:
             return
         x, y = (geometry.x, geometry.y) if geometry.geom_type == "Point" and not geometry.is_empty else NOWHERE
         new = number
         if number in self.nodes and (self.nodes[number].lon, self.nodes[number].lat) != (x, y):
             new = self.fresh("node")
-        self.nodes[new] = Node(x, y, as_texts(said.get("tags")), as_texts(said.get("attributes")))
+        self.nodes[new] = Node(
+            x, y, as_texts(source_properties.get("tags")), as_texts(source_properties.get("attributes"))
+        )
         level.moved[number] = new
-        self.unknown("node", new, said)
+        self.unknown("node", new, source_properties)
 
-    def way(self, level: _Level, number: int, geometry: Any, said: Mapping[str, Any]) -> bool:
+    def way(self, level: _Level, number: int, geometry: Any, source_properties: Mapping[str, Any]) -> bool:
         """Write an OSM way; False where its properties or its geometry are no longer those of one."""
-        refs = integers(said.get("refs"))
+        refs = integers(source_properties.get("refs"))
         at = _course(geometry)
         if refs is None or at is None:
             return False
-        tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
-        missing = set(integers(said.get("missing")) or ())
+        tags, attributes = as_texts(source_properties.get("tags")), as_texts(source_properties.get("attributes"))
+        missing = set(integers(source_properties.get("missing")) or ())
         first = self.fresh("way") if number in self.ways else number
         if level.has_network and "highway" in tags and not deleted(attributes):
             runs = self.runs(level, number, refs, tags, {refs[k] for k in missing if 0 <= k < len(refs)})
         else:
             runs = [(0, len(refs), tags)]
         written: list[int] = []
-        for begin, end, said_tags in runs:
+        for begin, end, run_tags in runs:
             new = self.fresh("way") if written else first
-            whole = end - begin == len(refs)
-            nodes = self.bend(level, refs, at, missing, said.get("vertices"), range(begin, end))
-            self.ways[new] = (nodes, said_tags, attributes if whole or not written else NOTHING)
+            complete = end - begin == len(refs)
+            nodes = self.bend(level, refs, at, missing, source_properties.get("vertices"), range(begin, end))
+            self.ways[new] = (nodes, run_tags, attributes if complete or not written else NOTHING)
             written.append(new)
         if written:
-            self.unknown("way", written[0], said)
+            self.unknown("way", written[0], source_properties)
         else:
             self.lose("ways whose edges are no longer in the network")
         level.ways[number] = written
@@ -787,51 +811,54 @@ class _Writer:
         """The pieces of a highway way that the network still has: (first, one past the last index of refs, tags)."""
         expected = way_edges(number, refs, tags, absent)
         # Of each segment: the directions that are there, of those that the way means, and the tags if they differ.
-        there: dict[int, tuple[set[str], Any]] = {}
+        headings_by_segment: dict[int, tuple[set[str], Any]] = {}
         edited: dict[int, dict[str, dict[str, Any]]] = {}
-        known: dict[tuple[int, str], Mapping[str, Any]] = {}
-        wanted: dict[int, int] = {}
+        cache: dict[tuple[int, str], Mapping[str, Any]] = {}
+        edge_counts: dict[int, int] = {}
         for k, i, a, b in zip(expected.segment, expected.ids, expected.source, expected.target, strict=True):
-            wanted[k] = wanted.get(k, 0) + 1
+            edge_counts[k] = edge_counts.get(k, 0) + 1
             edge = level.edges.get(i)
             if edge is not None and edge[0] == f"n{a}" and edge[1] == f"n{b}":
                 level.explained.add(i)
-                ways, other = there.get(k, (set(), None))
-                way: Literal["forward", "backward"] = "forward" if a == refs[k] else "backward"
-                ways.add(way)
+                headings, other = headings_by_segment.get(k, (set(), None))
+                heading: Literal["forward", "backward"] = "forward" if a == refs[k] else "backward"
+                headings.add(heading)
                 other = edge[2] if edge[2] is not None and edge[2] != tags else other
-                there[k] = (ways, other)
-                own = tags if edge[2] is None else edge[2]
-                said = known.get((id(own), way))
-                if said is None:
-                    said = known[id(own), way] = edge_words(as_texts(own), way)
-                new = {w: v for w in _EDGE_WORDS if _differs(v := edge[3].get(w), said.get(w))}
+                headings_by_segment[k] = (headings, other)
+                own_tags = tags if edge[2] is None else edge[2]
+                values = cache.get((id(own_tags), heading))
+                if values is None:
+                    values = cache[id(own_tags), heading] = edge_words(as_texts(own_tags), heading)
+                new = {w: v for w in _EDGE_WORDS if _differs(v := edge[3].get(w), values.get(w))}
                 if new:
-                    edited.setdefault(k, {})[way] = new
+                    edited.setdefault(k, {})[heading] = new
         for k, changes in edited.items():
-            ways, other = there[k]
-            there[k] = (ways, _edited(tags if other is None else as_texts(other), changes, ways))
-        if all(k in there and len(there[k][0]) == n and there[k][1] is None for k, n in wanted.items()):
+            headings, other = headings_by_segment[k]
+            headings_by_segment[k] = (headings, _edited(tags if other is None else as_texts(other), changes, headings))
+        if all(
+            k in headings_by_segment and len(headings_by_segment[k][0]) == n and headings_by_segment[k][1] is None
+            for k, n in edge_counts.items()
+        ):
             return [(0, len(refs), tags)]
         out: list[tuple[int, int, Mapping[str, str]]] = []
         state: Any = None
         for k in range(len(refs) - 1):
-            if k in wanted and k not in there:
+            if k in edge_counts and k not in headings_by_segment:
                 state = None
                 continue
-            said = tags
-            if k in there:
-                ways, other = there[k]
-                said = as_texts(other) if other is not None else tags
-                if len(ways) < wanted[k]:
-                    said = {**said, "oneway": "yes" if "forward" in ways else "-1"}
+            values = tags
+            if k in headings_by_segment:
+                headings, other = headings_by_segment[k]
+                values = as_texts(other) if other is not None else tags
+                if len(headings) < edge_counts[k]:
+                    values = {**values, "oneway": "yes" if "forward" in headings else "-1"}
             elif state is not None:
-                said = state
-            if state is not None and said == state and out:
-                out[-1] = (out[-1][0], k + 2, said)
+                values = state
+            if state is not None and values == state and out:
+                out[-1] = (out[-1][0], k + 2, values)
             else:
-                out.append((k, k + 2, said))
-            state = said
+                out.append((k, k + 2, values))
+            state = values
         return out
 
     def bend(
@@ -841,7 +868,7 @@ class _Writer:
         at: NDArray[np.float64],
         missing: set[int],
         vertices: Any,
-        wanted: range,
+        span: range,
     ) -> list[int]:
         """The node ids of (part of) a way, making those that exist nowhere but in the way."""
         located = len(refs) - len(missing)
@@ -851,42 +878,42 @@ class _Writer:
         places = at.tolist()
         out, j = [], 0
         for k, ref in enumerate(refs):
-            place = None
+            position = None
             if k not in missing:
-                place = places[j]
+                position = places[j]
                 j += 1
-            if k not in wanted:
+            if k not in span:
                 continue
             new = level.moved.get(ref, ref)
-            known = self.nodes.get(new)
-            if place is not None:
-                if known is None:
-                    self.nodes[new] = Node(place[0], place[1], NOTHING, as_texts(attributes[k]), vertex=True)
-                elif known.vertex and (known.lon != place[0] or known.lat != place[1]):
+            node = self.nodes.get(new)
+            if position is not None:
+                if node is None:
+                    self.nodes[new] = Node(position[0], position[1], NOTHING, as_texts(attributes[k]), vertex=True)
+                elif node.vertex and (node.lon != position[0] or node.lat != position[1]):
                     # Two ways no longer agree where their common node is: each keeps its course.
                     new = self.fresh("node")
-                    self.nodes[new] = Node(place[0], place[1], vertex=True)
+                    self.nodes[new] = Node(position[0], position[1], vertex=True)
             out.append(new)
         return out
 
     def redraw(self, level: _Level, refs: list[int], at: NDArray[np.float64]) -> list[int]:
         """Nodes for a way whose geometry was edited: its own where one stands at a vertex, else new ones."""
-        known = {}
+        node_ids = {}
         for ref in refs:
             node = self.nodes.get(level.moved.get(ref, ref))
             if node is not None:
-                known[node.lon, node.lat] = level.moved.get(ref, ref)
+                node_ids[node.lon, node.lat] = level.moved.get(ref, ref)
         out = []
         for x, y in at.tolist():
-            if (x, y) not in known:
-                known[x, y] = new = self.fresh("node")
+            if (x, y) not in node_ids:
+                node_ids[x, y] = new = self.fresh("node")
                 self.nodes[new] = Node(x, y, vertex=True)
-            out.append(known[x, y])
+            out.append(node_ids[x, y])
         return out
 
-    def relation(self, level: _Level, number: int, said: Mapping[str, Any]) -> None:
+    def relation(self, level: _Level, number: int, source_properties: Mapping[str, Any]) -> None:
         members: list[tuple[str, int, str]] = []
-        rows = said.get("members")
+        rows = source_properties.get("members")
         for row in rows if isinstance(rows, list) else []:
             if not (isinstance(row, list | tuple) and len(row) == 3 and type(row[1]) is int and abs(row[1]) < INT64):
                 self.lose("relation members that are not [type, id, role]")
@@ -902,8 +929,8 @@ class _Writer:
                 members.append((kind, level.relations.get(i, i), role))
             else:
                 members.append((kind, i, role))
-        self.unknown("relation", level.relations[number], said)
-        tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
+        self.unknown("relation", level.relations[number], source_properties)
+        tags, attributes = as_texts(source_properties.get("tags")), as_texts(source_properties.get("attributes"))
         self.relations[level.relations[number]] = (members, tags, attributes)
 
     def new_ways(self, part: Features, level: _Level) -> None:
@@ -915,10 +942,10 @@ class _Writer:
         ]
         if not left:
             return
-        chosen = part.take(left)
+        features = part.take(left)
         pairs: dict[tuple[int, int], list[int]] = {}
         signs: list[tuple[Any, ...]] = []
-        for k, (i, p) in enumerate(zip(chosen.ids, chosen.properties, strict=True)):
+        for k, (i, p) in enumerate(zip(features.ids, features.properties, strict=True)):
             a, b = level.nodes.get(str(p.get("source"))), level.nodes.get(str(p.get("target")))
             tags = self.edge_tags(i, p, level)
             signs.append((p.get("drawn_from"), tuple(sorted(tags.items()))))
@@ -937,8 +964,8 @@ class _Writer:
                 twin = n < len(back) and back[n] >= 0 and signs[back[n]] == signs[k]
                 if twin:
                     back[n] = -1
-                if course is None and shapely.get_num_coordinates(chosen.geometry).max() > 2:
-                    course = chosen.in_wgs84(self.layers.frame)
+                if course is None and shapely.get_num_coordinates(features.geometry).max() > 2:
+                    course = features.in_wgs84(self.layers.frame)
                 nodes = [a, *self.inner(course[k] if course is not None else None), b]
                 sign = (*signs[k], twin)
                 if nodes == [a, a]:  # by itself: within a line it would be a node that stands twice
@@ -967,18 +994,18 @@ class _Writer:
         return out
 
     def edge_tags(self, i: str, p: Properties, level: _Level) -> dict[str, str]:
-        said = p.get("osm")
-        if isinstance(said, Mapping) and isinstance(said.get("tags"), Mapping):
-            own = {k: v for k, v in as_texts(said["tags"]).items() if k != "oneway"}
-            limits = {own.pop(k, None) for k in ("maxspeed:forward", "maxspeed:backward")} - {None}
-            words = edge_words(own, "forward")
-            new = {w: v for w in _EDGE_WORDS if _differs(v := p.get(w), words.get(w))}
-            if limits and "speed_limit" not in new and "maxspeed" not in own:
+        source_properties = p.get("osm")
+        if isinstance(source_properties, Mapping) and isinstance(source_properties.get("tags"), Mapping):
+            own_tags = {k: v for k, v in as_texts(source_properties["tags"]).items() if k != "oneway"}
+            limits = {own_tags.pop(k, None) for k in ("maxspeed:forward", "maxspeed:backward")} - {None}
+            values = edge_words(own_tags, "forward")
+            new = {w: v for w in _EDGE_WORDS if _differs(v := p.get(w), values.get(w))}
+            if limits and "speed_limit" not in new and "maxspeed" not in own_tags:
                 new["speed_limit"] = min((v for v in map(osm_tags.speed, limits) if v), default=None)
-            return dict(_edited(own, {"forward": {w: v for w, v in new.items() if v}}, {"forward"}))
+            return dict(_edited(own_tags, {"forward": {w: v for w, v in new.items() if v}}, {"forward"}))
         tags = {"highway": "path"}
-        for word, key in (("name", "name"), ("action", "action"), ("width", "width")):
-            value = p.get(word)
+        for member, key in (("name", "name"), ("action", "action"), ("width", "width")):
+            value = p.get(member)
             if isinstance(value, str | int | float) and not isinstance(value, bool) and value != i:
                 tags[key] = str(value)
         speed = p.get("speed_limit")
@@ -996,10 +1023,10 @@ class _Writer:
 
     # --- items of other formats ---
 
-    def tags(self, i: str, p: Properties, words: Iterable[str] = (), level: str = GROUND) -> dict[str, str]:
+    def tags(self, i: str, p: Properties, keys: Iterable[str] = (), level: str = GROUND) -> dict[str, str]:
         """Tags for an item that OSM does not know: its name, and the plain values among these words (or all)."""
         tags = {"name": str(p.get("name") or i)}
-        names = list(words) or [k for k in p if k not in ("drawn_from",)]
+        names = list(keys) or [k for k in p if k not in ("drawn_from",)]
         for k in names:
             value = p.get(k)
             if isinstance(value, bool):
@@ -1014,9 +1041,9 @@ class _Writer:
 
     def other(self, level: _Level, i: str, geometry: Any, properties: Properties, zone: bool) -> None:
         tags = self.tags(i, properties, level=level.name)
-        said = properties.get("osm")
-        if isinstance(said, Mapping):
-            tags = {**as_texts(said.get("tags")), **tags}
+        source_properties = properties.get("osm")
+        if isinstance(source_properties, Mapping):
+            tags = {**as_texts(source_properties.get("tags")), **tags}
         if zone:
             tags["zone"] = str(properties.get("kind") or "yes")
         parts = _simple(geometry)
@@ -1061,28 +1088,28 @@ class _Writer:
     # --- XML ---
 
     def text(self) -> bytes:
-        for what, times in sorted(self.lost.items()):
-            self.context.drop(what, times, "OSM has no place for them")
+        for item, times in sorted(self.lost.items()):
+            self.context.drop(item, times, "OSM has no place for them")
         return _osm_text.document(self.head(), self.nodes, self.ways, self.relations, self.children)
 
     def head(self) -> list[str]:
         documents = [p.document for p in self.layers.parts.values() if isinstance(p, Features)]
-        said = [d["osm"] for d in documents if isinstance(d.get("osm"), Mapping)]
+        source_documents = [d["osm"] for d in documents if isinstance(d.get("osm"), Mapping)]
         root: dict[str, str] = {"version": "0.6", "generator": GENERATOR}
-        for one in said:
+        for one in source_documents:
             root |= as_texts(one.get("attributes"))
         root["version"] = "0.6"
         if self.context.attribution and not root.keys() & {"attribution", "copyright", "license"}:
             root["attribution"] = "; ".join(self.context.attribution)
         lines = [f"<osm{attribute_text(root, frozenset())}>"]
-        for one in said:
+        for one in source_documents:
             lines += _osm_text.element_lines(one.get("elements"))
         boxes = [d["bounds"] for d in documents if _is_box(d.get("bounds"))]
         if not boxes:
             boxes = self.fence()
         if boxes:
-            kept = [as_texts(b) for one in said for b in one.get("bounds") or []]
-            lines += [f" <bounds{attribute_text(box, frozenset())}/>" for box in _bounds(kept, boxes)]
+            source_bounds = [as_texts(b) for one in source_documents for b in one.get("bounds") or []]
+            lines += [f" <bounds{attribute_text(box, frozenset())}/>" for box in _bounds(source_bounds, boxes)]
         return lines
 
     def fence(self) -> list[list[float]]:
@@ -1098,29 +1125,29 @@ class _Writer:
 _EDGE_WORDS = ("speed_limit", "width", "surface", "access")
 
 
-def _told(said: Mapping[str, Any], p: Properties, i: str) -> Mapping[str, Any]:
+def _told(source_properties: Mapping[str, Any], p: Properties, i: str) -> Mapping[str, Any]:
     """An object's own words with the tags that its name and measures say now. A highway's are its edges'."""
-    tags = as_texts(said.get("tags"))
+    tags = as_texts(source_properties.get("tags"))
     if "highway" in tags:
-        return said
-    words = object_words(tags)
-    new = {w: v for w in _SPOKEN if _differs(v := p.get(w), words.get(w)) and v != i}
+        return source_properties
+    values = object_words(tags)
+    new = {w: v for w in _SPOKEN if _differs(v := p.get(w), values.get(w)) and v != i}
     if not new:
-        return said
-    told = {_SPOKEN[w]: v if isinstance(v, str) else _number(v) for w, v in new.items()}
-    return {**said, "tags": {**tags, **told}}
+        return source_properties
+    new_tags = {_SPOKEN[w]: v if isinstance(v, str) else _number(v) for w, v in new.items()}
+    return {**source_properties, "tags": {**tags, **new_tags}}
 
 
-def _edited(tags: Mapping[str, str], changes: Mapping[str, Mapping[str, Any]], ways: Set[str]) -> Mapping[str, str]:
+def _edited(tags: Mapping[str, str], changes: Mapping[str, Mapping[str, Any]], headings: Set[str]) -> Mapping[str, str]:
     """A highway's tags with the words that its edges say now. changes: by direction; ways: those that are there."""
     out = dict(tags)
-    limits = {way: new["speed_limit"] for way, new in changes.items() if "speed_limit" in new}
-    if limits and limits.keys() == ways and len(set(limits.values())) == 1:
+    limits = {heading: new["speed_limit"] for heading, new in changes.items() if "speed_limit" in new}
+    if limits and limits.keys() == headings and len(set(limits.values())) == 1:
         for key in ("maxspeed:forward", "maxspeed:backward"):
             out.pop(key, None)
         out["maxspeed"] = _kmh(next(iter(limits.values())))
     else:
-        out |= {f"maxspeed:{way}": _kmh(limit) for way, limit in sorted(limits.items())}
+        out |= {f"maxspeed:{heading}": _kmh(limit) for heading, limit in sorted(limits.items())}
     for new in changes.values():
         out |= {w: v if isinstance(v, str) else _number(v) for w, v in new.items() if w != "speed_limit"}
     return out
@@ -1128,8 +1155,8 @@ def _edited(tags: Mapping[str, str], changes: Mapping[str, Mapping[str, Any]], w
 
 def _course(geometry: Any) -> NDArray[np.float64] | None:
     """The vertices of a way's geometry; None where it is not of one piece."""
-    whole = geometry.geom_type in ("LineString", "LinearRing", "Point") or geometry.is_empty
-    if whole or (geometry.geom_type == "Polygon" and not len(geometry.interiors)):
+    is_path = geometry.geom_type in ("LineString", "LinearRing", "Point") or geometry.is_empty
+    if is_path or (geometry.geom_type == "Polygon" and not len(geometry.interiors)):
         return np.asarray(shapely.get_coordinates(geometry), np.float64)
     return None
 
@@ -1148,22 +1175,24 @@ def _simple(geometry: Any) -> list[Any]:
     return out
 
 
-def _bounds(kept: Sequence[Mapping[str, str]], boxes: Sequence[Sequence[float]]) -> Sequence[Mapping[str, str]]:
+def _bounds(
+    source_bounds: Sequence[Mapping[str, str]], boxes: Sequence[Sequence[float]]
+) -> Sequence[Mapping[str, str]]:
     """The attributes of ``<bounds>``: those that were read, while they are still the box around these boxes, else of
     that one box. What they say besides (their origin) stays with them."""
-    whole = _around(boxes)
+    extent = _around(boxes)
     try:
-        known = [box for one in kept if (box := _box(one)) is not None]
+        old_boxes = [box for one in source_bounds if (box := _box(one)) is not None]
     except (UnreadableFile, ValueError):  # edits can put anything there
-        known = []
-    if len(known) != len(kept) or not known or _around(known) != whole:
-        known, kept = [whole], kept if len(kept) == 1 else [NOTHING]
+        old_boxes = []
+    if len(old_boxes) != len(source_bounds) or not old_boxes or _around(old_boxes) != extent:
+        old_boxes, source_bounds = [extent], source_bounds if len(source_bounds) == 1 else [NOTHING]
     names = ("minlat", "minlon", "maxlat", "maxlon")
     out = []
-    for one, (w, s, e, n) in zip(kept, known, strict=True):
+    for one, (w, s, e, n) in zip(source_bounds, old_boxes, strict=True):
         texts = numbers(np.array([s, w, n, e], np.float64), DEGREES)
-        place = {k: plain(v) for k, v in zip(names, texts, strict=True)}
-        out.append({**{k: v for k, v in one.items() if k != "box"}, **place})
+        attributes = {k: plain(v) for k, v in zip(names, texts, strict=True)}
+        out.append({**{k: v for k, v in one.items() if k != "box"}, **attributes})
     return out
 
 

@@ -38,15 +38,15 @@ def read(files: Files, context: ReadContext) -> Layers:
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``map.pcd`` (``<name>.pcd`` where a name is asked for). Raises MissingLayer, NotFound, Ambiguous or Invalid."""
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    wanted = _points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
+    source = _points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
     name = _points.file_name(options.name, NAME)
-    if wanted.data is not None and options.data is None:
-        return {name: wanted.data}
-    cloud = wanted.cloud()
-    if wanted.form != NAME:
+    if source.data is not None and options.data is None:
+        return {name: source.data}
+    cloud = source.cloud()
+    if source.form != NAME:
         cloud = replace(cloud, columns=_pcd.for_pcl(_points.plain(cloud)), comments=())
-        for what, count in cloud.further.items():
-            context.drop(what, count, "a PCD has points only")
+        for noun, count in cloud.further.items():
+            context.drop(noun, count, "a PCD has points only")
     return {name: _pcd.pack(cloud, options.data or "binary")}
 
 

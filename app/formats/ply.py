@@ -38,18 +38,18 @@ def read(files: Files, context: ReadContext) -> Layers:
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``map.ply`` (``<name>.ply`` where a name is asked for). Raises MissingLayer, NotFound, Ambiguous or Invalid."""
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    wanted = _points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
+    source = _points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
     name = _points.file_name(options.name, NAME)
-    if wanted.data is not None and options.data is None:
-        return {name: wanted.data}
-    cloud = wanted.cloud()
-    if wanted.form != NAME:
+    if source.data is not None and options.data is None:
+        return {name: source.data}
+    cloud = source.cloud()
+    if source.form != NAME:
         if cloud.height > 1:
             context.drop("rows and columns of the cloud", 1, "a PLY's vertices are one list: ask for pcd")
         context.drop("viewpoint", int(cloud.viewpoint != _points.UNTURNED), "PLY has no place for it: ask for pcd")
         cloud = replace(cloud, columns=_points.plain(cloud), comments=())
-    for what, count in cloud.further.items():
-        context.drop(what, count, "written again, a PLY has vertices only: leave out data= and frame= to keep it")
+    for noun, count in cloud.further.items():
+        context.drop(noun, count, "written again, a PLY has vertices only: leave out data= and frame= to keep it")
     return {name: _ply.pack(cloud, options.data or "binary_little_endian")}
 
 

@@ -134,44 +134,44 @@ def read(files: Files, context: ReadContext) -> Layers:
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
     picture = _picture(top.get(PICTURE), files, main, context)
     names, pixels, rests = _nodes(top["nodes"])
-    if again := without_repeats(names):
-        context.warn(f"{len(again)} ids stand twice or more: {some(again)}; edges to them go to the first")
+    if repeats := without_repeats(names):
+        context.warn(f"{len(repeats)} ids stand twice or more: {some(repeats)}; edges to them go to the first")
     if len(pixels) and (pixels.min() < -0.5 or pixels[:, 1].max() > picture.height - 0.5):
         context.warn(f"some nodes lie outside the map's picture ({picture.height} rows)")
     _fields.check(top, SHAPE, context)
-    place = {name: k for k, name in reversed(list(enumerate(names)))}
+    index_by_name = {name: k for k, name in reversed(list(enumerate(names)))}
     ids = unique_ids(map(identifier, names))
     xyz = np.concatenate([picture.metres(pixels), np.zeros((len(names), 1))], axis=1)
     if len(xyz) and np.abs(xyz).max() > MAX_METRES:
         refuse(f"nodes must lie within ±{MAX_METRES:g} m", "nodes")
-    found, dangling = _edges(top.get("edges"), place, context)
-    warn_lonely(len(names), (k for line in found for k in (line.a, line.b)), names, context)
+    file_lines, dangling = _edges(top.get("edges"), index_by_name, context)
+    warn_lonely(len(names), (k for line in file_lines for k in (line.a, line.b)), names, context)
     properties: list[Properties] = []
-    for i, name, rest in zip(ids, names, rests, strict=True):
-        known = canonical(("name",), rest)
-        more = {key: value for key, value in rest.items() if key not in known and key != "id"}
-        said: dict[str, Any] = {"more": more} if more else {}
-        if "id" in rest or name != i:
-            said["id"] = rest.get("id", name)
-        properties.append({"kind": "node", **known, NAME: said})
-    edge_ids, shapes, edge_properties = edges(found, ids, xyz, NAME)
+    for i, name, extra_members in zip(ids, names, rests, strict=True):
+        canonical_members = canonical(("name",), extra_members)
+        more = {key: value for key, value in extra_members.items() if key not in canonical_members and key != "id"}
+        source_members: dict[str, Any] = {"more": more} if more else {}
+        if "id" in extra_members or name != i:
+            source_members["id"] = extra_members.get("id", name)
+        properties.append({"kind": "node", **canonical_members, NAME: source_members})
+    edge_ids, shapes, edge_properties = edges(file_lines, ids, xyz, NAME)
     document: dict[str, Any] = {"picture": picture.as_dict()}
-    rest = {key: value for key, value in top.items() if key not in OWN_KEYS}
-    document |= ({"top": rest} if rest else {}) | ({"dangling": dangling} if dangling else {})
+    extra_members = {key: value for key, value in top.items() if key not in OWN_KEYS}
+    document |= ({"top": extra_members} if extra_members else {}) | ({"dangling": dangling} if dangling else {})
     geometry = np.empty(len(ids) + len(shapes), object)
     geometry[:] = [*node_points(xyz), *shapes]
     part = from_columns([*ids, *edge_ids], geometry, [*properties, *edge_properties], "local", {NAME: document})
     return Layers({PartKey("topology", context.level, NETWORK): part})
 
 
-def _picture(said: Any, files: Files, main: str, context: ReadContext) -> _Picture:
+def _picture(members: Any, files: Files, main: str, context: ReadContext) -> _Picture:
     """What the options say, else the file itself, else the map beside it."""
     options = context.options if isinstance(context.options, ReadOptions) else ReadOptions()
     if options.resolution is not None and options.height is not None:
         _check_origin(options.origin, main)
         return _Picture(options.resolution, options.origin, options.height)
-    if said is not None:
-        return _picture_said(said)
+    if members is not None:
+        return _picture_said(members)
     for name in looks_at(main, list(files)):
         if not name.lower().endswith((".yaml", ".yml")):
             continue
@@ -190,16 +190,16 @@ def _picture(said: Any, files: Files, main: str, context: ReadContext) -> _Pictu
     raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
 
 
-def _picture_said(said: Any) -> _Picture:
+def _picture_said(members: Any) -> _Picture:
     """A mapping's resolution, origin and height, checked."""
-    if not isinstance(said, dict):
+    if not isinstance(members, dict):
         refuse("must be a mapping with resolution, origin and height", PICTURE)
-    origin, height = said.get("origin"), said.get("height")
+    origin, height = members.get("origin"), members.get("height")
     if not isinstance(origin, list) or len(origin) != 3:
         refuse("must be [x, y, yaw]", f"{PICTURE}.origin")
     if isinstance(height, bool) or not isinstance(height, int) or not 1 <= height <= 2**31:
         refuse("must be a whole number above 0", f"{PICTURE}.height")
-    resolution = number(said.get("resolution"), f"{PICTURE}.resolution")
+    resolution = number(members.get("resolution"), f"{PICTURE}.resolution")
     if not 1e-6 <= resolution <= 1e4:
         refuse("must be between 1e-6 and 1e4 metres", f"{PICTURE}.resolution")
     x, y, yaw = (number(v, f"{PICTURE}.origin") for v in origin)
@@ -220,63 +220,67 @@ def looks_at(main: str, names: Sequence[str]) -> Iterable[str]:
     root = folder.rpartition("/")[0] if folder.rpartition("/")[2] == "topological" else None
     likely = [] if root is None else [f"{root}/metric/map".lstrip("/")]
     folders = dict.fromkeys([*likely, folder])
-    found = [f"{f}/{m}".lstrip("/") for f in folders for m in MAPS]
-    known = set(names)
-    found = [n for n in found if n in known]
-    if not found:
-        every = [n for n in sorted(known) if n.rpartition("/")[2] in MAPS]
-        found = every if len({n.rpartition("/")[0] for n in every}) == 1 else []
-    homes = {n.rpartition("/")[0] for n in found}
-    pictures = [n for n in sorted(known) if n.rpartition("/")[0] in homes and n.lower().endswith(PICTURES)]
-    return [*(n for n in found if n != main), *pictures]
+    maps = [f"{f}/{m}".lstrip("/") for f in folders for m in MAPS]
+    name_set = set(names)
+    maps = [n for n in maps if n in name_set]
+    if not maps:
+        every = [n for n in sorted(name_set) if n.rpartition("/")[2] in MAPS]
+        maps = every if len({n.rpartition("/")[0] for n in every}) == 1 else []
+    homes = {n.rpartition("/")[0] for n in maps}
+    pictures = [n for n in sorted(name_set) if n.rpartition("/")[0] in homes and n.lower().endswith(PICTURES)]
+    return [*(n for n in maps if n != main), *pictures]
 
 
-def _nodes(said: Sequence[Any]) -> tuple[list[str], Array, list[dict[str, Any]]]:
+def _nodes(entries: Sequence[Any]) -> tuple[list[str], Array, list[dict[str, Any]]]:
     """(ids as texts, float64 [n, 2] pixels, further keys; ``id`` among them where it is no whole number)."""
     names, rows, rests = [], [], []
-    for k, node in enumerate(said):
-        where = f"nodes[{k}]"
+    for k, node in enumerate(entries):
+        location = f"nodes[{k}]"
         if not isinstance(node, dict):
-            refuse("a node is a mapping with id, x and y", where)
-        rest = {key: value for key, value in node.items() if key not in ("id", "x", "y")}
-        names.append(_id(node.get("id"), f"{where}.id"))
+            refuse("a node is a mapping with id, x and y", location)
+        extra_members = {key: value for key, value in node.items() if key not in ("id", "x", "y")}
+        names.append(_id(node.get("id"), f"{location}.id"))
         if not isinstance(node["id"], int):
-            rest["id"] = node["id"]
-        rows.append((number(node.get("x"), f"{where}.x"), number(node.get("y"), f"{where}.y")))
+            extra_members["id"] = node["id"]
+        rows.append((number(node.get("x"), f"{location}.x"), number(node.get("y"), f"{location}.y")))
         if max(map(abs, rows[-1])) > 1e12:
-            refuse("a pixel this far away is of no picture", where)
-        rests.append(rest)
+            refuse("a pixel this far away is of no picture", location)
+        rests.append(extra_members)
     return names, np.array(rows, np.float64).reshape(-1, 2), rests
 
 
-def _id(said: Any, where: str) -> str:
-    if isinstance(said, bool) or not isinstance(said, (int, float, str)):
-        refuse("an id is a number or a text", where)
-    return checked_name(said if isinstance(said, str) else _yaml.text(said), where)
+def _id(value: Any, location: str) -> str:
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        refuse("an id is a number or a text", location)
+    return checked_name(value if isinstance(value, str) else _yaml.text(value), location)
 
 
-def _edges(said: Any, place: Mapping[str, int], context: ReadContext) -> tuple[list[Line], list[dict[str, Any]]]:
+def _edges(
+    entries: Any, index_by_name: Mapping[str, int], context: ReadContext
+) -> tuple[list[Line], list[dict[str, Any]]]:
     """(edges between nodes; those to nowhere as they stand)."""
-    if said is not None and not isinstance(said, list):
+    if entries is not None and not isinstance(entries, list):
         refuse("must be a list", "edges")
-    found, dangling = [], []
-    for k, edge in enumerate(said or ()):
-        where = f"edges[{k}]"
+    file_lines, dangling = [], []
+    for k, edge in enumerate(entries or ()):
+        location = f"edges[{k}]"
         if not isinstance(edge, dict):
-            refuse("an edge is a mapping with from and to", where)
-        ends = [_id(edge.get(word), f"{where}.{word}") for word in ("from", "to")]
-        lost = [end for end in ends if end not in place]
-        if lost:
-            context.warn(f"there is no node {lost[0]!r}: the edge is kept, but is no part of the network", where=where)
+            refuse("an edge is a mapping with from and to", location)
+        ends = [_id(edge.get(end), f"{location}.{end}") for end in ("from", "to")]
+        absent = [end for end in ends if end not in index_by_name]
+        if absent:
+            context.warn(
+                f"there is no node {absent[0]!r}: the edge is kept, but is no part of the network", where=location
+            )
             dangling.append(edge)
             continue
         if ends[0] == ends[1]:
-            context.warn(f"{ends[0]} is joined with itself", where=where)
-        rest = {key: value for key, value in edge.items() if key not in ("from", "to")}
-        if "weight" in rest:
-            number(rest["weight"], f"{where}.weight")
-        found.append(Line(place[ends[0]], place[ends[1]], rest))
-    return found, dangling
+            context.warn(f"{ends[0]} is joined with itself", where=location)
+        extra_members = {key: value for key, value in edge.items() if key not in ("from", "to")}
+        if "weight" in extra_members:
+            number(extra_members["weight"], f"{location}.weight")
+        file_lines.append(Line(index_by_name[ends[0]], index_by_name[ends[1]], extra_members))
+    return file_lines, dangling
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -304,58 +308,62 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     exact = picture.pixels(xy)
     near = np.round(exact)
     own_nodes = np.array([NAME in n.properties for n in net.nodes], bool)
-    whole = np.asarray((np.abs(exact - near) <= WHOLE).all(axis=1), bool)
-    moved = int((~whole & ~own_nodes).sum())
+    is_integer = np.asarray((np.abs(exact - near) <= WHOLE).all(axis=1), bool)
+    moved = int((~is_integer & ~own_nodes).sum())
     context.drop("places of nodes within their pixels", moved, f"pixels of {picture.resolution:g} m are whole numbers")
     # The pixel that holds the place, its left and lower edge included; a roadmap's own broken pixels stay broken.
     inside = np.stack([np.floor(exact[:, 0] + 0.5 + WHOLE), np.ceil(exact[:, 1] - 0.5 - WHOLE)], axis=1)
-    pixels = np.where(whole[:, None], near, np.where(own_nodes[:, None], np.round(exact, 6), inside))
+    pixels = np.where(is_integer[:, None], near, np.where(own_nodes[:, None], np.round(exact, 6), inside))
     ids = _ids(net)
     top = document.get("top")
     top = {key: v for key, v in top.items() if key not in OWN_KEYS} if isinstance(top, dict) else {}
     out = [_yaml.mapping(top, 0)] if top else []
     out.append("nodes:\n" if net.nodes else "nodes: []\n")
-    lost = renamed = 0
+    dropped_count = renamed = 0
     for k, (node, i) in enumerate(zip(net.nodes, ids, strict=True)):
         p = node.properties
         more = own(p, NAME).get("more")
-        said = {key: v for key, v in more.items() if key not in ("id", "x", "y")} if isinstance(more, dict) else {}
+        members = {key: v for key, v in more.items() if key not in ("id", "x", "y")} if isinstance(more, dict) else {}
         called = p.get("name")
         if isinstance(called, str) and called:
-            said["name"] = called
+            members["name"] = called
         elif str(i) != node.id and NAME not in p:
-            said["name"] = node.id
+            members["name"] = node.id
         renamed += str(i) != node.id and NAME not in p
-        lost += bool(p.keys() - NODE_CANONICAL - {NAME})
+        dropped_count += bool(p.keys() - NODE_CANONICAL - {NAME})
         x, y = (_yaml.text(_plain(v)) for v in pixels[k].tolist())
-        out.append(f"- id: {_yaml.text(i)}\n  x: {x}\n  y: {y}\n{_yaml.mapping(said, 2) if said else ''}")
-    context.drop("attributes of nodes", lost, "the format has no place for them")
+        out.append(f"- id: {_yaml.text(i)}\n  x: {x}\n  y: {y}\n{_yaml.mapping(members, 2) if members else ''}")
+    context.drop("attributes of nodes", dropped_count, "the format has no place for them")
     if renamed:
         context.warn(f"{renamed} nodes got a number for an id; their own one is their name, where they had none")
     weighed = 0
-    told = []
+    line_texts = []
     for line in lines(net, context, NAME):
-        said = {key: v for key, v in line.said.items() if key not in ("from", "to")}
-        if not isinstance(said.get("weight"), (int, float)):
+        members = {key: v for key, v in line.said.items() if key not in ("from", "to")}
+        if not isinstance(members.get("weight"), (int, float)):
             a, b = pixels[line.a], pixels[line.b]
-            said["weight"] = round(float(np.hypot(*(a - b))), 9)
+            members["weight"] = round(float(np.hypot(*(a - b))), 9)
             weighed += 1
-        told.append(_edge(ids[line.a], ids[line.b], said))
-    kept = document.get("dangling")
-    kept = [e for e in kept if isinstance(e, dict) and {"from", "to"} <= e.keys()] if isinstance(kept, list) else []
-    told += [_edge(e["from"], e["to"], {k: v for k, v in e.items() if k not in ("from", "to")}) for e in kept]
+        line_texts.append(_edge(ids[line.a], ids[line.b], members))
+    dangling = document.get("dangling")
+    dangling = (
+        [e for e in dangling if isinstance(e, dict) and {"from", "to"} <= e.keys()]
+        if isinstance(dangling, list)
+        else []
+    )
+    line_texts += [_edge(e["from"], e["to"], {k: v for k, v in e.items() if k not in ("from", "to")}) for e in dangling]
     if weighed:
         context.fill("edges: weight", "distance in pixels", f"{weighed} edges come from a format that does not say it")
-    out += ["edges:\n", *told] if told else ["edges: []\n"]
+    out += ["edges:\n", *line_texts] if line_texts else ["edges: []\n"]
     out.append(_yaml.mapping({PICTURE: picture.as_dict()}, 0))
     return {FILE: "".join(out).encode()}
 
 
-def _edge(a: Any, b: Any, said: dict[str, Any]) -> str:
-    weight = f"  weight: {_yaml.text(said['weight'])}\n" if isinstance(said.get("weight"), (int, float)) else ""
-    rest = {key: value for key, value in said.items() if key != "weight" or not weight}
+def _edge(a: Any, b: Any, members: dict[str, Any]) -> str:
+    weight = f"  weight: {_yaml.text(members['weight'])}\n" if isinstance(members.get("weight"), (int, float)) else ""
+    extra_members = {key: value for key, value in members.items() if key != "weight" or not weight}
     ends = f"- from: {_yaml.text(a)}\n  to: {_yaml.text(b)}\n"
-    return f"{ends}{weight}{_yaml.mapping(rest, 2) if rest else ''}"
+    return f"{ends}{weight}{_yaml.mapping(extra_members, 2) if extra_members else ''}"
 
 
 def _plain(value: float) -> float:
@@ -365,8 +373,10 @@ def _plain(value: float) -> float:
 def _sorted(net: Net) -> Net:
     """The same with nodes in the order of their ids."""
     order = sorted(range(len(net.nodes)), key=lambda k: natural(net.nodes[k].id))
-    place = {old: new for new, old in enumerate(order)}
-    moved = [type(e)(e.id, place[e.source], place[e.target], e.properties, e.geometry, e.level) for e in net.edges]
+    new_index = {old: new for new, old in enumerate(order)}
+    moved = [
+        type(e)(e.id, new_index[e.source], new_index[e.target], e.properties, e.geometry, e.level) for e in net.edges
+    ]
     return Net([net.nodes[k] for k in order], moved, net.levels)
 
 
@@ -377,10 +387,10 @@ def _ids(net: Net) -> list[Any]:
     """The ids as the file says them: whole numbers and a roadmap's own texts; the others get free numbers."""
     out: list[Any] = []
     for node in net.nodes:
-        said = own(node.properties, NAME).get("id")
-        keep = isinstance(said, (int, float)) or (isinstance(said, str) and is_name(said))
-        if keep and not isinstance(said, bool):
-            out.append(said)
+        source_id = own(node.properties, NAME).get("id")
+        keep = isinstance(source_id, (int, float)) or (isinstance(source_id, str) and is_name(source_id))
+        if keep and not isinstance(source_id, bool):
+            out.append(source_id)
         elif _WHOLE_NUMBER.match(node.id):
             out.append(int(node.id))
         else:
@@ -399,22 +409,22 @@ def _ids(net: Net) -> list[Any]:
 def _picture_of(layers: Layers, document: Mapping[str, Any], xy: Array, context: WriteContext) -> _Picture:
     """The picture whose pixels are written."""
     grids = layers.grids()
-    chosen = choose(sorted(grids), None)
-    if chosen:
-        grid: OccupancyGrid = grids[chosen[0]]
+    keys = choose(sorted(grids), None)
+    if keys:
+        grid: OccupancyGrid = grids[keys[0]]
         return _Picture(grid.resolution, grid.origin, grid.height)
-    known = document.get("picture")
-    if isinstance(known, dict):
+    source_picture = document.get("picture")
+    if isinstance(source_picture, dict):
         with contextlib.suppress(UnreadableFile):  # a document may be edited
-            return _picture_said(known)
+            return _picture_said(source_picture)
     low = np.floor(xy.min(axis=0) - MARGIN) if len(xy) else np.zeros(2)
     high = np.ceil(xy.max(axis=0) + MARGIN) if len(xy) else np.ones(2)
     size = context.options.pixel_size if isinstance(context.options, WriteOptions) else RESOLUTION
     rows = max(1, math.ceil((high[1] - low[1]) / size))
-    made = _Picture(size, (float(low[0]), float(low[1]), 0.0), rows)
-    told = "picture: resolution, origin, height"
-    context.fill(told, made.as_dict(), "no map's picture is known", "pixel_size")
-    return made
+    picture = _Picture(size, (float(low[0]), float(low[1]), 0.0), rows)
+    item = "picture: resolution, origin, height"
+    context.fill(item, picture.as_dict(), "no map's picture is known", "pixel_size")
+    return picture
 
 
 def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
@@ -436,8 +446,8 @@ def detect(name: str, data: bytes) -> bool:
     """YAML with a list of nodes that begin with id, x or y, and with edges from and to."""
     if not name.lower().endswith((".yaml", ".yml")) or not _NODES.search(data[: 2**16]):
         return False
-    found = _EDGES.search(data)
-    return bool(found and (_EDGE.search(data, found.end()) or re.match(rb"[ \t]*\[\]", data[found.end() :][:8])))
+    match = _EDGES.search(data)
+    return bool(match and (_EDGE.search(data, match.end()) or re.match(rb"[ \t]*\[\]", data[match.end() :][:8])))
 
 
 register(

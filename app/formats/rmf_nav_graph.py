@@ -127,19 +127,21 @@ def read(files: Files, context: ReadContext) -> Layers:
         _fields.check(graphs[graph], SHAPE, context)
         top, graphs[graph] = graphs[graph], {}  # what was parsed is let go before the features are made
         tops[str(graph)] = {key: value for key, value in top.items() if key not in ("levels", "doors", "lifts")}
-        for name, said in mapping(top.get("levels"), "levels").items():
-            _level(levels.setdefault(name, _Level()), graph, mapping(said, f"levels.{name}"), f"levels.{name}", context)
+        for name, members in mapping(top.get("levels"), "levels").items():
+            _level(
+                levels.setdefault(name, _Level()), graph, mapping(members, f"levels.{name}"), f"levels.{name}", context
+            )
         _collect(doors, mapping(top.get("doors"), "doors"), graph, context, "doors")
         _collect(lifts, mapping(top.get("lifts"), "lifts"), graph, context, "lifts")
-    top = said = {}
+    top = members = {}
     if not levels:
         refuse("a navigation graph needs at least one level", "levels")
     if context.level != GROUND:
         context.warn(f"its levels have names of their own: level={context.level} is not used", where="levels")
-    for name, (said, inside, k) in doors.items():
-        _door(levels, name, said, {"index": k, **_partly(inside, graphs)})
-    for name, (said, inside, k) in lifts.items():
-        _lift(levels, name, said, {"index": k, **_partly(inside, graphs)})
+    for name, (members, inside, k) in doors.items():
+        _door(levels, name, members, {"index": k, **_partly(inside, graphs)})
+    for name, (members, inside, k) in lifts.items():
+        _lift(levels, name, members, {"index": k, **_partly(inside, graphs)})
     parts: dict[PartKey, Part] = {}
     taken: set[str] = set()
     for name, level in levels.items():
@@ -167,9 +169,13 @@ def _graphs(files: Files, context: ReadContext) -> dict[int, dict[str, Any]]:
         if not isinstance(top, dict):
             refuse("must be a mapping with levels", "")
         stem = _stem(name)
-        wanted = int(stem) if stem.isdecimal() and stem.isascii() and len(stem) < 5 else None
-        graph = wanted if wanted is not None and wanted not in out else next(k for k in range(10**6) if k not in out)
-        if wanted is None:
+        graph_number = int(stem) if stem.isdecimal() and stem.isascii() and len(stem) < 5 else None
+        graph = (
+            graph_number
+            if graph_number is not None and graph_number not in out
+            else next(k for k in range(10**6) if k not in out)
+        )
+        if graph_number is None:
             context.warn(f"its name is no number: it is taken as graph {graph}")
         out[graph] = top
     return out
@@ -179,26 +185,26 @@ def _stem(name: str) -> str:
     return name.rpartition("/")[2].partition(".")[0]
 
 
-def _level(level: _Level, graph: int, said: Mapping[str, Any], where: str, context: ReadContext) -> None:
-    rows = listing(said.get("vertices"), f"{where}.vertices")
+def _level(level: _Level, graph: int, members: Mapping[str, Any], location: str, context: ReadContext) -> None:
+    rows = listing(members.get("vertices"), f"{location}.vertices")
     places: list[int] = []
-    for k, (row, (x, y)) in enumerate(zip(rows, _rmf.places(rows, f"{where}.vertices").tolist(), strict=True)):
-        parameters = mapping(row[2] if len(row) > 2 else None, f"{where}.vertices[{k}][2]")
+    for k, (row, (x, y)) in enumerate(zip(rows, _rmf.places(rows, f"{location}.vertices").tolist(), strict=True)):
+        parameters = mapping(row[2] if len(row) > 2 else None, f"{location}.vertices[{k}][2]")
         # A graph may list twins; of other graphs each vertex is found again by what it says.
         key = orjson.dumps((x, y, parameters, row[3:]), option=orjson.OPT_SORT_KEYS).decode()
-        place = level.nodes.get(key)
-        if place is None or str(graph) in level.nodes_say[place]["graphs"]:
-            place = len(level.at)
-            level.nodes.setdefault(key, place)
+        node_index = level.nodes.get(key)
+        if node_index is None or str(graph) in level.nodes_say[node_index]["graphs"]:
+            node_index = len(level.at)
+            level.nodes.setdefault(key, node_index)
             level.at.append((x, y))
             more = {"more": row[3:]} if len(row) > 3 else {}
             level.nodes_say.append({"graphs": {}, "parameters": parameters, **more})
-        level.nodes_say[place]["graphs"][str(graph)] = k
-        places.append(place)
+        level.nodes_say[node_index]["graphs"][str(graph)] = k
+        places.append(node_index)
     shared: dict[str, dict[str, Any]] = {}
     compact = Compact()
-    for k, row in enumerate(listing(said.get("lanes"), f"{where}.lanes")):
-        at = f"{where}.lanes[{k}]"
+    for k, row in enumerate(listing(members.get("lanes"), f"{location}.lanes")):
+        at = f"{location}.lanes[{k}]"
         if not isinstance(row, list) or len(row) < 2:
             refuse("must be a list [vertex, vertex, {…}]", at)
         i, j = index(row[0], f"{at}[0]"), index(row[1], f"{at}[1]")
@@ -211,29 +217,29 @@ def _level(level: _Level, graph: int, said: Mapping[str, Any], where: str, conte
         more = {"more": row[3:]} if len(row) > 3 else {}
         if len(shared) < SHARED:
             parameters = shared.setdefault(orjson.dumps(parameters).decode(), parameters)
-        rest = {"graph": graph, "index": k, "parameters": parameters, **more}
-        level.edges.append((places[i], places[j], compact(rest)))
+        extra_members = {"graph": graph, "index": k, "parameters": parameters, **more}
+        level.edges.append((places[i], places[j], compact(extra_members)))
         if parameters.get("is_bidirectional") is True:
-            level.edges.append((places[j], places[i], compact({**rest, "reverse": True})))
-    rest = {key: value for key, value in said.items() if key not in ("vertices", "lanes")}
-    if rest:
-        level.rest[str(graph)] = rest
+            level.edges.append((places[j], places[i], compact({**extra_members, "reverse": True})))
+    extra_members = {key: value for key, value in members.items() if key not in ("vertices", "lanes")}
+    if extra_members:
+        level.rest[str(graph)] = extra_members
 
 
 def _collect(
-    known: dict[str, tuple[Any, list[int], int]],
-    said: Mapping[str, Any],
+    entries: dict[str, tuple[Any, list[int], int]],
+    members: Mapping[str, Any],
     graph: int,
     context: ReadContext,
     section: str,
 ) -> None:
     """Doors or lifts of one graph, beside those of the graphs before it."""
-    for name, one in said.items():
-        if name not in known:
-            known[name] = (one, [graph], len(known))
+    for name, one in members.items():
+        if name not in entries:
+            entries[name] = (one, [graph], len(entries))
             continue
-        known[name][1].append(graph)
-        if known[name][0] != one:
+        entries[name][1].append(graph)
+        if entries[name][0] != one:
             context.warn("differs from what an earlier graph says, which is kept", where=f"{section}.{name}")
 
 
@@ -241,33 +247,37 @@ def _partly(inside: list[int], graphs: Mapping[int, Any]) -> dict[str, Any]:
     return {} if len(inside) == len(graphs) else {"graphs": inside}
 
 
-def _door(levels: Mapping[str, _Level], name: str, said: Any, rest: dict[str, Any]) -> None:
-    where = f"doors.{name}"
-    one = dict(mapping(said, where))
-    ends = listing(one.pop("endpoints", None), f"{where}.endpoints")
+def _door(levels: Mapping[str, _Level], name: str, members: Any, source_properties: dict[str, Any]) -> None:
+    location = f"doors.{name}"
+    one = dict(mapping(members, location))
+    ends = listing(one.pop("endpoints", None), f"{location}.endpoints")
     if len(ends) != 2:
-        refuse("must be two points", f"{where}.endpoints")
-    at = _rmf.places(ends, f"{where}.endpoints")
+        refuse("must be two points", f"{location}.endpoints")
+    at = _rmf.places(ends, f"{location}.endpoints")
     level = one.pop("map", None)
     if level not in levels:
         one["map"] = level
         level = next(iter(levels))
-    properties = {"kind": "door", "name": name, NAME: {**rest, "says": one}}
+    properties = {"kind": "door", "name": name, NAME: {**source_properties, "says": one}}
     levels[str(level)].objects.append((f"{level}/door/{_rmf.short(name)}", shapely.LineString(at), properties))
 
 
-def _lift(levels: Mapping[str, _Level], name: str, said: Any, rest: dict[str, Any]) -> None:
-    where = f"lifts.{name}"
-    one = dict(mapping(said, where))
-    position = listing(one.pop("position", None), f"{where}.position")
-    dims = listing(one.pop("dims", None), f"{where}.dims")
+def _lift(levels: Mapping[str, _Level], name: str, members: Any, source_properties: dict[str, Any]) -> None:
+    location = f"lifts.{name}"
+    one = dict(mapping(members, location))
+    position = listing(one.pop("position", None), f"{location}.position")
+    dims = listing(one.pop("dims", None), f"{location}.dims")
     if len(position) < 2 or len(dims) != 2:
-        refuse("needs position [x, y, yaw] and dims [width, depth]", where)
-    x, y, yaw = (number(v, f"{where}.position") for v in [*position, 0.0][:3])
-    size = [*(number(v, f"{where}.dims") for v in dims), CABIN_HEIGHT]
+        refuse("needs position [x, y, yaw] and dims [width, depth]", location)
+    x, y, yaw = (number(v, f"{location}.position") for v in [*position, 0.0][:3])
+    size = [*(number(v, f"{location}.dims") for v in dims), CABIN_HEIGHT]
     level = next(iter(levels))
     properties: dict[str, Any] = {"kind": "lift", "name": name, "pose": [x, y, 0.0, 0.0, 0.0, yaw], "size": size}
-    row = (f"{level}/lift/{_rmf.short(name)}", shapely.Point(x, y), {**properties, NAME: {**rest, "says": one}})
+    row = (
+        f"{level}/lift/{_rmf.short(name)}",
+        shapely.Point(x, y),
+        {**properties, NAME: {**source_properties, "says": one}},
+    )
     levels[level].objects.append(row)
 
 
@@ -275,36 +285,38 @@ def _network(name: str, level: _Level, taken: set[str]) -> Features:
     level.nodes.clear()
     properties: list[Properties] = []
     compact = Compact()
-    wanted = []
-    for k, rest in enumerate(level.nodes_say):
-        called = rest["parameters"].get("name")
-        said: dict[str, Any] = {"kind": "node"}
+    names = []
+    for k, source_properties in enumerate(level.nodes_say):
+        called = source_properties["parameters"].get("name")
+        item_properties: dict[str, Any] = {"kind": "node"}
         if isinstance(called, str) and called:
-            said["name"] = called
-            rest["parameters"] = {key: value for key, value in rest["parameters"].items() if key != "name"}
-        properties.append(compact({**said, NAME: compact(rest)}))
-        wanted.append(_rmf.short(called) if "name" in said else f"{_rmf.short(name, 200)}/{k}")
-    ids = unique_ids(wanted, taken)
+            item_properties["name"] = called
+            source_properties["parameters"] = {
+                key: value for key, value in source_properties["parameters"].items() if key != "name"
+            }
+        properties.append(compact({**item_properties, NAME: compact(source_properties)}))
+        names.append(_rmf.short(called) if "name" in item_properties else f"{_rmf.short(name, 200)}/{k}")
+    ids = unique_ids(names, taken)
     taken.update(ids)
     at = np.array(level.at, np.float64).reshape(-1, 2)
     sources, targets = [i for i, _, _ in level.edges], [j for _, j, _ in level.edges]
     edges = [_rmf.short(f"{ids[i]}_{ids[j]}", 490) for i, j in zip(sources, targets, strict=True)]
     edges = unique_ids(edges, taken)
     taken.update(edges)
-    for i, j, rest in level.edges:
-        said = {"kind": "edge", "source": ids[i], "target": ids[j], NAME: rest}
-        limit = _limit(rest["parameters"])
+    for i, j, source_properties in level.edges:
+        item_properties = {"kind": "edge", "source": ids[i], "target": ids[j], NAME: source_properties}
+        limit = _limit(source_properties["parameters"])
         if limit:
-            said["speed_limit"] = limit
-        properties.append(compact(said))
+            item_properties["speed_limit"] = limit
+        properties.append(compact(item_properties))
     lines = segments(at[sources], at[targets]) if sources else np.empty(0, object)
     return from_columns([*ids, *edges], np.concatenate([points(at), lines]), properties, "local")
 
 
 def _limit(parameters: Mapping[str, Any]) -> float:
-    said = parameters.get("speed_limit")
-    good = isinstance(said, (int, float)) and not isinstance(said, bool) and said > 0
-    return float(said) if good and said is not None else 0.0
+    speed = parameters.get("speed_limit")
+    valid = isinstance(speed, (int, float)) and not isinstance(speed, bool) and speed > 0
+    return float(speed) if valid and speed is not None else 0.0
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -343,10 +355,16 @@ class _Edge:
     @property
     def order(self) -> tuple[bool, int, bool, int, str]:
         """Its place among the lanes of its file; edges that come from none follow by id."""
-        rest = own(self.p, NAME) or own(self.p, BUILDING)
-        was = rest.get("index")
-        known = isinstance(was, int)
-        return not known, was if isinstance(was, int) else 0, rest.get("reverse") is True, len(self.id), self.id
+        source_members = own(self.p, NAME) or own(self.p, BUILDING)
+        was = source_members.get("index")
+        has_index = isinstance(was, int)
+        return (
+            not has_index,
+            was if isinstance(was, int) else 0,
+            source_members.get("reverse") is True,
+            len(self.id),
+            self.id,
+        )
 
 
 @dataclass(slots=True)
@@ -388,12 +406,12 @@ class _Writer:
         building: dict[str, Any] = {}
         tops: dict[str, Any] = {}
         for part in [*self.layers.vector("topology").values(), *self.layers.vector("objects").values()]:
-            said = part.document.get(BUILDING)
-            if isinstance(said, dict) and not building:
-                building = mapping(said.get("building"), "building")
-            said = part.document.get(NAME)
-            if isinstance(said, dict) and not tops:
-                tops = mapping(said.get("graphs"), "graphs")
+            document = part.document.get(BUILDING)
+            if isinstance(document, dict) and not building:
+                building = mapping(document.get("building"), "building")
+            document = part.document.get(NAME)
+            if isinstance(document, dict) and not tops:
+                tops = mapping(document.get("graphs"), "graphs")
         return building, tops
 
     def files(self) -> dict[str, bytes]:
@@ -412,8 +430,8 @@ class _Writer:
                 limited = f"{why}, where they have none"
                 self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
         self.robots.report(self.context)
-        for what, count in sorted(self.lost.items()):
-            self.context.drop(what, count, "a navigation graph has no place for it")
+        for item, count in sorted(self.lost.items()):
+            self.context.drop(item, count, "a navigation graph has no place for it")
         if self.building.get("coordinate_system") in ("wgs84", "web_mercator"):
             self.context.warn(
                 "the building is drawn on earth: its graphs are in metres of the environment's local frame, not in the "
@@ -431,8 +449,8 @@ class _Writer:
             self.lost["nodes without lanes"] += int((~used).sum())
         for key, part in self.layers.vector("objects").items():
             if key.name in (BUILDING, NAME):
-                rest = sum(p.get("kind") not in ("door", "lift") for p in part.properties)
-                self.lost["objects that are neither door nor lift"] += rest
+                count = sum(p.get("kind") not in ("door", "lift") for p in part.properties)
+                self.lost["objects that are neither door nor lift"] += count
 
     # what is there
 
@@ -441,9 +459,9 @@ class _Writer:
         for key, part in self.layers.vector("objects").items():
             if key.name not in (BUILDING, NAME):
                 continue
-            chosen = part.of_kind(kind)
-            geometry = chosen.in_local(self.layers.frame)
-            rows = list(zip(chosen.ids, chosen.properties, geometry, strict=True))
+            subset = part.of_kind(kind)
+            geometry = subset.in_local(self.layers.frame)
+            rows = list(zip(subset.ids, subset.properties, geometry, strict=True))
             rows.sort(key=lambda row: (_place(row[1]), row[0]))
             for i, p, g in rows:
                 yield key.level, i, p, g, part.document
@@ -457,13 +475,13 @@ class _Writer:
                 self.lost["doors without two ends, or of a name that another one has"] += 1
                 continue
             names.add(name)
-            rest = own(p, NAME)
-            inside = rest.get("graphs") if isinstance(rest.get("graphs"), list) else None
-            out.append(_Door(name, level, _rmf.ends(g), inside, mapping(rest.get("says"), "says")))
+            source_members = own(p, NAME)
+            inside = source_members.get("graphs") if isinstance(source_members.get("graphs"), list) else None
+            out.append(_Door(name, level, _rmf.ends(g), inside, mapping(source_members.get("says"), "says")))
         return out
 
     def _lifts(self) -> list[_Lift]:
-        found = []
+        lifts = []
         names: set[str] = set()
         for _, i, p, g, _ in self._items("lift"):
             name = str(p.get("name") or i)
@@ -471,29 +489,29 @@ class _Writer:
                 self.lost["lifts without a point, or of a name that another one has"] += 1
                 continue
             names.add(name)
-            said = mapping(own(p, BUILDING).get("says"), "says")
+            lift_members = mapping(own(p, BUILDING).get("says"), "says")
             pose, size = _rmf.pose_of(p), _rmf.size_of(p) or (1.0, 1.0)
-            yaw = pose[5] if pose else said.get("yaw", 0.0)
+            yaw = pose[5] if pose else lift_members.get("yaw", 0.0)
             yaw = float(yaw) if isinstance(yaw, (int, float)) else 0.0
-            rest = own(p, NAME)
-            inside = rest.get("graphs") if isinstance(rest.get("graphs"), list) else None
+            source_members = own(p, NAME)
+            inside = source_members.get("graphs") if isinstance(source_members.get("graphs"), list) else None
             position = (float(g.x), float(g.y), yaw)
-            says = mapping(rest.get("says"), "says")
-            served = self._served(said)
+            says = mapping(source_members.get("says"), "says")
+            served = self._served(lift_members)
             lift = _Lift(name, position, size, _shaft(position, size), served, inside, says)
-            found.append((_place(p), name, lift))
-        found.sort(key=lambda row: row[:2])
-        return [lift for _, _, lift in found]
+            lifts.append((_place(p), name, lift))
+        lifts.sort(key=lambda row: row[:2])
+        return [lift for _, _, lift in lifts]
 
-    def _served(self, said: Mapping[str, Any]) -> frozenset[str]:
+    def _served(self, lift_members: Mapping[str, Any]) -> frozenset[str]:
         """The levels between a lift's lowest and highest floor; none where it has no door on any."""
-        if not said.get("level_doors"):
+        if not lift_members.get("level_doors"):
             return frozenset()
-        known = {level.name: level.elevation for level in self.layers.levels}
-        low = known.get(str(said.get("lowest_floor") or ""), -math.inf)
-        high = known.get(str(said.get("highest_floor") or ""), math.inf)
+        elevations = {level.name: level.elevation for level in self.layers.levels}
+        low = elevations.get(str(lift_members.get("lowest_floor") or ""), -math.inf)
+        high = elevations.get(str(lift_members.get("highest_floor") or ""), math.inf)
         names = {key.level for key in self.layers.vector("topology")}
-        return frozenset(name for name in names if low <= known.get(name, 0.0) <= high)
+        return frozenset(name for name in names if low <= elevations.get(name, 0.0) <= high)
 
     def _storeys(self) -> list[_Storey]:
         by_level: dict[str, list[Features]] = {}
@@ -509,16 +527,16 @@ class _Writer:
             for part in networks:
                 documents = {**part.document, **documents}
                 point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
-                where = [k for k, p in enumerate(part.properties) if p.get("kind") == "node" and point[k]]
-                ids += [part.ids[k] for k in where]
-                nodes += [part.properties[k] for k in where]
-                at.append(shapely.get_coordinates(part.take(where).in_local(self.layers.frame)))
+                indices = [k for k, p in enumerate(part.properties) if p.get("kind") == "node" and point[k]]
+                ids += [part.ids[k] for k in indices]
+                nodes += [part.properties[k] for k in indices]
+                at.append(shapely.get_coordinates(part.take(indices).in_local(self.layers.frame)))
             places = {i: k for k, i in reversed(list(enumerate(ids)))}
             edges = self._edges(networks, places)
             document = mapping(documents.get(NAME), NAME)
             scale = mapping(documents.get(BUILDING), BUILDING).get("transform")
-            said = scale[0] if isinstance(scale, list) and scale else None
-            factor = float(said) ** 2 if isinstance(said, (int, float)) else 1.0
+            ratio = scale[0] if isinstance(scale, list) and scale else None
+            factor = float(ratio) ** 2 if isinstance(ratio, (int, float)) else 1.0
             storey = _Storey(level, ids, nodes, np.concatenate(at), edges, document, PARALLEL * factor)
             storey.lifts = self._inside(storey)
             out.append(storey)
@@ -568,10 +586,10 @@ class _Writer:
         top = dict(mapping(self.tops.get(str(graph)), "graphs"))
         if "building_name" not in top:
             name = self.building.get("building_name", self.building.get("name"))
-            usual = self.options.building or self.context.title
-            top["building_name"] = usual if name is None else name
+            default = self.options.building or self.context.title
+            top["building_name"] = default if name is None else name
             if name is None:
-                self.context.fill("building_name", usual, "no source names the building", "building")
+                self.context.fill("building_name", default, "no source names the building", "building")
         if self.building.get("coordinate_system") == "cartesian_meters":
             parameters = self.building.get("parameters")
             top.setdefault("offset", [value_of(parameters, key, 0) for key in ("offset_x", "offset_y")])
@@ -594,8 +612,8 @@ class _Writer:
         names: Counter[str] = Counter()
         for storey in self.storeys:
             rows = self._level(storey, graph, names)
-            while some := list(islice(rows, ROWS)):
-                out.write("".join(some).encode())
+            while batch := list(islice(rows, ROWS)):
+                out.write("".join(batch).encode())
         out.write(_yaml.mapping(after, 0).encode())
         twice = sorted(name for name, count in names.items() if count > 1)
         if twice:
@@ -608,38 +626,42 @@ class _Writer:
         """The lines of a level in a graph; names: how often vertices have each."""
         edges = storey.edges.get(graph, [])
         graphs = [own(p, NAME).get("graphs") for p in storey.nodes]
-        listed = [said.get(str(graph)) if isinstance(said, dict) else None for said in graphs]
+        listed = [members.get(str(graph)) if isinstance(members, dict) else None for members in graphs]
         order = sorted((k for k, at in enumerate(listed) if isinstance(at, int)), key=lambda k: (listed[k], k))
         order = list(dict.fromkeys([*order, *(k for e in edges for k in (e.source, e.target))]))
-        place = {k: n for n, k in enumerate(order)}
+        new_index = {k: n for n, k in enumerate(order)}
         yield f"  {_yaml.text(storey.name)}:\n"
-        yield from _section("lanes", self._lanes(storey, graph, edges, place))
+        yield from _section("lanes", self._lanes(storey, graph, edges, new_index))
         yield from _section("vertices", self._vertices(storey, order, names))
-        rest = mapping(mapping(storey.document.get("level"), "level").get(str(graph)), "level")
-        yield _yaml.mapping(rest, 4) if rest else ""
+        extra_members = mapping(mapping(storey.document.get("level"), "level").get(str(graph)), "level")
+        yield _yaml.mapping(extra_members, 4) if extra_members else ""
 
     def _vertices(self, storey: _Storey, order: Sequence[int], names: Counter[str]) -> Iterator[str]:
         texts = list(map(_yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
         for n, k in enumerate(order):
-            said = {**self._vertex(storey, k), **self.robots.at(storey.name, storey.ids[k])}
-            if said.get("name"):
-                names[str(said["name"])] += 1
+            options = {**self._vertex(storey, k), **self.robots.at(storey.name, storey.ids[k])}
+            if options.get("name"):
+                names[str(options["name"])] += 1
             more = "".join(f", {self.flow(v)}" for v in own(storey.nodes[k], NAME).get("more") or ())
-            yield f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(said)}{more}]\n"
+            yield f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(options)}{more}]\n"
 
-    def _lanes(self, storey: _Storey, graph: int, edges: Sequence[_Edge], place: Mapping[int, int]) -> Iterator[str]:
+    def _lanes(
+        self, storey: _Storey, graph: int, edges: Sequence[_Edge], new_index: Mapping[int, int]
+    ) -> Iterator[str]:
         crossed = self._crossed(storey, edges)
         blocked = {(e.source, e.target) for e in edges if e.p.get("blocked") is True}
         for n, e in enumerate(edges):
             if own(e.p, NAME).get("reverse") is True and e.paired:
                 continue  # it is told by the lane that says is_bidirectional
             more = "".join(f", {self.flow(v)}" for v in own(e.p, NAME).get("more") or ())
-            said = self._lane(storey, e, crossed[n])
-            if e.p.get("blocked") is True or (said.get("is_bidirectional") is True and (e.target, e.source) in blocked):
-                said["blocked"] = True  # a lane counts as one, whichever direction is closed
-            yield f"      - [{place[e.source]}, {place[e.target]}, {self.flow(said)}{more}]\n"
+            options = self._lane(storey, e, crossed[n])
+            if e.p.get("blocked") is True or (
+                options.get("is_bidirectional") is True and (e.target, e.source) in blocked
+            ):
+                options["blocked"] = True  # a lane counts as one, whichever direction is closed
+            yield f"      - [{new_index[e.source]}, {new_index[e.target]}, {self.flow(options)}{more}]\n"
         for row in mapping(storey.document.get("dangling"), "dangling").get(str(graph), ()):
-            if all(0 <= v < len(place) for v in row[:2]):
+            if all(0 <= v < len(new_index) for v in row[:2]):
                 self.lost["lanes to vertices that did not exist"] += 1
             else:
                 yield f"      - {self.flow(row)}\n"
@@ -649,56 +671,56 @@ class _Writer:
     def _vertex(self, storey: _Storey, k: int) -> dict[str, Any]:
         p = storey.nodes[k]
         if NAME in p:
-            said = dict(mapping(own(p, NAME).get("parameters"), "parameters"))
+            options = dict(mapping(own(p, NAME).get("parameters"), "parameters"))
             name = p.get("name")
-            if isinstance(name, str) or "name" not in said:
-                said["name"] = name or ""
-            return said
+            if isinstance(name, str) or "name" not in options:
+                options["name"] = name or ""
+            return options
         if BUILDING in p:
             parameters = mapping(own(p, BUILDING).get("parameters"), "parameters")
-            said = {"name": p.get("name") or ""}
-            said |= {key: value_of(parameters, key, value) for key, value in parameters.items()}
+            options = {"name": p.get("name") or ""}
+            options |= {key: value_of(parameters, key, value) for key, value in parameters.items()}
         else:
             self.lost["nodes' orientations"] += p.get("orientation") is not None
             self.lost["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
-            said = {"name": p.get("name") or storey.ids[k]}
+            options = {"name": p.get("name") or storey.ids[k]}
         if storey.lifts[k] is not None:
-            said["lift"] = storey.lifts[k]
-        return said
+            options["lift"] = storey.lifts[k]
+        return options
 
     def _lane(self, storey: _Storey, e: _Edge, door: str | None) -> dict[str, Any]:
         limit = _rmf.limit(e.p)
         if NAME in e.p:
-            said = dict(mapping(own(e.p, NAME).get("parameters"), "parameters"))
-            if _limit(said) != limit:
-                said["speed_limit"] = limit
-            if said.get("is_bidirectional") is True and not e.paired:
-                said["is_bidirectional"] = False
-            return said
-        said = {}
+            options = dict(mapping(own(e.p, NAME).get("parameters"), "parameters"))
+            if _limit(options) != limit:
+                options["speed_limit"] = limit
+            if options.get("is_bidirectional") is True and not e.paired:
+                options["is_bidirectional"] = False
+            return options
+        options = {}
         if BUILDING not in e.p:
             self.new_lanes += 1
             limit = limit or self.options.speed_limit
         if door is not None:
-            said["door_name"] = door
+            options["door_name"] = door
         if limit:
-            said["speed_limit"] = limit
-        rest = own(e.p, BUILDING)
-        parameters = rest.get("parameters")
+            options["speed_limit"] = limit
+        source_members = own(e.p, BUILDING)
+        parameters = source_members.get("parameters")
         orientation = value_of(parameters, "orientation")
         if orientation:
             turned = _rmf.turned(orientation) if orientation in ("forward", "backward") else ""
-            said["orientation_constraint"] = turned if rest.get("reverse") is True else orientation
+            options["orientation_constraint"] = turned if source_members.get("reverse") is True else orientation
         for key in LANE_WORDS:
             if value_of(parameters, key):
-                said[key] = value_of(parameters, key)
-        for word, k in (("dock_name", e.target), ("undock_name", e.source)):
+                options[key] = value_of(parameters, key)
+        for dock_key, k in (("dock_name", e.target), ("undock_name", e.source)):
             dock = value_of(own(storey.nodes[k], BUILDING).get("parameters"), "dock_name")
             if dock:
-                said[word] = dock
+                options[dock_key] = dock
         if not e.paired:
-            said["is_bidirectional"] = False
-        return said
+            options["is_bidirectional"] = False
+        return options
 
     def _crossed(self, storey: _Storey, edges: Sequence[_Edge]) -> list[str | None]:
         """The door that each edge leads through; of several the last."""
@@ -732,8 +754,8 @@ def _paired(edges: Sequence[_Edge], nodes: int) -> list[bool]:
     lanes: dict[int | None, int] = {}
     lane = np.array([lanes.setdefault(_lane_of(e.p), len(lanes)) for e in edges], np.int64)
     forth, back = ends[:, 0] * nodes + ends[:, 1], ends[:, 1] * nodes + ends[:, 0]
-    place = np.unique(np.concatenate([forth, back]), return_inverse=True)[1]
-    key = place.reshape(2, -1) * len(lanes) + lane
+    pair_index = np.unique(np.concatenate([forth, back]), return_inverse=True)[1]
+    key = pair_index.reshape(2, -1) * len(lanes) + lane
     paired: list[bool] = (np.isin(key[0], key[1]) & (ends[:, 0] != ends[:, 1])).tolist()
     return paired
 
@@ -779,12 +801,12 @@ def _graph_of(p: Properties) -> int | None:
 
 def _lane_of(p: Properties) -> int | None:
     """The number of the lane in its file: what two edges of one two-way lane have in common."""
-    said = own(p, NAME) if NAME in p else own(p, BUILDING)
+    source_members = own(p, NAME) if NAME in p else own(p, BUILDING)
     if NAME in p:
-        parameters = said.get("parameters")
+        parameters = source_members.get("parameters")
         if not isinstance(parameters, dict) or parameters.get("is_bidirectional") is not True:
             return None
-    index = said.get("index")
+    index = source_members.get("index")
     return index if isinstance(index, int) else None
 
 

@@ -104,9 +104,9 @@ def read(files: Files, context: ReadContext) -> Layers:
         refuse("must be a site: a mapping with format_version and levels", "")
     reader = _Reader(top, context)
     parts = reader.parts()
-    found = images(files, main, list(reader.drawings()), context)
-    if found and context.wants("resources"):
-        parts[PartKey("resources", GROUND, BUILDING)] = Resources(found)
+    pictures = images(files, main, list(reader.drawings()), context)
+    if pictures and context.wants("resources"):
+        parts[PartKey("resources", GROUND, BUILDING)] = Resources(pictures)
     parts = {key: part for key, part in parts.items() if context.wants(key.layer)}
     levels = tuple(Level(level.name, level.elevation) for level in reader.levels.values())
     return Layers(parts, reader.datum(), levels)
@@ -128,16 +128,16 @@ class _Reader:
         self.levels = self._levels()
         guided = mapping(mapping(top.get("navigation"), "navigation").get("guided"), "navigation.guided")
         self.guided = guided
-        where = "navigation.guided"
-        self.lanes = elements(guided.get("lanes"), f"{where}.lanes")
-        self.locations = elements(guided.get("locations"), f"{where}.locations")
-        graphs = elements(guided.get("graphs"), f"{where}.graphs")
-        self.graphs = _rmf_site.graph_numbers(graphs, references(guided.get("ranking") or [], f"{where}.ranking"))
+        location = "navigation.guided"
+        self.lanes = elements(guided.get("lanes"), f"{location}.lanes")
+        self.locations = elements(guided.get("locations"), f"{location}.locations")
+        graphs = elements(guided.get("graphs"), f"{location}.graphs")
+        self.graphs = _rmf_site.graph_numbers(graphs, references(guided.get("ranking") or [], f"{location}.ranking"))
         self.mutexes = {
-            i: text(said.get("name"), f"{where}.mutex_groups.{i}.name")
-            for i, said in elements(guided.get("mutex_groups"), f"{where}.mutex_groups")
+            i: text(element.get("name"), f"{location}.mutex_groups.{i}.name")
+            for i, element in elements(guided.get("mutex_groups"), f"{location}.mutex_groups")
         }
-        self.lifts = [self._lift(i, said) for i, said in elements(top.get("lifts"), "lifts")]
+        self.lifts = [self._lift(i, element) for i, element in elements(top.get("lifts"), "lifts")]
         self.cabins = {
             anchor: lift
             for lift in self.lifts
@@ -159,23 +159,23 @@ class _Reader:
     # what stands where
 
     def _version(self) -> None:
-        said = self.top.get("format_version")
-        found = _VERSION.fullmatch(said) if isinstance(said, str) else None
-        if found is None:
-            refuse(f'must be a text "major.minor", is {str(said)[:40]!r}', "format_version")
-        if int(found[1]) > 0:
+        version = self.top.get("format_version")
+        match = _VERSION.fullmatch(version) if isinstance(version, str) else None
+        if match is None:
+            refuse(f'must be a text "major.minor", is {str(version)[:40]!r}', "format_version")
+        if int(match[1]) > 0:
             refuse(
-                f"version {said} is not supported, only 0.x: save the site with a release that writes 0.x",
+                f"version {version} is not supported, only 0.x: save the site with a release that writes 0.x",
                 "format_version",
             )
 
-    def _look(self, said: Mapping[str, Any], section: str) -> None:
+    def _look(self, element: Mapping[str, Any], section: str) -> None:
         """Count members that no release has."""
-        for member in unknown(said, section):
+        for member in unknown(element, section):
             self.strange[f"{section}: {member[:60]}" if section else member[:60]] += 1
 
-    def _anchors(self, said: Any, where: str) -> dict[str, list[float]]:
-        return {key: place(raw, "General", f"{where}.{key}") for key, raw in by_id(said, where)}
+    def _anchors(self, anchors: Any, location: str) -> dict[str, list[float]]:
+        return {key: place(raw, "General", f"{location}.{key}") for key, raw in by_id(anchors, location)}
 
     def _levels(self) -> dict[str, _Level]:
         listed = elements(self.top.get("levels"), "levels")
@@ -184,64 +184,64 @@ class _Reader:
         if self.context.level != GROUND:
             problem = f"its levels have names of their own: level={self.context.level} is not used"
             self.context.warn(problem, where="levels")
-        properties = [mapping(said.get("properties"), f"levels.{i}.properties") for i, said in listed]
-        wanted = []
-        for (i, said), p in zip(listed, properties, strict=True):
-            self._look(said, "levels")
+        properties = [mapping(level.get("properties"), f"levels.{i}.properties") for i, level in listed]
+        level_names = []
+        for (i, level), p in zip(listed, properties, strict=True):
+            self._look(level, "levels")
             self._look(p, "levels.properties")
-            wanted.append(_rmf.short(text(p.get("name"), f"levels.{i}.properties.name")) or f"level {i}")
-        names = unique_ids(wanted)
-        if twice := sorted({a for a, b in zip(wanted, names, strict=True) if a != b}):
+            level_names.append(_rmf.short(text(p.get("name"), f"levels.{i}.properties.name")) or f"level {i}")
+        names = unique_ids(level_names)
+        if twice := sorted({a for a, b in zip(level_names, names, strict=True) if a != b}):
             self.context.warn(f"levels have the same name: {', '.join(twice[:5])}; they get a number", where="levels")
         return {
             i: _Level(
                 i,
                 name,
                 order,
-                said,
+                level,
                 number(p.get("elevation", 0.0), f"levels.{i}.properties.elevation"),
-                self._anchors(said.get("anchors"), f"levels.{i}.anchors"),
+                self._anchors(level.get("anchors"), f"levels.{i}.anchors"),
             )
-            for order, ((i, said), p, name) in enumerate(zip(listed, properties, names, strict=True))
+            for order, ((i, level), p, name) in enumerate(zip(listed, properties, names, strict=True))
         }
 
     def datum(self) -> Datum | None:
         """The place on earth of (0, 0); a warning where it is not the environment's."""
-        said = mapping(self.top.get("properties"), "properties").get("geographic_offset")
-        where = "properties.geographic_offset"
-        if said is None:
+        offset = mapping(self.top.get("properties"), "properties").get("geographic_offset")
+        location = "properties.geographic_offset"
+        if offset is None:
             return None
-        latitude, longitude = _rmf_site.vector(mapping(said, where).get("anchor"), 2, f"{where}.anchor")
-        known = self.context.frame.datum if self.context.frame is not None else None
-        if known is None:
+        latitude, longitude = _rmf_site.vector(mapping(offset, location).get("anchor"), 2, f"{location}.anchor")
+        datum = self.context.frame.datum if self.context.frame is not None else None
+        if datum is None:
             return Datum(latitude, longitude)
-        near = abs(known.latitude - latitude) < 1e-5 and abs(known.longitude - longitude) < 1e-5
+        near = abs(datum.latitude - latitude) < 1e-5 and abs(datum.longitude - longitude) < 1e-5
         if not near:  # the editor keeps single precision: a metre or so
             self.context.warn(
-                f"its place {latitude!r}, {longitude!r} is not the environment's datum {known.latitude!r}, "
-                f"{known.longitude!r}, which stays: change the environment's datum, or the site",
-                where=where,
+                f"its place {latitude!r}, {longitude!r} is not the environment's datum {datum.latitude!r}, "
+                f"{datum.longitude!r}, which stays: change the environment's datum, or the site",
+                where=location,
             )
         return None
 
-    def _lift(self, i: str, said: dict[str, Any]) -> _Lift:
-        where = f"lifts.{i}"
-        self._look(said, "lifts")
-        properties = mapping(said.get("properties"), f"{where}.properties")
-        ends = references(properties.get("reference_anchors"), f"{where}.properties.reference_anchors", 2)
+    def _lift(self, i: str, lift: dict[str, Any]) -> _Lift:
+        location = f"lifts.{i}"
+        self._look(lift, "lifts")
+        properties = mapping(lift.get("properties"), f"{location}.properties")
+        ends = references(properties.get("reference_anchors"), f"{location}.properties.reference_anchors", 2)
         at = []
         for anchor in ends:
             raw = mapping(self.top.get("anchors"), "anchors").get(anchor)
             if raw is None:
-                refuse(f"there is no anchor {anchor} of the site", f"{where}.properties.reference_anchors")
+                refuse(f"there is no anchor {anchor} of the site", f"{location}.properties.reference_anchors")
             at.append(place(raw, "Lift", f"anchors.{anchor}"))
-        name = _rmf.short(text(properties.get("name"), f"{where}.properties.name")) or f"lift {i}"
+        name = _rmf.short(text(properties.get("name"), f"{location}.properties.name")) or f"lift {i}"
         visits: list[str] = []
-        for key, door in elements(said.get("cabin_doors"), f"{where}.cabin_doors"):
-            visits += references(door.get("visits", []), f"{where}.cabin_doors.{key}.visits")
+        for key, door in elements(lift.get("cabin_doors"), f"{location}.cabin_doors"):
+            visits += references(door.get("visits", []), f"{location}.cabin_doors.{key}.visits")
         served = [level for level in self.levels if level in visits]
-        cabin = _rmf_site.cabin_of(properties, at[0], at[1], f"{where}.properties")
-        return _Lift(i, name, said, cabin, served)
+        cabin = _rmf_site.cabin_of(properties, at[0], at[1], f"{location}.properties")
+        return _Lift(i, name, lift, cabin, served)
 
     # the parts
 
@@ -288,24 +288,26 @@ class _Reader:
 
     def _document(self, level: _Level) -> dict[str, Any]:
         """What of a level is no item, and what its items do not say."""
-        rest = {key: value for key, value in level.said.items() if key not in _LISTS}
-        rest["id"] = level.id
+        members = {key: value for key, value in level.said.items() if key not in _LISTS}
+        members["id"] = level.id
         drawings: dict[str, Any] = {}
-        for i, said in elements(level.said.get("drawings"), f"{level.where}.drawings"):
-            where = f"{level.where}.drawings.{i}"
-            drawings[i] = {k: v for k, v in said.items() if k not in ("anchors", "fiducials", "measurements")}
-            drawings[i]["transform"] = self._transform(said, where)
+        for i, drawing in elements(level.said.get("drawings"), f"{level.where}.drawings"):
+            location = f"{level.where}.drawings.{i}"
+            drawings[i] = {k: v for k, v in drawing.items() if k not in ("anchors", "fiducials", "measurements")}
+            drawings[i]["transform"] = self._transform(drawing, location)
             used: set[str] = set()
-            for key, one in elements(said.get("measurements"), f"{where}.measurements"):
-                used.update(references(one.get("anchors"), f"{where}.measurements.{key}.anchors", 2))
-            used |= {str(one.get("anchor")) for _, one in elements(said.get("fiducials"), f"{where}.fiducials")}
-            drawings[i]["anchors"] = {a: raw for a, raw in mapping(said.get("anchors"), where).items() if a not in used}
+            for key, one in elements(drawing.get("measurements"), f"{location}.measurements"):
+                used.update(references(one.get("anchors"), f"{location}.measurements.{key}.anchors", 2))
+            used |= {str(one.get("anchor")) for _, one in elements(drawing.get("fiducials"), f"{location}.fiducials")}
+            drawings[i]["anchors"] = {
+                a: raw for a, raw in mapping(drawing.get("anchors"), location).items() if a not in used
+            }
         forms = {
             anchor: raw
             for anchor, raw in mapping(level.said.get("anchors"), f"{level.where}.anchors").items()
             if anchor not in level.nodes and "Translate2D" not in raw
         }
-        return {"level": rest, "drawings": drawings, "forms": forms, "order": level.order}
+        return {"level": members, "drawings": drawings, "forms": forms, "order": level.order}
 
     # the network
 
@@ -321,8 +323,11 @@ class _Reader:
             for k, anchor in enumerate(level.nodes):
                 p = self._node(level, anchor, k, locations.get(anchor, []), docks.get((i, anchor)))
                 if (robot := robots.get((i, anchor))) is not None:
-                    said = p[BUILDING].setdefault("parameters", {})
-                    said[_rmf.ROBOT], said[_rmf.ROBOT_TYPE] = [1, robot["name"]], [1, robot.pop("model_name")]
+                    parameters = p[BUILDING].setdefault("parameters", {})
+                    parameters[_rmf.ROBOT], parameters[_rmf.ROBOT_TYPE] = (
+                        [1, robot["name"]],
+                        [1, robot.pop("model_name")],
+                    )
                     p[NAME]["robot"] = robot
                 properties.append(p)
             xyz = np.array([self._node_place(level, a) for a in level.nodes], np.float64).reshape(-1, 3)
@@ -344,23 +349,23 @@ class _Reader:
     def _locations(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
         """The locations by anchor."""
         out: dict[str, list[tuple[str, dict[str, Any]]]] = {}
-        for i, said in self.locations:
-            self._look(said, "locations")
-            anchor = reference(said.get("anchor"), f"navigation.guided.locations.{i}.anchor")
-            out.setdefault(anchor, []).append((i, said))
+        for i, element in self.locations:
+            self._look(element, "locations")
+            anchor = reference(element.get("anchor"), f"navigation.guided.locations.{i}.anchor")
+            out.setdefault(anchor, []).append((i, element))
         return out
 
     def _name_nodes(self, locations: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]], taken: set[str]) -> None:
         """Which anchors of which levels are nodes, and their ids."""
         owners = {anchor: level for level in self.levels.values() for anchor in level.anchors}
         moved: set[str] = set(locations)
-        for i, said in self.lanes:
-            self._look(said, "lanes")
-            ends = references(said.get("anchors"), f"navigation.guided.lanes.{i}.anchors", 2)
+        for i, element in self.lanes:
+            self._look(element, "lanes")
+            ends = references(element.get("anchors"), f"navigation.guided.lanes.{i}.anchors", 2)
             moved.update(ends)
-            for here, other in (ends, ends[::-1]):
-                if here in self.cabins and other in owners:
-                    owners[other].cabins.add(here)
+            for end, other in (ends, ends[::-1]):
+                if end in self.cabins and other in owners:
+                    owners[other].cabins.add(end)
         inside = {anchor for level in self.levels.values() for anchor in level.cabins}
         for anchor in locations.keys() & self.cabins.keys() - inside:
             served = self.cabins[anchor].visits
@@ -369,19 +374,21 @@ class _Reader:
             fixed = {a for kind in ("walls", "doors", "floors") for _, s in self._items(level, kind) for a in s[0]}
             names = [a for a in level.anchors if a in moved or a not in fixed]
             names += sorted(level.cabins, key=int)
-            wanted = []
+            node_names = []
             for anchor in names:
-                known = text(locations[anchor][0][1].get("name"), "locations") if anchor in locations else ""
-                known = "" if known == UNNAMED else known
-                wanted.append(_rmf.short(known) or f"{_rmf.short(level.name, 200)}/{anchor}")
-            ids = unique_ids(wanted, taken)
+                name = text(locations[anchor][0][1].get("name"), "locations") if anchor in locations else ""
+                name = "" if name == UNNAMED else name
+                node_names.append(_rmf.short(name) or f"{_rmf.short(level.name, 200)}/{anchor}")
+            ids = unique_ids(node_names, taken)
             taken.update(ids)
             level.nodes = dict(zip(names, ids, strict=True))
             for anchor in names:
                 self.homes.setdefault(anchor, []).append(level)
-        lost = {i: said for anchor, listed in locations.items() if anchor not in self.homes for i, said in listed}
-        if lost:
-            self._keep("locations", lost)
+        dangling = {
+            i: element for anchor, listed in locations.items() if anchor not in self.homes for i, element in listed
+        }
+        if dangling:
+            self._keep("locations", dangling)
 
     def _keep(self, section: str, items: dict[str, Any]) -> None:
         self.dangling.setdefault(section, {}).update(items)
@@ -397,67 +404,69 @@ class _Reader:
         dock: str | None,
     ) -> dict[str, Any]:
         p: dict[str, Any] = {"kind": "node"}
-        rest: dict[str, Any] = {"anchor": int(anchor)}
+        source_properties: dict[str, Any] = {"anchor": int(anchor)}
         parameters: dict[str, Any] = {}
         source: Any = level.said.get("anchors")
         if anchor in level.cabins:
             lift = self.cabins[anchor]
             parameters["lift_cabin"] = [1, lift.name]
             source = lift.said["cabin_anchors"]
-            rest["lift"] = lift.name
+            source_properties["lift"] = lift.name
         if "Translate2D" not in (raw := source[anchor]):
-            rest["says"] = raw
-        for i, said in locations:
-            where = f"navigation.guided.locations.{i}"
-            name = text(said.get("name"), f"{where}.name")
+            source_properties["says"] = raw
+        for i, element in locations:
+            location = f"navigation.guided.locations.{i}"
+            name = text(element.get("name"), f"{location}.name")
             if name and name != UNNAMED:
                 p.setdefault("name", name)
-            for m, tag in enumerate(said.get("tags") or []):
-                word, _ = variant(tag, f"{where}.tags[{m}]")
-                if word in _TAGS:
-                    parameters[_TAGS[word]] = [4, True]
-            if (mutex := self._mutex(said, where)) is not None:
+            for m, tag in enumerate(element.get("tags") or []):
+                tag_name, _ = variant(tag, f"{location}.tags[{m}]")
+                if tag_name in _TAGS:
+                    parameters[_TAGS[tag_name]] = [4, True]
+            if (mutex := self._mutex(element, location)) is not None:
                 parameters["mutex"] = [1, mutex]
         if dock is not None:
             parameters["dock_name"] = [1, dock]
         if locations:
-            rest["locations"] = {i: {k: v for k, v in said.items() if k != "anchor"} for i, said in locations}
+            source_properties["locations"] = {
+                i: {k: v for k, v in element.items() if k != "anchor"} for i, element in locations
+            }
         p[BUILDING] = {"index": k, **({"parameters": parameters} if parameters else {})}
-        p[NAME] = rest
+        p[NAME] = source_properties
         return p
 
-    def _mutex(self, said: Mapping[str, Any], where: str) -> str | None:
-        group = said.get("mutex")
-        return None if group is None else self.mutexes.get(reference(group, f"{where}.mutex"))
+    def _mutex(self, element: Mapping[str, Any], location: str) -> str | None:
+        group = element.get("mutex")
+        return None if group is None else self.mutexes.get(reference(group, f"{location}.mutex"))
 
     def _edges(self, rows: dict[str, list[tuple[str, Any, Properties]]], taken: set[str]) -> dict[tuple[str, str], str]:
         """The lanes as edges in the rows of their levels; gives the docks by level and anchor."""
         docks: dict[tuple[str, str], str] = {}
-        lost: dict[str, Any] = {}
+        dangling: dict[str, Any] = {}
         counts: Counter[str] = Counter()
-        made: list[tuple[str, str, Any, Properties]] = []
+        edges: list[tuple[str, str, Any, Properties]] = []
         several = 0
-        for i, said in self.lanes:
-            where = f"navigation.guided.lanes.{i}"
-            ends = references(said.get("anchors"), f"{where}.anchors", 2)
-            found = self._level_of(ends)
-            if found is None:
-                lost[i] = said
+        for i, element in self.lanes:
+            location = f"navigation.guided.lanes.{i}"
+            ends = references(element.get("anchors"), f"{location}.anchors", 2)
+            homes = self._level_of(ends)
+            if homes is None:
+                dangling[i] = element
                 continue
-            level, target = found
-            xyz = np.array([self._node_place(home, end) for home, end in zip(found, ends, strict=True)])
+            level, target = homes
+            xyz = np.array([self._node_place(home, end) for home, end in zip(homes, ends, strict=True)])
             if target is not level or xyz[:, 2].any():
-                xyz[:, 2] += [home.elevation for home in found]
+                xyz[:, 2] += [home.elevation for home in homes]
             line = xyz if target is not level or xyz[:, 2].any() else xyz[:, :2]
-            graph, graphs = _rmf_site.graphs_of(said.get("graphs"), self.graphs, f"{where}.graphs")
+            graph, graphs = _rmf_site.graphs_of(element.get("graphs"), self.graphs, f"{location}.graphs")
             several += graphs > 1
-            for both, motion, backward in self._motions(said, where):
+            for both, motion, backward in self._motions(element, location):
                 mirrored = both and backward
                 a, b = (1, 0) if backward else (0, 1)
-                source, end = found[a].nodes[ends[a]], found[b].nodes[ends[b]]
+                source, end = homes[a].nodes[ends[a]], homes[b].nodes[ends[b]]
                 counts[level.id] += not mirrored
-                orientation, limit = motion_words(motion, where)
-                mutex = self._mutex(said, where)
+                orientation, limit = motion_words(motion, location)
+                mutex = self._mutex(element, location)
                 parameters: dict[str, Any] = {
                     "bidirectional": [4, both],
                     "graph_idx": [2, graph],
@@ -466,37 +475,37 @@ class _Reader:
                     **({"speed_limit": [3, limit]} if limit else {}),
                 }
                 if motion.get("dock") is not None:
-                    dock = mapping(motion["dock"], f"{where}.dock")
-                    docks[found[b].id, ends[b]] = text(dock.get("name"), f"{where}.dock.name")
-                rest = {"index": counts[level.id] - 1, "parameters": parameters}
+                    dock = mapping(motion["dock"], f"{location}.dock")
+                    docks[homes[b].id, ends[b]] = text(dock.get("name"), f"{location}.dock.name")
+                lane_properties = {"index": counts[level.id] - 1, "parameters": parameters}
                 if mirrored:
-                    rest["reverse"] = True
+                    lane_properties["reverse"] = True
                 p: dict[str, Any] = {"kind": "edge", **({"speed_limit": limit} if limit else {})}
-                p |= {"source": source, "target": end, BUILDING: rest}
-                p[NAME] = {"lane": int(i), "says": {k: v for k, v in said.items() if k != "anchors"}}
+                p |= {"source": source, "target": end, BUILDING: lane_properties}
+                p[NAME] = {"lane": int(i), "says": {k: v for k, v in element.items() if k != "anchors"}}
                 if backward:
                     p[NAME]["reverse"] = True
-                made.append((level.id, _rmf.short(f"{source}_{end}", 490), segments(line[[a]], line[[b]])[0], p))
-        names = unique_ids((wanted for _, wanted, _, _ in made), taken)
+                edges.append((level.id, _rmf.short(f"{source}_{end}", 490), segments(line[[a]], line[[b]])[0], p))
+        names = unique_ids((name for _, name, _, _ in edges), taken)
         taken.update(names)
-        for name, (home, _, geometry, edge) in zip(names, made, strict=True):
+        for name, (home, _, geometry, edge) in zip(names, edges, strict=True):
             rows[home].append((name, geometry, edge))
-        if lost:
-            self._keep("lanes", lost)
+        if dangling:
+            self._keep("lanes", dangling)
         if several:
             problem = f"{several} lanes are of several graphs; a building and navigation graphs have them in the first"
             self.context.warn(problem, where="navigation.guided.lanes")
         return docks
 
-    def _motions(self, said: Mapping[str, Any], where: str) -> Iterable[tuple[bool, Mapping[str, Any], bool]]:
+    def _motions(self, element: Mapping[str, Any], location: str) -> Iterable[tuple[bool, Mapping[str, Any], bool]]:
         """(whether a building's two-way lane says it, motion, backward) of a lane's one or two directions."""
-        forward = mapping(said.get("forward"), f"{where}.forward")
-        name, content = variant(said.get("reverse", "Same"), f"{where}.reverse")
+        forward = mapping(element.get("forward"), f"{location}.forward")
+        name, content = variant(element.get("reverse", "Same"), f"{location}.reverse")
         if name not in ("Same", "Disable", "Different"):
-            refuse(f"must be Same, Disable or Different, is {name[:40]!r}", f"{where}.reverse")
-        back = forward if name == "Same" else mapping(content, f"{where}.reverse")
-        there, here = (motion_words(motion, where) for motion in (forward, back))
-        both = name != "Disable" and here == (_rmf.turned(there[0]), there[1])
+            refuse(f"must be Same, Disable or Different, is {name[:40]!r}", f"{location}.reverse")
+        back = forward if name == "Same" else mapping(content, f"{location}.reverse")
+        forth_words, back_words = (motion_words(motion, location) for motion in (forward, back))
+        both = name != "Disable" and back_words == (_rmf.turned(forth_words[0]), forth_words[1])
         yield both, forward, False
         if name != "Disable":
             yield both, back, True
@@ -514,9 +523,9 @@ class _Reader:
     def _items(self, level: _Level, section: str) -> list[tuple[str, tuple[list[str], dict[str, Any]]]]:
         """(id, (anchors, what else it says)) of walls, doors and floors."""
         out = []
-        for i, said in elements(level.said.get(section), f"{level.where}.{section}"):
-            where = f"{level.where}.{section}.{i}.anchors"
-            out.append((i, (references(said.get("anchors"), where, None if section == "floors" else 2), said)))
+        for i, element in elements(level.said.get(section), f"{level.where}.{section}"):
+            location = f"{level.where}.{section}.{i}.anchors"
+            out.append((i, (references(element.get("anchors"), location, None if section == "floors" else 2), element)))
         return out
 
     def _raw_anchor(self, level: _Level, anchor: str) -> Any:
@@ -532,50 +541,50 @@ class _Reader:
             ("doors", "door", "Door"),
             ("floors", "floor", "Floor"),
         ):
-            for k, (i, (anchors, said)) in enumerate(self._items(level, section)):
-                self._look(said, section)
+            for k, (i, (anchors, element)) in enumerate(self._items(level, section)):
+                self._look(element, section)
                 raws = [self._raw_anchor(level, a) for a in anchors]
                 if any(raw is None for raw in raws):
                     refuse("stands on anchors that neither its level nor the site has", f"{level.where}.{section}.{i}")
                 at = np.array([place(raw, category, "anchors")[:2] for raw in raws]).reshape(-1, 2)
-                where = f"{level.where}.{section}.{i}"
-                p = self._solid(kind, k, said, where)
-                rest = {key: value for key, value in said.items() if key not in ("anchors", "name")}
-                p[NAME] = {"id": int(i), "anchors": [int(a) for a in anchors], "says": rest}
+                location = f"{level.where}.{section}.{i}"
+                p = self._solid(kind, k, element, location)
+                members = {key: value for key, value in element.items() if key not in ("anchors", "name")}
+                p[NAME] = {"id": int(i), "anchors": [int(a) for a in anchors], "says": members}
                 rows.append((self._id(level, kind, i), shapely.LineString(at) if kind != "floor" else _ring(at), p))
         return [*rows, *self._drawn(level), *self._models(level)]
 
     def _id(self, level: _Level, kind: str, i: str) -> str:
         return f"{_rmf.short(level.name, 200)}/{kind}/{i}"
 
-    def _solid(self, kind: str, k: int, said: Mapping[str, Any], where: str) -> dict[str, Any]:
+    def _solid(self, kind: str, k: int, element: Mapping[str, Any], location: str) -> dict[str, Any]:
         p: dict[str, Any] = {"kind": kind}
         parameters: dict[str, Any] = {}
         if kind == "door":
-            name = text(said.get("name"), f"{where}.name")
+            name = text(element.get("name"), f"{location}.name")
             if name:
                 p["name"] = name
-            parameters = _rmf_site.door_parameters(said.get("kind"), f"{where}.kind")
+            parameters = _rmf_site.door_parameters(element.get("kind"), f"{location}.kind")
             parameters["name"] = [1, name]
-        elif said.get("texture") is not None:
-            group = self.textures.get(reference(said["texture"], f"{where}.texture"))
+        elif element.get("texture") is not None:
+            group = self.textures.get(reference(element["texture"], f"{location}.texture"))
             parameters = _rmf_site.texture_parameters(group, kind) if group is not None else {}
         if kind != "floor":
-            for word, member in (("height", "top"), ("base", "bottom")):
-                found = _rmf_site.height(said.get(member), f"{where}.{member}")
-                if found is not None and found > 0:
-                    p[word] = found
+            for key, member in (("height", "top"), ("base", "bottom")):
+                height = _rmf_site.height(element.get(member), f"{location}.{member}")
+                if height is not None and height > 0:
+                    p[key] = height
         p[BUILDING] = {"index": k, "parameters": parameters}
         return p
 
     def drawings(self) -> Iterable[tuple[str, str]]:
         """(place, file) of the images that are named on this machine."""
         for level in self.levels.values():
-            for i, said in elements(level.said.get("drawings"), f"{level.where}.drawings"):
-                where = f"{level.where}.drawings.{i}.properties.source"
-                kind, name = _rmf_site.asset(mapping(said.get("properties"), where).get("source"), where)
+            for i, drawing in elements(level.said.get("drawings"), f"{level.where}.drawings"):
+                location = f"{level.where}.drawings.{i}.properties.source"
+                kind, name = _rmf_site.asset(mapping(drawing.get("properties"), location).get("source"), location)
                 if name and kind in ("Local", "Remote"):
-                    yield where, name
+                    yield location, name
 
     def _primary(self, level: _Level) -> str | None:
         """The drawing that a building would have."""
@@ -584,23 +593,25 @@ class _Reader:
         ranked = references(rankings, f"{level.where}.rankings.drawings")
         return next((i for i in ranked if i in listed), next(iter(listed), None))
 
-    def _transform(self, said: Mapping[str, Any], where: str) -> list[float]:
+    def _transform(self, drawing: Mapping[str, Any], location: str) -> list[float]:
         """[scale, rotation, x, y] from a drawing's pixels (y up) to metres.
 
         Measurements that say the same scale in double precision say it better than pixels_per_meter.
         """
-        p = mapping(said.get("properties"), f"{where}.properties")
-        pixels = number(p.get("pixels_per_meter", 100.0), f"{where}.properties.pixels_per_meter")
+        p = mapping(drawing.get("properties"), f"{location}.properties")
+        pixels = number(p.get("pixels_per_meter", 100.0), f"{location}.properties.pixels_per_meter")
         if not 1e-6 <= pixels <= 1e9:
-            refuse("must be between 1e-6 and 1e9", f"{where}.properties.pixels_per_meter")
-        x, y, _, _, _, yaw = _rmf_site.pose(p.get("pose"), f"{where}.properties.pose")
-        anchors = self._anchors(said.get("anchors"), f"{where}.anchors")
+            refuse("must be between 1e-6 and 1e9", f"{location}.properties.pixels_per_meter")
+        x, y, _, _, _, yaw = _rmf_site.pose(p.get("pose"), f"{location}.properties.pose")
+        anchors = self._anchors(drawing.get("anchors"), f"{location}.anchors")
         scales = []
-        for k, m in elements(said.get("measurements"), f"{where}.measurements"):
-            a, b = references(m.get("anchors"), f"{where}.measurements.{k}.anchors", 2)
+        for k, m in elements(drawing.get("measurements"), f"{location}.measurements"):
+            a, b = references(m.get("anchors"), f"{location}.measurements.{k}.anchors", 2)
             if m.get("distance") is not None and a in anchors and b in anchors:
                 length = math.dist(anchors[a][:2], anchors[b][:2])
-                scales.append(number(m["distance"], f"{where}.measurements.{k}.distance") / length if length else 0.0)
+                scales.append(
+                    number(m["distance"], f"{location}.measurements.{k}.distance") / length if length else 0.0
+                )
         mean = sum(scales) / len(scales) if scales else 0.0
         scale = mean if abs(mean * pixels - 1.0) < _rmf_site.SINGLE else 1.0 / pixels
         return [scale, yaw, x, y]
@@ -609,38 +620,40 @@ class _Reader:
         """The measurements and fiducials of a level's drawings, in metres."""
         rows: list[tuple[str, Any, Properties]] = []
         counts: Counter[str] = Counter()
-        for i, said in elements(level.said.get("drawings"), f"{level.where}.drawings"):
-            where = f"{level.where}.drawings.{i}"
-            self._look(said, "drawings")
-            transform = self._transform(said, where)
-            anchors = self._anchors(said.get("anchors"), f"{where}.anchors")
+        for i, drawing in elements(level.said.get("drawings"), f"{level.where}.drawings"):
+            location = f"{level.where}.drawings.{i}"
+            self._look(drawing, "drawings")
+            transform = self._transform(drawing, location)
+            anchors = self._anchors(drawing.get("anchors"), f"{location}.anchors")
             at = {key: moved(transform, place_) for key, place_ in anchors.items()}
 
-            def places(ids: Sequence[str], what: str, at: Mapping[str, Array] = at) -> list[Array]:
+            def places(ids: Sequence[str], path: str, at: Mapping[str, Array] = at) -> list[Array]:
                 if any(a not in at for a in ids):
-                    refuse("stands on anchors that its drawing does not have", what)
+                    refuse("stands on anchors that its drawing does not have", path)
                 return [at[a] for a in ids]
 
             for section, kind in (("measurements", "measurement"), ("fiducials", "fiducial")):
-                for key, one in elements(said.get(section), f"{where}.{section}"):
+                for key, one in elements(drawing.get(section), f"{location}.{section}"):
                     self._look(one, section)
-                    here = f"{where}.{section}.{key}"
+                    item_location = f"{location}.{section}.{key}"
                     p: dict[str, Any] = {"kind": kind, BUILDING: {"index": counts[kind]}}
                     counts[kind] += 1
                     if kind == "measurement":
-                        ids = references(one.get("anchors"), f"{here}.anchors", 2)
-                        geometry = shapely.LineString(places(ids, here))
+                        ids = references(one.get("anchors"), f"{item_location}.anchors", 2)
+                        geometry = shapely.LineString(places(ids, item_location))
                         distance = one.get("distance")
-                        known = {} if distance is None else {"distance": [3, number(distance, f"{here}.distance")]}
-                        p[BUILDING]["parameters"] = known
+                        parameters = (
+                            {} if distance is None else {"distance": [3, number(distance, f"{item_location}.distance")]}
+                        )
+                        p[BUILDING]["parameters"] = parameters
                     else:
-                        ids = [reference(one.get("anchor"), f"{here}.anchor")]
-                        geometry = shapely.Point(places(ids, here)[0])
+                        ids = [reference(one.get("anchor"), f"{item_location}.anchor")]
+                        geometry = shapely.Point(places(ids, item_location)[0])
                         if one.get("affiliation") is not None:
-                            group = self.groups.get(reference(one["affiliation"], f"{here}.affiliation"), {})
+                            group = self.groups.get(reference(one["affiliation"], f"{item_location}.affiliation"), {})
                             p["name"] = text(group.get("name"), "fiducial_groups")
-                    rest = {k: v for k, v in one.items() if k not in ("anchor", "anchors")}
-                    p[NAME] = {"id": int(key), "drawing": int(i), "anchors": [int(a) for a in ids], "says": rest}
+                    members = {k: v for k, v in one.items() if k not in ("anchor", "anchors")}
+                    p[NAME] = {"id": int(key), "drawing": int(i), "anchors": [int(a) for a in ids], "says": members}
                     rows.append((self._id(level, kind, key), geometry, p))
         return rows
 
@@ -649,21 +662,21 @@ class _Reader:
     def _instances(self, level: _Level) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
         """(id, instance, description) of the level's models; older releases say both at once, below the level."""
         out = []
-        for i, said in self.placed.get(level.id, []):
-            key = said.get("description")
-            known = None if key is None else reference(key, f"model_instances.{i}.description")
-            out.append((i, said, self.descriptions.get(known or "", {})))
+        for i, element in self.placed.get(level.id, []):
+            key = element.get("description")
+            description_id = None if key is None else reference(key, f"model_instances.{i}.description")
+            out.append((i, element, self.descriptions.get(description_id or "", {})))
         older = elements(level.said.get("models"), f"{level.where}.models")
-        return out + [(i, said, said) for i, said in older]
+        return out + [(i, element, element) for i, element in older]
 
     def _placed(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
         """The models by the level that they stand on."""
         out: dict[str, list[tuple[str, dict[str, Any]]]] = {}
-        for i, said in elements(self.top.get("model_instances"), "model_instances"):
-            parent = reference(said.get("parent"), f"model_instances.{i}.parent")
+        for i, element in elements(self.top.get("model_instances"), "model_instances"):
+            parent = reference(element.get("parent"), f"model_instances.{i}.parent")
             if parent not in self.levels:
-                self.dangling.setdefault("model_instances", {})[i] = said
-            out.setdefault(parent, []).append((i, said))
+                self.dangling.setdefault("model_instances", {})[i] = element
+            out.setdefault(parent, []).append((i, element))
         return out
 
     def _robots_at(self) -> dict[tuple[str, str], dict[str, Any]]:
@@ -674,42 +687,42 @@ class _Reader:
             if not self.robots or not listed:
                 continue
             tree = shapely.STRtree(points(np.array([level.anchors[a][:2] for a in listed])))
-            for i, said, description in self._instances(level):
-                if str(said.get("description")) not in self.robots:
+            for i, element, description in self._instances(level):
+                if str(element.get("description")) not in self.robots:
                     continue
-                now = _rmf_site.pose(said.get("pose"), f"model_instances.{i}.pose")
+                now = _rmf_site.pose(element.get("pose"), f"model_instances.{i}.pose")
                 near = tree.query_nearest(shapely.Point(now[:2]), max_distance=SAME_PLACE, all_matches=False)
                 anchor = listed[int(near[0])] if len(near) else None
-                name = text(said.get("name"), f"model_instances.{i}.name")
+                name = text(element.get("name"), f"model_instances.{i}.name")
                 if anchor is None or (level.id, anchor) in out or not name:
                     continue
-                rest = {k: v for k, v in said.items() if k not in ("parent", "name")}
+                members = {k: v for k, v in element.items() if k not in ("parent", "name")}
                 model = _model_name(description, f"model_instances.{i}")
-                out[level.id, anchor] = {"id": int(i), "name": name, "says": rest, "model_name": model}
+                out[level.id, anchor] = {"id": int(i), "name": name, "says": members, "model_name": model}
         self.placed_robots = {robot["id"] for robot in out.values()}
         return out
 
     def _models(self, level: _Level) -> list[tuple[str, Any, Properties]]:
         rows: list[tuple[str, Any, Properties]] = []
-        for i, said, description in self._instances(level):
+        for i, element, description in self._instances(level):
             if int(i) in self.placed_robots:
                 continue
-            where = f"model_instances.{i}"
-            self._look(said, "model_instances")
-            x, y, z, *turn = _rmf_site.pose(said.get("pose"), f"{where}.pose")
-            name = text(said.get("name"), f"{where}.name")
+            location = f"model_instances.{i}"
+            self._look(element, "model_instances")
+            x, y, z, *turn = _rmf_site.pose(element.get("pose"), f"{location}.pose")
+            name = text(element.get("name"), f"{location}.name")
             p: dict[str, Any] = {
-                "kind": "robot" if str(said.get("description")) in self.robots else "model",
+                "kind": "robot" if str(element.get("description")) in self.robots else "model",
                 **({"name": name} if name else {}),
                 "pose": [x, y, z + level.elevation, *turn],
                 BUILDING: {
                     "index": len(rows),
                     "says": {
-                        "model_name": _model_name(description, where),
+                        "model_name": _model_name(description, location),
                         "static": description.get("is_static") is True,
                     },
                 },
-                NAME: {"id": int(i), "says": {k: v for k, v in said.items() if k not in ("parent", "name")}},
+                NAME: {"id": int(i), "says": {k: v for k, v in element.items() if k not in ("parent", "name")}},
             }
             rows.append((self._id(level, "model", i), shapely.Point(x, y), p))
         return rows
@@ -719,22 +732,24 @@ class _Reader:
     def _lift_row(self, k: int, lift: _Lift) -> tuple[str, tuple[str, Any, Properties]]:
         """(level, row) of a lift; it stands on its initial level, else on the lowest that it visits."""
         properties = mapping(lift.said.get("properties"), f"lifts.{lift.id}.properties")
-        where = f"lifts.{lift.id}"
-        rect = _rmf_site.rectangle(properties, where)
+        location = f"lifts.{lift.id}"
+        rect = _rmf_site.rectangle(properties, location)
         initial = properties.get("initial_level")
-        home = None if initial is None else reference(initial, f"{where}.properties.initial_level")
+        home = None if initial is None else reference(initial, f"{location}.properties.initial_level")
         floors = sorted(lift.visits or self.levels, key=lambda i: self.levels[i].elevation)
         level = self.levels[home if home in self.levels else floors[0]]
         doors: dict[str, Any] = {}
         served: dict[str, list[str]] = {self.levels[i].name: [] for i in lift.visits}
-        said_doors = dict(elements(lift.said.get("cabin_doors"), f"{where}.cabin_doors"))
+        door_elements = dict(elements(lift.said.get("cabin_doors"), f"{location}.cabin_doors"))
         for face in _rmf_site.FACES:
-            door = _rmf_site.cabin_door(rect, face, f"{where}.properties.cabin.{face}")
+            door = _rmf_site.cabin_door(rect, face, f"{location}.properties.cabin.{face}")
             if door is None:
                 continue
             doors[face] = door
-            key = reference(rect[face].get("door"), f"{where}.properties.cabin.{face}.door")
-            for visit in references(said_doors.get(key, {}).get("visits", []), f"{where}.cabin_doors.{key}.visits"):
+            key = reference(rect[face].get("door"), f"{location}.properties.cabin.{face}.door")
+            for visit in references(
+                door_elements.get(key, {}).get("visits", []), f"{location}.cabin_doors.{key}.visits"
+            ):
                 if visit in self.levels:
                     served[self.levels[visit].name].append(face)
         says = {
@@ -747,10 +762,10 @@ class _Reader:
             "plugins": properties.get("is_static") is not True,
         }
         cabin = lift.cabin
-        rest = {
+        members = {
             **lift.said,
             "cabin_anchors": {
-                a: raw for a, raw in mapping(lift.said.get("cabin_anchors"), where).items() if a not in self.homes
+                a: raw for a, raw in mapping(lift.said.get("cabin_anchors"), location).items() if a not in self.homes
             },
         }
         p = {
@@ -759,7 +774,7 @@ class _Reader:
             "size": _rmf_site.cabin_size(cabin),
             "pose": [cabin.x, cabin.y, level.elevation, 0.0, 0.0, cabin.yaw],
             BUILDING: {"index": k, "says": says},
-            NAME: {"id": int(lift.id), "says": rest, "was": [*cabin.pose, cabin.depth, cabin.width]},
+            NAME: {"id": int(lift.id), "says": members, "was": [*cabin.pose, cabin.depth, cabin.width]},
         }
         return level.id, (self._id(level, "lift", lift.id), shapely.Point(cabin.x, cabin.y), p)
 
@@ -768,40 +783,40 @@ class _Reader:
     def _building(self) -> dict[str, dict[str, Any]]:
         """What a building's documents would say: pixels where each level has a drawing, else metres."""
         name = text(mapping(self.top.get("properties"), "properties").get("name"), "properties.name")
-        found: dict[str, tuple[list[float], str]] = {}
+        drawings: dict[str, tuple[list[float], str]] = {}
         for i, level in self.levels.items():
             primary = self._primary(level)
             if primary is None:
                 continue
-            said = mapping(level.said["drawings"], "drawings")[primary]
-            where = f"{level.where}.drawings.{primary}"
-            _, file = _rmf_site.asset(mapping(said.get("properties"), where).get("source"), where)
-            found[i] = self._transform(said, where), file
-        drawn = len(found) == len(self.levels)
+            members = mapping(level.said["drawings"], "drawings")[primary]
+            location = f"{level.where}.drawings.{primary}"
+            _, file = _rmf_site.asset(mapping(members.get("properties"), location).get("source"), location)
+            drawings[i] = self._transform(members, location), file
+        drawn = len(drawings) == len(self.levels)
         system = "reference_image" if drawn else "cartesian_meters"
         building: dict[str, Any] = {"name": name, "coordinate_system": system}
-        straight = [i for i, (turn, _) in found.items() if turn[1:] == [0.0, 0.0, 0.0]]
+        straight = [i for i, (turn, _) in drawings.items() if turn[1:] == [0.0, 0.0, 0.0]]
         if drawn and straight:
             building["reference_level_name"] = self.levels[straight[0]].name
         out: dict[str, dict[str, Any]] = {}
         for i, level in self.levels.items():
-            said = {"elevation": level.elevation}
-            out[i] = {"building": building, "level": said, "order": level.order}
-            if i in found:
-                out[i]["transform"], file = found[i]
-                said["drawing"] = {"filename": file}
+            members = {"elevation": level.elevation}
+            out[i] = {"building": building, "level": members, "order": level.order}
+            if i in drawings:
+                out[i]["transform"], file = drawings[i]
+                members["drawing"] = {"filename": file}
         return out
 
 
-def motion_words(motion: Mapping[str, Any], where: str) -> tuple[str, float]:
+def motion_words(motion: Mapping[str, Any], location: str) -> tuple[str, float]:
     """(orientation in a building's words, speed limit or 0) of a motion along a lane."""
-    name, content = variant(motion.get("orientation_constraint") or "None", f"{where}.orientation_constraint")
+    name, content = variant(motion.get("orientation_constraint") or "None", f"{location}.orientation_constraint")
     if name in ("RelativeYaw", "AbsoluteYaw"):
-        _rmf_site.angle(content, f"{where}.orientation_constraint")
+        _rmf_site.angle(content, f"{location}.orientation_constraint")
     elif name not in _ORIENTATIONS and name != "None":
-        refuse(f"unknown orientation constraint {name[:40]!r}", where)
+        refuse(f"unknown orientation constraint {name[:40]!r}", location)
     limit = motion.get("speed_limit")
-    return _ORIENTATIONS.get(name, ""), 0.0 if limit is None else max(0.0, number(limit, f"{where}.speed_limit"))
+    return _ORIENTATIONS.get(name, ""), 0.0 if limit is None else max(0.0, number(limit, f"{location}.speed_limit"))
 
 
 def moved(transform: Sequence[float], at: Sequence[float]) -> Array:
@@ -819,11 +834,11 @@ def _ring(at: Array) -> Any:
     return shapely.MultiPoint(at) if len(at) < (4 if closed else 3) else shapely.Polygon(at)
 
 
-def _model_name(description: Mapping[str, Any], where: str) -> str:
+def _model_name(description: Mapping[str, Any], location: str) -> str:
     """The name that a building would find the model by."""
     if "source" not in description:
         return ""
-    kind, name = _rmf_site.asset(description["source"], f"{where}.source")
+    kind, name = _rmf_site.asset(description["source"], f"{location}.source")
     if kind == "Search":
         return name
     parts = [part for part in name.split("/") if part and "." not in part]

@@ -145,29 +145,29 @@ def _world_end(name: str) -> str | None:
 def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
     """Of a world file its picture, of a picture its world file; with the .prj and .aux.xml beside the two."""
     del data
-    known = _by_lower(tuple(names))
+    by_lower = _by_lower(tuple(names))
     lower = main.lower()
     stem = lower.rpartition(".")[0]
     end = _world_end(main)
     if end is not None:
-        picture = next((stem + e for e in WORLD_ENDS[end] if stem + e in known), None)
-        wanted = [picture] if picture else []
+        picture = next((stem + e for e in WORLD_ENDS[end] if stem + e in by_lower), None)
+        candidates = [picture] if picture else []
     else:
         picture = lower
-        mine = [w for w, ends in WORLD_ENDS.items() if lower.endswith(ends)]
-        wanted = [world for w in mine for world in (stem + w, lower + "w") if world in known][:1]
-    wanted += [stem + ".prj", stem + ".aux.xml"] + ([picture + ".aux.xml"] if picture else [])
-    return [known[n] for n in dict.fromkeys(wanted) if n in known and known[n] != main]
+        endings = [w for w, ends in WORLD_ENDS.items() if lower.endswith(ends)]
+        candidates = [world for w in endings for world in (stem + w, lower + "w") if world in by_lower][:1]
+    candidates += [stem + ".prj", stem + ".aux.xml"] + ([picture + ".aux.xml"] if picture else [])
+    return [by_lower[n] for n in dict.fromkeys(candidates) if n in by_lower and by_lower[n] != main]
 
 
 @lru_cache(maxsize=4)
 def _by_lower(names: tuple[str, ...]) -> dict[str, str]:
     """Names by their small letters, the first of those that differ in nothing else; kept, since every picture of an
     upload asks for the same."""
-    known: dict[str, str] = {}
+    by_lower: dict[str, str] = {}
     for name in names:
-        known.setdefault(name.lower(), name)
-    return known
+        by_lower.setdefault(name.lower(), name)
+    return by_lower
 
 
 # --- reading ------------------------------------------------------------------------------------------------------
@@ -193,13 +193,13 @@ def read(files: Files, context: ReadContext) -> Layers:
         raise type(error)(f"{image}: {error.detail}", [Problem(error.detail, image)]) from error
     for doubt in raster.doubts:
         context.warn(doubt, file=image)
-    said = raster.crs or _sidecar_crs(files, context)
-    transform, crs = _place(replace(raster, crs=said), image, world, files, options, context)
+    file_crs = raster.crs or _sidecar_crs(files, context)
+    transform, crs = _place(replace(raster, crs=file_crs), image, world, files, options, context)
     try:
         picture = Picture(raster.pixels, transform, crs, raster.properties)
     except Invalid as error:
-        where = world if world is not None and raster.transform is None else image
-        raise UnreadableFile(f"{where}: {error.detail}", [Problem(error.detail, where)]) from error
+        file = world if world is not None and raster.transform is None else image
+        raise UnreadableFile(f"{file}: {error.detail}", [Problem(error.detail, file)]) from error
     _check_place(picture, image)
     name = options.picture or image.rpartition("/")[2].rpartition(".")[0]
     if not name or len(name) > 256 or not is_writable(name):
@@ -230,12 +230,12 @@ def _pixels(image: Image.Image, mode: str, kind: type[np.generic]) -> NDArray[An
     out = np.empty((image.height, image.width, bands), kind)
     rows = max(1, _image.STRIP // image.width)
     for y in range(0, image.height, rows):
-        some = image.crop((0, y, image.width, min(image.height, y + rows)))
-        if some.mode != mode:
-            if "transparency" in some.info and mode == "LA":
-                some = some.convert("RGBA")
-            some = some.convert(mode)
-        part = np.asarray(some)
+        strip = image.crop((0, y, image.width, min(image.height, y + rows)))
+        if strip.mode != mode:
+            if "transparency" in strip.info and mode == "LA":
+                strip = strip.convert("RGBA")
+            strip = strip.convert(mode)
+        part = np.asarray(strip)
         out[y : y + rows] = part if part.ndim == 3 else part[..., None]
     return out
 
@@ -270,21 +270,21 @@ def _place(
 ) -> tuple[Affine, str]:
     """Where the picture lies: what it says itself, else its world file, else the options."""
     height, width = raster.pixels.shape[:2]
-    own, teller = raster.transform, image
-    if own is not None and world is not None:
+    file_transform, teller = raster.transform, image
+    if file_transform is not None and world is not None:
         context.warn("the world file is not used: the picture says itself where it lies", file=world)
-    elif own is None and world is not None:
-        own, teller = _read_world(files[world], world), world
-    asked = "corners" if options.corners else "metres_per_pixel" if options.metres_per_pixel else None
-    if own is not None:
-        if asked:
+    elif file_transform is None and world is not None:
+        file_transform, teller = _read_world(files[world], world), world
+    option = "corners" if options.corners else "metres_per_pixel" if options.metres_per_pixel else None
+    if file_transform is not None:
+        if option:
             context.warn(
-                f"the option {asked} is not used: {teller} says where the picture lies", file=image, where=asked
+                f"the option {option} is not used: {teller} says where the picture lies", file=image, where=option
             )
-        return own, _crs_of(own, raster, teller, options, context)
-    if options.crs is not None and asked:
+        return file_transform, _crs_of(file_transform, raster, teller, options, context)
+    if options.crs is not None and option:
         reason = (
-            "corners are latitude and longitude" if asked == "corners" else "metres_per_pixel is of the local frame"
+            "corners are latitude and longitude" if option == "corners" else "metres_per_pixel is of the local frame"
         )
         context.warn(f"the option crs is not used: {reason}", file=image, where="crs")
     if options.corners is not None:
@@ -297,13 +297,13 @@ def _place(
 
 
 def _crs_of(transform: Affine, raster: _raster.Raster, teller: str, options: ReadOptions, context: ReadContext) -> str:
-    asked = options.crs
+    option = options.crs
     if raster.crs is not None:
-        if asked is not None:
+        if option is not None:
             context.warn("the option crs is not used: the picture names its own", file=teller, where="crs")
         return raster.crs
-    if asked is not None:
-        return {"wgs84": WGS84, LOCAL: LOCAL}.get(asked.lower(), asked.upper())
+    if option is not None:
+        return {"wgs84": WGS84, LOCAL: LOCAL}.get(option.lower(), option.upper())
     if _like_degrees(transform, raster.pixels.shape[1], raster.pixels.shape[0]):
         context.warn(
             "it names no CRS: its numbers are taken for degrees (longitude, latitude on WGS 84); if they are not, say "
@@ -327,17 +327,17 @@ def _like_degrees(transform: Affine, width: int, height: int) -> bool:
 
 def _read_world(data: bytes, name: str) -> Affine:
     """A world file's six numbers, from the centre of the first pixel to its outer corner."""
-    words = data.split()
-    wrong = next((k for k, word in enumerate(words[:6]) if not _NUMBER.fullmatch(word)), None)
-    if len(words) != 6 or wrong is not None:
-        found = f"{len(words)} words" if wrong is None else repr(words[wrong][:40].decode("latin1"))
-        reason = f"a world file has six lines of one number each (with a point), found {found}"
-        raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name, None if wrong is None else wrong + 1)])
-    numbers = [float(re.sub(rb"[dD]", b"e", word) if b"inf" not in word.lower() else word) for word in words]
-    wrong = next((k for k, v in enumerate(numbers) if not math.isfinite(v)), None)
-    if wrong is not None:
-        reason = f"a world file's numbers must be finite, got {numbers[wrong]}"
-        raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name, wrong + 1)])
+    tokens = data.split()
+    bad_index = next((k for k, token in enumerate(tokens[:6]) if not _NUMBER.fullmatch(token)), None)
+    if len(tokens) != 6 or bad_index is not None:
+        shown = f"{len(tokens)} words" if bad_index is None else repr(tokens[bad_index][:40].decode("latin1"))
+        reason = f"a world file has six lines of one number each (with a point), found {shown}"
+        raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name, None if bad_index is None else bad_index + 1)])
+    numbers = [float(re.sub(rb"[dD]", b"e", token) if b"inf" not in token.lower() else token) for token in tokens]
+    bad_index = next((k for k, v in enumerate(numbers) if not math.isfinite(v)), None)
+    if bad_index is not None:
+        reason = f"a world file's numbers must be finite, got {numbers[bad_index]}"
+        raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name, bad_index + 1)])
     a, d, b, e, c, f = numbers
     return (a, b, c - a / 2 - b / 2, d, e, f - d / 2 - e / 2)
 
@@ -354,11 +354,11 @@ def _from_corners(corners: Sequence[float], width: int, height: int, image: str,
     if max(longitude) - min(longitude) > 180.0:
         longitude = [v + 360.0 if v < 0.0 else v for v in longitude]
     ends = ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height))
-    found = _raster.fitted([(u, v, x, y) for (u, v), x, y in zip(ends, longitude, latitude, strict=True)])
-    if found is None or not math.isfinite(found[1]):
+    fit = _raster.fitted([(u, v, x, y) for (u, v), x, y in zip(ends, longitude, latitude, strict=True)])
+    if fit is None or not math.isfinite(fit[1]):
         reason = "the corners lie on one line"
         raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where="corners")])
-    transform, off = found
+    transform, off = fit
     if off > 0.02 * math.hypot(width, height):
         reason = (
             f"the corners are no parallelogram ({off:.0f} pixels off): give them as upper left, upper right, lower "
@@ -411,9 +411,11 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     picture = pictures[key]
     crs = {"source": picture.crs, "local": LOCAL, "wgs84": WGS84}[options.crs]
     if options.crs != "source" or options.resolution is not None:
-        made = resampled(picture, layers.frame, crs=crs, resolution=options.resolution, method=options.resampling)
-        if made is not picture:
-            picture = replace(made, properties=_without_statistics(made.properties))
+        new_picture = resampled(
+            picture, layers.frame, crs=crs, resolution=options.resolution, method=options.resampling
+        )
+        if new_picture is not picture:
+            picture = replace(new_picture, properties=_without_statistics(new_picture.properties))
     elif options.resampling is not None:
         raise Invalid("resampling only says how crs=local, crs=wgs84 or a resolution are made: ask for one of them")
     stem = file_stem(options.picture or NAME, NAME)
@@ -443,7 +445,7 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named picture; else ``satellite``, else the only one; on its level, else on the ground, else the only one."""
     supply = "upload one (a GeoTIFF, or a PNG with its world file)"
     return the_one(
-        keys, "imagery", options.picture, options.level, what="picture", option="picture", supply=supply, usual=NAME
+        keys, "imagery", options.picture, options.level, noun="picture", option="picture", supply=supply, default=NAME
     )
 
 
@@ -458,8 +460,8 @@ def by_file(name: str) -> dict[str, str]:
 
 
 def _tags(picture: Picture) -> dict[str, str]:
-    own = picture.properties.get(NAME)
-    tags = own.get("tags") if isinstance(own, Mapping) else None
+    source_properties = picture.properties.get(NAME)
+    tags = source_properties.get("tags") if isinstance(source_properties, Mapping) else None
     return {str(k): str(v) for k, v in tags.items()} if isinstance(tags, Mapping) else {}
 
 
@@ -467,10 +469,10 @@ def _without_statistics(properties: Mapping[str, Any]) -> dict[str, Any]:
     """Of resampled bands: their stated statistics hold no longer."""
     bands = []
     for band in properties.get("bands", ()):
-        own = band.get(NAME) if isinstance(band, Mapping) else None
-        if isinstance(own, Mapping) and isinstance(own.get("tags"), Mapping):
-            kept = {k: v for k, v in own["tags"].items() if not str(k).startswith("STATISTICS_")}
-            bands.append({**band, NAME: {**own, "tags": kept}})
+        source_properties = band.get(NAME) if isinstance(band, Mapping) else None
+        if isinstance(source_properties, Mapping) and isinstance(source_properties.get("tags"), Mapping):
+            tags = {k: v for k, v in source_properties["tags"].items() if not str(k).startswith("STATISTICS_")}
+            bands.append({**band, NAME: {**source_properties, "tags": tags}})
         else:
             bands.append(band)
     return {**properties, "bands": bands} if bands else dict(properties)
@@ -533,7 +535,7 @@ register(
         extensions=IMAGE_ENDS,
         choose=choose,
         by_file=by_file,
-        parts=Parts("imagery", "picture", partial(file_stem, usual=NAME), default=NAME),
+        parts=Parts("imagery", "picture", partial(file_stem, default=NAME), default=NAME),
         yields=yields,
         lacking=lacking,
         completing=frozenset({"corners", "metres_per_pixel"}),

@@ -50,28 +50,28 @@ def read(files: Files, context: ReadContext) -> Layers:
     if len(data) > context.limits.text_bytes:
         raise TooLarge(f"the table has {len(data)} bytes; the limit for a text is {context.limits.text_bytes}")
     rows = _rows(data.decode("utf-8-sig"))
-    header = [word.strip() for word in next(rows, ("", []))[1]]
+    header = [title.strip() for title in next(rows, ("", []))[1]]
     axes = _axes(header)
     if axes is None or without_repeats(header):
         refuse("the first row must name the columns, each once: name, and x and y or latitude and longitude", "line 1")
     names: list[str] = []
     places: list[tuple[float, ...]] = []
     properties: list[Properties] = []
-    for where, row in rows:
+    for location, row in rows:
         if len(row) != len(header):
-            refuse(f"has {len(row)} values, the first row names {len(header)} columns", where)
+            refuse(f"has {len(row)} values, the first row names {len(header)} columns", location)
         cells = dict(zip(header, row, strict=True))
-        names.append(checked_name(cells.pop("name").strip(), f"{where}, name"))
-        places.append(tuple(_number(cells.pop(axis), axis, where) for axis in axes))
+        names.append(checked_name(cells.pop("name").strip(), f"{location}, name"))
+        places.append(tuple(_number(cells.pop(axis), axis, location) for axis in axes))
         node: dict[str, object] = {"kind": "node", "name": names[-1]}
-        mine: dict[str, object] = {}
+        source_members: dict[str, object] = {}
         if yaw := cells.pop("yaw", "").strip():
-            mine["yaw"] = angle = _number(yaw, "yaw", where)
+            source_members["yaw"] = angle = _number(yaw, "yaw", location)
             node["orientation"] = quaternion(angle)
-        mine |= {column: text for column, text in cells.items() if text}
-        properties.append({**node, NAME: mine})
-    if again := without_repeats(names):
-        context.warn(f"{len(again)} names stand twice or more and got a number: {some(again)}")
+        source_members |= {column: text for column, text in cells.items() if text}
+        properties.append({**node, NAME: source_members})
+    if repeats := without_repeats(names):
+        context.warn(f"{len(repeats)} names stand twice or more and got a number: {some(repeats)}")
     xy = np.array(places, np.float64).reshape(-1, 2)
     points = np.asarray(shapely.points(xy if axes == METRES else xy[:, ::-1]), object).reshape(-1)
     anchor: Anchor = "local" if axes == METRES else "wgs84"
@@ -93,16 +93,16 @@ def _rows(text: str) -> Iterator[tuple[str, list[str]]]:
 
 def _axes(header: Sequence[str]) -> tuple[str, str] | None:
     """Which columns are the coordinates; None where this is no such table."""
-    found = [axes for axes in (METRES, DEGREES) if set(axes) <= set(header)]
-    return found[0] if "name" in header and len(found) == 1 else None
+    candidates = [axes for axes in (METRES, DEGREES) if set(axes) <= set(header)]
+    return candidates[0] if "name" in header and len(candidates) == 1 else None
 
 
-def _number(text: str, column: str, where: str) -> float:
+def _number(text: str, column: str, location: str) -> float:
     if not _DECIMAL.fullmatch(text):
-        refuse(f"must be a number, is {text[:60]!r}", f"{where}, {column}")
+        refuse(f"must be a number, is {text[:60]!r}", f"{location}, {column}")
     value = float(text)
     if not abs(value) <= LIMITS[column]:
-        refuse(f"must be within ±{LIMITS[column]:g}, is {text[:60]}", f"{where}, {column}")
+        refuse(f"must be within ±{LIMITS[column]:g}, is {text[:60]}", f"{location}, {column}")
     return value
 
 
@@ -122,20 +122,20 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         if layers.frame is None:
             raise MissingDatum("waypoints in degrees need a datum: give the environment one")
         places, decimals = layers.frame.to_wgs84(places)[:, ::-1], _text.DEGREES
-    lost = 0
+    dropped_count = 0
     out = io.StringIO(newline="")
     table = csv.writer(out, lineterminator="\n")
     table.writerow(columns)
-    for node, place in sorted(zip(net.nodes, places.tolist(), strict=True), key=lambda one: one[0].id):
-        p, mine = node.properties, own(node.properties, NAME)
-        angle = said_yaw(mine.get("yaw"), p.get("orientation"))
-        cells = {key: str(value) for key, value in mine.items()}
-        cells |= dict(zip(axes, _text.numbers(place, decimals), strict=True))
+    for node, position in sorted(zip(net.nodes, places.tolist(), strict=True), key=lambda one: one[0].id):
+        p, source_members = node.properties, own(node.properties, NAME)
+        angle = said_yaw(source_members.get("yaw"), p.get("orientation"))
+        cells = {key: str(value) for key, value in source_members.items()}
+        cells |= dict(zip(axes, _text.numbers(position, decimals), strict=True))
         cells |= {"name": str(p.get("name") or node.id), "yaw": "" if angle is None else _text.number(angle, 12)}
         table.writerow([cells.get(str(column), "") for column in columns])
-        lost += bool(p.keys() - {"kind", "name", "orientation", NAME})
+        dropped_count += bool(p.keys() - {"kind", "name", "orientation", NAME})
         context.drop("orientations of nodes", angle is not None and "yaw" not in columns, "the table has no column yaw")
-    context.drop("attributes of nodes", lost, "the table has no columns for them")
+    context.drop("attributes of nodes", dropped_count, "the table has no columns for them")
     return {"waypoints.csv": out.getvalue().encode()}
 
 
@@ -144,7 +144,7 @@ def detect(name: str, data: bytes) -> bool:
     if not name.lower().endswith(".csv"):
         return False
     first = data[:4096].decode("utf-8-sig", "replace").partition("\n")[0]
-    return _axes([word.strip() for word in first.split(",")]) is not None
+    return _axes([title.strip() for title in first.split(",")]) is not None
 
 
 register(

@@ -132,19 +132,21 @@ def all_generators() -> Mapping[str, Generator]:
 
 def get_generator(name: str) -> Generator:
     """NotFound, with the known ones, for a name that is none."""
-    known = all_generators()
-    if name not in known:
-        raise NotFound(f"there is no generator {name!r}{did_you_mean(name, known)}; known ones: {', '.join(known)}")
-    return known[name]
+    generators = all_generators()
+    if name not in generators:
+        raise NotFound(
+            f"there is no generator {name!r}{did_you_mean(name, generators)}; known ones: {', '.join(generators)}"
+        )
+    return generators[name]
 
 
 def check(name: str, seed: int, values: Mapping[str, Any]) -> tuple[Generator, Any]:
     """The generator and its parameters, before any work. NotFound, or Invalid with each wrong value."""
-    known = get_generator(name)
+    generator = get_generator(name)
     if not 0 <= seed <= MAX_SEED:
         problem = f"must be from 0 to {MAX_SEED}, got {seed}"
         raise Invalid(f"seed: {problem}", [Problem(problem, where="seed")])
-    return known, parameters.parse(known.parameters, values, f"parameter of {name}")
+    return generator, parameters.parse(generator.parameters, values, f"parameter of {name}")
 
 
 def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: Notes) -> Layers:
@@ -152,25 +154,25 @@ def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: N
 
     Raises NotFound, Invalid, MissingLayer (with what it works on), CannotGenerate.
     """
-    known, options = check(name, seed, values)
-    lacking = known.needs - given.layers
+    maker, options = check(name, seed, values)
+    lacking = maker.needs - given.layers
     if lacking:
         raise MissingLayer(
             f"{name} works on {', '.join(sorted(lacking))}, and there is none: upload a map or generate one first"
         )
-    if known.changes and not known.changes & given.layers:
+    if maker.changes and not maker.changes & given.layers:
         raise MissingLayer(
-            f"{name} works on {' or '.join(sorted(known.changes))}, and there is none: upload a map or generate one "
+            f"{name} works on {' or '.join(sorted(maker.changes))}, and there is none: upload a map or generate one "
             "first"
         )
-    made = known.function(given, options, Source(seed, name), notes)
-    fresh = {k: p for k, p in made.parts.items() if given.parts.get(k) is not p and not is_empty(p)}
+    generated_layers = maker.function(given, options, Source(seed, name), notes)
+    fresh = {k: p for k, p in generated_layers.parts.items() if given.parts.get(k) is not p and not is_empty(p)}
     if not fresh:
         raise CannotGenerate(f"{name} made nothing with these parameters")
-    unknown = {k.layer for k in fresh} - known.gives
+    unknown = {k.layer for k in fresh} - maker.gives
     if unknown:
         raise ValueError(f"{name} made {', '.join(sorted(unknown))} and does not declare it")
-    return Layers(fresh, given.datum or made.datum, made.levels)
+    return Layers(fresh, given.datum or generated_layers.datum, generated_layers.levels)
 
 
 def step(
@@ -180,9 +182,9 @@ def step(
 
     used: hashes of the parts that it was given. datum: the one that it made up.
     """
-    known, options = check(name, seed, values)
-    defaults = {p["name"]: p["default"] for p in parameters.describe(known.parameters)}
-    members: dict[str, Any] = {"step": name, "seed": seed, "version": known.version}
+    generator, options = check(name, seed, values)
+    defaults = {p["name"]: p["default"] for p in parameters.describe(generator.parameters)}
+    members: dict[str, Any] = {"step": name, "seed": seed, "version": generator.version}
     members["parameters"] = {**defaults, **parameters.canonical(options)}
     if datum is not None:
         members["datum"] = datum.as_dict()

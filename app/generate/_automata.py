@@ -57,7 +57,7 @@ def joined(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: f
     import cv2
 
     out = occupied.copy()
-    ways = 0
+    passages = 0
     width = max(round(passage), 2 * int(np.ceil(radius)) + 1)
     for _ in range(ROUNDS):
         label, sizes = _places(out, radius)
@@ -70,7 +70,7 @@ def joined(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: f
         for a, b in _shortest(np.where(keep[label], label, 0)):
             cv2.line(cut, (a[1], a[0]), (b[1], b[0]), 1, thickness=width, lineType=cv2.LINE_4)
             cv2.line(cut, (a[1], a[0]), (b[1], b[0]), 1, lineType=cv2.LINE_4)
-            ways += 1
+            passages += 1
         before = out
         out = out & ~((cut > 0) & ~rim)
         if np.array_equal(before, out):
@@ -80,12 +80,12 @@ def joined(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: f
     if not sizes.any():
         label, sizes = _places(out, 0.0)
     if not sizes.any():
-        return np.ones_like(out), int(np.count_nonzero(~out)), ways
+        return np.ones_like(out), int(np.count_nonzero(~out)), passages
     main = label == int(np.argmax(sizes))
     _, free = cv2.connectedComponents((~out).astype(np.uint8), connectivity=4)
-    kept = np.asarray(free) == int(np.asarray(free)[main][0])
-    filled = int(np.count_nonzero(~out & ~kept))
-    return ~kept, filled, ways
+    remaining = np.asarray(free) == int(np.asarray(free)[main][0])
+    filled = int(np.count_nonzero(~out & ~remaining))
+    return ~remaining, filled, passages
 
 
 def _places(occupied: Bool, radius: float) -> tuple[NDArray[np.int32], I64]:
@@ -110,16 +110,16 @@ def _shortest(label: NDArray[np.int32]) -> list[tuple[tuple[int, int], tuple[int
 
     near = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
     owner = label[near[0], near[1]]
-    found = []
+    blocks = []
     for axis in (0, 1):
         a, b = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
         differ = owner[a] != owner[b]
-        found.append(
+        blocks.append(
             np.stack(
                 [owner[a][differ], owner[b][differ], *(near[k][s][differ] for s in (a, b) for k in (0, 1))], axis=1
             ).astype(np.int64)
         )
-    rows = np.concatenate(found)
+    rows = np.concatenate(blocks)
     swap = rows[:, 0] > rows[:, 1]
     rows[swap] = rows[swap][:, [1, 0, 4, 5, 2, 3]]
     length = (rows[:, 2] - rows[:, 4]) ** 2 + (rows[:, 3] - rows[:, 5]) ** 2

@@ -143,27 +143,27 @@ def parse(text: str, constants: Mapping[str, float]) -> Grammar:
     statements = [s for s in statements if s]
     if not 0 < len(statements) <= MOST_RULES:
         refuse(f"there are {len(statements)} rules; there must be 1 to {MOST_RULES}", "rules")
-    known = frozenset({*SHAPE_NAMES, *constants})
+    names = frozenset({*SHAPE_NAMES, *constants})
     rules: dict[str, list[Rule]] = {}
-    for k, said in enumerate(statements):
-        where = f"rules, rule {k + 1}"
-        head, arrow, tail = said.partition("->")
+    for k, statement in enumerate(statements):
+        location = f"rules, rule {k + 1}"
+        head, arrow, tail = statement.partition("->")
         head, at, weight = head.partition("@")
-        found = _RULE.fullmatch(head)
-        if not arrow or found is None:
-            refuse(f"{said[:60]!r} is no rule, such as lots : area > 600 @ 2 -> cut(0.5, 0) lots lots", where)
-        if found[2] is not None and not found[2].strip():
-            refuse("a condition is missing behind :", where)
-        rule = _action(tail, known, where)
-        rules.setdefault(found[1], []).append(
+        match = _RULE.fullmatch(head)
+        if not arrow or match is None:
+            refuse(f"{statement[:60]!r} is no rule, such as lots : area > 600 @ 2 -> cut(0.5, 0) lots lots", location)
+        if match[2] is not None and not match[2].strip():
+            refuse("a condition is missing behind :", location)
+        rule = _action(tail, names, location)
+        rules.setdefault(match[1], []).append(
             Rule(
-                _expressions.parse(found[2], known, where) if found[2] else None,
-                _expressions.parse(weight, known, where) if at else None,
+                _expressions.parse(match[2], names, location) if match[2] else None,
+                _expressions.parse(weight, names, location) if at else None,
                 *rule,
-                where,
+                location,
             )
         )
-    grammar = Grammar(next(iter(rules)), {name: tuple(found) for name, found in rules.items()}, dict(constants))
+    grammar = Grammar(next(iter(rules)), {name: tuple(match) for name, match in rules.items()}, dict(constants))
     for found_ in grammar.rules.values():
         for rule_ in found_:
             for name in rule_.makes:
@@ -172,19 +172,19 @@ def parse(text: str, constants: Mapping[str, float]) -> Grammar:
     return grammar
 
 
-def _action(text: str, known: frozenset[str], where: str) -> tuple[str, tuple[Expression, ...], tuple[str, ...]]:
-    found = _ACTION.fullmatch(text)
-    if found is None:
-        refuse(f"{text.strip()[:60]!r} is no action with the shapes it makes, such as cut(0.5, 8) a b", where)
-    name, inside, rest = found[1], found[2], tuple(found[3].split())
+def _action(text: str, names: frozenset[str], location: str) -> tuple[str, tuple[Expression, ...], tuple[str, ...]]:
+    match = _ACTION.fullmatch(text)
+    if match is None:
+        refuse(f"{text.strip()[:60]!r} is no action with the shapes it makes, such as cut(0.5, 8) a b", location)
+    name, inside, rest = match[1], match[2], tuple(match[3].split())
     if name not in ACTIONS:
         if inside is None and not rest:
             return "is", (), (name,)
-        refuse(f"there is no action {name!r}; there are {', '.join(ACTIONS)}, or a shape's name alone", where)
-    values = tuple(_expressions.parse(one, known, where) for one in _split(inside or "()"))
+        refuse(f"there is no action {name!r}; there are {', '.join(ACTIONS)}, or a shape's name alone", location)
+    values = tuple(_expressions.parse(one, names, location) for one in _split(inside or "()"))
     wants, makes = ACTIONS[name]
     if len(values) != wants or len(rest) != makes:
-        refuse(f"{name} takes {wants} values and makes {makes} shapes, got {len(values)} and {len(rest)}", where)
+        refuse(f"{name} takes {wants} values and makes {makes} shapes, got {len(values)} and {len(rest)}", location)
     return name, values, rest
 
 
@@ -210,11 +210,11 @@ def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
     """
     town = Town()
     waiting = [_Shape(grammar.start, boundary, boundary, None, 0)]
-    made = 0
+    shape_count = 0
     while waiting:
         shape = waiting.pop()
-        made += 1
-        if made > MOST_SHAPES:
+        shape_count += 1
+        if shape_count > MOST_SHAPES:
             _stop(f"the rules make more than {MOST_SHAPES} shapes", "rules")
         rules = grammar.rules.get(shape.name)
         if rules is None or shape.land.area < SMALLEST:
@@ -232,8 +232,8 @@ def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
     return town
 
 
-def _stop(what: str, where: str) -> None:
-    raise CannotGenerate(f"{where}: {what}", [Problem(what, where=where)])
+def _stop(problem: str, location: str) -> None:
+    raise CannotGenerate(f"{location}: {problem}", [Problem(problem, where=location)])
 
 
 def _end(town: Town, shape: _Shape, use: str, storeys: int = 0) -> None:
@@ -329,12 +329,12 @@ def _ring(town: Town, shape: _Shape, rule: Rule, width: float, deep: int) -> lis
         _stop("a ring needs a street's width", rule.where)
     middle = _pieces(shapely.buffer(shape.land, -width / 2, join_style="mitre"))
     out = []
-    for whole in middle:
-        land = _pieces(shapely.buffer(whole, -width / 2, join_style="mitre"))
+    for block in middle:
+        land = _pieces(shapely.buffer(block, -width / 2, join_style="mitre"))
         if not land:
             continue
-        town.street(shapely.LineString(shapely.get_coordinates(whole.exterior)), width)
-        out += [_Shape(rule.makes[0], whole, piece, None, deep) for piece in land]
+        town.street(shapely.LineString(shapely.get_coordinates(block.exterior)), width)
+        out += [_Shape(rule.makes[0], block, piece, None, deep) for piece in land]
     if not out:
         _stop(f"there is no room for a ring of {width:g} m and anything in it", rule.where)
     return out
@@ -366,10 +366,10 @@ def _cut(town: Town, shape: _Shape, rule: Rule, share: float, width: float, deep
         if strip is None:
             out += [_Shape(name, p, p, front, deep) for p in _pieces(shapely.intersection(shape.land, side))]
             continue
-        for whole in _pieces(shapely.intersection(shape.whole, side)):
-            land = shapely.intersection(shape.land, whole)
+        for block in _pieces(shapely.intersection(shape.whole, side)):
+            land = shapely.intersection(shape.land, block)
             land = shapely.difference(land, strip)
-            out += [_Shape(name, whole, piece, front, deep) for piece in _pieces(land)]
+            out += [_Shape(name, block, piece, front, deep) for piece in _pieces(land)]
     return out
 
 

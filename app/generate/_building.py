@@ -98,10 +98,10 @@ class Building:
     rooms: list[Room] = field(default_factory=list)
     _count: dict[str, int] = field(default_factory=dict)
 
-    def number(self, what: str) -> int:
+    def number(self, kind: str) -> int:
         """The next number of a kind of thing, from 1."""
-        self._count[what] = self._count.get(what, 0) + 1
-        return self._count[what]
+        self._count[kind] = self._count.get(kind, 0) + 1
+        return self._count[kind]
 
     # walls, doors, floors, the lift
 
@@ -249,9 +249,9 @@ class Building:
     def furnish(self, room: Room, goal: tuple[float, float]) -> Furniture:
         """What may be put into a room whose node is at ``goal`` (metres along and inward)."""
         along = room.door - room.box[0]
-        way = shapely.LineString([room.at(along, -PARTITION), room.at(along, self.radius + 0.5), room.at(*goal)])
+        path = shapely.LineString([room.at(along, -PARTITION), room.at(along, self.radius + 0.5), room.at(*goal)])
         keep = self.radius + 3 * self.site.resolution + 0.1
-        return Furniture(self, room, shapely.buffer(way, keep, cap_style="square"))
+        return Furniture(self, room, shapely.buffer(path, keep, cap_style="square"))
 
     def charger(self, things: Furniture, goal: tuple[float, float]) -> None:
         """A charger at the room's outer wall behind its node, and the place before it, where there is room."""
@@ -261,8 +261,8 @@ class Building:
             return
         k = self.number("dock")
         things.put("charger", goal[0], room.depth - 0.03 - depth / 2, (0.5, depth, 0.6), "charger", gap=0.0)
-        way = shapely.LineString([room.at(*goal), room.at(goal[0], inward)])
-        things.taken = shapely.union(things.taken, shapely.buffer(way, keep))
+        path = shapely.LineString([room.at(*goal), room.at(goal[0], inward)])
+        things.taken = shapely.union(things.taken, shapely.buffer(path, keep))
         at = self.place.at(*room.at(goal[0], inward))
         words = {"openrmf": {"parameters": {"is_charger": [4, True], "is_parking_spot": [4, True]}}}
         yaw = self.place.yaw + room.side * math.pi / 2
@@ -364,10 +364,10 @@ def fits_robot(site: Site, measures: Storeys, radius: float) -> None:
     widths = {"door_width": measures.door, "corridor": measures.corridor - ENTRANCE}
     if measures.lift:
         widths["robot_radius"] = LIFT_DOOR
-    for where, width in widths.items():
+    for parameter, width in widths.items():
         if width < need - 1e-9:
-            what = {"robot_radius": "the lift's doors are", "corridor": "its entrance is"}.get(where, "it is")
-            raise refused(where, f"{what} {width:.3g} m wide; a robot of {radius:g} m needs {need:.2f} m here")
+            label = {"robot_radius": "the lift's doors are", "corridor": "its entrance is"}.get(parameter, "it is")
+            raise refused(parameter, f"{label} {width:.3g} m wide; a robot of {radius:g} m needs {need:.2f} m here")
 
 
 def names_of(levels: int) -> list[str]:
@@ -431,12 +431,12 @@ def _storey(building: Building, k: int, level: str, west: float, chance: np.rand
     used: list[float] = []
     for side in (1, -1):
         widths = _widths(m, chance)
-        told = kinds(k, side, widths, chance)
+        room_kinds = kinds(k, side, widths, chance)
         base = high if side > 0 else 0.0
         at = west
         openings: list[tuple[float, float]] = []
         gaps: list[tuple[float, float]] = []
-        for n, (width, kind) in enumerate(zip(widths, told, strict=True)):
+        for n, (width, kind) in enumerate(zip(widths, room_kinds, strict=True)):
             name = f"{kind}_{k + 1}{n * 2 + (1 if side > 0 else 2):02d}"
             open_ = kind == "nurse_station"
             stop = _door(at - west + 0.3 + m.door / 2, at - west + width - 0.3 - m.door / 2, used)
@@ -469,10 +469,10 @@ def _storey(building: Building, k: int, level: str, west: float, chance: np.rand
 
 def _widths(m: Storeys, chance: np.random.Generator) -> list[float]:
     """Widths of the rooms along one side, together the corridor's length, in steps of a decimetre."""
-    fewest, most = math.ceil(m.length / m.most - 1e-9), math.floor(m.length / m.least + 1e-9)
-    if most < 1 or fewest > most:
+    min_count, max_count = math.ceil(m.length / m.most - 1e-9), math.floor(m.length / m.least + 1e-9)
+    if max_count < 1 or min_count > max_count:
         raise refused("room_width", f"no number of rooms from {m.least:g} to {m.most:g} m fills {m.length:g} m")
-    count = int(chance.integers(fewest, most + 1))
+    count = int(chance.integers(min_count, max_count + 1))
     spare = m.length - count * m.least
     shares = chance.random(count) + 0.2
     # What goes beyond the widest is given to the others.

@@ -77,9 +77,9 @@ def placed(site: Site, width: float, depth: float, resolution: float, *, step: i
     low_x, low_y, high_x, high_y = site.bounded(shapely.box(0.0, 0.0, width, depth)).bounds
     if not site.is_given:
         columns, rows = (max(1, round(v / size)) for v in (width, depth))
-        found = Place(0.0, 0.0, resolution, columns * step, rows * step)
-        site.fence = found.box
-        return found
+        frame = Place(0.0, 0.0, resolution, columns * step, rows * step)
+        site.fence = frame.box
+        return frame
     x, y = (math.floor(v / resolution + 1e-6) for v in (low_x, low_y))
     columns, rows = (math.ceil((v - o * resolution) / size - 1e-6) for v, o in ((high_x, x), (high_y, y)))
     if columns * rows * step * step > MAX_CELLS:
@@ -122,28 +122,28 @@ def stand(site: Site, place: Place, occupied: Bool, seen: Look) -> None:
 
 def finished(site: Site, options: SiteOptions, notes: Notes, *, ground: str) -> Layers:
     """The site's layers with the network of its grid: the largest piece of what its robot can reach."""
-    made = site.finish(ground=ground)
-    grid = made.parts[PartKey("occupancy", GROUND, MAP)]
+    layers = site.finish(ground=ground)
+    grid = layers.parts[PartKey("occupancy", GROUND, MAP)]
     if not isinstance(grid, OccupancyGrid):
         raise TypeError("a site has a grid")
-    ways = ways_of(grid, options.robot_radius, notes)
-    parts: dict[PartKey, Part] = dict(made.parts)
-    if ways is not None:
-        parts[PartKey("topology", GROUND, NETWORK)] = ways
-    return Layers(dict(sorted(parts.items())), made.datum, made.levels)
+    topology = ways_of(grid, options.robot_radius, notes)
+    parts: dict[PartKey, Part] = dict(layers.parts)
+    if topology is not None:
+        parts[PartKey("topology", GROUND, NETWORK)] = topology
+    return Layers(dict(sorted(parts.items())), layers.datum, layers.levels)
 
 
 def ways_of(grid: OccupancyGrid, radius: float, notes: Notes) -> Features | None:
     """The network of a grid's free space, one piece of it; None, with a warning, where a robot finds no way."""
-    own = Notes()
+    network_notes = Notes()
     spacing = max(1.5, 25 * grid.resolution)
     try:
-        found = network(grid, Parameters(robot_radius=radius, spacing=spacing), own, "the grid")
+        topology = network(grid, Parameters(robot_radius=radius, spacing=spacing), network_notes, "the grid")
     except CannotConvert as error:
         notes.warn(f"there is no network: {error.detail}")
         return None
-    notes.dropped += own.dropped
-    return _largest(found, notes)
+    notes.dropped += network_notes.dropped
+    return _largest(topology, notes)
 
 
 def _largest(network: Features, notes: Notes) -> Features:
@@ -157,16 +157,16 @@ def _largest(network: Features, notes: Notes) -> Features:
             i = parent[i]
         return i
 
-    for k, said in enumerate(network.properties):
-        if said.get("kind") == "edge":
-            for end in (said["source"], said["target"]):
+    for k, properties in enumerate(network.properties):
+        if properties.get("kind") == "edge":
+            for end in (properties["source"], properties["target"]):
                 parent[root(k)] = root(place[end])
     roots = np.array([root(k) for k in range(len(network))])
-    nodes = np.array([said.get("kind") == "node" for said in network.properties])
-    which, counts = np.unique(roots[nodes], return_counts=True)
-    kept = roots == which[int(np.argmax(counts))]
-    notes.drop("nodes", int(np.count_nonzero(nodes & ~kept)), "in places from which the robot finds no way to the rest")
-    return network.take(kept)
+    nodes = np.array([properties.get("kind") == "node" for properties in network.properties])
+    components, counts = np.unique(roots[nodes], return_counts=True)
+    mask = roots == components[int(np.argmax(counts))]
+    notes.drop("nodes", int(np.count_nonzero(nodes & ~mask)), "in places from which the robot finds no way to the rest")
+    return network.take(mask)
 
 
 def _pieces(occupied: Bool) -> list[Any]:
@@ -187,8 +187,8 @@ def _pieces(occupied: Bool) -> list[Any]:
 def _outlines(label: NDArray[np.int32]) -> list[Any]:
     from rasterio import features
 
-    found = features.shapes(label, mask=label > 0, connectivity=4)
-    return [shapely.normalize(shapely.geometry.shape(s)) for s, _ in found]
+    polygons = features.shapes(label, mask=label > 0, connectivity=4)
+    return [shapely.normalize(shapely.geometry.shape(s)) for s, _ in polygons]
 
 
 def _mask(areas: list[Any], shape: tuple[int, int]) -> Bool:

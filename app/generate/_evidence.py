@@ -57,12 +57,12 @@ class Grid:
 # --- walls ---
 
 
-def walls(grid: Grid, wanted: Bool) -> Bool:
+def walls(grid: Grid, target: Bool) -> Bool:
     """The wanted cells over which a straight wall goes on from one known end to another."""
     import cv2
 
-    out = np.zeros(wanted.shape, np.uint8)
-    edge = cv2.dilate(wanted.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    out = np.zeros(target.shape, np.uint8)
+    edge = cv2.dilate(target.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     at = np.argwhere(grid.occupied & edge)
     if not 2 <= len(at) <= MAX_ENDS:
         return out.astype(bool)
@@ -87,7 +87,7 @@ def walls(grid: Grid, wanted: Bool) -> Bool:
         row, column = (np.round(np.linspace(p, q, steps + 1)).astype(int)[1:-1] for p, q in zip(a, b, strict=True))
         if len(row) and not seen_free[row, column].any():
             out[row, column] = 1
-    return out.astype(bool) & wanted
+    return out.astype(bool) & target
 
 
 def _directions(grid: Grid, at: Places) -> tuple[Array, Bool]:
@@ -99,8 +99,8 @@ def _directions(grid: Grid, at: Places) -> tuple[Array, Bool]:
     direction, straight = np.zeros((len(at), 2)), np.zeros(len(at), bool)
     portion = max(1, 2**22 // len(offset))
     for begin in range(0, len(at), portion):
-        here = at[begin : begin + portion] + radius
-        weight = padded[here[:, :1] + offset[:, 0], here[:, 1:] + offset[:, 1]].astype(np.float64)
+        batch = at[begin : begin + portion] + radius
+        weight = padded[batch[:, :1] + offset[:, 0], batch[:, 1:] + offset[:, 1]].astype(np.float64)
         total = np.maximum(weight.sum(axis=1), 1.0)
         mean = weight @ offset / total[:, None]
         squares = np.stack([offset[:, 0] ** 2, offset[:, 0] * offset[:, 1], offset[:, 1] ** 2], axis=1)
@@ -134,9 +134,9 @@ def surroundings(grid: Grid, at: Places) -> NDArray[np.int64]:
             row, column = at[left, 0] + up * step, at[left, 1] + right * step
             inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
             left, row, column = left[inside], row[inside], column[inside]
-            found = code[row, column]
-            hit = found != NOTHING
-            seen[ray, left[hit]] = found[hit]
+            codes = code[row, column]
+            hit = codes != NOTHING
+            seen[ray, left[hit]] = codes[hit]
             nearest[left[hit]] = np.minimum(nearest[left[hit]], step * math.hypot(up, right))
             left = left[~hit]
             if not len(left):
@@ -173,10 +173,10 @@ def confidence(grid: Grid, side: float, draw: np.random.Generator) -> Array:
 
 def _holes(grid: Grid, side: float, draw: np.random.Generator) -> Iterator[tuple[Grid, Bool]]:
     """Places of the grid, each with a square hole around a known cell."""
-    known = np.flatnonzero(grid.known)
+    indices = np.flatnonzero(grid.known)
     half, margin = max(1, round(side / 2 / grid.cell)), round(SPAN_METRES / grid.cell)
     width = grid.known.shape[1]
-    for middle in draw.choice(known, size=HOLES).tolist():
+    for middle in draw.choice(indices, size=HOLES).tolist():
         row, column = divmod(middle, width)
         top, left = max(0, row - half - margin), max(0, column - half - margin)
         part = np.s_[top : row + half + margin, left : column + half + margin]

@@ -59,46 +59,46 @@ class Expression:
     def __call__(self, names: Mapping[str, float], chance: np.random.Generator) -> float:
         """The number, finite and at most 1e9. CannotGenerate names the expression otherwise."""
         try:
-            found = self.value(names, chance)
+            value = self.value(names, chance)
         except (ArithmeticError, ValueError) as error:
             self._stop(str(error))
-        if not abs(found) <= LARGEST:
-            self._stop(f"{found:g} is beyond ±{LARGEST:g}")
-        return found
+        if not abs(value) <= LARGEST:
+            self._stop(f"{value:g} is beyond ±{LARGEST:g}")
+        return value
 
     def _stop(self, reason: str) -> NoReturn:
         problem = f"{self.text.strip()!r} cannot be computed: {reason}"
         raise CannotGenerate(f"{self.where}: {problem}", [Problem(problem, where=self.where)])
 
 
-def refuse(problem: str, where: str) -> NoReturn:
+def refuse(problem: str, location: str) -> NoReturn:
     """Raise Invalid that names the place in the rules."""
-    raise Invalid(f"{where}: {problem}", [Problem(problem, where=where)])
+    raise Invalid(f"{location}: {problem}", [Problem(problem, where=location)])
 
 
-def parse(text: str, names: frozenset[str] | set[str], where: str) -> Expression:
+def parse(text: str, names: frozenset[str] | set[str], location: str) -> Expression:
     """The expression. Invalid, with the place, for anything that is not one, and for names that nobody gives."""
-    parser = _Parser(_tokens(text, where), names, where)
+    parser = _Parser(_tokens(text, location), names, location)
     value = parser.either(0)
     if parser.peek():
-        refuse(f"{parser.peek()!r} stands where the expression {text.strip()!r} should end", where)
-    return Expression(text, where, value)
+        refuse(f"{parser.peek()!r} stands where the expression {text.strip()!r} should end", location)
+    return Expression(text, location, value)
 
 
-def _tokens(text: str, where: str) -> list[str]:
+def _tokens(text: str, location: str) -> list[str]:
     out: list[str] = []
     at = 0
     end = len(text.rstrip())
     while at < end:
-        found = _TOKEN.match(text, at)
-        if found is None:
-            refuse(f"{text[at:].strip()[:20]!r} is no part of an expression", where)
-        out.append(found.group().strip())
-        at = found.end()
+        match = _TOKEN.match(text, at)
+        if match is None:
+            refuse(f"{text[at:].strip()[:20]!r} is no part of an expression", location)
+        out.append(match.group().strip())
+        at = match.end()
         if len(out) > LONGEST:
-            refuse(f"an expression has at most {LONGEST} numbers, names and signs", where)
+            refuse(f"an expression has at most {LONGEST} numbers, names and signs", location)
     if not out:
-        refuse("an expression is missing", where)
+        refuse("an expression is missing", location)
     return out
 
 
@@ -142,8 +142,8 @@ _SIMPLE: Mapping[str, Callable[[list[float]], float]] = {
 class _Parser:
     """Recursive descent, its depth bounded."""
 
-    def __init__(self, tokens: list[str], names: frozenset[str] | set[str], where: str) -> None:
-        self.tokens, self.names, self.where = tokens, names, where
+    def __init__(self, tokens: list[str], names: frozenset[str] | set[str], location: str) -> None:
+        self.tokens, self.names, self.where = tokens, names, location
         self.at = 0
 
     def peek(self) -> str:
@@ -164,12 +164,12 @@ class _Parser:
         """Alternatives, the loosest binding."""
         if depth > DEEPEST:
             refuse(f"an expression is at most {DEEPEST} deep", self.where)
-        found = [value for _, value in self._series(depth + 1, ("|",), self._both)]
-        return found[0] if len(found) == 1 else lambda n, c: float(any(v(n, c) != 0 for v in found))
+        terms = [value for _, value in self._series(depth + 1, ("|",), self._both)]
+        return terms[0] if len(terms) == 1 else lambda n, c: float(any(v(n, c) != 0 for v in terms))
 
     def _both(self, depth: int) -> Value:
-        found = [value for _, value in self._series(depth, ("&",), self._not)]
-        return found[0] if len(found) == 1 else lambda n, c: float(all(v(n, c) != 0 for v in found))
+        terms = [value for _, value in self._series(depth, ("&",), self._not)]
+        return terms[0] if len(terms) == 1 else lambda n, c: float(all(v(n, c) != 0 for v in terms))
 
     def _not(self, depth: int) -> Value:
         if self.peek() != "!":
@@ -208,10 +208,10 @@ class _Parser:
         if self.peek() != "^":
             return base
         self.take()
-        said = self.take()
-        if not said.isdecimal() or int(said) > 16:
-            refuse(f"a power is a whole number from 0 to 16, got {said!r}", self.where)
-        return lambda n, c: math.prod([base(n, c)] * int(said))
+        exponent = self.take()
+        if not exponent.isdecimal() or int(exponent) > 16:
+            refuse(f"a power is a whole number from 0 to 16, got {exponent!r}", self.where)
+        return lambda n, c: math.prod([base(n, c)] * int(exponent))
 
     def _primary(self, depth: int) -> Value:
         token = self.take()
@@ -226,9 +226,9 @@ class _Parser:
             return self._function(token, depth)
         if token and (token[0].isalpha() or token[0] == "_"):
             if token not in self.names:
-                known = ", ".join(sorted(self.names)) or "none"
+                name_list = ", ".join(sorted(self.names)) or "none"
                 refuse(
-                    f"nothing is called {token!r} here; there are: {known}; functions: {', '.join(_FUNCTIONS)}",
+                    f"nothing is called {token!r} here; there are: {name_list}; functions: {', '.join(_FUNCTIONS)}",
                     self.where,
                 )
             return lambda n, c: n[token]
@@ -241,10 +241,11 @@ class _Parser:
         self._expect("(")
         given = [value for _, value in self._series(depth + 1, (",",), self.either)]
         self._expect(")")
-        least, most = _FUNCTIONS[name]
-        if not least <= len(given) <= most:
+        minimum, maximum = _FUNCTIONS[name]
+        if not minimum <= len(given) <= maximum:
             refuse(
-                f"{name} takes {least if least == most else f'{least} or more'} values, got {len(given)}", self.where
+                f"{name} takes {minimum if minimum == maximum else f'{minimum} or more'} values, got {len(given)}",
+                self.where,
             )
         if name == "rand":
             low, high = given

@@ -141,7 +141,7 @@ def open_field(
     options: FieldOptions,
     lines: Sequence[Line],
     *,
-    own: int | None,
+    row_count: int | None,
     spacing: float,
     half: float,
     word: str = "row_spacing",
@@ -155,7 +155,7 @@ def open_field(
     room.
     """
     margin = 2.0
-    count = len(lines) if own is None else own
+    count = len(lines) if row_count is None else row_count
     across = (options.row_length or length) + 2 * options.headland
     depth = options.yard + options.headland * 1.5 + (count - 1) * spacing
     room = min(spacing, options.headland) / 2 - options.robot_radius - half
@@ -166,7 +166,7 @@ def open_field(
     else:
         lines = lines[:count]
     _check_room(site, options, spacing, half, word)
-    _lay(out, lines, spacing, asked=own is None)
+    _lay(out, lines, spacing, count_lost=row_count is None)
     nodes = 2 + 2 * options.docks + sum(len(stops(out, aisle)) for aisle in out.aisles[1:])
     if nodes > MOST_NODES - 200:
         raise refused("node_spacing", f"there would be {nodes} nodes; the limit is {MOST_NODES - 200}")
@@ -197,7 +197,7 @@ def _check_room(site: Site, options: FieldOptions, spacing: float, half: float, 
         raise refused("headland", f"{options.headland:g} m are too few to turn: at least {2 * needed:.2f} m are needed")
 
 
-def _lay(out: Field, lines: Sequence[Line], spacing: float, *, asked: bool) -> None:
+def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool) -> None:
     """Rows and aisles, from the lane on as far as the fence reaches."""
     options, site = out.options, out.site
     turn = options.headland / 2
@@ -219,12 +219,12 @@ def _lay(out: Field, lines: Sequence[Line], spacing: float, *, asked: bool) -> N
     for k, line in enumerate(lines):
         before = out.aisles[-1]
         last = k == len(lines) - 1
-        found = None if last else _widest(inner, v + spacing / 2, (before.low, before.high))
-        if found is not None:
-            found = _at_most(found, options, (before.low, before.high))
-        if found is None or found[1] - found[0] < options.headland + SHORTEST:
-            found = None
-        after = None if found is None else Aisle(line.aisle, v + spacing / 2, *found)
+        span = None if last else _widest(inner, v + spacing / 2, (before.low, before.high))
+        if span is not None:
+            span = _at_most(span, options, (before.low, before.high))
+        if span is None or span[1] - span[0] < options.headland + SHORTEST:
+            span = None
+        after = None if span is None else Aisle(line.aisle, v + spacing / 2, *span)
         if after is not None:
             ends = [((before.low, before.v), (after.low, after.v)), ((before.high, before.v), (after.high, after.v))]
             after.west, after.east = (drive.contains(shapely.LineString(end)) for end in ends)
@@ -234,7 +234,7 @@ def _lay(out: Field, lines: Sequence[Line], spacing: float, *, asked: bool) -> N
         if row is not None:
             out.rows.append(row)
         if after is None:
-            left = sum(one.kind == "row" for one in lines[k + 1 :]) if asked else 0
+            left = sum(one.kind == "row" for one in lines[k + 1 :]) if count_lost else 0
             break
         out.aisles.append(after)
         v += spacing
@@ -247,10 +247,10 @@ def _row(line: Line, v: float, before: Aisle, after: Aisle | None, inner: Any, t
     """The row between two aisles, a headland shorter than both."""
     low = before.low if after is None else max(before.low, after.low)
     high = before.high if after is None else min(before.high, after.high)
-    here = _widest(inner, v, (low, high))
-    if here is None:
+    span = _widest(inner, v, (low, high))
+    if span is None:
         return None
-    low, high = max(low, here[0]) + turn, min(high, here[1]) - turn
+    low, high = max(low, span[0]) + turn, min(high, span[1]) - turn
     return Row(line.number, v, low, high, line.kind) if high - low >= 1.0 else None
 
 
@@ -335,28 +335,28 @@ def _at_lane(out: Field) -> dict[str, float]:
     lane, options = out.aisles[0], out.options
     pitch = _pitch(options)
     middle = mm((lane.low + lane.high + options.docks * pitch) / 2)
-    found = {f"Yard{k + 1}": mm(middle - k * pitch) for k in range(options.docks)}
-    found["YardGate"] = mm(middle - options.docks * pitch - 1.0)
-    return found
+    positions = {f"Yard{k + 1}": mm(middle - k * pitch) for k in range(options.docks)}
+    positions["YardGate"] = mm(middle - options.docks * pitch - 1.0)
+    return positions
 
 
 def yard(out: Field) -> dict[str, float]:
     """The yard along the longest side: docks, a gate, a barn and a water tank, as far as there is room; its nodes on
     the lane, and their u."""
     site, options, lane = out.site, out.options, out.aisles[0]
-    found = _at_lane(out)
+    positions = _at_lane(out)
     radius = options.robot_radius
     reach = lane.v - max(2.0, 2 * radius + 0.5)
-    first, gate = found["Yard1"], found["YardGate"]
+    first, gate = positions["Yard1"], positions["YardGate"]
     if gate - 0.5 < lane.low or first + 0.5 > lane.high:
         raise refused("docks", f"the lane of {lane.high - lane.low:.1f} m has no room for {options.docks} docks")
     low_u, high_u = max(lane.low, gate - 2.0), min(lane.high, first + radius + 14.0)
     site.draw(out.area(low_u, 0.0, high_u, lane.v + 1.0), "gravel")
     free = shapely.buffer(site.fence, -0.3)
-    for name, u in found.items():
+    for name, u in positions.items():
         site.node(name, out.at(u, lane.v), yaw=out.yaw)
     for k in range(options.docks):
-        u = found[f"Yard{k + 1}"]
+        u = positions[f"Yard{k + 1}"]
         dock = f"Dock{k + 1}"
         facing = out.yaw - math.pi / 2
         charging: dict[str, Any] = {"openrmf": {"parameters": {"is_charger": [4, True], "is_parking_spot": [4, True]}}}
@@ -392,7 +392,7 @@ def yard(out: Field) -> dict[str, float]:
     slow = out.area(low_u, 0.0, high_u, lane.v + 1.0)
     if slow.geom_type == "Polygon":
         site.zone("speed-yard", "speed", slow, name="Yard", value=0.5)
-    return found
+    return positions
 
 
 def lowest(out: Field, u: float, margin: float) -> float | None:

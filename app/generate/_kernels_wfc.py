@@ -108,14 +108,14 @@ def _pop(keys: I64, where: I64, size: int) -> int:
 @native
 def _only(domain: U64) -> int:
     """The only pattern of a domain, or -1 where there are several, -2 where there is none."""
-    found = np.int64(-2)
+    tile = np.int64(-2)
     for k in range(len(domain)):
         word = domain[k]
         if word != ZERO:
-            if found != -2 or word & (word - ONE) != ZERO:
+            if tile != -2 or word & (word - ONE) != ZERO:
                 return -1
-            found = (k << 6) + _BIT[np.int64((word * _BITS) >> _S58)]
-    return found
+            tile = (k << 6) + _BIT[np.int64((word * _BITS) >> _S58)]
+    return tile
 
 
 @native
@@ -123,7 +123,7 @@ def _observe(
     domain: U64, weights: I64, tile: I64, shares: I64, placed: I64, totals: I64, balance: int, state: U64, chance: I64
 ) -> int:
     """One pattern of a domain, by weight; patterns that were placed too often by now weigh less, and the other way."""
-    whole = np.int64(0)
+    total = np.int64(0)
     count = 0
     for k in range(len(domain)):
         word = domain[k]
@@ -138,10 +138,10 @@ def _observe(
                 ratio = min(max((should << 10) // (placed[c] + balance), 1 << 6), 1 << 14)
                 share = max((((weights[p] << 10) * ratio) >> 10) * ratio >> 10, 1)
             chance[count] = share
-            whole += share
+            total += share
             count += 1
             word ^= low
-    at = _random(state) % whole
+    at = _random(state) % total
     count = 0
     for k in range(len(domain)):
         word = domain[k]
@@ -218,7 +218,7 @@ def collapse(
     of the first contradiction, places widened, steps.
     """
     n, words = domain.shape
-    balance, most, radius0, work = settings[0], settings[1], settings[2], settings[3]
+    balance, max_repairs, radius0, work = settings[0], settings[1], settings[2], settings[3]
     scan = settings[5] != 0
     fresh = settings[4] != 0  # nothing was observed so far: what contradicts itself was given so
     patterns = len(weights)
@@ -238,7 +238,7 @@ def collapse(
         waiting[start[i]] = 1
         size += 1
     current = np.full(n, -1, np.int64)
-    keys, where = np.empty(n + 1024, np.int64), np.empty(n + 1024, np.int64)
+    keys, places = np.empty(n + 1024, np.int64), np.empty(n + 1024, np.int64)
     heap = 0
     for a in range(n):
         p = _only(domain[a])
@@ -253,7 +253,7 @@ def collapse(
             current[a] = a if scan else _entropy(domain[a], weights, heavy, logs) + noise[a]
             if heap + 1 >= len(keys):
                 return TIRED
-            heap = _push(keys, where, heap, current[a], a)
+            heap = _push(keys, places, heap, current[a], a)
     seen = np.zeros(n, np.int32)
     turn = np.int32(0)
     block = np.empty(n, np.int64)
@@ -270,11 +270,11 @@ def collapse(
                 b = neighbours[a, d]
                 if b < 0:
                     continue
-                said = _revise(domain, a, b, allowed[d], union)
+                outcome = _revise(domain, a, b, allowed[d], union)
                 report[3] += words
-                if said == 0:
+                if outcome == 0:
                     continue
-                if said < 0:
+                if outcome < 0:
                     broken = b
                     break
                 if waiting[b] == 0:
@@ -294,24 +294,24 @@ def collapse(
                         current[b] = key
                         if heap + 1 >= len(keys):
                             # Stale entries are dropped before the heap grows.
-                            kept = 0
+                            fresh_size = 0
                             for i in range(heap):
-                                if current[where[i]] == keys[i]:
-                                    kept = _push(keys, where, kept, keys[i], where[i])
-                            heap = kept
+                                if current[places[i]] == keys[i]:
+                                    fresh_size = _push(keys, places, fresh_size, keys[i], places[i])
+                            heap = fresh_size
                             if 2 * heap > len(keys):
                                 more_keys = np.empty(2 * len(keys), np.int64)
-                                more_where = np.empty(2 * len(keys), np.int64)
-                                more_keys[:heap], more_where[:heap] = keys[:heap], where[:heap]
-                                keys, where = more_keys, more_where
-                        heap = _push(keys, where, heap, key, b)
+                                more_places = np.empty(2 * len(keys), np.int64)
+                                more_keys[:heap], more_places[:heap] = keys[:heap], places[:heap]
+                                keys, places = more_keys, more_places
+                        heap = _push(keys, places, heap, key, b)
             if broken < 0:
                 continue
             # A contradiction: what is around it is unmade.
             report[0] += 1
             if report[1] < 0:
                 report[1] = broken
-            if report[0] > most or report[3] > work:
+            if report[0] > max_repairs or report[3] > work:
                 return TIRED
             if fresh and not observed and len(wider) == 0:
                 report[1] = broken
@@ -361,10 +361,10 @@ def collapse(
                     current[b] = b if scan else _entropy(domain[b], weights, heavy, logs) + noise[b]
                     if heap + 1 >= len(keys):
                         more_keys = np.empty(2 * len(keys), np.int64)
-                        more_where = np.empty(2 * len(keys), np.int64)
-                        more_keys[:heap], more_where[:heap] = keys[:heap], where[:heap]
-                        keys, where = more_keys, more_where
-                    heap = _push(keys, where, heap, current[b], b)
+                        more_places = np.empty(2 * len(keys), np.int64)
+                        more_keys[:heap], more_places[:heap] = keys[:heap], places[:heap]
+                        keys, places = more_keys, more_places
+                    heap = _push(keys, places, heap, current[b], b)
                 if waiting[b] == 0:
                     tail = head + size
                     queue[tail if tail <= n else tail - n - 1] = b
@@ -381,24 +381,24 @@ def collapse(
         if report[3] > work:
             return TIRED
         # The place of least entropy is observed.
-        found = -1
-        while heap > 0 and found < 0:
-            heap = _pop(keys, where, heap)
-            if current[where[heap]] == keys[heap] and single[where[heap]] < 0:
-                found = where[heap]
-        if found < 0:
+        cell = -1
+        while heap > 0 and cell < 0:
+            heap = _pop(keys, places, heap)
+            if current[places[heap]] == keys[heap] and single[places[heap]] < 0:
+                cell = places[heap]
+        if cell < 0:
             return DONE
         observed = True
-        p = _observe(domain[found], weights, tile, shares, placed, totals, balance, state, chance)
+        p = _observe(domain[cell], weights, tile, shares, placed, totals, balance, state, chance)
         for j in range(words):
-            domain[found, j] = ZERO
-        domain[found, p >> 6] = ONE << np.uint64(p & 63)
-        single[found] = p
-        current[found] = -1
-        placed[tile[p]] += counted[found]
-        totals[0] += counted[found]
-        queue[head] = found
-        waiting[found] = 1
+            domain[cell, j] = ZERO
+        domain[cell, p >> 6] = ONE << np.uint64(p & 63)
+        single[cell] = p
+        current[cell] = -1
+        placed[tile[p]] += counted[cell]
+        totals[0] += counted[cell]
+        queue[head] = cell
+        waiting[cell] = 1
         size = 1
 
 

@@ -126,27 +126,27 @@ def parse(text: str) -> System:
     axiom: tuple[Word, ...] | None = None
     rules: dict[tuple[str, int], list[Rule]] = {}
     never = np.random.Generator(np.random.PCG64(0))
-    for k, said in enumerate(statements):
-        where = f"rules, statement {k + 1}"
-        head, arrow, tail = said.partition("->")
+    for k, statement in enumerate(statements):
+        location = f"rules, statement {k + 1}"
+        head, arrow, tail = statement.partition("->")
         if arrow:
-            rule = _rule(head, tail, constants, where)
+            rule = _rule(head, tail, constants, location)
             rules.setdefault((rule.symbol, len(rule.names)), []).append(rule)
-        elif found := _AXIOM.fullmatch(said):
+        elif match := _AXIOM.fullmatch(statement):
             if axiom is not None:
-                refuse("there is an axiom already", where)
-            axiom = _words(found[1], frozenset(constants), where)
-        elif found := _CONSTANT.fullmatch(said):
-            if found[1] in constants:
-                refuse(f"{found[1]!r} has a value already", where)
-            if "rand" in found[2]:
-                refuse("a constant cannot be drawn by chance: put rand into a rule", where)
-            constants[found[1]] = _expressions.parse(found[2], frozenset(constants), where)(constants, never)
+                refuse("there is an axiom already", location)
+            axiom = _words(match[1], frozenset(constants), location)
+        elif match := _CONSTANT.fullmatch(statement):
+            if match[1] in constants:
+                refuse(f"{match[1]!r} has a value already", location)
+            if "rand" in match[2]:
+                refuse("a constant cannot be drawn by chance: put rand into a rule", location)
+            constants[match[1]] = _expressions.parse(match[2], frozenset(constants), location)(constants, never)
         else:
-            refuse(f"{said[:60]!r} is none of: axiom: …, name = number, symbol -> symbols", where)
+            refuse(f"{statement[:60]!r} is none of: axiom: …, name = number, symbol -> symbols", location)
     if axiom is None:
         refuse("an axiom is missing: axiom: F A(1)", "rules")
-    system = System(axiom, {key: tuple(found) for key, found in rules.items()}, constants)
+    system = System(axiom, {key: tuple(match) for key, match in rules.items()}, constants)
     _check_symbols(system)
     return system
 
@@ -163,27 +163,27 @@ def _statements(text: str) -> list[str]:
                 out.append(piece)
                 open_ = 0
             open_ += sum(piece.count(s) for s in "[(") - sum(piece.count(s) for s in "])")
-    return [said.strip() for said in out if said.strip()]
+    return [statement.strip() for statement in out if statement.strip()]
 
 
-def _rule(head: str, tail: str, constants: Mapping[str, float], where: str) -> Rule:
+def _rule(head: str, tail: str, constants: Mapping[str, float], location: str) -> Rule:
     head, at, chance = head.partition("@")
-    found = _RULE.fullmatch(head)
-    if found is None:
-        refuse(f"{head.strip()[:60]!r} is no symbol with names, such as A(l, w) : l > 1 @ 2", where)
-    names = tuple(part.strip() for part in found[2].split(",")) if found[2] and found[2].strip() else ()
+    match = _RULE.fullmatch(head)
+    if match is None:
+        refuse(f"{head.strip()[:60]!r} is no symbol with names, such as A(l, w) : l > 1 @ 2", location)
+    names = tuple(part.strip() for part in match[2].split(",")) if match[2] and match[2].strip() else ()
     if not all(_NAME.fullmatch(name) for name in names) or len(set(names)) != len(names) or len(names) > 8:
-        refuse(f"({found[2]}) must be up to 8 different names", where)
-    known = frozenset({*constants, *names})
-    said = found[3] or ""
-    if found[3] is not None and not said.strip():
-        refuse("a condition is missing behind :", where)
-    condition = _expressions.parse(said, known, where) if said.strip() else None
-    weight = _expressions.parse(chance, known, where) if at else None
-    return Rule(found[1], names, condition, weight, _words(tail, known, where), where)
+        refuse(f"({match[2]}) must be up to 8 different names", location)
+    scope = frozenset({*constants, *names})
+    condition_text = match[3] or ""
+    if match[3] is not None and not condition_text.strip():
+        refuse("a condition is missing behind :", location)
+    condition = _expressions.parse(condition_text, scope, location) if condition_text.strip() else None
+    weight = _expressions.parse(chance, scope, location) if at else None
+    return Rule(match[1], names, condition, weight, _words(tail, scope, location), location)
 
 
-def _words(text: str, names: frozenset[str], where: str) -> tuple[Word, ...]:
+def _words(text: str, names: frozenset[str], location: str) -> tuple[Word, ...]:
     """Symbols with the expressions of their values; brackets must come in pairs."""
     out: list[Word] = []
     at = open_ = 0
@@ -193,24 +193,26 @@ def _words(text: str, names: frozenset[str], where: str) -> tuple[Word, ...]:
         if letter.isspace():
             continue
         if not (_LETTER.fullmatch(letter) or letter in TURTLE):
-            refuse(f"{letter!r} is no symbol: letters and {' '.join(s for s in TURTLE if not s.isalpha())} are", where)
+            refuse(
+                f"{letter!r} is no symbol: letters and {' '.join(s for s in TURTLE if not s.isalpha())} are", location
+            )
         open_ += (letter == "[") - (letter == "]")
         if open_ < 0:
-            refuse("] without [", where)
+            refuse("] without [", location)
         rest = re.match(r"\s*\(", text[at:])
         values: tuple[Expression, ...] = ()
         if rest is not None:
-            inside, at = _inside(text, at + rest.end(), where)
-            values = tuple(_expressions.parse(one, names, where) for one in inside)
+            inside, at = _inside(text, at + rest.end(), location)
+            values = tuple(_expressions.parse(one, names, location) for one in inside)
         out.append((letter, values))
         if len(out) > MOST_WORDS:
-            refuse(f"there are more than {MOST_WORDS} symbols on one side", where)
+            refuse(f"there are more than {MOST_WORDS} symbols on one side", location)
     if open_:
-        refuse("[ without ]", where)
+        refuse("[ without ]", location)
     return tuple(out)
 
 
-def _inside(text: str, at: int, where: str) -> tuple[list[str], int]:
+def _inside(text: str, at: int, location: str) -> tuple[list[str], int]:
     """The values behind an opening parenthesis, cut at their commas, and where they end."""
     start, deep, out = at, 0, []
     while at < len(text):
@@ -223,22 +225,22 @@ def _inside(text: str, at: int, where: str) -> tuple[list[str], int]:
             start = at + 1
         deep += (sign == "(") - (sign == ")")
         at += 1
-    return refuse(") is missing", where)
+    return refuse(") is missing", location)
 
 
 def _check_symbols(system: System) -> None:
     """Every letter has a meaning: a rule for as many values, or the turtle's."""
     sides = [("axiom", system.axiom), *((r.where, r.after) for rules in system.rules.values() for r in rules)]
-    for where, words in sides:
+    for location, words in sides:
         for letter, values in words:
-            least, most = TURTLE.get(letter, (1, 0))
-            if least <= len(values) <= most or (letter, len(values)) in system.rules:
+            minimum, maximum = TURTLE.get(letter, (1, 0))
+            if minimum <= len(values) <= maximum or (letter, len(values)) in system.rules:
                 continue
             takes = [str(n) for symbol, n in system.rules if symbol == letter]
-            takes += [f"{least} to {most}" if least < most else str(least)] if letter in TURTLE else []
+            takes += [f"{minimum} to {maximum}" if minimum < maximum else str(minimum)] if letter in TURTLE else []
             if takes:
-                refuse(f"{letter} has {len(values)} values and takes {' or '.join(takes)}", where)
-            refuse(f"no rule says what becomes of {letter}, and the turtle does not know it", where)
+                refuse(f"{letter} has {len(values)} values and takes {' or '.join(takes)}", location)
+            refuse(f"no rule says what becomes of {letter}, and the turtle does not know it", location)
 
 
 # --- rewriting -------------------------------------------------------------------------------------------------------
@@ -270,9 +272,9 @@ def expand(system: System, iterations: int, chance: np.random.Generator, budget:
     return symbols
 
 
-def _explodes(what: str) -> None:
-    why = f"the L-system {what}: give fewer iterations, or conditions that end its growth"
-    raise CannotGenerate(why, [Problem(f"the L-system {what}", where="rules")])
+def _explodes(problem: str) -> None:
+    why = f"the L-system {problem}: give fewer iterations, or conditions that end its growth"
+    raise CannotGenerate(why, [Problem(f"the L-system {problem}", where="rules")])
 
 
 def _made(words: Iterable[Word], names: Mapping[str, float], chance: np.random.Generator) -> list[Symbol]:
@@ -286,8 +288,8 @@ def _rewritten(
     names = dict(system.constants)
     holding: list[Rule] = []
     for rule in rules:
-        known = {**names, **dict(zip(rule.names, symbol[1], strict=True))}
-        if rule.condition is None or rule.condition(known, chance) != 0:
+        variables = {**names, **dict(zip(rule.names, symbol[1], strict=True))}
+        if rule.condition is None or rule.condition(variables, chance) != 0:
             holding.append(rule)
     if not holding:
         return None
@@ -295,8 +297,8 @@ def _rewritten(
     if len(holding) > 1:
         weights = []
         for rule in holding:
-            known = {**names, **dict(zip(rule.names, symbol[1], strict=True))}
-            weights.append(1.0 if rule.weight is None else rule.weight(known, chance))
+            variables = {**names, **dict(zip(rule.names, symbol[1], strict=True))}
+            weights.append(1.0 if rule.weight is None else rule.weight(variables, chance))
         if min(weights) < 0 or not sum(weights) > 0:
             problem = "weights must not be negative, and one must be above 0"
             raise CannotGenerate(f"{chosen.where}: {problem}", [Problem(problem, where=chosen.where)])
@@ -306,8 +308,8 @@ def _rewritten(
             left -= weight
             if left < 0:
                 break
-    known = {**names, **dict(zip(chosen.names, symbol[1], strict=True))}
-    return _made(chosen.after, known, chance)
+    variables = {**names, **dict(zip(chosen.names, symbol[1], strict=True))}
+    return _made(chosen.after, variables, chance)
 
 
 # --- drawing ---------------------------------------------------------------------------------------------------------
@@ -379,8 +381,10 @@ def draw(symbols: Iterable[Symbol], *, angle: float, length: float, radius: floa
     return out
 
 
-def _beyond(what: str) -> None:
-    raise CannotGenerate(f"the plant {what}: give fewer iterations", [Problem(f"the plant {what}", where="rules")])
+def _beyond(problem: str) -> None:
+    raise CannotGenerate(
+        f"the plant {problem}: give fewer iterations", [Problem(f"the plant {problem}", where="rules")]
+    )
 
 
 def _plus(a: Vector, b: Vector, times: float) -> Vector:

@@ -46,8 +46,8 @@ def placed(site: Site, width: float, depth: float, margin: float, room: float = 
     depth). In a given fence it lies along the fence's longer side where it fits, else across it or along the axes.
     CannotGenerate where the fence has no room for it.
     """
-    whole = shapely.box(-margin, -margin, width + margin, depth + margin)
-    fence = site.bounded(whole, room=room)
+    outline = shapely.box(-margin, -margin, width + margin, depth + margin)
+    fence = site.bounded(outline, room=room)
     if not site.is_given:
         return Place()
     shapely.prepare(fence)
@@ -57,7 +57,7 @@ def placed(site: Site, width: float, depth: float, margin: float, room: float = 
             x = middle[0] - (c * width - s * depth) / 2
             y = middle[1] - (s * width + c * depth) / 2
             place = Place(mm(x), mm(y), angle(yaw), s, c)
-            if shapely.contains(fence, place.of(whole)):
+            if shapely.contains(fence, place.of(outline)):
                 return place
     need = f"{width + 2 * margin:.1f} × {depth + 2 * margin:.1f} m"
     problem = f"the fence has no room for the site, which needs {need}: make the site smaller, or the fence wider"
@@ -80,5 +80,5 @@ def _middles(fence: Any) -> list[tuple[float, float]]:
     """Places to try for the middle: the fence's own, and that of the largest circle in it."""
     circle = shapely.maximum_inscribed_circle(fence, tolerance=0.5)
     box = shapely.minimum_rotated_rectangle(fence)
-    found = [shapely.centroid(box), shapely.centroid(fence), shapely.Point(shapely.get_coordinates(circle)[0])]
-    return [(round(p.x, 3), round(p.y, 3)) for p in found]
+    points = [shapely.centroid(box), shapely.centroid(fence), shapely.Point(shapely.get_coordinates(circle)[0])]
+    return [(round(p.x, 3), round(p.y, 3)) for p in points]

@@ -129,13 +129,13 @@ class Plant:
 
 def grown(species: str, count: int, source: Source) -> list[Plant]:
     """So many different plants of a species of ``SPECIES``; the same for the same source."""
-    known = SPECIES[species]
-    system = _lsystem.parse(known.rules)
+    plant_species = SPECIES[species]
+    system = _lsystem.parse(plant_species.rules)
     budget = _lsystem.Budget()
     out = []
     for k in range(count):
         chance = source.stream(f"plant/{species}/{k}")
-        out.append(grow(system, known, f"{species}_{k + 1}", chance, budget))
+        out.append(grow(system, plant_species, f"{species}_{k + 1}", chance, budget))
     return out
 
 
@@ -267,8 +267,8 @@ def obj(triangles: Array, name: str) -> bytes:
 def _decimal(steps: int) -> str:
     """A whole number of the finest steps, in metres and without needless zeros."""
     sign, steps = ("-", -steps) if steps < 0 else ("", steps)
-    whole, rest = divmod(steps, 10**FINEST)
-    return f"{sign}{whole}.{rest:0{FINEST}d}".rstrip("0").rstrip(".")
+    integer, rest = divmod(steps, 10**FINEST)
+    return f"{sign}{integer}.{rest:0{FINEST}d}".rstrip("0").rstrip(".")
 
 
 def files_of(plants: Iterable[Plant]) -> dict[str, bytes]:

@@ -202,22 +202,22 @@ class Site:
 
     # --- the ground --------------------------------------------------------------------------------------------------
 
-    def bounded(self, own: Any, *, room: float = math.inf) -> Any:
-        """The fence: the environment's where it has one (the largest of several polygons), else ``own``.
+    def bounded(self, area: Any, *, room: float = math.inf) -> Any:
+        """The fence: the environment's where it has one (the largest of several polygons), else ``area``.
 
-        own: a polygon in metres. room: metres between a robot on its way and what stands beside it, at the narrowest:
+        area: a polygon in metres. room: metres between a robot on its way and what stands beside it, at the narrowest:
         the cells are fine enough to show it. Raises CannotGenerate where a grid of it would be too large.
         """
         self._room = room
-        known = fences(self.given, self.notes).get(GROUND)
-        if known is not None:
-            pieces = [p for p in shapely.get_parts(known) if p.geom_type == "Polygon"]
+        stored_fence = fences(self.given, self.notes).get(GROUND)
+        if stored_fence is not None:
+            pieces = [p for p in shapely.get_parts(stored_fence) if p.geom_type == "Polygon"]
             pieces.sort(key=lambda p: (-p.area, *p.bounds))
             if len(pieces) > 1:
                 self.notes.drop("polygons of the fence", len(pieces) - 1, "the site lies in the largest one")
             self.fence, self.is_given = pieces[0], True
         else:
-            self.fence = shapely.orient_polygons(rounded(own))
+            self.fence = shapely.orient_polygons(rounded(area))
         _ = self.resolution
         return self.fence
 
@@ -227,15 +227,15 @@ class Site:
         box = self.fence.bounds
         easy = next((r for r in RESOLUTIONS if _cells(box, r) <= EASY), RESOLUTIONS[-1])
         fine = max((r for r in RESOLUTIONS if SLACK * r <= self._room + 1e-9), default=RESOLUTIONS[0])
-        asked = self.options.resolution or min(easy, fine)
-        if _cells(box, asked) * len(self.levels) > MAX_CELLS:
+        size = self.options.resolution or min(easy, fine)
+        if _cells(box, size) * len(self.levels) > MAX_CELLS:
             side = f"{box[2] - box[0]:.0f} × {box[3] - box[1]:.0f} m"
             raise refused(
                 "resolution",
-                f"{side} on {len(self.levels)} levels would be more than {MAX_CELLS} cells of {asked:g} m: ask for a "
+                f"{side} on {len(self.levels)} levels would be more than {MAX_CELLS} cells of {size:g} m: ask for a "
                 "coarser resolution or a smaller site",
             )
-        return asked
+        return size
 
     def draw(self, shape: Any, colour: str, *, level: str = GROUND) -> None:
         """Paint ground on the picture, over what is there already. shape: polygons or lines."""
@@ -265,14 +265,14 @@ class Site:
         self._count += 1
         if self._count > MAX_OBJECTS:
             raise CannotGenerate(f"the site has more than {MAX_OBJECTS} objects: make it smaller")
-        said: dict[str, Any] = {"kind": kind, **words}
+        properties: dict[str, Any] = {"kind": kind, **words}
         if pose is not None:
             x, y, z, yaw = pose
-            said["pose"] = [mm(x), mm(y), mm(z), 0.0, 0.0, angle(yaw)]
+            properties["pose"] = [mm(x), mm(y), mm(z), 0.0, 0.0, angle(yaw)]
         if shapes:
             tint = {"colour": rgb(colour)} if self.coloured and colour is not None else {}
-            said["shapes"] = [{**_plain(shape), **({} if "colour" in shape else tint)} for shape in shapes]
-        self._objects.setdefault((level, family), []).append((i, rounded(geometry), said))
+            properties["shapes"] = [{**_plain(shape), **({} if "colour" in shape else tint)} for shape in shapes]
+        self._objects.setdefault((level, family), []).append((i, rounded(geometry), properties))
         if colour is not None:
             shape = geometry if seen is None else seen
             self._bodies.setdefault(level, []).append((_NUMBER[colour], _listed(shape)))
@@ -332,7 +332,7 @@ class Site:
 
     def elevation(self, level: str) -> float:
         """Metres of a level's floor."""
-        return next(known.elevation for known in self.levels if known.name == level)
+        return next(candidate.elevation for candidate in self.levels if candidate.name == level)
 
     # --- the network -------------------------------------------------------------------------------------------------
 
@@ -342,8 +342,8 @@ class Site:
             raise ValueError(f"two nodes are called {name}")
         if len(self._nodes) >= MOST_NODES:
             raise CannotGenerate(f"the network has more than {MOST_NODES} nodes: make the site smaller")
-        said = {"kind": "node", "name": name, "orientation": orientation(yaw), **words}
-        self._nodes[name] = (level, (mm(at[0]), mm(at[1])), said)
+        properties = {"kind": "node", "name": name, "orientation": orientation(yaw), **words}
+        self._nodes[name] = (level, (mm(at[0]), mm(at[1])), properties)
         return name
 
     def way(
@@ -364,10 +364,10 @@ class Site:
             i = f"{source}_{target}"
             if i in self._edges or i in self._nodes:
                 raise ValueError(f"two edges are called {i}")
-            said: dict[str, Any] = {"kind": "edge", "source": source, "target": target, "action": action, **words}
+            properties: dict[str, Any] = {"kind": "edge", "source": source, "target": target, "action": action, **words}
             if speed is not None:
-                said["speed_limit"] = speed
-            self._edges[i] = (source, target, shapely.LineString(line), said)
+                properties["speed_limit"] = speed
+            self._edges[i] = (source, target, shapely.LineString(line), properties)
 
     def position(self, name: str) -> tuple[float, float]:
         """Where a node stands."""
@@ -398,10 +398,14 @@ class Site:
             parts[PartKey("zones", level, ZONES)] = features(rows, "local")
         widths = self._checked(grids)
         for level in {level for level, _, _ in self._nodes.values()}:
-            nodes = [(i, shapely.Point(at), said) for i, (where, at, said) in self._nodes.items() if where == level]
+            nodes = [
+                (i, shapely.Point(at), properties)
+                for i, (node_level, at, properties) in self._nodes.items()
+                if node_level == level
+            ]
             edges = [
-                (i, line, {**said, **({"width": widths[i]} if i in widths else {})})
-                for i, (a, _, line, said) in self._edges.items()
+                (i, line, {**properties, **({"width": widths[i]} if i in widths else {})})
+                for i, (a, _, line, properties) in self._edges.items()
                 if self._nodes[a][0] == level
             ]
             parts[PartKey("topology", level, NETWORK)] = features([*nodes, *edges], "local")
@@ -415,84 +419,84 @@ class Site:
         if self.options.resolution is None and resolution != RESOLUTIONS[0]:
             why = f"{RESOLUTIONS[0]} m would be more than {EASY} cells; a finer one can be asked for"
             self.notes.fill("resolution", resolution, why)
-        asked = Parameters(height=self.options.height, resolution=resolution)
-        own = Notes()
-        known = {k: p for k, p in parts.items() if k.layer != "location"}
+        grid_parameters = Parameters(height=self.options.height, resolution=resolution)
+        grid_notes = Notes()
+        grid_parts = {k: p for k, p in parts.items() if k.layer != "location"}
         for key, part in parts.items():
             if isinstance(part, Features) and key.layer == "objects":
-                known[key] = self._near_slice(part, self.elevation(key.level) + self.options.height)
-        known[PartKey("location", GROUND, SITE)] = features([("fence", self.fence, {"kind": "fence"})], "local")
+                grid_parts[key] = self._near_slice(part, self.elevation(key.level) + self.options.height)
+        grid_parts[PartKey("location", GROUND, SITE)] = features([("fence", self.fence, {"kind": "fence"})], "local")
         try:
-            made = objects_to_occupancy(Layers(known, self.datum, self.levels), asked, own)
+            grid_layers = objects_to_occupancy(Layers(grid_parts, self.datum, self.levels), grid_parameters, grid_notes)
         except CannotConvert as error:
             raise CannotGenerate(error.detail, error.problems) from error
-        self.notes.warnings += own.warnings
+        self.notes.warnings += grid_notes.warnings
         out: dict[PartKey, Part] = {}
-        for key, grid in made.grids().items():
+        for key, grid in grid_layers.grids().items():
             cells, closed = connected(grid.cells)
             if closed:
                 area = round(closed * grid.resolution**2, 2)
                 self.notes.drop(
                     "free cells", closed, f"{area:g} m² that no way leads to count as unknown on {key.level}"
                 )
-            said = {"slice": {"of": "objects", "height": self.options.height}}
+            properties = {"slice": {"of": "objects", "height": self.options.height}}
             out[PartKey("occupancy", key.level, MAP)] = OccupancyGrid(
-                cells, grid.resolution, grid.origin, properties=said
+                cells, grid.resolution, grid.origin, properties=properties
             )
         return out
 
     def _near_slice(self, part: Features, z: float) -> Features:
         """The objects without the solids that do not reach a height: crowns above a slice are most of a forest."""
-        known = solids.Solids(self.files)
+        solid_reader = solids.Solids(self.files)
         radii: dict[str, float] = {}
-        kept: list[int] = []
-        said: list[Properties] = []
+        rows: list[int] = []
+        properties: list[Properties] = []
         for k, p in enumerate(part.properties):
             shapes = p.get("shapes")
             if shapes:
                 base = p["pose"][2] if "pose" in p else 0.0
-                near = [shape for shape in shapes if _reaches(shape, z - base, known, radii)]
+                near = [shape for shape in shapes if _reaches(shape, z - base, solid_reader, radii)]
                 if not near:
                     continue
-                said.append({**p, "shapes": near} if len(near) < len(shapes) else p)
+                properties.append({**p, "shapes": near} if len(near) < len(shapes) else p)
             else:
-                said.append(p)
-            kept.append(k)
-        index = np.array(kept, np.intp)
-        return Features(tuple(part.ids[k] for k in kept), part.geometry[index], tuple(said), part.local[index])
+                properties.append(p)
+            rows.append(k)
+        index = np.array(rows, np.intp)
+        return Features(tuple(part.ids[k] for k in rows), part.geometry[index], tuple(properties), part.local[index])
 
     def _checked_zones(self) -> None:
         """No edge leads through a keep-out zone."""
         for level, rows in self._zones.items():
-            shut = [polygon for _, polygon, said in rows if said["kind"] == "keepout"]
-            here = [(i, e[2]) for i, e in self._edges.items() if self._nodes[e[0]][0] == level]
-            if shut and here:
-                lines = np.array([line for _, line in here], object)
+            shut = [polygon for _, polygon, properties in rows if properties["kind"] == "keepout"]
+            level_edges = [(i, e[2]) for i, e in self._edges.items() if self._nodes[e[0]][0] == level]
+            if shut and level_edges:
+                lines = np.array([line for _, line in level_edges], object)
                 hits = shapely.STRtree(lines).query(np.array(shut, object), predicate="intersects")[1]
                 if len(hits):
-                    raise RuntimeError(f"the edge {here[int(hits[0])][0]} leads through a keep-out zone")
+                    raise RuntimeError(f"the edge {level_edges[int(hits[0])][0]} leads through a keep-out zone")
 
     def _checked(self, grids: Mapping[PartKey, Part]) -> dict[str, float]:
         """Metres of free width of each edge. RuntimeError where a robot cannot take one, or come to a node."""
-        ways = [(a, b) for a, b, _, _ in self._edges.values()]
-        for start, directed in ((0, ways), (1, [(b, a) for a, b in ways])):
+        edges = [(a, b) for a, b, _, _ in self._edges.values()]
+        for start, directed in ((0, edges), (1, [(b, a) for a, b in edges])):
             lost = _unreached(list(self._nodes), directed)
             if lost:
-                way = "to" if start == 0 else "from"
-                raise RuntimeError(f"no way leads {way} {len(lost)} of the nodes, as {', '.join(lost[:5])}")
+                direction = "to" if start == 0 else "from"
+                raise RuntimeError(f"no way leads {direction} {len(lost)} of the nodes, as {', '.join(lost[:5])}")
         out: dict[str, float] = {}
         for key, grid in grids.items():
             if not isinstance(grid, OccupancyGrid):
                 continue
-            here = [i for i, e in self._edges.items() if {self._nodes[n][0] for n in e[:2]} == {key.level}]
-            lines = [self._edges[i][2] for i in here]
+            level_edges = [i for i, e in self._edges.items() if {self._nodes[n][0] for n in e[:2]} == {key.level}]
+            lines = [self._edges[i][2] for i in level_edges]
             stands = [shapely.Point(at) for level, at, _ in self._nodes.values() if level == key.level]
             good = passable(grid, [*lines, *stands], self.options.robot_radius)
             if not good.all():
                 k = int(np.flatnonzero(~good)[0])
-                what = f"the edge {here[k]}" if k < len(here) else "a node"
-                raise RuntimeError(f"{what} is nearer to an obstacle than {self.options.robot_radius:g} m")
-            out |= dict(zip(here, clearance(grid, lines).tolist(), strict=True))
+                label = f"the edge {level_edges[k]}" if k < len(level_edges) else "a node"
+                raise RuntimeError(f"{label} is nearer to an obstacle than {self.options.robot_radius:g} m")
+            out |= dict(zip(level_edges, clearance(grid, lines).tolist(), strict=True))
         return out
 
     def _picture(self, level: str, ground: str) -> Picture:
@@ -550,9 +554,9 @@ def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArra
     edges = np.concatenate([np.stack([at[:-1], at[1:]], axis=1)[same], np.stack([at, at], axis=1)])
     number = np.concatenate([owner[:-1][same], owner])
     for spans in _raster.lines(edges, frame):
-        which, row, column = _raster.expanded(spans)
+        index, row, column = _raster.expanded(spans)
         near = away[row, column] <= radius / grid.resolution + 1e-4
-        good[number[which[near]]] = False
+        good[number[index[near]]] = False
     return good
 
 
@@ -570,10 +574,10 @@ def clearance(grid: OccupancyGrid, lines: Sequence[Any]) -> Array:
     x, y, r = grid.origin[0], grid.origin[1], grid.resolution
     boxes = shapely.box(x + (first - 1) * r, y + (row - 1) * r, x + (end - 1) * r, y + row * r)
     given = np.array(lines, object)
-    found, distance = shapely.STRtree(boxes).query_nearest(
+    pairs, distance = shapely.STRtree(boxes).query_nearest(
         given, max_distance=WIDEST / 2, return_distance=True, all_matches=False
     )
-    out[found[0]] = np.floor(np.round(2 * distance, 6) * 100) / 100
+    out[pairs[0]] = np.floor(np.round(2 * distance, 6) * 100) / 100
     return np.asarray(np.minimum(out, WIDEST), np.float64)
 
 
@@ -586,21 +590,24 @@ def _cells(box: Sequence[float], resolution: float) -> float:
 
 def _datum(given: Layers, options: SiteOptions, notes: Notes) -> Datum:
     """The environment's datum, else the one asked for, else DATUM."""
-    asked = None if options.datum is None else Datum(options.datum[0], options.datum[1])
+    option_datum = None if options.datum is None else Datum(options.datum[0], options.datum[1])
     if given.datum is not None:
-        if asked is not None and (asked.latitude, asked.longitude) != (given.datum.latitude, given.datum.longitude):
+        if option_datum is not None and (option_datum.latitude, option_datum.longitude) != (
+            given.datum.latitude,
+            given.datum.longitude,
+        ):
             reason = "the environment has a datum already: leave this out, or change the datum with PATCH"
             raise Invalid(f"datum: {reason}", [Problem(reason, where="datum")])
         return given.datum
-    if asked is None:
+    if option_datum is None:
         notes.fill("datum", DATUM.as_dict(), "neither the environment nor the parameter datum says where the site is")
-    return asked or DATUM
+    return option_datum or DATUM
 
 
-def _unreached(names: Sequence[str], ways: Iterable[tuple[str, str]]) -> list[str]:
+def _unreached(names: Sequence[str], edges: Iterable[tuple[str, str]]) -> list[str]:
     """The nodes to which no way leads from the first one."""
     following: dict[str, list[str]] = {name: [] for name in names}
-    for a, b in ways:
+    for a, b in edges:
         following[a].append(b)
     seen, waiting = set(names[:1]), list(names[:1])
     while waiting:
@@ -611,7 +618,7 @@ def _unreached(names: Sequence[str], ways: Iterable[tuple[str, str]]) -> list[st
     return [name for name in names if name not in seen]
 
 
-def _reaches(shape: Mapping[str, Any], z: float, known: solids.Solids, radii: dict[str, float]) -> bool:
+def _reaches(shape: Mapping[str, Any], z: float, solid_reader: solids.Solids, radii: dict[str, float]) -> bool:
     """Whether a shape may reach a height of its object's frame, whose z axis is upright: never False where it does."""
     kind = shape["type"]
     if kind == "box":
@@ -620,7 +627,7 @@ def _reaches(shape: Mapping[str, Any], z: float, known: solids.Solids, radii: di
         radius = math.hypot(shape["radius"], shape["length"] / 2) + (shape["radius"] if kind == "capsule" else 0.0)
     elif kind == "mesh" and "center" not in shape:
         if shape["file"] not in radii:
-            vertices = known.mesh(shape["file"]).vertices
+            vertices = solid_reader.mesh(shape["file"]).vertices
             radii[shape["file"]] = float(np.linalg.norm(vertices, axis=1).max())
         radius = radii[shape["file"]] * max(map(abs, shape.get("scale", (1.0, 1.0, 1.0))))
     else:

@@ -113,10 +113,10 @@ def _longer(line: Any) -> Any:
 def _trimmed(parts: list[Any]) -> list[Any]:
     """Without short pieces that lead nowhere, and joined again where these were."""
     count = _ends(parts)
-    kept = [p for p in parts if p.length >= DANGLE or min(count[_at(c)] for c in (p.coords[0], p.coords[-1])) > 1]
-    if len(kept) == len(parts):
+    remaining = [p for p in parts if p.length >= DANGLE or min(count[_at(c)] for c in (p.coords[0], p.coords[-1])) > 1]
+    if len(remaining) == len(parts):
         return parts
-    return [p for p in shapely.get_parts(shapely.line_merge(shapely.multilinestrings(kept))) if p.length > 0]
+    return [p for p in shapely.get_parts(shapely.line_merge(shapely.multilinestrings(remaining))) if p.length > 0]
 
 
 def _ends(parts: Sequence[Any]) -> dict[Point, int]:
@@ -212,8 +212,8 @@ def _lane(streets: Streets, line: Any, start: int, end: int, off: float) -> Any:
         step = ends[1] - ends[0]
         lane = shapely.LineString(ends + np.array([step[1], -step[0]]) / math.sqrt(float(step @ step)) * off)
     at = shapely.get_coordinates(lane)
-    wanted = shapely.get_coordinates(middle)[0]
-    if float(((at[0] - wanted) ** 2).sum()) > float(((at[-1] - wanted) ** 2).sum()):
+    middle_start = shapely.get_coordinates(middle)[0]
+    if float(((at[0] - middle_start) ** 2).sum()) > float(((at[-1] - middle_start) ** 2).sum()):
         lane = shapely.reverse(lane)
     return shapely.transform(lane, lambda xy: np.round(xy, 3) + 0.0)
 
@@ -243,16 +243,16 @@ def sidewalks(site: Site, streets: Streets, blocks: Sequence[Any], edge: Any, sp
     crossings = [c for c in crossings if c[0] in joined and c[2] in joined]
     for k in sorted(joined):
         _corners(streets.loops[k], k)
-    ways = []
+    footways = []
     for n, (a, p, b, q) in enumerate(crossings):
         ends = [_stop(streets.loops[k], at, f"crossing_{n + 1}{side}") for k, at, side in ((a, p, "a"), (b, q, "b"))]
         streets.kept += [p, q]
         if ends[0] != ends[1]:
-            ways.append(ends)
+            footways.append(ends)
     for k in sorted(joined):
         _around(site, streets.loops[k], speed)
     done: set[frozenset[str]] = set()
-    for one, other in ways:
+    for one, other in footways:
         if frozenset((one, other)) not in done:
             done.add(frozenset((one, other)))
             site.way(one, other, action="cross", speed=speed / 2, surface="asphalt")
@@ -269,9 +269,9 @@ def _crossings(streets: Streets) -> list[tuple[int, Point, int, Point]]:
         cuts = [_before(streets, end) if len(streets.around(end)) > 1 else math.inf for end in link.ends]
         places = sorted({cuts[0], long - cuts[1]}) if max(cuts) < math.inf and long > sum(cuts) + 8.0 else [long / 2]
         for place in places:
-            found = _across(streets, link, place, tree)
-            if found is not None:
-                out.append(found)
+            crossing = _across(streets, link, place, tree)
+            if crossing is not None:
+                out.append(crossing)
     return out
 
 
@@ -284,7 +284,7 @@ def _across(streets: Streets, link: Link, place: float, tree: Any) -> tuple[int,
     norm = math.sqrt(dx * dx + dy * dy)
     if norm == 0:
         return None
-    found: list[tuple[int, Point]] = []
+    sides: list[tuple[int, Point]] = []
     want = (link.width - streets.walk) / 2
     for side in (-1.0, 1.0):
         nx, ny = -dy / norm * side, dx / norm * side
@@ -297,8 +297,8 @@ def _across(streets: Streets, link: Link, place: float, tree: Any) -> tuple[int,
                     best = (off, k, _at((x, y)))
         if best is None:
             return None
-        found.append(best[1:])
-    (a, p), (b, q) = found
+        sides.append(best[1:])
+    (a, p), (b, q) = sides
     return (a, p, b, q)
 
 
@@ -324,18 +324,18 @@ def _joined(count: int, pairs: Sequence[tuple[int, int]]) -> set[int]:
 def _corners(loop: Loop, number: int) -> None:
     """Nodes where a sidewalk turns."""
     at = shapely.get_coordinates(loop.ring)[:-1]
-    for k, here in enumerate(at):
-        a, b = here - at[k - 1], at[(k + 1) % len(at)] - here
+    for k, corner in enumerate(at):
+        a, b = corner - at[k - 1], at[(k + 1) % len(at)] - corner
         turn = abs(math.atan2(float(a[0] * b[1] - a[1] * b[0]), float(a @ b)))
         if turn > CORNER:
-            _stop(loop, _at(here), f"corner_{number + 1}_{k + 1}")
+            _stop(loop, _at(corner), f"corner_{number + 1}_{k + 1}")
 
 
 def _stop(loop: Loop, at: Point, name: str) -> str:
     """A node on a sidewalk, or one that is there within half a metre."""
-    for _, known, place in loop.stops:
+    for _, stop_name, place in loop.stops:
         if (place[0] - at[0]) ** 2 + (place[1] - at[1]) ** 2 < 0.25:
-            return known
+            return stop_name
     loop.stops.append((float(shapely.line_locate_point(loop.ring, shapely.Point(at))), name, at))
     return name
 
@@ -349,11 +349,11 @@ def _around(site: Site, loop: Loop, speed: float) -> None:
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shapely.get_coordinates(loop.ring), axis=0).T))])
     total = float(along[-1])
     pairs = list(itertools.pairwise([*stops, stops[0]]))
-    for (here, a, _), (there, b, _) in pairs[: 1 if len(stops) == 2 else None]:
+    for (start, a, _), (end, b, _) in pairs[: 1 if len(stops) == 2 else None]:
         if a == b:
             continue
-        length = (there - here) % total
-        bends = sorted(((float(s) - here) % total, k) for k, s in enumerate(along[:-1]))
+        length = (end - start) % total
+        bends = sorted(((float(s) - start) % total, k) for k, s in enumerate(along[:-1]))
         between = [at[k].tolist() for s, k in bends if 0.3 < s < length - 0.3]
         site.way(a, b, speed=speed, bends=between, surface="paving_stones")
 
@@ -374,7 +374,7 @@ def stop(site: Site, streets: Streets, roads: Sequence[Sequence[tuple[str, Any]]
     for name, lane in lanes_:
         start = shapely.Point(shapely.get_coordinates(lane)[0])
         k = int(np.asarray(places.nearest(start)))
-        found = (round(float(shapely.distance(start, shapely.Point(walks[k][1]))), 3), walks[k][0], name)
-        best = found if best is None or found < best else best
+        candidate = (round(float(shapely.distance(start, shapely.Point(walks[k][1]))), 3), walks[k][0], name)
+        best = candidate if best is None or candidate < best else best
     assert best is not None
     site.way(best[1], best[2], action="cross", speed=0.5, surface="asphalt")

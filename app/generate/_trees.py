@@ -84,18 +84,18 @@ def tree(
     )
 
 
-def jittered(stream: np.random.Generator, count: int, most: float) -> Any:
+def jittered(stream: np.random.Generator, count: int, max_offset: float) -> Any:
     """Offsets float64 [n, 2] along and across, at most so many metres, evenly spread."""
-    return np.round((2.0 * stream.random((count, 2)) - 1.0) * most, 3)
+    return np.round((2.0 * stream.random((count, 2)) - 1.0) * max_offset, 3)
 
 
-def places(out: Field, stream: np.random.Generator, kind: str, step: float, most: float) -> list[list[Any]]:
+def places(out: Field, stream: np.random.Generator, kind: str, step: float, max_offset: float) -> list[list[Any]]:
     """The places (u, v) of what stands in the rows of a kind, row by row; none beyond a row's ends."""
-    found = []
+    rows = []
     for row in out.rows:
         if row.kind == kind:
             along = np.array(between(row, step))
-            offset = jittered(stream, len(along), most)
+            offset = jittered(stream, len(along), max_offset)
             u = np.clip(along + offset[:, 0], row.low, row.high)
-            found.append([(mm(a), mm(row.v + b)) for a, b in zip(u, offset[:, 1], strict=True)])
-    return found
+            rows.append([(mm(a), mm(row.v + b)) for a, b in zip(u, offset[:, 1], strict=True)])
+    return rows

@@ -103,7 +103,7 @@ def learn(
     pattern: int,
     symmetry: Symmetry,
     wrap: bool = False,
-    known: Bool | None = None,
+    valid: Bool | None = None,
 ) -> Model:
     """A model of a sample. tile: cells along a tile, by which the sample's sides must divide. pattern: tiles along a
     pattern; 1 is the simple tiled model. wrap: the sample goes on at its other side. known: windows with cells that are
@@ -115,7 +115,7 @@ def learn(
             f"a sample of {width} × {height} cells does not hold {max(pattern, 2)} × {max(pattern, 2)} tiles of {tile} "
             "cells, or is no whole number of them: give a larger sample, or a smaller tile or pattern"
         )
-    sure = np.ones(cells.shape, bool) if known is None else known
+    sure = np.ones(cells.shape, bool) if valid is None else valid
     blocks = [_blocks(one, tile) for one in turned(cells, symmetry)]
     teach = [_blocks(one, tile).min(axis=(2, 3)) for one in turned(sure, symmetry)]
     tiles, index = _distinct(np.concatenate([b.reshape(-1, tile * tile) for b in blocks]))
@@ -126,21 +126,21 @@ def learn(
         rows, columns = b.shape[:2]
         maps.append(index[at : at + rows * columns].reshape(rows, columns).astype(np.uint16))
         at += rows * columns
-    found = []
+    windows = []
     for one, good in zip(maps, teach, strict=True):
         taught = _windows(_wrapped(good, pattern, wrap), pattern).all(axis=(2, 3))
-        found.append(_windows(_wrapped(one, pattern, wrap), pattern)[taught].reshape(-1, pattern * pattern))
-    if not sum(len(f) for f in found):
+        windows.append(_windows(_wrapped(one, pattern, wrap), pattern)[taught].reshape(-1, pattern * pattern))
+    if not sum(len(f) for f in windows):
         raise CannotGenerate(
             f"no window of {pattern} × {pattern} tiles of the sample is known all over: give a smaller pattern"
         )
-    patterns, which = _distinct(np.concatenate(found))
+    patterns, pattern_index = _distinct(np.concatenate(windows))
     if len(patterns) > MOST_PATTERNS:
         raise CannotGenerate(
             f"the sample has {len(patterns)} different patterns, the limit is {MOST_PATTERNS}: give a smaller pattern, "
             "fewer symmetries, or a plainer sample"
         )
-    counts = np.bincount(which, minlength=len(patterns))
+    counts = np.bincount(pattern_index, minlength=len(patterns))
     stack = patterns.reshape(-1, pattern, pattern).astype(np.int64)
     if pattern == 1:
         pairs = [_pairs(m, t, wrap) for m, t in zip(maps, teach, strict=True)]
@@ -163,9 +163,9 @@ def agreeing(patterns: I64) -> U64:
     n = patterns.shape[1]
     out = []
     for dy, dx in DIRECTIONS:
-        mine = patterns[:, max(dy, 0) : n + min(dy, 0), max(dx, 0) : n + min(dx, 0)].reshape(len(patterns), -1)
+        part = patterns[:, max(dy, 0) : n + min(dy, 0), max(dx, 0) : n + min(dx, 0)].reshape(len(patterns), -1)
         other = patterns[:, max(-dy, 0) : n + min(-dy, 0), max(-dx, 0) : n + min(-dx, 0)].reshape(len(patterns), -1)
-        _, key = _distinct(np.concatenate([mine, other]))
+        _, key = _distinct(np.concatenate([part, other]))
         a, b = key[: len(patterns)], key[len(patterns) :]
         out.append(packed(a[:, None] == b[None, :]))
     return np.stack(out)
@@ -240,18 +240,18 @@ class Lattice:
     periodic: bool
 
     @classmethod
-    def of(cls, shape: tuple[int, int], pattern: int, *, periodic: bool = False, wanted: Bool | None = None) -> Lattice:
+    def of(cls, shape: tuple[int, int], pattern: int, *, periodic: bool = False, target: Bool | None = None) -> Lattice:
         """All windows of so many tiles; wanted: bool [rows, columns] of tiles, only windows that cover one of these."""
         height, width = shape
         if not periodic:
             height, width = height - pattern + 1, width - pattern + 1
-        there = np.ones((height, width), bool)
-        if wanted is not None:
-            tiles = np.pad(wanted, (0, pattern - 1), mode="wrap") if periodic else wanted
+        present = np.ones((height, width), bool)
+        if target is not None:
+            tiles = np.pad(target, (0, pattern - 1), mode="wrap") if periodic else target
             total = np.pad(tiles.astype(np.int64), ((1, 0), (1, 0))).cumsum(0).cumsum(1)
             n = pattern
-            there = (total[n:, n:] - total[:-n, n:] - total[n:, :-n] + total[:-n, :-n]) > 0
-        rows, columns = np.nonzero(there)
+            present = (total[n:, n:] - total[:-n, n:] - total[n:, :-n] + total[:-n, :-n]) > 0
+        rows, columns = np.nonzero(present)
         index = np.full((height, width), -1, np.int32)
         index[rows, columns] = np.arange(len(rows), dtype=np.int32)
         neighbours = np.empty((len(rows), 4), np.int32)
@@ -276,13 +276,13 @@ class Lattice:
                 y, x = self.rows + dy, self.columns + dx
                 if self.periodic:
                     y, x = y % self.shape[0], x % self.shape[1]
-                said = fixed[y, x]
+                fixed_tile = fixed[y, x]
                 if wall >= 0:
-                    out[said != wall] &= packed((patterns[:, dy, dx] != wall)[None])
-                for tile in np.unique(said[said != -1]).tolist():
+                    out[fixed_tile != wall] &= packed((patterns[:, dy, dx] != wall)[None])
+                for tile in np.unique(fixed_tile[fixed_tile != -1]).tolist():
                     if (dy, dx, tile) not in by_tile:
                         by_tile[dy, dx, tile] = packed((patterns[:, dy, dx] == tile)[None])
-                    out[said == tile] &= by_tile[dy, dx, tile]
+                    out[fixed_tile == tile] &= by_tile[dy, dx, tile]
         return out
 
 
@@ -464,11 +464,11 @@ def _join(wave: Wave) -> bool:
         apart = [k for k in range(1, count) if sizes[k] and k != main]
         if not apart:
             return bool(sizes[main])
-        mine = _blocks(label == main, tile).max(axis=(2, 3))
+        main_tiles = _blocks(label == main, tile).max(axis=(2, 3))
         cells = _blocks(label, tile)
         for k in apart:
             small = sizes[k] <= 8 * (wave.model.size * tile) ** 2
-            _mend(wave, (cells == k).max(axis=(2, 3)), mine, close=bool((turn + k) % 2 == 0 and small))
+            _mend(wave, (cells == k).max(axis=(2, 3)), main_tiles, close=bool((turn + k) % 2 == 0 and small))
     return False
 
 
@@ -492,7 +492,7 @@ def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
     rows, columns = np.nonzero(piece)
     if close:
         cells = rows, columns
-        wanted = (model.tiles != FREE).all(axis=(1, 2))
+        matching = (model.tiles != FREE).all(axis=(1, 2))
     else:
         low_y, high_y = max(int(rows.min()) - REACH, 0), int(rows.max()) + REACH + 1
         low_x, high_x = max(int(columns.min()) - REACH, 0), int(columns.max()) + REACH + 1
@@ -507,10 +507,10 @@ def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
         ys = [*range(y, end_y, 1 if end_y > y else -1), *[end_y] * (abs(end_x - x) + 1)]
         xs = [*[x] * abs(end_y - y), *range(x, end_x, 1 if end_x > x else -1), end_x]
         cells = np.array(ys) + low_y, np.array(xs) + low_x
-        wanted = (model.tiles == FREE).all(axis=(1, 2))
+        matching = (model.tiles == FREE).all(axis=(1, 2))
     touched: dict[int, U64] = {}
     masks = {
-        (dy, dx): packed(wanted[model.patterns[:, dy, dx]][None])[0]
+        (dy, dx): packed(matching[model.patterns[:, dy, dx]][None])[0]
         for dy in range(model.size)
         for dx in range(model.size)
     }
@@ -528,8 +528,8 @@ def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
     if any(not domain.any() for domain in touched.values()):
         return
     before = wave.domain.copy(), wave.initial.copy()
-    whole = place[rows, columns]  # the piece itself
-    near = np.union1d(np.fromiter(touched, np.int64), whole[whole >= 0])
+    piece_places = place[rows, columns]  # the piece itself
+    near = np.union1d(np.fromiter(touched, np.int64), piece_places[piece_places >= 0])
     for _ in range(2 * model.size):
         around = wave.lattice.neighbours[near].ravel()
         near = np.union1d(near, around[around >= 0])

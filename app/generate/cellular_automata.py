@@ -149,7 +149,7 @@ def _grown(
         rim |= ~_within(site.fence, coarse)
     occupied |= rim
     passage = 3 * options.robot_radius if options.passage is None else options.passage
-    joined, closed, ways = _automata.joined(
+    joined, closed, passages = _automata.joined(
         occupied,
         rim,
         options.robot_radius / options.cell,
@@ -159,8 +159,8 @@ def _grown(
     if joined.all():
         raise CannotGenerate("nothing is left free: give a lower density, another rule, or a smaller robot_radius")
     notes.drop("free cells", closed, "in places apart: they are filled")
-    if ways:
-        notes.fill("passages", ways, "joined places of free space that the rule left apart")
+    if passages:
+        notes.fill("passages", passages, "joined places of free space that the rule left apart")
     if border is look:
         _cells.stand(site, coarse, joined, look)
     else:
@@ -176,18 +176,18 @@ MOST_STEPS = 2**32
 def _fine(options: CaveOptions) -> float:
     """The usual resolution where the automaton's cells are whole ones of it, else these cells."""
     step = options.cell / RESOLUTION
-    whole = abs(step - round(step)) < 1e-6 and step >= 1
-    return RESOLUTION if whole and options.width * options.depth / RESOLUTION**2 <= 2**22 else options.cell
+    is_multiple = abs(step - round(step)) < 1e-6 and step >= 1
+    return RESOLUTION if is_multiple and options.width * options.depth / RESOLUTION**2 <= 2**22 else options.cell
 
 
 def _rule(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """(neighbours with which a cell comes alive, with which it stays so)."""
-    found = RULE.fullmatch(text.strip().upper())
-    if found is None:
+    match = RULE.fullmatch(text.strip().upper())
+    if match is None:
         raise refused(
             "rule", f"must be B and S with numbers of neighbours from 0 to 8, as B5678/S45678, got {text[:40]!r}"
         )
-    born, stays = (tuple(sorted({int(c) for c in digits})) for digits in found.groups())
+    born, stays = (tuple(sorted({int(c) for c in digits})) for digits in match.groups())
     return born, stays
 
 

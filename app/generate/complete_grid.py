@@ -82,41 +82,41 @@ def _completed(grid: OccupancyGrid, options: Options, source: Source, notes: Not
     name = called(key)
     if grid.cells.size > MAX_CELLS:
         raise CannotGenerate(f"{name} has {grid.cells.size} cells, the limit is {MAX_CELLS}")
-    known = grid.cells != UNKNOWN
+    known_cells = grid.cells != UNKNOWN
     grey = unknown_grey(grid)
     if grey is not None:
-        known &= ~grey
+        known_cells &= ~grey
         notes.warn(grey_warning(grid, grey, name, "nothing is learned from them, and they stay as they are"))
-    wanted = _wanted(known, options.reach / grid.resolution)
+    target = _wanted(known_cells, options.reach / grid.resolution)
     if grey is not None:
-        wanted &= ~grey
-    count = int(np.count_nonzero(wanted))
+        target &= ~grey
+    count = int(np.count_nonzero(target))
     if count > MOST:
         raise refused("reach", f"{name}: {count} cells would be filled in, the limit is {MOST}: give a smaller reach")
     if not count:
         raise refused("reach", f"{name}: no unknown cell is that near to a known one: give a larger reach")
-    occupied = known & (grid.cells >= grid.occupied_thresh * OCCUPIED)
+    occupied = known_cells & (grid.cells >= grid.occupied_thresh * OCCUPIED)
     n = options.pattern
-    counts = _counts(occupied, known, n, options.symmetry)
+    counts = _counts(occupied, known_cells, n, options.symmetry)
     if not counts.any():
         raise CannotGenerate(f"{name}: no window of {n} × {n} cells is known all over, so nothing can be learned")
     cells = grid.cells.copy()
-    before = _evidence.Grid(occupied, known, grid.resolution)
-    wall = _evidence.walls(before, wanted)
+    before = _evidence.Grid(occupied, known_cells, grid.resolution)
+    wall = _evidence.walls(before, target)
     cells[wall] = OCCUPIED
-    occupied, known, wanted = occupied | wall, known | wall, wanted & ~wall
+    occupied, known_cells, target = occupied | wall, known_cells | wall, target & ~wall
     if options.confidence:
         side = min(2 * options.reach or HOLE, _evidence.SPAN_METRES)
         share = _evidence.confidence(before, side, source.stream(f"{key.level}/{key.name}/holes"))
-        at = np.argwhere(wanted)
-        kind = _evidence.surroundings(_evidence.Grid(occupied, known, grid.resolution), at)
-        wanted = np.zeros_like(wanted)
-        wanted[tuple(at[share[kind] >= options.confidence].T)] = True
-        if not wanted.any() and not wall.any():
+        at = np.argwhere(target)
+        kind = _evidence.surroundings(_evidence.Grid(occupied, known_cells, grid.resolution), at)
+        target = np.zeros_like(target)
+        target[tuple(at[share[kind] >= options.confidence].T)] = True
+        if not target.any() and not wall.any():
             reason = f"{name}: no unknown cell reaches this confidence: set a lower confidence, or a smaller reach"
             raise refused("confidence", reason)
-    if wanted.any():
-        _fill(cells, occupied, known, wanted, counts, options, source, notes, key)
+    if target.any():
+        _fill(cells, occupied, known_cells, target, counts, options, source, notes, key)
     if options.confidence:
         left = count - int(np.count_nonzero((cells != UNKNOWN) & (grid.cells == UNKNOWN)))
         why = f"they stay unknown: free cells need a confidence of {options.confidence:g}"
@@ -127,8 +127,8 @@ def _completed(grid: OccupancyGrid, options: Options, source: Source, notes: Not
 def _fill(
     cells: U8,
     occupied: Bool,
-    known: Bool,
-    wanted: Bool,
+    known_cells: Bool,
+    target: Bool,
     counts: NDArray[np.int64],
     options: Options,
     source: Source,
@@ -138,19 +138,19 @@ def _fill(
     """Make up the wanted cells, in place. What is not free stays unknown unless all is to be made up."""
     n = options.pattern
     # Only what is near the wanted cells is looked at.
-    rows, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
+    rows, columns = np.flatnonzero(target.any(axis=1)), np.flatnonzero(target.any(axis=0))
     y0, y1 = max(int(rows[0]) - n, 0), int(rows[-1]) + n + 1
     x0, x1 = max(int(columns[0]) - n, 0), int(columns[-1]) + n + 1
     part = np.s_[y0:y1, x0:x1]
-    tiles = _filled(occupied[part], known[part], wanted[part], counts, options, source, notes, key)
+    tiles = _filled(occupied[part], known_cells[part], target[part], counts, options, source, notes, key)
     inside = cells[part]
-    inside[wanted[part]] = np.where(tiles == 1, UNKNOWN if options.confidence else OCCUPIED, FREE)[wanted[part]]
+    inside[target[part]] = np.where(tiles == 1, UNKNOWN if options.confidence else OCCUPIED, FREE)[target[part]]
 
 
 def _filled(
     occupied: Bool,
-    known: Bool,
-    wanted: Bool,
+    known_cells: Bool,
+    target: Bool,
     counts: NDArray[np.int64],
     options: Options,
     source: Source,
@@ -163,10 +163,10 @@ def _filled(
     patterns = (codes[:, None] >> np.arange(n * n) & 1).reshape(-1, n, n).astype(np.int64)
     tiles = np.array([FREE, OCCUPIED], np.uint8).reshape(2, 1, 1)
     model = _wfc.Model(tiles, patterns, _wfc.scaled(counts), _wfc.agreeing(patterns))
-    lattice = _wfc.Lattice.of(wanted.shape, n, wanted=wanted)
+    lattice = _wfc.Lattice.of(target.shape, n, target=target)
     if not len(lattice.rows):
         raise CannotGenerate(f"{called(key)} is smaller than a window of {n} × {n} cells")
-    wider = lattice.fitting(patterns, np.where(known, occupied.astype(np.int8), np.int8(-1)))
+    wider = lattice.fitting(patterns, np.where(known_cells, occupied.astype(np.int8), np.int8(-1)))
     seen = _wfc.packed((counts > 0)[None])
     narrow = wider & seen
     empty = ~narrow.any(axis=1)
@@ -200,19 +200,19 @@ def _filled(
     )
 
 
-def _wanted(known: Bool, reach: float) -> Bool:
+def _wanted(known_cells: Bool, reach: float) -> Bool:
     """The unknown cells within so many cells of a known one (middle to middle); all where reach is 0."""
     import cv2
 
-    if not reach or not known.any():
-        return ~known
-    away = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return ~known & (np.asarray(away) <= reach + 1e-4)
+    if not reach or not known_cells.any():
+        return ~known_cells
+    away = cv2.distanceTransform((~known_cells).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return ~known_cells & (np.asarray(away) <= reach + 1e-4)
 
 
-def _counts(occupied: Bool, known: Bool, n: int, symmetry: _wfc.Symmetry) -> NDArray[np.int64]:
+def _counts(occupied: Bool, known_cells: Bool, n: int, symmetry: _wfc.Symmetry) -> NDArray[np.int64]:
     """How often each window stands where all is known, by its cells as bits, row by row from below: int64 [2^(n·n)]."""
-    height, width = (v - n + 1 for v in known.shape)
+    height, width = (v - n + 1 for v in known_cells.shape)
     counts = np.zeros(2 ** (n * n), np.int64)
     if height < 1 or width < 1:
         return counts
@@ -220,7 +220,7 @@ def _counts(occupied: Bool, known: Bool, n: int, symmetry: _wfc.Symmetry) -> NDA
     for k in range(n * n):
         window = np.s_[k // n : k // n + height, k % n : k % n + width]
         code |= occupied[window].astype(np.int16) << k
-        good &= known[window]
+        good &= known_cells[window]
     plain = np.bincount(code[good], minlength=len(counts))
     for order in _wfc.turned(np.arange(n * n).reshape(n, n), symmetry):
         codes = np.arange(len(counts))

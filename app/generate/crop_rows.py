@@ -46,7 +46,7 @@ def crop_rows(given: Layers, options: CropRows, source: Source, notes: Notes) ->
         site,
         options,
         _field.numbered(options.beds or _field.MOST_ROWS),
-        own=None if options.beds else 10,
+        row_count=None if options.beds else 10,
         spacing=width + options.aisle,
         half=width / 2 + options.plant_diameter / 2 + options.jitter,
         word="aisle",
@@ -74,8 +74,8 @@ def _row(site: Site, i: str, out: _field.Field, row: Row, options: CropRows, str
     size = 0.75 + 0.25 * stream.random((len(along), 2))
     shapes: list[dict[str, Any]] = []
     seen = []
-    for wanted, (a, b), (c, d) in zip(along.tolist(), offset.tolist(), size.tolist(), strict=True):
-        u = min(max(wanted + a, row.low), row.high)
+    for position, (a, b), (c, d) in zip(along.tolist(), offset.tolist(), size.tolist(), strict=True):
+        u = min(max(position + a, row.low), row.high)
         side, height = mm(options.plant_diameter * c * 0.8), mm(options.plant_height * d)
         place = [mm(u - row.low), mm(b), mm(height / 2), 0.0, 0.0, 0.0]
         shapes.append({"type": "box", "size": [side, side, height], "pose": place})

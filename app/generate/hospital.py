@@ -39,10 +39,10 @@ class Options(SiteOptions):
 )
 def hospital(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
     """A hospital ward: rooms with beds, a nurse station and a corridor; several wards are joined by a lift."""
-    least, most = options.room_width
+    min_width, max_width = options.room_width
     lift = options.levels > 1
     measures = Storeys(
-        options.levels, options.length, options.depth, options.corridor, least, most, options.door_width,
+        options.levels, options.length, options.depth, options.corridor, min_width, max_width, options.door_width,
         options.storey_height, lift,
     )  # fmt: skip
     furnish = _furnish if options.furniture else None

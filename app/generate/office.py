@@ -40,10 +40,10 @@ class Options(SiteOptions):
 )
 def office(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
     """An office building: rooms with doors along corridors, two levels or more with a lift, furniture."""
-    least, most = options.room_width
+    min_width, max_width = options.room_width
     lift = options.levels > 1
     measures = Storeys(
-        options.levels, options.length, options.depth, options.corridor, least, most, options.door_width,
+        options.levels, options.length, options.depth, options.corridor, min_width, max_width, options.door_width,
         options.storey_height, lift,
     )  # fmt: skip
     furnish = _furnish if options.furniture else None
@@ -57,8 +57,8 @@ def _kinds(level: int, side: int, widths: list[float], chance: np.random.Generat
     out = ["office"] * len(widths)
     out[int(np.argmax(widths))] = "meeting"
     rest = [n for n, kind in enumerate(out) if kind == "office"]
-    wanted = ("kitchen",) if side > 0 else ("copy", "storage")
-    for kind in wanted:
+    kinds = ("kitchen",) if side > 0 else ("copy", "storage")
+    for kind in kinds:
         if len(rest) > 1:
             out[rest.pop(int(chance.integers(0, len(rest))))] = kind
     if level == 0 and side > 0 and rest:

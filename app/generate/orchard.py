@@ -42,7 +42,7 @@ def orchard(given: Layers, options: Orchard, source: Source, notes: Notes) -> La
         site,
         options,
         lines,
-        own=None if options.rows else 8,
+        row_count=None if options.rows else 8,
         spacing=options.row_spacing,
         half=options.trunk_diameter / 2 + options.jitter,
     )
@@ -55,9 +55,9 @@ def orchard(given: Layers, options: Orchard, source: Source, notes: Notes) -> La
         site.draw(out.strip(row, min(1.0, options.row_spacing / 2)), "soil")
     size = source.stream("size")
     stood = _trees.places(out, source.stream("places"), "row", options.tree_spacing, options.jitter)
-    for row, found in zip(out.rows, stood, strict=True):
-        drawn = size.random((len(found), 3))
-        for k, ((u, v), (a, b, c)) in enumerate(zip(found, drawn.tolist(), strict=True), 1):
+    for row, plants in zip(out.rows, stood, strict=True):
+        drawn = size.random((len(plants), 3))
+        for k, ((u, v), (a, b, c)) in enumerate(zip(plants, drawn.tolist(), strict=True), 1):
             height = options.tree_height * (0.85 + 0.15 * a)
             _trees.tree(
                 site,

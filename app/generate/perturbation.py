@@ -170,17 +170,17 @@ def perturbation(given: Layers, options: Perturbation, source: Source, notes: No
     if options.severity == 0.0:
         raise CannotGenerate("severity: 0 changes nothing", [Problem("0 changes nothing", where="severity")])
     if options.grid is not None and options.grid not in {k.name for k in given.grids()}:
-        there = ", ".join(sorted({k.name for k in given.grids()})) or "none"
-        reason = f"there is no grid {options.grid!r} to disturb; there are: {there}"
+        grid_names = ", ".join(sorted({k.name for k in given.grids()})) or "none"
+        reason = f"there is no grid {options.grid!r} to disturb; there are: {grid_names}"
         raise CannotGenerate(f"grid: {reason}", [Problem(reason, where="grid")])
     parts: dict[PartKey, Part] = {}
     for level in levels:
         parts |= _Level(given, options, source, notes, level).made()
     if not parts:
-        told = "; ".join(f"{w.where}: {w.problem}" for w in notes.warnings)
-        told += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped)
+        text = "; ".join(f"{w.where}: {w.problem}" for w in notes.warnings)
+        text += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped)
         raise CannotGenerate(
-            f"nothing is disturbed by these parameters{': ' + told.removeprefix('; ') if told else ''}: ask for more, "
+            f"nothing is disturbed by these parameters{': ' + text.removeprefix('; ') if text else ''}: ask for more, "
             "or upload or derive objects that stand in the way, or a grid"
         )
     if options.edges == "remove":
@@ -211,25 +211,25 @@ class _Level:
         """The parts of the level that are changed."""
         out: dict[PartKey, Part] = {}
         things = self._things()
-        known = self.maps if things else {k: g for k, g in self.grids.items() if k in self.noisy}
-        first = next((k for k in known if k.name == MAP), next(iter(known), None))
-        main = None if first is None else known[first]
+        grids = self.maps if things else {k: g for k, g in self.grids.items() if k in self.noisy}
+        first = next((k for k in grids if k.name == MAP), next(iter(grids), None))
+        main = None if first is None else grids[first]
         if things:
             change, objects = self._objects(things, main)
             out |= objects
             changes = dict.fromkeys(self.maps, change)
         elif first is not None:
-            changes = {k: self._pieces(k, g) for k, g in known.items()}
+            changes = {k: self._pieces(k, g) for k, g in grids.items()}
             change = changes[first]
         else:
             self.notes.warn("it has neither objects that stand in the way nor a grid", where=self.level)
             return out
-        network, kept = self._network(change, main)
+        network, edge_lines = self._network(change, main)
         out |= network
         for key, grid in self.grids.items():
             cells = _applied(grid, changes[key]) if key in changes else grid.cells
             if key in self.noisy:
-                cells = self._noise(key, grid, cells, kept)
+                cells = self._noise(key, grid, cells, edge_lines)
             if not np.array_equal(cells, grid.cells):
                 out[key] = _with_grey(self.stored[key], cells)
         return out
@@ -237,13 +237,13 @@ class _Level:
     # --- objects -----------------------------------------------------------------------------------------------------
     def _things(self) -> list[_Thing]:
         """Everything with a body, those that may move first told apart from those that stay."""
-        known = solids.Solids(self.given.resources())
+        solid_reader = solids.Solids(self.given.resources())
         out: list[_Thing] = []
         for key, part in self.parts.items():
             metres = part.in_local(self.given.frame)
             for k, (p, geometry) in enumerate(zip(part.properties, metres, strict=True)):
                 try:
-                    body = footprint_of(p, geometry, known)
+                    body = footprint_of(p, geometry, solid_reader)
                 except (Invalid, BadUpload) as error:
                     self.notes.warn(f"it stays as it is: {error.detail}", where=part.ids[k])
                     continue
@@ -273,29 +273,31 @@ class _Level:
         if back:
             self.notes.drop("shifts", back, "another thing stands there")
         fresh = self._obstacles(things, main or self._slice(self.given.parts, None))
-        told = self._told(things)
+        phrases = self._told(things)
         out: dict[PartKey, Part] = {}
         for key, part in self.parts.items():
-            mine = {t.place[1]: t for t in things if isinstance(t.place, tuple) and t.place[0] == key and t.changed}
-            if mine:
-                out[key] = _changed(part, mine, self.given)
+            part_things = {
+                t.place[1]: t for t in things if isinstance(t.place, tuple) and t.place[0] == key and t.changed
+            }
+            if part_things:
+                out[key] = _changed(part, part_things, self.given)
         if fresh:
             key = PartKey("objects", self.level, NAME)
             before = out.get(key, self.parts.get(key))
             assert before is None or isinstance(before, Features)
             out[key] = _joined(before, fresh)
-            told.append(f"{len(fresh)} new obstacles")
-        if told:
-            self.notes.warn(f"disturbed: {', '.join(told)}", where=self.level)
+            phrases.append(f"{len(fresh)} new obstacles")
+        if phrases:
+            self.notes.warn(f"disturbed: {', '.join(phrases)}", where=self.level)
         merged = {**self.parts, **out}
         return self._sliced(merged, main), out
 
     def _told(self, things: Sequence[_Thing]) -> list[str]:
-        gone = sum(t.gone for t in things)
-        moved = sum(t.changed for t in things) - gone
+        removed_count = sum(t.gone for t in things)
+        moved = sum(t.changed for t in things) - removed_count
         rows = len({t.row for t in things if t.row >= 0 and t.moved is not None})
-        said = [f"{moved} things moved" + (f" ({rows} rows)" if rows else "")] if moved else []
-        return said + ([f"{gone} gone"] if gone else [])
+        phrases = [f"{moved} things moved" + (f" ({rows} rows)" if rows else "")] if moved else []
+        return phrases + ([f"{removed_count} gone"] if removed_count else [])
 
     def _shaken(self, loose: list[_Thing]) -> None:
         """Draw what goes, and how far what stays is moved."""
@@ -303,8 +305,8 @@ class _Level:
         go = self.draw("missing").random(len(loose)) < min(options.missing * s, 1.0)
         by = self.draw("shift").random((len(loose), 3)) * 2 - 1
         rows = self.draw("rows").random((max((t.row for t in loose), default=-1) + 1, 2)) * 2 - 1
-        for t, gone, (dx, dy, turn) in zip(loose, go.tolist(), by.tolist(), strict=True):
-            if gone:
+        for t, removed, (dx, dy, turn) in zip(loose, go.tolist(), by.tolist(), strict=True):
+            if removed:
                 t.gone = True
                 continue
             along = rows[t.row].tolist() if t.row >= 0 else (0.0, 0.0)
@@ -316,31 +318,33 @@ class _Level:
 
     def _sliced(self, merged: dict[PartKey, Any], main: OccupancyGrid | None) -> _Change:
         """What a slice of the objects shows now and did not before, and the other way round."""
-        said = main.properties.get("slice") if main is not None else None
-        height = said.get("height") if isinstance(said, dict) else None
+        slice_properties = main.properties.get("slice") if main is not None else None
+        height = slice_properties.get("height") if isinstance(slice_properties, dict) else None
         size = None if main is None else main.resolution
-        asked = Slice(height=height, resolution=size, padding=0.0)
+        slice_parameters = Slice(height=height, resolution=size, padding=0.0)
         rest = {k: p for k, p in self.given.parts.items() if k.layer == "resources"}
-        found: list[OccupancyGrid | None] = []
+        grids: list[OccupancyGrid | None] = []
         for objects in (self.parts, merged):
-            grid = self._slice({**rest, **objects}, asked)
-            found.append(grid)
+            grid = self._slice({**rest, **objects}, slice_parameters)
+            grids.append(grid)
             size = size if grid is None else grid.resolution
-            asked = replace(asked, resolution=size)
+            slice_parameters = replace(slice_parameters, resolution=size)
         if size is None:
             return _Change(1.0)
-        before, after = (_occupied(g) if g is not None else np.empty(0, np.int64) for g in found)
+        before, after = (_occupied(g) if g is not None else np.empty(0, np.int64) for g in grids)
         freed, filled = np.setdiff1d(before, after, True), np.setdiff1d(after, before, True)
         return _Change(size, _places(freed), _places(filled), _places(before))
 
-    def _slice(self, parts: Mapping[PartKey, Part], asked: Slice | None) -> OccupancyGrid | None:
+    def _slice(self, parts: Mapping[PartKey, Part], slice_parameters: Slice | None) -> OccupancyGrid | None:
         """The level's grid of these objects; None where nothing stands there at that height."""
-        kept = {k: p for k, p in parts.items() if k.layer in ("resources", "location") or k.level == self.level}
+        level_parts = {k: p for k, p in parts.items() if k.layer in ("resources", "location") or k.level == self.level}
         try:
-            made = objects_to_occupancy(Layers(kept, self.given.datum, self.given.levels), asked or Slice(), Notes())
+            sliced_layers = objects_to_occupancy(
+                Layers(level_parts, self.given.datum, self.given.levels), slice_parameters or Slice(), Notes()
+            )
         except CannotConvert:
             return None
-        return made.grids(self.level).get(PartKey("occupancy", self.level, MAP))
+        return sliced_layers.grids(self.level).get(PartKey("occupancy", self.level, MAP))
 
     # --- new obstacles -----------------------------------------------------------------------------------------------
     def _obstacles(self, things: Sequence[_Thing], main: OccupancyGrid | None) -> list[tuple[str, Any, dict[str, Any]]]:
@@ -350,15 +354,15 @@ class _Level:
         tree = shapely.STRtree(bodies)
         new: list[Any] = []
         rows: list[tuple[str, Any, dict[str, Any]]] = []
-        where = self._room(main)
+        random_position = self._room(main)
         count = self._many(self.options.obstacles)
         floor = self.given.elevation(self.level)
         taken = {i for part in self.parts.values() for i in part.ids}
-        for _ in range(count if where is not None else 0):
+        for _ in range(count if random_position is not None else 0):
             shape, yaw, high, size = self._body(rng)
             for _ in range(TRIES):
-                assert where is not None
-                x, y = where(rng)
+                assert random_position is not None
+                x, y = random_position(rng)
                 body = _moved(shape, (0.0, 0.0), (x, y, yaw))
                 near = [bodies[k] for k in tree.query(body)] + new
                 if not any(shapely.intersects(body, other) for other in near):
@@ -375,8 +379,8 @@ class _Level:
                 solid = {"type": "box", "size": [*size, high]}
             solid["pose"] = [0.0, 0.0, round(high / 2, 4), 0.0, 0.0, 0.0]
             wide = [size[0], size[-1], high]
-            said = {"kind": "obstacle", "pose": [x, y, floor, 0.0, 0.0, yaw], "size": wide, "height": high}
-            rows.append((f"new/{number}", body, {**said, "shapes": [solid]}))
+            properties = {"kind": "obstacle", "pose": [x, y, floor, 0.0, 0.0, yaw], "size": wide, "height": high}
+            rows.append((f"new/{number}", body, {**properties, "shapes": [solid]}))
         if len(rows) < count:
             self.notes.drop("new obstacles", count - len(rows), f"there is no room for them on {self.level}")
         return rows
@@ -416,8 +420,8 @@ class _Level:
         occupied = (grid.cells == OCCUPIED).astype(np.uint8)
         _, label, stats, _ = cv2.connectedComponentsWithStats(occupied, connectivity=8)
         size = grid.resolution
-        most = self.options.largest / size
-        fits = (np.hypot(stats[:, 2], stats[:, 3]) <= most) & (stats[:, 4] >= 4)
+        max_diagonal = self.options.largest / size
+        fits = (np.hypot(stats[:, 2], stats[:, 3]) <= max_diagonal) & (stats[:, 4] >= 4)
         fits[0] = False
         pieces = np.flatnonzero(fits)
         if len(pieces) > PIECES:
@@ -431,7 +435,7 @@ class _Level:
             t.row = row
         self._shaken(loose)
         cells = grid.cells.copy()
-        held = 0
+        blocked_count = 0
         for t in loose:
             assert isinstance(t.place, int)
             x, y, w, h, _ = (int(v) for v in stats[t.place])
@@ -441,17 +445,17 @@ class _Level:
             into = _window(cells, x + dx, y + dy, w, h)
             if not t.gone and (into is None or (cells[into][inside] != FREE).any()):
                 t.moved, into = (0.0, 0.0, 0.0), _window(cells, x, y, w, h)
-                held += 1
+                blocked_count += 1
             elif (dx, dy) == (0, 0) and not t.gone:
                 t.moved = (0.0, 0.0, 0.0)
             if not t.gone and into is not None:
                 cells[into][inside] = OCCUPIED
-        if held:
-            self.notes.drop("shifts", held, "another thing stands there, or it is not known what does")
+        if blocked_count:
+            self.notes.drop("shifts", blocked_count, "another thing stands there, or it is not known what does")
         added = self._painted(key, grid, cells)
-        told = self._told(loose) + ([f"{added} new obstacles"] if added else [])
-        if told:
-            self.notes.warn(f"disturbed, by its cells: {', '.join(told)}", where=f"{self.level}/{key.name}")
+        phrases = self._told(loose) + ([f"{added} new obstacles"] if added else [])
+        if phrases:
+            self.notes.warn(f"disturbed, by its cells: {', '.join(phrases)}", where=f"{self.level}/{key.name}")
         row, column = np.nonzero((grid.cells == OCCUPIED) & (cells != OCCUPIED))
         freed = np.stack([column, row], axis=1)
         row, column = np.nonzero((grid.cells != OCCUPIED) & (cells == OCCUPIED))
@@ -487,7 +491,7 @@ class _Level:
     def _network(self, change: _Change, main: OccupancyGrid | None) -> tuple[dict[PartKey, Part], list[Any]]:
         """The parts of the network that change, and the lines (metres) that robots still take."""
         out: dict[PartKey, Part] = {}
-        kept: list[Any] = []
+        edge_lines: list[Any] = []
         boxes, old = (_squares(places, change.size, main) for places in (change.filled, change.before))
         tree, was = shapely.STRtree(boxes), shapely.STRtree(old)
         for key, part in self.lines.items():
@@ -495,24 +499,24 @@ class _Level:
             coarse = HALF * (change.size or (main.resolution if main is not None else 0.0))
             hit = _nearest(tree, metres, self.options.robot_radius + coarse) < self._reach(was, metres, coarse)
             edge = np.array([p.get("kind") == "edge" for p in part.properties])
-            kept += [g for g, e, h in zip(metres, edge, hit, strict=True) if e and not h and not g.is_empty]
+            edge_lines += [g for g, e, h in zip(metres, edge, hit, strict=True) if e and not h and not g.is_empty]
             crossed = [part.ids[k] for k in np.flatnonzero(hit & edge)]
             covered = [part.ids[k] for k in np.flatnonzero(hit & ~edge)]
             if not crossed and not covered:
                 continue
             if self.options.edges == "block":
-                said = tuple(
+                properties = tuple(
                     {**p, "blocked": True} if h and e else p for p, h, e in zip(part.properties, hit, edge, strict=True)
                 )
                 if crossed:
-                    out[key] = Features(part.ids, part.geometry.copy(), said, part.local.copy(), part.document)
+                    out[key] = Features(part.ids, part.geometry.copy(), properties, part.local.copy(), part.document)
                 self._warn("blocked", crossed, key)
                 self._warn("under an obstacle", covered, key, "nodes")
             else:
                 out[key] = part.take(~hit)
                 self._warn("removed", crossed, key)
                 self._warn("removed", covered, key, "nodes")
-        return out, kept
+        return out, edge_lines
 
     def _reach(self, was: shapely.STRtree, metres: NDArray[np.object_], coarse: float) -> Array:
         """How near an obstacle may come to each line or point: the robot's radius, and as much as cells are coarse;
@@ -521,19 +525,21 @@ class _Level:
         away = _nearest(was, metres, radius)
         return np.where(away < radius - 2 * coarse, away / 2, np.nextafter(radius + coarse, np.inf))
 
-    def _warn(self, what: str, ids: Sequence[str], key: PartKey, kind: str = "edges") -> None:
+    def _warn(self, effect: str, ids: Sequence[str], key: PartKey, kind: str = "edges") -> None:
         if ids:
             some = ", ".join(ids[:10]) + (" …" if len(ids) > 10 else "")
-            where = f"{key.level}/{key.name}"
-            self.notes.warn(f"{len(ids)} {kind} are {what}, since an obstacle now stands there: {some}", where=where)
+            location = f"{key.level}/{key.name}"
+            self.notes.warn(
+                f"{len(ids)} {kind} are {effect}, since an obstacle now stands there: {some}", where=location
+            )
 
     # --- noise -------------------------------------------------------------------------------------------------------
     def _noise(
         self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8], lines: Sequence[Any]
     ) -> NDArray[np.uint8]:
         """Cells as a sensor that errs sees them."""
-        known = cells != UNKNOWN
-        down, across = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        known_cells = cells != UNKNOWN
+        down, across = np.flatnonzero(known_cells.any(axis=1)), np.flatnonzero(known_cells.any(axis=0))
         if not len(down):
             return cells
         y0, x0 = int(down[0]), int(across[0])
@@ -575,9 +581,9 @@ class _Level:
         out[worn & (chance < min(options.erode * s, 1.0) * share)] = FREE
         out[beside & ~near & (chance < min(options.dilate * s, 1.0) * share)] = OCCUPIED
         out[free & ~beside & ~near & (chance < min(options.speckle * s, 1.0) * weight)] = OCCUPIED
-        known = np.flatnonzero((cells != UNKNOWN) & ~near)
-        for _ in range(self._many(options.dropped) if len(known) else 0):
-            row, column = divmod(int(known[int(rng.integers(len(known)))]), cells.shape[1])
+        candidates = np.flatnonzero((cells != UNKNOWN) & ~near)
+        for _ in range(self._many(options.dropped) if len(candidates) else 0):
+            row, column = divmod(int(candidates[int(rng.integers(len(candidates)))]), cells.shape[1])
             radius = max(1, round(options.patch / 2 / grid.resolution * (0.3 + 0.7 * float(rng.random()))))
             y0, x0 = max(0, row - radius), max(0, column - radius)
             hole = (slice(y0, row + radius + 1), slice(x0, column + radius + 1))
@@ -598,11 +604,12 @@ def _without_lost(given: Layers, parts: dict[PartKey, Part], notes: Notes) -> di
         after[key] = new
     if all(after[k] is p for k, p in before.items()):
         return {}
-    gone = {i for p in before.values() for i in p.ids} - {i for p in after.values() for i in p.ids}
+    removed = {i for p in before.values() for i in p.ids} - {i for p in after.values() for i in p.ids}
     out: dict[PartKey, Part] = {}
     for key, part in after.items():
         lost = [
-            p.get("kind") == "edge" and (p.get("source") in gone or p.get("target") in gone) for p in part.properties
+            p.get("kind") == "edge" and (p.get("source") in removed or p.get("target") in removed)
+            for p in part.properties
         ]
         if any(lost):
             notes.drop("edges", sum(lost), "an obstacle stands where they lead from or to")
@@ -612,7 +619,7 @@ def _without_lost(given: Layers, parts: dict[PartKey, Part], notes: Notes) -> di
     used = {
         p[end] for f in before.values() for p in f.properties if p.get("kind") == "edge" for end in ("source", "target")
     }
-    was, now = (_connected(list(f.values()), used - gone) for f in (before, after))
+    was, now = (_connected(list(f.values()), used - removed) for f in (before, after))
     if now > was:
         notes.warn(f"the network falls into {now} pieces, and was in {was}")
     return out
@@ -624,8 +631,10 @@ def _connected(collections: Sequence[Features], nodes: set[str]) -> int:
     from scipy.sparse.csgraph import connected_components
 
     number = {i: k for k, i in enumerate(sorted(nodes))}
-    said = [p for f in collections for p in f.properties if p.get("kind") == "edge"]
-    ends = [(number[p["source"]], number[p["target"]]) for p in said if p["source"] in number and p["target"] in number]
+    edges = [p for f in collections for p in f.properties if p.get("kind") == "edge"]
+    ends = [
+        (number[p["source"]], number[p["target"]]) for p in edges if p["source"] in number and p["target"] in number
+    ]
     if not nodes:
         return 0
     a, b = np.array(ends, np.int64).reshape(-1, 2).T
@@ -663,12 +672,12 @@ def _changed(part: Features, things: dict[int, _Thing], given: Layers) -> Featur
             assert given.frame is not None
             back = given.frame.geometries_to_wgs84(np.array([metres[k]], object))
             geometry[k] = shapely.set_precision(back[0], 1e-12, mode="pointwise")
-        said = properties[k]
-        if said.get("pose") is not None or said.get("shapes"):
-            pose = list(solids.pose_of(said))
+        object_properties = properties[k]
+        if object_properties.get("pose") is not None or object_properties.get("shapes"):
+            pose = list(solids.pose_of(object_properties))
             place = shapely.get_coordinates(_moved(shapely.Point(pose[:2]), t.at, t.moved))[0].tolist()
             yaw = round(math.remainder(pose[5] + t.moved[2], math.tau), 6) + 0.0
-            properties[k] = {**said, "pose": [*place, pose[2], pose[3], pose[4], yaw]}
+            properties[k] = {**object_properties, "pose": [*place, pose[2], pose[3], pose[4], yaw]}
     stays = np.array([k not in things or not things[k].gone for k in range(len(part))], bool)
     return Features(part.ids, geometry, tuple(properties), part.local.copy(), part.document).take(stays)
 
@@ -680,8 +689,8 @@ def _joined(before: Features | None, rows: list[tuple[str, Any, dict[str, Any]]]
         return fresh
     geometry = np.concatenate([before.geometry, fresh.geometry])
     local = np.concatenate([before.local, fresh.local])
-    said = (*before.properties, *fresh.properties)
-    return Features((*before.ids, *fresh.ids), geometry, said, local, before.document)
+    properties = (*before.properties, *fresh.properties)
+    return Features((*before.ids, *fresh.ids), geometry, properties, local, before.document)
 
 
 def _rows(at: Array) -> NDArray[np.int64]:
@@ -695,24 +704,24 @@ def _rows(at: Array) -> NDArray[np.int64]:
     out = np.full(len(at), -1, np.int64)
     if len(at) < ROW:
         return out
-    away, which = cKDTree(at).query(at, 2)
+    away, neighbour = cKDTree(at).query(at, 2)
     apart = away[:, 1]
-    there = apart > 1e-6
-    if there.sum() < ROW:
+    mask = apart > 1e-6
+    if mask.sum() < ROW:
         return out
-    to = at[which[:, 1]] - at
+    to = at[neighbour[:, 1]] - at
     angle = np.round(np.arctan2(to[:, 1], to[:, 0]) % math.pi, 6)
-    bins = np.bincount((angle[there] / math.pi * 36).astype(np.int64) % 36, minlength=36)
+    bins = np.bincount((angle[mask] / math.pi * 36).astype(np.int64) % 36, minlength=36)
     smooth = bins + np.roll(bins, 1) + np.roll(bins, -1)
     best = int(np.argmax(smooth))
-    if smooth[best] < max(ROW, 0.4 * there.sum()):
+    if smooth[best] < max(ROW, 0.4 * mask.sum()):
         return out
     # The mean of directions that are 180 degrees apart is half the mean of their doubles.
-    close = there & (np.abs((angle / math.pi * 36 - best - 0.5 + 18) % 36 - 18) <= 1.5)
+    close = mask & (np.abs((angle / math.pi * 36 - best - 0.5 + 18) % 36 - 18) <= 1.5)
     double = 2 * angle[close]
-    way = math.atan2(float(np.sin(double).sum()), float(np.cos(double).sum())) / 2
-    across = np.round(-math.sin(way) * at[:, 0] + math.cos(way) * at[:, 1], 3)
-    gap = max(float(np.median(apart[there])) / 2, 0.05)
+    direction = math.atan2(float(np.sin(double).sum()), float(np.cos(double).sum())) / 2
+    across = np.round(-math.sin(direction) * at[:, 0] + math.cos(direction) * at[:, 1], 3)
+    gap = max(float(np.median(apart[mask])) / 2, 0.05)
     order = np.argsort(across, kind="stable")
     row = np.empty(len(at), np.int64)
     row[order] = np.concatenate([[0], np.cumsum(np.diff(across[order]) > gap)])
@@ -723,29 +732,29 @@ def _rows(at: Array) -> NDArray[np.int64]:
 
 def _apart(things: Sequence[_Thing]) -> int:
     """Put back what has come to stand in others and did not before: how many things."""
-    there = [t for t in things if not t.gone]
-    before = np.array([t.body for t in there], object)
+    present_things = [t for t in things if not t.gone]
+    before = np.array([t.body for t in present_things], object)
     put = 0
     while True:
-        now = np.array([t.now() for t in there], object)
+        now = np.array([t.now() for t in present_things], object)
         a, b = shapely.STRtree(now).query(now, predicate="intersects")
         pair = a < b
         a, b = a[pair], b[pair]
-        moved = np.array([t.moved is not None and any(t.moved) for t in there], bool)
+        moved = np.array([t.moved is not None and any(t.moved) for t in present_things], bool)
         wrong = (moved[a] | moved[b]) & ~shapely.intersects(before[a], before[b])
         if not wrong.any():
             return put
         for k in np.unique(np.concatenate([a[wrong], b[wrong]])).tolist():
             if moved[k]:
-                there[k].moved = (0.0, 0.0, 0.0)
+                present_things[k].moved = (0.0, 0.0, 0.0)
                 put += 1
 
 
 def _with_grey(stored: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
     """A stored grid with other cells; those of unknown's grey that stay unknown keep it."""
     grey = unknown_grey(stored)
-    kept = cells if grey is None else np.where(grey & (cells == UNKNOWN), np.uint8(FREE), cells)
-    return replace(stored, cells=kept)
+    new_cells = cells if grey is None else np.where(grey & (cells == UNKNOWN), np.uint8(FREE), cells)
+    return replace(stored, cells=new_cells)
 
 
 # --- cells ------------------------------------------------------------------------------------------------------------
@@ -792,8 +801,8 @@ def _applied(grid: OccupancyGrid, change: _Change) -> NDArray[np.uint8]:
         inside = ((at >= 0) & (at < [grid.width, grid.height])).all(axis=1)
         column, row = at[inside].T
         if value == FREE:
-            known = cells[row, column] == OCCUPIED
-            column, row = column[known], row[known]
+            occupied = cells[row, column] == OCCUPIED
+            column, row = column[occupied], row[occupied]
         cells[row, column] = value
     return cells
 
@@ -815,12 +824,14 @@ def _cells_of(grid: OccupancyGrid, change: _Change, places: Cells) -> Cells:
     return reached[np.isin(_numbers(middles), _numbers(places))]
 
 
-def _nearest(tree: shapely.STRtree, metres: NDArray[np.object_], most: float) -> Array:
-    """Metres from each geometry to the nearest of the tree's; infinite beyond ``most``."""
+def _nearest(tree: shapely.STRtree, metres: NDArray[np.object_], max_distance: float) -> Array:
+    """Metres from each geometry to the nearest of the tree's; infinite beyond ``max_distance``."""
     out = np.full(len(metres), np.inf)
     usable = np.flatnonzero(~shapely.is_empty(metres))
-    if len(usable) and len(tree.geometries) and most > 0:
-        at, away = tree.query_nearest(metres[usable], max_distance=most, return_distance=True, all_matches=False)
+    if len(usable) and len(tree.geometries) and max_distance > 0:
+        at, away = tree.query_nearest(
+            metres[usable], max_distance=max_distance, return_distance=True, all_matches=False
+        )
         out[usable[at[0]]] = np.round(away, 6)
     elif len(usable) and len(tree.geometries):
         out[usable[np.unique(tree.query(metres[usable], predicate="intersects")[0])]] = 0.0

@@ -87,8 +87,8 @@ def plants(given: Layers, options: Options, source: Source, notes: Notes) -> Lay
         strip = shapely.box(head - spacing / 2, v - body, head + along + spacing / 2, v + body)
         site.draw(place.of(strip), "soil")
         for column in range(options.columns):
-            du, dv, turn, size, which = chance.random(5).tolist()
-            plant = grown[int(which * len(grown))]
+            du, dv, turn, size, choice = chance.random(5).tolist()
+            plant = grown[int(choice * len(grown))]
             scale = round(1.0 + options.variation * (2.0 * size - 1.0), 3)
             shift = options.jitter * 0.7  # so that no corner of the square lies farther off
             x, y = place.at(head + column * spacing + shift * (2 * du - 1), v + shift * (2 * dv - 1))
@@ -120,15 +120,15 @@ def _grown(options: Options, source: Source) -> list[_plants.Plant]:
     """The plants that stand here. Invalid and CannotGenerate say what is wrong with rules."""
     name: str = options.species if options.rules is None else "own"
     if options.rules is None:
-        known = _plants.SPECIES[options.species]
+        template = _plants.SPECIES[options.species]
     elif options.rules.strip():
-        known = _plants.Species("plant", options.rules, 6)
+        template = _plants.Species("plant", options.rules, 6)
     else:
         raise Invalid("rules: there are none", [Problem("there are none", where="rules")])
     species = replace(
-        known,
-        iterations=known.iterations if options.iterations is None else options.iterations,
-        body=options.body or known.body,
+        template,
+        iterations=template.iterations if options.iterations is None else options.iterations,
+        body=options.body or template.body,
     )
     system = _lsystem.parse(species.rules)
     budget = _lsystem.Budget()

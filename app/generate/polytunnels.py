@@ -50,12 +50,12 @@ def polytunnels(given: Layers, options: Polytunnels, source: Source, notes: Note
         raise refused("tunnel_height", "must be above side_height")
     site = Site(given, options, notes, coloured=True)
     count = options.rows_per_tunnel
-    wanted = options.tunnels or 2
+    tunnel_count = options.tunnels or 2
     out = _field.open_field(
         site,
         options,
         _lines(options.tunnels or MOST_TUNNELS, count),
-        own=None if options.tunnels else wanted * (count + 1) + 1,
+        row_count=None if options.tunnels else tunnel_count * (count + 1) + 1,
         spacing=options.row_spacing,
         half=max(options.table_width / 2, 0.04),
     )

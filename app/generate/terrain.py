@@ -94,21 +94,21 @@ def terrain(given: Layers, options: Options, source: Source, notes: Notes) -> La
         trees = _trees(site, (x, y, height), (rows, columns), options, source)
     if not trees:
         _posts(site, (x, y, height), notes)
-    made = site.finish(ground="meadow")
-    grid = made.parts[PartKey("occupancy", GROUND, MAP)]
+    layers = site.finish(ground="meadow")
+    grid = layers.parts[PartKey("occupancy", GROUND, MAP)]
     if not isinstance(grid, OccupancyGrid):
         raise TypeError("a site has a grid")
     steep = _steepness(grid, (x, y, height)) / round(math.tan(math.radians(options.climb)), 9)
-    parts: dict[PartKey, Part] = dict(made.parts)
+    parts: dict[PartKey, Part] = dict(layers.parts)
     if options.rough == "costs":
         parts[PartKey("occupancy", GROUND, "costs")] = _costs(grid, steep)
     elif options.rough == "speed":
         parts[PartKey("occupancy", GROUND, "speed")] = _speed(grid, steep)
     level = np.where((grid.cells == FREE) & (steep >= 1.0), np.uint8(OCCUPIED), grid.cells)
-    ways = _cells.ways_of(replace(grid, cells=level), options.robot_radius, notes)
-    if ways is not None:
-        parts[PartKey("topology", GROUND, NETWORK)] = ways
-    return Layers(dict(sorted(parts.items())), made.datum, made.levels)
+    topology = _cells.ways_of(replace(grid, cells=level), options.robot_radius, notes)
+    if topology is not None:
+        parts[PartKey("topology", GROUND, NETWORK)] = topology
+    return Layers(dict(sorted(parts.items())), layers.datum, layers.levels)
 
 
 def _heights(x: Array, y: Array, options: Options, source: Source) -> Array:
@@ -133,8 +133,8 @@ def _trees(
     fractal = Fractal(options.noise, options.grove, 3)
     dense = np.round(noise3(x, y, np.array([options.epoch]), fractal, source.stream("woods"))[0], 9)
     soil = np.round(noise2(x, y, Fractal(options.noise, 2 * options.grove, 2), source.stream("soil")), 9)
-    wanted = max(1, round(options.vegetation * dense.size))
-    order = np.argsort(-dense.ravel(), kind="stable")[:wanted]
+    tree_count = max(1, round(options.vegetation * dense.size))
+    order = np.argsort(-dense.ravel(), kind="stable")[:tree_count]
     inner = shapely.buffer(site.fence, -0.3)
     shapely.prepare(inner)
     floor = site.elevation(GROUND)
@@ -238,8 +238,8 @@ def _costs(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
     """Nav2's keepout mask: 0 where it is flat, 100 where it is too steep or something stands, between in proportion."""
     cells = np.where(steep >= 1.0, OCCUPIED, np.floor(np.minimum(steep, 1.0) * 99.0)).astype(np.uint8)
     cells = np.where(grid.cells == FREE, cells, grid.cells).astype(np.uint8)
-    said = {masks.NAME: {"params": masks.params("costs", masks.Info(masks.KEEPOUT, 0.0, 1.0))}}
-    return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=said)
+    properties = {masks.NAME: {"params": masks.params("costs", masks.Info(masks.KEEPOUT, 0.0, 1.0))}}
+    return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=properties)
 
 
 def _speed(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
@@ -247,8 +247,8 @@ def _speed(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
     percent = np.maximum(np.rint(100.0 * (1.0 - np.minimum(steep, 1.0))), SLOWEST).astype(np.uint8)
     cells = np.where(grid.cells == UNKNOWN, 0, percent).astype(np.uint8)
     info = masks.Info(masks.SPEED_PERCENT, 0.0, 1.0)
-    said = {masks.NAME: {"params": masks.params("speed", info)}}
-    return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=said)
+    properties = {masks.NAME: {"params": masks.params("speed", info)}}
+    return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=properties)
 
 
 def _png(grey: U8) -> bytes:

@@ -88,59 +88,59 @@ def town(given: Layers, options: Options, source: Source, notes: Notes) -> Layer
     grammar = _blocks.parse(RULES if options.rules is None else options.rules, constants)
     site = Site(given, options, notes)
     boundary = _bounded(site, options)
-    made = _blocks.grow(grammar, boundary, source.stream("rules"))
-    if not made.streets:
+    layout = _blocks.grow(grammar, boundary, source.stream("rules"))
+    if not layout.streets:
         raise CannotGenerate("the rules make no street: use ring or cut", [Problem("no street", where="rules")])
-    streets = _streets.network_of(made.streets, options.sidewalk)
+    streets = _streets.network_of(layout.streets, options.sidewalk)
     need = options.robot_radius + SLACK * site.resolution
     if streets.walk / 2 < need:
         raise refused("sidewalk", f"{streets.walk:.2f} m are too narrow for the robot, which needs {2 * need:.2f} m")
-    _paint(site, streets, made, boundary)
-    _buildings(site, [lot for lot in made.lots if lot.use in _blocks.ROOFS])
+    _paint(site, streets, layout, boundary)
+    _buildings(site, [lot for lot in layout.lots if lot.use in _blocks.ROOFS])
     ring = any(rule.action == "ring" for rule in grammar.rules[grammar.start])
-    _streets.sidewalks(site, streets, made.blocks, boundary if ring else None, 1.2, notes)
+    _streets.sidewalks(site, streets, layout.blocks, boundary if ring else None, 1.2, notes)
     roads = _streets.lanes(site, streets, 5.0, need)
     _streets.stop(site, streets, roads, notes)
     if options.lamps:
         _lamps(site, streets, need, notes)
     if options.trees:
-        _green(site, [lot for lot in made.lots if lot.use in _blocks.OPEN], source)
-    for k, lot in enumerate(lot for lot in made.lots if lot.use in ("park", "square")):
+        _green(site, [lot for lot in layout.lots if lot.use in _blocks.OPEN], source)
+    for k, lot in enumerate(lot for lot in layout.lots if lot.use in ("park", "square")):
         site.zone(f"{lot.use}_{k + 1}", "speed", lot.area, value=1.0, name=f"{lot.use} {k + 1}")
     return site.finish(ground="meadow")
 
 
 def _bounded(site: Site, options: Options) -> Any:
     """The town's boundary: the one that was asked for, else the fence, else a rectangle."""
-    asked = None if options.boundary is None else _polygon(options.boundary)
-    own = shapely.box(0.0, 0.0, options.width, options.depth) if asked is None else asked
-    if own.area > MOST_AREA:
-        raise refused("boundary", f"{own.area / 1e6:.1f} km² are more than {MOST_AREA / 1e6:g} km²")
-    around = shapely.buffer(own, MARGIN, join_style="mitre", mitre_limit=3.0)
+    boundary = None if options.boundary is None else _polygon(options.boundary)
+    outline = shapely.box(0.0, 0.0, options.width, options.depth) if boundary is None else boundary
+    if outline.area > MOST_AREA:
+        raise refused("boundary", f"{outline.area / 1e6:.1f} km² are more than {MOST_AREA / 1e6:g} km²")
+    around = shapely.buffer(outline, MARGIN, join_style="mitre", mitre_limit=3.0)
     fence = site.bounded(around, room=options.sidewalk / 2 - options.robot_radius)
     if not site.is_given:
-        return own
-    if asked is not None:
-        if not shapely.contains(fence, asked):
+        return outline
+    if boundary is not None:
+        if not shapely.contains(fence, boundary):
             raise refused("boundary", "reaches beyond the fence of the environment")
-        return asked
+        return boundary
     inner = [p for p in shapely.get_parts(shapely.buffer(fence, -0.5, join_style="mitre")) if p.area > 0]
     if not inner:
         raise CannotGenerate("the fence has no room for a town", [Problem("no room for a town", where="fence")])
     return shapely.normalize(shapely.transform(max(inner, key=lambda p: p.area), lambda xy: np.round(xy, 3) + 0.0))
 
 
-def _polygon(said: Sequence[float]) -> Any:
+def _polygon(numbers: Sequence[float]) -> Any:
     """The polygon of x1,y1,x2,y2,…: Invalid where it is none."""
 
     def wrong(problem: str) -> Invalid:
         return Invalid(f"boundary: {problem}", [Problem(problem, where="boundary")])
 
-    if len(said) % 2 or not 6 <= len(said) <= 2 * MOST_POINTS:
-        raise wrong(f"must be x,y of 3 to {MOST_POINTS} corners, got {len(said)} numbers")
-    if max(map(abs, said)) > 1e6:
+    if len(numbers) % 2 or not 6 <= len(numbers) <= 2 * MOST_POINTS:
+        raise wrong(f"must be x,y of 3 to {MOST_POINTS} corners, got {len(numbers)} numbers")
+    if max(map(abs, numbers)) > 1e6:
         raise wrong("must lie within a million metres of the origin")
-    ring = [(mm(x), mm(y)) for x, y in zip(said[::2], said[1::2], strict=True)]
+    ring = [(mm(x), mm(y)) for x, y in zip(numbers[::2], numbers[1::2], strict=True)]
     polygon = shapely.Polygon(ring)
     if not polygon.is_valid:
         raise wrong(f"is no polygon: {shapely.is_valid_reason(polygon)}")
@@ -152,7 +152,7 @@ def _polygon(said: Sequence[float]) -> Any:
 # --- what is seen -----------------------------------------------------------------------------------------------------
 
 
-def _paint(site: Site, streets: _streets.Streets, made: _blocks.Town, boundary: Any) -> None:
+def _paint(site: Site, streets: _streets.Streets, layout: _blocks.Town, boundary: Any) -> None:
     """Ground and roads."""
     site.draw(boundary, "paving")
     for k, link in enumerate(streets.links):
@@ -165,10 +165,10 @@ def _paint(site: Site, streets: _streets.Streets, made: _blocks.Town, boundary: 
     for link in streets.links:
         site.draw(shapely.buffer(link.line, 0.1), "white")
     ground = {"garden": "grass", "park": "grass", "square": "concrete"}
-    site.draw(list(made.blocks), "soil" if not made.lots else "grass")
-    for lot in made.lots:
+    site.draw(list(layout.blocks), "soil" if not layout.lots else "grass")
+    for lot in layout.lots:
         site.draw(lot.area, ground.get(lot.use, "concrete"))
-    for k, block in enumerate(made.blocks):
+    for k, block in enumerate(layout.blocks):
         site.mark(f"block_{k + 1}", "region", block, name=f"Block {k + 1}")
 
 
@@ -257,7 +257,7 @@ def _lamps(site: Site, streets: _streets.Streets, need: float, notes: Notes) -> 
         )
         return
     roads = shapely.STRtree([shapely.buffer(link.line, streets.carriage(link) / 2) for link in streets.links])
-    kept = shapely.STRtree([shapely.Point(at) for at in streets.kept])
+    reserved = shapely.STRtree([shapely.Point(at) for at in streets.kept])
     count = 0
     for loop in streets.loops:
         outside = loop.ring.is_ccw
@@ -266,7 +266,7 @@ def _lamps(site: Site, streets: _streets.Streets, need: float, notes: Notes) -> 
             continue
         for k in range(int(kerb.length / BETWEEN_LAMPS)):
             at = shapely.line_interpolate_point(kerb, (k + 0.5) * BETWEEN_LAMPS)
-            near = kept.query(at, predicate="dwithin", distance=3.0)
+            near = reserved.query(at, predicate="dwithin", distance=3.0)
             if len(near) or len(roads.query(at, predicate="dwithin", distance=0.1)):
                 continue
             count += 1
@@ -286,7 +286,7 @@ def _green(site: Site, lots: Sequence[Lot], source: Source) -> None:
         step = {"park": 9.0, "garden": 8.0, "square": 14.0}[lot.use]
         for row in range(int((high_y - low_y) / step) + 1):
             for column in range(int((high_x - low_x) / step) + 1):
-                du, dv, what, large, turn = chance.random(5).tolist()
+                du, dv, choice, large, turn = chance.random(5).tolist()
                 x, y = mm(low_x + (column + du) * step), mm(low_y + (row + dv) * step)
                 if not shapely.contains_xy(inner, x, y):
                     continue
@@ -296,7 +296,7 @@ def _green(site: Site, lots: Sequence[Lot], source: Source) -> None:
                         f"bench_{benches}", "bench", (x, y), (1.6, 0.5, 0.45), yaw=angle(6.28 * turn), colour="wood"
                     )
                     continue
-                name = "bush" if what < 0.25 else "pine" if what < 0.5 else "apple"
+                name = "bush" if choice < 0.25 else "pine" if choice < 0.5 else "apple"
                 plant = kinds[name][int(large * 997) % len(kinds[name])]
                 scale = round({"bush": 1.0, "pine": 1.1, "apple": 2.0}[name] * (0.8 + 0.4 * large), 3)
                 trees += 1

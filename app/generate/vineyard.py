@@ -41,7 +41,7 @@ def vineyard(given: Layers, options: Vineyard, source: Source, notes: Notes) -> 
         site,
         options,
         _field.numbered(options.rows or _field.MOST_ROWS),
-        own=None if options.rows else 9,
+        row_count=None if options.rows else 9,
         spacing=options.row_spacing,
         half=options.canopy_width / 2 + options.jitter,
     )
@@ -53,9 +53,9 @@ def vineyard(given: Layers, options: Vineyard, source: Source, notes: Notes) -> 
         _trellis(site, out, row, options)
     size = source.stream("size")
     stood = _trees.places(out, source.stream("places"), "row", options.vine_spacing, options.jitter)
-    for row, found in zip(out.rows, stood, strict=True):
-        drawn = size.random((len(found), 3)).tolist()
-        for k, ((u, v), chance) in enumerate(zip(found, drawn, strict=True), 1):
+    for row, plants in zip(out.rows, stood, strict=True):
+        drawn = size.random((len(plants), 3)).tolist()
+        for k, ((u, v), chance) in enumerate(zip(plants, drawn, strict=True), 1):
             _vine(site, f"vine{row.number}-{k}", out, (u, v), row, options, chance)
     _field.network(out, _field.yard(out), aisle_speed=0.8, lane_speed=1.2)
     return site.finish(ground="grass")
@@ -75,8 +75,8 @@ def _trellis(site: Site, out: Field, row: Row, options: Vineyard) -> None:
         place = [mm(row.length / 2), 0.0, mm(z), 0.0, 0.0, 0.0]
         shapes.append({"type": "box", "size": [mm(row.length), 0.01, 0.01], "pose": place, "colour": rgb("metal")})
     x, y = out.at(row.low, row.v)
-    said: dict[str, Any] = {"name": f"Row {row.number}", "height": mm(options.canopy_top), "width": 0.1}
-    site.put(f"trellis{row.number}", "fence", out.line(row), shapes=shapes, pose=(x, y, 0.0, out.yaw), **said)
+    members: dict[str, Any] = {"name": f"Row {row.number}", "height": mm(options.canopy_top), "width": 0.1}
+    site.put(f"trellis{row.number}", "fence", out.line(row), shapes=shapes, pose=(x, y, 0.0, out.yaw), **members)
     site.zone(f"row{row.number}", "keepout", out.strip(row, options.canopy_width), name=f"Row {row.number}")
 
 

@@ -69,7 +69,7 @@ def warehouse(given: Layers, options: Warehouse, source: Source, notes: Notes) -
         site,
         options,
         lines,
-        own=None if options.racks else 5,
+        row_count=None if options.racks else 5,
         spacing=2 * options.rack_depth + options.aisle,
         half=options.rack_depth,
         word="aisle",
@@ -152,7 +152,7 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
             f"{len(names)} docks, chargers and parking places need {(len(names) + 1) * pitch:g} m of the "
             f"longest side, which has {lane.high - lane.low:.1f} m",
         )
-    found: dict[str, float] = {}
+    positions: dict[str, float] = {}
     doors = []
     clear = radius + WALL + SLACK * site.resolution + 0.1
     first = mm((lane.low + lane.high - (len(names) - 1) * pitch) / 2)
@@ -160,7 +160,7 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
     for k, name in enumerate(names):
         u = mm(first + k * pitch)
         stop = f"At{name}"
-        found[stop] = u
+        positions[stop] = u
         site.node(stop, out.at(u, lane.v), yaw=out.yaw)
         wall, near = _field.lowest(out, u, 0.0), _field.lowest(out, u, clear)
         if wall is None or near is None:
@@ -198,13 +198,13 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
             continue
         rings = [np.round(shapely.get_coordinates(r), 3).tolist()[:-1] for r in (piece.exterior, *piece.interiors)]
         shape = {"type": "polyline", "points": rings, "height": mm(options.wall_height)}
-        said: dict[str, Any] = {"height": mm(options.wall_height), "name": f"Wall {k}"}
-        site.put(f"wall{k}", "wall", piece, shapes=[shape], pose=(0.0, 0.0, 0.0, 0.0), colour="wall", **said)
+        members: dict[str, Any] = {"height": mm(options.wall_height), "name": f"Wall {k}"}
+        site.put(f"wall{k}", "wall", piece, shapes=[shape], pose=(0.0, 0.0, 0.0, 0.0), colour="wall", **members)
     low, high = lane.low, lane.high
     slow = out.area(low, 0.0, high, lane.v + 1.0)
     if slow.geom_type == "Polygon":
         site.zone("speed-dispatch", "speed", slow, name="Dispatch", value=0.8)
-    return found
+    return positions
 
 
 def _door(fence: Any, gap: Any) -> Any:

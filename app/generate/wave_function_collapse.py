@@ -128,10 +128,10 @@ def wave_function_collapse(given: Layers, options: Options, source: Source, note
     Raises CannotGenerate for a sample that is not there, too large or too varied, for fixed places that contradict it,
     and where all attempts fail.
     """
-    sample, known, resolution, look = _sample(given, options, notes)
+    sample, known_cells, resolution, look = _sample(given, options, notes)
     pattern = _pattern(options)
     tile = options.tile or (1 if options.model == "overlapping" else 2)
-    sample, known = _whole(sample, known, tile, notes)
+    sample, known_cells = _whole(sample, known_cells, tile, notes)
     if sample.size > MOST_SAMPLE * tile * tile:
         raise refused("sample", f"has {sample.size // tile**2} tiles, the limit is {MOST_SAMPLE}: give a larger tile")
     site = Site(given, options, notes)
@@ -141,13 +141,17 @@ def wave_function_collapse(given: Layers, options: Options, source: Source, note
     thick = max(1, round(WALL / (resolution * tile))) if options.border == "walls" else 0
     rows, columns = place.rows // tile, place.columns // tile
     if min(rows, columns) < max(pattern, 2 * thick + 1):
-        least = max(pattern, 2 * thick + 1) * tile * resolution
-        raise refused("width", f"{columns} × {rows} tiles are too few: at least {least:g} m along each side are needed")
+        min_side = max(pattern, 2 * thick + 1) * tile * resolution
+        raise refused(
+            "width", f"{columns} × {rows} tiles are too few: at least {min_side:g} m along each side are needed"
+        )
     if thick:
         ring = max(pattern - 1, thick) * tile
         sample = np.pad(sample, ring, constant_values=BORDER)
-        known = np.pad(known, ring, constant_values=True)
-    model = _wfc.learn(sample, tile=tile, pattern=pattern, symmetry=options.symmetry, wrap=options.wrap, known=known)
+        known_cells = np.pad(known_cells, ring, constant_values=True)
+    model = _wfc.learn(
+        sample, tile=tile, pattern=pattern, symmetry=options.symmetry, wrap=options.wrap, valid=known_cells
+    )
     open_ = (model.tiles == FREE).all(axis=(1, 2))
     full = (model.tiles == OCCUPIED).all(axis=(1, 2))
     fixed = np.full((rows, columns), -1, np.int64)
@@ -156,14 +160,14 @@ def wave_function_collapse(given: Layers, options: Options, source: Source, note
         wall = _only((model.tiles == BORDER).all(axis=(1, 2)), "border", "a wall tile")
         fixed[:thick], fixed[-thick:], fixed[:, :thick], fixed[:, -thick:] = wall, wall, wall, wall
     size = resolution * tile
-    for where, mask, what in (("free", open_, "a free tile"), ("blocked", full, "an occupied tile")):
-        for x, y in _points(getattr(options, where), where):
+    for option, mask, label in (("free", open_, "a free tile"), ("blocked", full, "an occupied tile")):
+        for x, y in _points(getattr(options, option), option):
             r, c = int((y - place.y) // size), int((x - place.x) // size)
             if not (0 <= r < rows and 0 <= c < columns):
-                raise refused(where, f"({x:g}, {y:g}) lies outside of the site")
-            number = _only(mask, where, what)
+                raise refused(option, f"({x:g}, {y:g}) lies outside of the site")
+            number = _only(mask, option, label)
             if fixed[r, c] not in (-1, number):
-                raise refused(where, f"({x:g}, {y:g}) lies on a wall, or is to be free and occupied")
+                raise refused(option, f"({x:g}, {y:g}) lies on a wall, or is to be free and occupied")
             fixed[r, c] = number
     tiles = _wfc.collapsed(
         model,
@@ -194,16 +198,16 @@ def _sample(given: Layers, options: Options, notes: Notes) -> tuple[U8, Bool, fl
     """(cells of 0 and 100, which of them are known, metres a cell, what its obstacles are)."""
     grids = {key.name: grid for key, grid in reversed(given.grids().items())}
     if options.sample in SAMPLES and options.sample not in grids:
-        own = SAMPLES[options.sample]
+        sample = SAMPLES[options.sample]
         resolution = options.resolution or RESOLUTION
-        cells = own.cells(resolution)
-        return cells, np.ones(cells.shape, bool), resolution, own.look
+        cells = sample.cells(resolution)
+        return cells, np.ones(cells.shape, bool), resolution, sample.look
     grid = grids.get(options.sample)
     if grid is None:
-        there = ", ".join(sorted(grids)) or "none"
+        grid_names = ", ".join(sorted(grids)) or "none"
         raise refused(
             "sample",
-            f"there is no sample {options.sample[:80]!r}: give one of {', '.join(SAMPLES)}, or a grid ({there})",
+            f"there is no sample {options.sample[:80]!r}: give one of {', '.join(SAMPLES)}, or a grid ({grid_names})",
         )
     resolution = round(grid.resolution, 3)
     if options.resolution is not None and abs(options.resolution - grid.resolution) > 1e-6:
@@ -216,31 +220,31 @@ def _sample(given: Layers, options: Options, notes: Notes) -> tuple[U8, Bool, fl
 def binary(grid: OccupancyGrid) -> tuple[U8, Bool]:
     """A grid's cells as 0 and 100, by its threshold, and which of them are known."""
     grid = as_seen(grid)
-    known = grid.cells != UNKNOWN
-    occupied = known & (grid.cells >= grid.occupied_thresh * OCCUPIED)
-    return np.where(occupied, OCCUPIED, FREE).astype(np.uint8), known
+    known_cells = grid.cells != UNKNOWN
+    occupied = known_cells & (grid.cells >= grid.occupied_thresh * OCCUPIED)
+    return np.where(occupied, OCCUPIED, FREE).astype(np.uint8), known_cells
 
 
-def _whole(cells: U8, known: Bool, tile: int, notes: Notes) -> tuple[U8, Bool]:
+def _whole(cells: U8, known_cells: Bool, tile: int, notes: Notes) -> tuple[U8, Bool]:
     """A sample of whole tiles."""
     rows, columns = (n // tile * tile for n in cells.shape)
     lost = cells.size - rows * columns
     if not rows * columns:
         raise refused("tile", f"the sample of {cells.shape[1]} × {cells.shape[0]} cells is smaller than one tile")
     notes.drop("cells of the sample", lost, f"beyond the last whole tile of {tile} cells")
-    return cells[:rows, :columns], known[:rows, :columns]
+    return cells[:rows, :columns], known_cells[:rows, :columns]
 
 
-def _only(mask: Bool, where: str, what: str) -> int:
-    found = np.flatnonzero(mask)
-    if not len(found):
-        raise refused(where, f"the sample has no {what.split(' ', 1)[1]} of this size: give a smaller tile")
-    return int(found[0])
+def _only(mask: Bool, option: str, label: str) -> int:
+    indices = np.flatnonzero(mask)
+    if not len(indices):
+        raise refused(option, f"the sample has no {label.split(' ', 1)[1]} of this size: give a smaller tile")
+    return int(indices[0])
 
 
-def _points(numbers: tuple[float, ...], where: str) -> list[tuple[float, float]]:
+def _points(numbers: tuple[float, ...], option: str) -> list[tuple[float, float]]:
     if len(numbers) % 2:
         raise CannotGenerate(
-            f"{where}: an even number of coordinates is needed", [Problem("x,y,x,y,… is needed", where=where)]
+            f"{option}: an even number of coordinates is needed", [Problem("x,y,x,y,… is needed", where=option)]
         )
     return list(zip(numbers[::2], numbers[1::2], strict=True))

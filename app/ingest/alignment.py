@@ -56,78 +56,82 @@ class Aligned:
     prepared: Prepared | None
 
 
-def prepare_alignment(database_url: str, blob_dir: str, base: Version, wish: Alignment) -> Aligned:
+def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: Alignment) -> Aligned:
     """In a worker: find where the grid lies, and put it there unless that is only to be told.
 
     Raises NotFound (no such grid), Invalid (parameters), CannotConvert (nothing fits well enough).
     """
     store = open_store(database_url, blob_dir)
-    key = PartKey("occupancy", wish.level, wish.grid)
-    target = PartKey("occupancy", wish.onto_level, wish.name)
+    key = PartKey("occupancy", request.level, request.grid)
+    target = PartKey("occupancy", request.onto_level, request.name)
     entries = {e.key: e for e in base.parts}
     if key not in entries:
         stored = [f"{k.level}/{k.name}" for k in sorted(entries) if k.layer == "occupancy"]
-        name = f"{wish.level}/{wish.grid}"
+        name = f"{request.level}/{request.grid}"
         raise NotFound(
             f"there is no grid {name}{did_you_mean(name, stored)}; stored grids: {', '.join(stored) or 'none'}"
         )
-    if not wish.pairs and wish.layer == "occupancy" and key == target:
+    if not request.pairs and request.layer == "occupancy" and key == target:
         reason = "a grid lies on itself already: name another one, a layer (objects, voxels), or pairs of points"
         raise Invalid(reason, [Problem(reason, where="body.onto")])
-    if wish.layer != "occupancy" and not wish.pairs:
-        wanted = [k for k in entries if k.layer in (wish.layer, "resources", "location")]
+    if request.layer != "occupancy" and not request.pairs:
+        target_keys = [k for k in entries if k.layer in (request.layer, "resources", "location")]
     else:
-        wanted = [] if wish.pairs else [target]
-    loaded = store.load(base, sorted({key, *wanted}))
+        target_keys = [] if request.pairs else [target]
+    loaded = store.load(base, sorted({key, *target_keys}))
     grid = loaded.parts[key]
     assert isinstance(grid, OccupancyGrid)
     notes = Notes()
-    if wish.pairs:
-        fit, told = _by_points(wish, notes)
+    if request.pairs:
+        fit, report = _by_points(request, notes)
     else:
-        known = loaded.parts.get(target) if wish.layer == "occupancy" else _seen(loaded, wish, target, notes)
-        assert isinstance(known, OccupancyGrid)
-        fits = alignment.of_grids(grid, known, angle=wish.angle, reach=wish.reach, near=wish.near)
-        fit, told = fits[0], {"others": [f.as_dict() for f in fits[1:4]]}
+        target_grid = (
+            loaded.parts.get(target) if request.layer == "occupancy" else _seen(loaded, request, target, notes)
+        )
+        assert isinstance(target_grid, OccupancyGrid)
+        fits = alignment.of_grids(grid, target_grid, angle=request.angle, reach=request.reach, near=request.near)
+        fit, report = fits[0], {"others": [f.as_dict() for f in fits[1:4]]}
         if len(fits) > 1 and fits[1].score >= fit.score - 0.05:
             notes.warn("another place fits about as well (see others): the site has a symmetry; give a smaller angle")
     moved = fit.moved(grid)
-    told = {
-        "grid": {"level": wish.level, "name": wish.grid},
+    report = {
+        "grid": {"level": request.level, "name": request.grid},
         **fit.as_dict(),
         "origin": list(moved.origin),
         "before": list(grid.origin),
-        **told,
+        **report,
     }
-    if fit.score < wish.least:
+    if fit.score < request.least:
         reason = (
-            f"the maps do not fit: at the best place {fit.score:.0%} agree within {wish.near:g} m, "
-            f"and {wish.least:.0%} are asked for (least)"
+            f"the maps do not fit: at the best place {fit.score:.0%} agree within {request.near:g} m, "
+            f"and {request.least:.0%} are asked for (least)"
         )
-        if not wish.dry_run:
+        if not request.dry_run:
             raise CannotConvert(f"{reason}; give pairs of points, a larger near, or look at it with dry_run", [])
         notes.warn(reason)
     if any(k.layer in ("topology", "zones", "imagery") or (k.layer == "occupancy" and k != key) for k in entries):
         notes.warn("other layers keep their place: what was drawn on the grid in local metres does not move with it")
-    if wish.dry_run:
-        return Aligned(told, tuple(notes.warnings), None)
+    if request.dry_run:
+        return Aligned(report, tuple(notes.warnings), None)
     old = entries[key].provenance.marked()
-    provenance = replace(old, steps=(*old.steps, {"step": ALIGNED, "parameters": told}))
+    provenance = replace(old, steps=(*old.steps, {"step": ALIGNED, "parameters": report}))
     prepared = store.prepare(base, Changes((Replace(key, moved, provenance),)))
-    return Aligned(told, tuple(notes.warnings), prepared)
+    return Aligned(report, tuple(notes.warnings), prepared)
 
 
-def told_before(version: Version, wish: Alignment) -> dict[str, Any] | None:
+def told_before(version: Version, request: Alignment) -> dict[str, Any] | None:
     """What a version's provenance says of such an alignment, for a request that is sent again."""
     for entry in version.parts:
-        if entry.key == PartKey("occupancy", wish.level, wish.grid):
+        if entry.key == PartKey("occupancy", request.level, request.grid):
             steps = [s for s in entry.provenance.steps if s.get("step") == ALIGNED]
             return dict(steps[-1]["parameters"]) if steps else None
     return None
 
 
-def _by_points(wish: Alignment, notes: Notes) -> tuple[alignment.Fit, dict[str, Any]]:
-    fit, disagreeing, scale = alignment.of_pairs(np.array(wish.pairs, np.float64).reshape(-1, 2, 2), near=wish.near)
+def _by_points(request: Alignment, notes: Notes) -> tuple[alignment.Fit, dict[str, Any]]:
+    fit, disagreeing, scale = alignment.of_pairs(
+        np.array(request.pairs, np.float64).reshape(-1, 2, 2), near=request.near
+    )
     if disagreeing:
         notes.warn(f"{len(disagreeing)} pairs disagree with the others and were not used: {disagreeing[:20]}")
     if abs(scale - 1.0) > 0.02:
@@ -135,18 +139,18 @@ def _by_points(wish: Alignment, notes: Notes) -> tuple[alignment.Fit, dict[str, 
     return fit, {"disagreeing": disagreeing, "scale": round(scale, 6)}
 
 
-def _seen(loaded: Layers, wish: Alignment, target: PartKey, notes: Notes) -> OccupancyGrid:
+def _seen(loaded: Layers, request: Alignment, target: PartKey, notes: Notes) -> OccupancyGrid:
     """The layer as the grid that a derivation makes of it."""
-    step = derive.all_derivations()[WAYS[wish.layer]].step()
-    unknown = wish.values.keys() - derive.takes(step.name)
+    step = derive.all_derivations()[WAYS[request.layer]].step()
+    unknown = request.values.keys() - derive.takes(step.name)
     if unknown:
         accepted = ", ".join(sorted(derive.takes(step.name)))
         reason = f"no such parameter of {step.name}; accepted: {accepted}"
         raise Invalid(reason, [Problem(reason, where=f"body.onto.parameters.{name}") for name in sorted(unknown)])
     bare = Layers({k: p for k, p in loaded.parts.items() if k.layer != "occupancy"}, loaded.datum, loaded.levels)
-    made = derive.run(derive.with_values([step], wish.values), bare, notes)
-    found = made.parts.get(PartKey("occupancy", target.level, MAP))
-    if not isinstance(found, OccupancyGrid):
-        levels = ", ".join(k.level for k in made.grids())
+    derived_layers = derive.run(derive.with_values([step], request.values), bare, notes)
+    grid = derived_layers.parts.get(PartKey("occupancy", target.level, MAP))
+    if not isinstance(grid, OccupancyGrid):
+        levels = ", ".join(k.level for k in derived_layers.grids())
         raise NotFound(f"{step.name} makes no grid of the level {target.level}; it makes: {levels}")
-    return found
+    return grid

@@ -26,74 +26,80 @@ class Wish:
     replace: bool = False
 
 
-def check(wish: Wish) -> None:
+def check(request: Wish) -> None:
     """NotFound for an unknown method (with the known ones), Invalid for a parameter that no derivation has."""
-    known = derive.all_derivations()
-    if wish.method not in known:
-        near = did_you_mean(wish.method, known)
-        raise NotFound(f"there is no derivation {wish.method!r}{near}; known ones: {', '.join(known)}")
-    own = {n: v for n, v in wish.values.items() if n in derive.takes(wish.method)}
-    parameters.parse(known[wish.method].parameters, own, f"parameter of {wish.method}")
-    everything = frozenset().union(*(derive.takes(name) for name in known))
-    for name in wish.values:
+    derivations = derive.all_derivations()
+    if request.method not in derivations:
+        near = did_you_mean(request.method, derivations)
+        raise NotFound(f"there is no derivation {request.method!r}{near}; known ones: {', '.join(derivations)}")
+    method_values = {n: v for n, v in request.values.items() if n in derive.takes(request.method)}
+    parameters.parse(derivations[request.method].parameters, method_values, f"parameter of {request.method}")
+    everything = frozenset().union(*(derive.takes(name) for name in derivations))
+    for name in request.values:
         if name not in everything:
-            accepted = ", ".join(sorted(derive.takes(wish.method))) or "none"
-            near = did_you_mean(name, derive.takes(wish.method))
-            problem = f"no such parameter of {wish.method}{near}; accepted: {accepted}"
+            accepted = ", ".join(sorted(derive.takes(request.method))) or "none"
+            near = did_you_mean(name, derive.takes(request.method))
+            problem = f"no such parameter of {request.method}{near}; accepted: {accepted}"
             raise Invalid(f"{name}: {problem}", [Problem(problem, where=f"parameters.{name}")])
 
 
 def prepare_derivation(
-    database_url: str, blob_dir: str, base: Version, wish: Wish
+    database_url: str, blob_dir: str, base: Version, request: Wish
 ) -> tuple[Prepared, tuple[Problem, ...]]:
     """In a worker: carry out a derivation on a version, with what has to be derived before it.
 
     Raises MissingLayer (with what is needed), CannotDerive, Conflict (a source has told that layer).
     """
     store = open_store(database_url, blob_dir)
-    known = derive.all_derivations()[wish.method]
-    stored = {e.key: e for e in base.parts if e.count > 0 and e.key.layer != known.gives and not _is_drawn(e)}
-    own = {e.key: e for e in base.parts if e.count > 0 and e.key.layer == known.gives}
-    without: frozenset[str] = frozenset({wish.method})
+    derivation = derive.all_derivations()[request.method]
+    stored = {e.key: e for e in base.parts if e.count > 0 and e.key.layer != derivation.gives and not _is_drawn(e)}
+    existing_parts = {e.key: e for e in base.parts if e.count > 0 and e.key.layer == derivation.gives}
+    without: frozenset[str] = frozenset({request.method})
     failed: list[str] = []
     while True:
-        steps = _steps(known, frozenset(k.layer for k in stored), base, without, failed)
+        steps = _steps(derivation, frozenset(k.layer for k in stored), base, without, failed)
         needed = {layer for step in steps for layer in step.reads}
         used = {k: e for k, e in stored.items() if k.layer in needed}
-        used |= {k: e for k, e in own.items() if known.gives in needed or (known.makes and k.name == MAP)}
+        used |= {
+            k: e
+            for k, e in existing_parts.items()
+            if derivation.gives in needed or (derivation.makes and k.name == MAP)
+        }
         # Not only the layers that are needed: a derivation may look at others where they are there (a fence).
         loaded = store.load(base, sorted(used))
         notes = Notes()
         try:
             layers = Layers(loaded.parts, base.datum, base.levels)
-            way = derive.with_values(steps, wish.values)
-            before = derive.run(way[:-1], layers, notes)
-            made = derive.run(way[-1:], before, notes)
+            chain = derive.with_values(steps, request.values)
+            before = derive.run(chain[:-1], layers, notes)
+            derived_layers = derive.run(chain[-1:], before, notes)
             break
         except CannotDerive as error:
-            if error.step == wish.method or not error.step:
+            if error.step == request.method or not error.step:
                 raise
             without |= {error.step}
             failed.append(error.detail)
-    _check_values(wish, way)
-    fresh = {k: p for k, p in made.parts.items() if k.layer == known.gives and before.parts.get(k) is not p}
+    _check_values(request, chain)
+    fresh = {
+        k: p for k, p in derived_layers.parts.items() if k.layer == derivation.gives and before.parts.get(k) is not p
+    }
     fresh = {k: p for k, p in fresh.items() if not is_empty(p)}
     if not fresh:
-        raise CannotDerive(f"{wish.method} made nothing of what is stored", step=wish.method)
-    _check_free(wish, fresh.keys(), own)
+        raise CannotDerive(f"{request.method} made nothing of what is stored", step=request.method)
+    _check_free(request, fresh.keys(), existing_parts)
     provenance = Provenance(
         "derived",
         None,
         tuple(sorted({s for e in used.values() for s in e.provenance.sources})),
         None,
-        tuple(step.as_dict() for step in way),
+        tuple(step.as_dict() for step in chain),
         tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution)),
         (*(input_line(e) for k, e in sorted(used.items())), frame_line(base.datum, base.levels)),
     )
     operations = tuple(Replace(key, part, provenance) for key, part in sorted(fresh.items()))
-    told = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
-    told += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
-    return store.prepare(base, Changes(operations)), (*notes.warnings, *told)
+    warnings = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
+    warnings += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
+    return store.prepare(base, Changes(operations)), (*notes.warnings, *warnings)
 
 
 def _is_drawn(entry: PartEntry) -> bool:
@@ -102,30 +108,36 @@ def _is_drawn(entry: PartEntry) -> bool:
 
 
 def _steps(
-    known: derive.Derivation, available: frozenset[Layer], base: Version, without: frozenset[str], failed: Sequence[str]
+    derivation: derive.Derivation,
+    available: frozenset[Layer],
+    base: Version,
+    without: frozenset[str],
+    failed: Sequence[str],
 ) -> tuple[Step, ...]:
     have: frozenset[Layer] = available if base.datum is None else available | {"location"}
-    before = derive.plan(have, known.needs, without)
+    before = derive.plan(have, derivation.needs, without)
     if before is None:
-        lacking = ", ".join(sorted(known.needs - have))
+        lacking = ", ".join(sorted(derivation.needs - have))
         tried = f"; what is stored does not do: {'; '.join(failed)}" if failed else ""
-        raise MissingLayer(f"{known.name} needs {lacking}, and the environment has none: upload a map that has{tried}")
-    return (*before.steps, known.step())
+        raise MissingLayer(
+            f"{derivation.name} needs {lacking}, and the environment has none: upload a map that has{tried}"
+        )
+    return (*before.steps, derivation.step())
 
 
-def _check_values(wish: Wish, way: Sequence[Step]) -> None:
+def _check_values(request: Wish, chain: Sequence[Step]) -> None:
     """Nothing is silently ignored: a parameter of a step that is not on the way is refused."""
-    taken = frozenset().union(*(derive.takes(step.name) for step in way))
-    for name in wish.values:
+    taken = frozenset().union(*(derive.takes(step.name) for step in chain))
+    for name in request.values:
         if name not in taken:
-            problem = f"no step on the way takes it ({', then '.join(step.name for step in way)})"
+            problem = f"no step on the way takes it ({', then '.join(step.name for step in chain)})"
             raise Invalid(f"{name}: {problem}", [Problem(problem, where=f"parameters.{name}")])
 
 
-def _check_free(wish: Wish, keys: Any, own: Mapping[PartKey, PartEntry]) -> None:
+def _check_free(request: Wish, keys: Any, existing_parts: Mapping[PartKey, PartEntry]) -> None:
     for key in sorted(keys):
-        entry = own.get(key)
-        if entry is None or wish.replace:
+        entry = existing_parts.get(key)
+        if entry is None or request.replace:
             continue
         if entry.provenance.information == "derived" and not entry.provenance.edited:
             continue

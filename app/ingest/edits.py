@@ -105,8 +105,8 @@ def edit_changes(
     if problems:
         raise Invalid("; ".join(p.problem for p in problems), problems)
     session.loosen()
-    wanted = session.changes()
-    return wanted, tuple(moved(base, wanted.datum)) if isinstance(wanted.datum, Datum) else ()
+    change_set = session.changes()
+    return change_set, tuple(moved(base, change_set.datum)) if isinstance(change_set.datum, Datum) else ()
 
 
 class _Session:
@@ -122,14 +122,14 @@ class _Session:
     def apply(self, change: Mapping[str, Any]) -> None:
         """One edit: op put, delete or cells."""
         operation = change.get("op")
-        known = {
+        members_by_operation = {
             "put": {"op", "layer", "level", "name", "feature", "crs"},
             "delete": {"op", "layer", "level", "name", "id"},
             "cells": {"op", "grid", "level", "polygon", "crs", "value"},
         }
-        if operation not in known:
+        if operation not in members_by_operation:
             raise Invalid(f"op must be put, delete or cells, got {operation!r}")
-        extra = set(change) - known[operation]
+        extra = set(change) - members_by_operation[operation]
         if extra:
             raise Invalid(f"{operation} has no member {sorted(extra)[0]!r}")
         {"put": self._put, "delete": self._delete, "cells": self._cells}[operation](change)
@@ -183,8 +183,10 @@ class _Session:
             if key.layer == "objects" and key.name in families:
                 touched[key.level] |= draft.edited()
             elif key.layer == "topology" and draft.stored is not None:
-                where = {i: k for k, i in enumerate(draft.stored.ids)}
-                sources = {draft.stored.properties[where[i]].get("drawn_from") for i in draft.edited() if i in where}
+                positions = {i: k for k, i in enumerate(draft.stored.ids)}
+                sources = {
+                    draft.stored.properties[positions[i]].get("drawn_from") for i in draft.edited() if i in positions
+                }
                 touched[key.level] |= {s for s in sources if isinstance(s, str)}
         for key in sorted(self._keys):
             if key.layer != "topology" or not touched[key.level]:
@@ -195,8 +197,8 @@ class _Session:
                     continue
                 geometry, properties, local = draft.row(item)
                 if properties.get("drawn_from") in touched[key.level]:
-                    kept = {name: value for name, value in properties.items() if name != "drawn_from"}
-                    draft.puts[item] = (geometry, kept, local)
+                    remaining = {name: value for name, value in properties.items() if name != "drawn_from"}
+                    draft.puts[item] = (geometry, remaining, local)
 
     def changes(self) -> Changes:
         """What the store is asked to do."""
@@ -233,11 +235,11 @@ class _Session:
         return self._drafts[key]
 
     def _layer(self, change: Mapping[str, Any]) -> Layer:
-        wanted = change.get("layer")
+        layer_name = change.get("layer")
         for layer in VECTOR_LAYERS:
-            if layer == wanted:
+            if layer == layer_name:
                 return layer
-        raise Invalid(f"layer must be one of {', '.join(sorted(VECTOR_LAYERS))}, got {wanted!r}")
+        raise Invalid(f"layer must be one of {', '.join(sorted(VECTOR_LAYERS))}, got {layer_name!r}")
 
     def _put(self, change: Mapping[str, Any]) -> None:
         layer, feature = self._layer(change), change.get("feature")
@@ -259,11 +261,11 @@ class _Session:
         key = self._key_of(layer, item, change)
         draft = self._draft(key)
         geometry, local = self._geometry(feature, change)
-        what: str = layer
+        kind: str = layer
         if layer == "topology":
             properties = _network_item(item, properties)
-            what = str(properties["kind"])
-            if geometry is None and what == "edge":
+            kind = str(properties["kind"])
+            if geometry is None and kind == "edge":
                 geometry, local = self._straight(draft, properties)
         before = draft.row(item) if draft.holds(item) else None
         if geometry is None:
@@ -271,7 +273,7 @@ class _Session:
         elif before is not None:
             geometry, local = self._as_before(before, geometry, local)
         if before is None or geometry is not before[0]:
-            _check_shape(what, item, geometry)
+            _check_shape(kind, item, geometry)
         draft.deletes.discard(item)
         draft.dragged.discard(item)
         draft.puts[item] = (geometry, dict(properties), local)
@@ -280,12 +282,14 @@ class _Session:
 
     def _take_datum(self, properties: Mapping[str, Any]) -> Mapping[str, Any]:
         """A location's properties without ``datum``, which is the environment's own and not kept twice."""
-        said = properties.get("datum")
-        if said is not None:
+        datum_values = properties.get("datum")
+        if datum_values is not None:
             names = ("latitude", "longitude", "altitude", "heading")
-            if not isinstance(said, Mapping) or not {"latitude", "longitude"} <= set(said) <= set(names):
+            if not isinstance(datum_values, Mapping) or not {"latitude", "longitude"} <= set(datum_values) <= set(
+                names
+            ):
                 raise Invalid('properties.datum must be {"latitude": …, "longitude": …, "altitude"?, "heading"?}')
-            self._datum = Datum(**said)
+            self._datum = Datum(**datum_values)
         return {name: value for name, value in properties.items() if name != "datum"}
 
     def _as_before(self, before: tuple[Any, Properties, bool], geometry: Any, local: bool) -> tuple[Any, bool]:
@@ -310,7 +314,7 @@ class _Session:
             if ends[-1][0].geom_type != "Point" or ends[-1][0].is_empty:
                 raise Invalid(f"{properties[end]!r} is no node with a place: give the edge a geometry, a LineString")
         local = ends[0][2]
-        places = [g if there == local else self._other(g, there) for g, _, there in ends]
+        places = [g if anchor == local else self._other(g, anchor) for g, _, anchor in ends]
         return shapely.LineString([shapely.get_coordinates(p, include_z=p.has_z)[0][:2] for p in places]), local
 
     def _other(self, geometry: Any, local: bool) -> Any:
@@ -364,8 +368,8 @@ class _Session:
         )
         holding = [k for k in fitting if self._draft(k).holds(item)]
         if len(holding) > 1:
-            where = ", ".join(f"level {k.level} name {k.name}" for k in holding)
-            raise Invalid(f"several parts of {layer} hold {item!r}: give 'level' and 'name', one of: {where}")
+            choices = ", ".join(f"level {k.level} name {k.name}" for k in holding)
+            raise Invalid(f"several parts of {layer} hold {item!r}: give 'level' and 'name', one of: {choices}")
         if holding:
             return holding[0]
         usual = PartKey(layer, level or GROUND, name or _USUAL_NAME[layer])
@@ -414,8 +418,8 @@ class _Session:
         cells[mask] = value
         # Once people have drawn in it, a grid tells more than the objects that it was a slice of.
         grid = without_unknown_grey(grid, mask)
-        said = {word: value for word, value in grid.properties.items() if word != "slice"}
-        self._grids[key] = replace(grid, cells=cells, properties=said)
+        properties = {word: value for word, value in grid.properties.items() if word != "slice"}
+        self._grids[key] = replace(grid, cells=cells, properties=properties)
 
     def _grid_key(self, change: Mapping[str, Any]) -> PartKey:
         name, level = change.get("grid"), change.get("level")
@@ -426,9 +430,9 @@ class _Session:
         for key in fitting:
             by_name[key.name].append(key)
         if not fitting:
-            known = sorted(k.name for k in self._keys if k.layer == "occupancy")
-            near = did_you_mean(name or "", known)
-            raise NotFound(f"there is no grid {name!r}{near}; known grids: {', '.join(known) or 'none'}")
+            grid_names = sorted(k.name for k in self._keys if k.layer == "occupancy")
+            near = did_you_mean(name or "", grid_names)
+            raise NotFound(f"there is no grid {name!r}{near}; known grids: {', '.join(grid_names) or 'none'}")
         if len(fitting) == 1:
             return fitting[0]
         if name is None and len(by_name["map"]) == 1:
@@ -485,12 +489,12 @@ def _near(a: Any, b: Any, tolerance: float) -> bool:
     return bool(np.allclose(ours, theirs, rtol=0.0, atol=SAME_METRES, equal_nan=True))
 
 
-def _check_shape(what: str, item: str, geometry: Any) -> None:
+def _check_shape(kind: str, item: str, geometry: Any) -> None:
     """Refuse a node that is no point, an edge that is no line, a fence or zone that is no polygon."""
-    allowed = _SHAPES.get(what)
+    allowed = _SHAPES.get(kind)
     if allowed is None or (geometry.geom_type in allowed and not geometry.is_empty):
         return
-    name = {"location": "fence", "zones": "zone"}.get(what, what)
+    name = {"location": "fence", "zones": "zone"}.get(kind, kind)
     got = "none" if geometry is NO_GEOMETRY else geometry.geom_type
     raise Invalid(f"{name} {item!r} must have a geometry of type {' or '.join(sorted(allowed))}, got {got}")
 

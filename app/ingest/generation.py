@@ -35,29 +35,35 @@ def prepare_generation(
     that part).
     """
     store = open_store(database_url, blob_dir)
-    known, _ = generate.check(order.generator, order.seed, order.values)
-    used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in known.reads}
-    if not known.works_on:
+    generator, _ = generate.check(order.generator, order.seed, order.values)
+    used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in generator.reads}
+    if not generator.works_on:
         used = {k: e for k, e in used.items() if not _made_up(e)}
     loaded = store.load(base, sorted(used))
     given = Layers(loaded.parts, base.datum, base.levels)
     notes = Notes()
-    made = generate.run(order.generator, order.seed, order.values, given, notes)
-    own = {e.key: e for e in base.parts if e.count > 0}
-    _check_free(order, known, made, own)
+    generated_layers = generate.run(order.generator, order.seed, order.values, given, notes)
+    existing_parts = {e.key: e for e in base.parts if e.count > 0}
+    _check_free(order, generator, generated_layers, existing_parts)
     credit = tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution))
-    made_up = made.datum if base.datum is None else None
+    made_up = generated_layers.datum if base.datum is None else None
     how = generate.step(order.generator, order.seed, order.values, {k: e.hash for k, e in used.items()}, made_up)
     sources = tuple(sorted({s for e in used.values() for s in e.provenance.sources}))
     provenance = Provenance("generated", None, sources, None, (how,), credit)
-    operations: list[Operation] = [Replace(key, part, provenance) for key, part in sorted(made.parts.items())]
-    if not known.works_on:
-        operations += [Drop(key) for key in sorted(own) if key not in made.parts and _made_up(own[key])]
-    datum = made.datum if made.datum != base.datum else KEEP
-    levels = made.levels if made.levels != base.levels else KEEP
-    told = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
-    told += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
-    return store.prepare(base, Changes(tuple(operations), datum, levels)), (*notes.warnings, *told)
+    operations: list[Operation] = [
+        Replace(key, part, provenance) for key, part in sorted(generated_layers.parts.items())
+    ]
+    if not generator.works_on:
+        operations += [
+            Drop(key)
+            for key in sorted(existing_parts)
+            if key not in generated_layers.parts and _made_up(existing_parts[key])
+        ]
+    datum = generated_layers.datum if generated_layers.datum != base.datum else KEEP
+    levels = generated_layers.levels if generated_layers.levels != base.levels else KEEP
+    warnings = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
+    warnings += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
+    return store.prepare(base, Changes(tuple(operations), datum, levels)), (*notes.warnings, *warnings)
 
 
 def _made_up(entry: PartEntry) -> bool:
@@ -65,11 +71,13 @@ def _made_up(entry: PartEntry) -> bool:
     return entry.provenance.information == "generated" and not entry.provenance.edited
 
 
-def _check_free(order: Order, known: generate.Generator, made: Layers, own: Mapping[PartKey, PartEntry]) -> None:
+def _check_free(
+    order: Order, generator: generate.Generator, generated_layers: Layers, existing_parts: Mapping[PartKey, PartEntry]
+) -> None:
     """A generator may replace what it was made to work on, and its like's work; the rest only where asked."""
-    for key in sorted(made.parts):
-        entry = own.get(key)
-        if entry is None or order.replace or key.layer in known.works_on or _made_up(entry):
+    for key in sorted(generated_layers.parts):
+        entry = existing_parts.get(key)
+        if entry is None or order.replace or key.layer in generator.works_on or _made_up(entry):
             continue
         edited, kind = entry.provenance.edited, entry.provenance.information
         why = f"was {kind} and then edited" if edited else f"is {kind}"

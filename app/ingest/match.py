@@ -30,20 +30,20 @@ def match_ids(store: Store, base: Version, key: PartKey, new: Features) -> Featu
     stored = store.load(base, [key]).parts.get(key)
     if not isinstance(stored, Features) or not len(stored) or not len(new):
         return new
-    known, present = set(stored.ids), set(new.ids)
-    strange = [k for k, i in enumerate(new.ids) if i not in known and new.properties[k].get("name") != i]
-    gone = [k for k, i in enumerate(stored.ids) if i not in present]
+    stored_ids, present = set(stored.ids), set(new.ids)
+    strange = [k for k, i in enumerate(new.ids) if i not in stored_ids and new.properties[k].get("name") != i]
+    missing = [k for k, i in enumerate(stored.ids) if i not in present]
     renamed: dict[str, str] = {}
     for edges in (False, True):  # edges last, when their nodes are known
         wanting = [k for k in strange if (new.properties[k].get("kind") == "edge") is edges]
-        left = [k for k in gone if (stored.properties[k].get("kind") == "edge") is edges]
+        left = [k for k in missing if (stored.properties[k].get("kind") == "edge") is edges]
         if not wanting or not left:
             continue
         places = _places(stored, left, {})
-        for place, here in _places(new, wanting, renamed).items():
-            there = places.get(place, [])
-            if len(here) == len(there) == 1:
-                renamed[new.ids[here[0]]] = stored.ids[there[0]]
+        for place, new_indices in _places(new, wanting, renamed).items():
+            stored_indices = places.get(place, [])
+            if len(new_indices) == len(stored_indices) == 1:
+                renamed[new.ids[new_indices[0]]] = stored.ids[stored_indices[0]]
     if not renamed:
         return new
     ids = tuple(renamed.get(i, i) for i in new.ids)
@@ -53,11 +53,11 @@ def match_ids(store: Store, base: Version, key: PartKey, new: Features) -> Featu
     return replace(new, ids=ids, properties=properties)
 
 
-def _places(f: Features, where: Sequence[int], renamed: dict[str, str]) -> dict[tuple[Any, ...], list[int]]:
+def _places(f: Features, indices: Sequence[int], renamed: dict[str, str]) -> dict[tuple[Any, ...], list[int]]:
     """The features at each place: anchor, kind, shape and, for an edge, the nodes it joins."""
-    shapes = shapely.to_wkb(f.geometry[np.array(where, np.intp)])
+    shapes = shapely.to_wkb(f.geometry[np.array(indices, np.intp)])
     out: dict[tuple[Any, ...], list[int]] = defaultdict(list)
-    for k, shape in zip(where, shapes, strict=True):
+    for k, shape in zip(indices, shapes, strict=True):
         p = f.properties[k]
         ends = tuple(renamed.get(p[w], p[w]) for w in ("source", "target") if isinstance(p.get(w), str))
         if not f.geometry[k].is_empty:

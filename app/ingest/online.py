@@ -96,9 +96,9 @@ class Provider:
 
     def told(self, chosen: Parameters) -> dict[str, Any]:
         """The step as a version's provenance says it."""
-        said = {p["name"]: getattr(chosen, p["name"]) for p in describe(Parameters)}
-        said |= {"provider": self.host, "kind": self.kind}
-        return {"step": METHOD, "from": ["location"], "to": "imagery", "parameters": said}
+        parameters = {p["name"]: getattr(chosen, p["name"]) for p in describe(Parameters)}
+        parameters |= {"provider": self.host, "kind": self.kind}
+        return {"step": METHOD, "from": ["location"], "to": "imagery", "parameters": parameters}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,10 +145,10 @@ class Sheet:
 # --- the site ---------------------------------------------------------------------------------------------------------
 def check_free(base: Version, chosen: Parameters, *, replace: bool) -> None:
     """Conflict where a source has told a picture of that name."""
-    own = {e.key: e for e in base.parts if e.count > 0}.get(chosen.key)
-    if own is not None and not replace and (own.provenance.information != "derived" or own.provenance.edited):
+    old = {e.key: e for e in base.parts if e.count > 0}.get(chosen.key)
+    if old is not None and not replace and (old.provenance.information != "derived" or old.provenance.edited):
         raise Conflict(
-            f"the picture {chosen.level}/{chosen.picture} is {own.provenance.information}: to put a fetched one in its "
+            f"the picture {chosen.level}/{chosen.picture} is {old.provenance.information}: to put a fetched one in its "
             "place, ask with replace=true, or name another picture"
         )
 
@@ -182,18 +182,18 @@ def sheet(provider: Provider, box: tuple[float, float, float, float], resolution
     stretch = 1.0 / math.cos(math.radians((south + north) / 2))
     zoom, size = 0, resolution * stretch
     if provider.kind != "wms":
-        whole = 2 * HALF / (MAPBOX_TILE if provider.kind == "mapbox" else provider.tile)
-        zoom = min(max(math.ceil(math.log2(whole / size) - 1e-9), 0), provider.max_zoom)
-        size = whole / 2**zoom
+        base_resolution = 2 * HALF / (MAPBOX_TILE if provider.kind == "mapbox" else provider.tile)
+        zoom = min(max(math.ceil(math.log2(base_resolution / size) - 1e-9), 0), provider.max_zoom)
+        size = base_resolution / 2**zoom
     left, right = math.floor((low[0] + HALF) / size), math.ceil((high[0] + HALF) / size)
     top, bottom = math.floor((HALF - high[1]) / size), math.ceil((HALF - low[1]) / size)
     width, height = right - left, bottom - top
     side = provider.tile if provider.kind == "xyz" else BLOCK[provider.kind]
     count = (math.ceil(width / side) + 1) * (math.ceil(height / side) + 1)
     if count > MOST_REQUESTS or width * height > MOST_PIXELS:
-        said = f"{width} × {height} pixels in about {count} requests"
+        cost = f"{width} × {height} pixels in about {count} requests"
         raise Invalid(
-            f"the picture would have {said}; at most {MOST_PIXELS} pixels and {MOST_REQUESTS} requests are made: give "
+            f"the picture would have {cost}; at most {MOST_PIXELS} pixels and {MOST_REQUESTS} requests are made: give "
             "a coarser resolution",
             [Problem("too fine for a site of this size", where="resolution")],
         )
@@ -218,16 +218,22 @@ def _tiles(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator
 
 
 def _maps(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[Block]:  # noqa: ARG001
-    said = dict(parse_qsl(urlsplit(provider.url).query, keep_blank_values=True))
-    upper = {key.upper() for key in said}
+    url_parameters = dict(parse_qsl(urlsplit(provider.url).query, keep_blank_values=True))
+    upper = {key.upper() for key in url_parameters}
     usual = {"SERVICE": "WMS", "VERSION": "1.3.0", "REQUEST": "GetMap", "STYLES": "", "FORMAT": "image/jpeg"}
-    query = {**{key: value for key, value in usual.items() if key not in upper}, **said}
-    old = next((value for key, value in said.items() if key.upper() == "VERSION"), "1.3.0") < "1.3"
+    query = {**{key: value for key, value in usual.items() if key not in upper}, **url_parameters}
+    old = next((value for key, value in url_parameters.items() if key.upper() == "VERSION"), "1.3.0") < "1.3"
     for column, row, w, h in _cut(edges, BLOCK["wms"]):
         x, y = (edges[0] + column) * size - HALF, HALF - (edges[1] + row) * size
         box = ",".join(f"{v:.9f}" for v in (x, y - h * size, x + w * size, y))
-        asked = {**query, "SRS" if old else "CRS": MERCATOR, "BBOX": box, "WIDTH": str(w), "HEIGHT": str(h)}
-        yield Block(column, row, w, h, _with_query(provider.url, asked))
+        request_parameters = {
+            **query,
+            "SRS" if old else "CRS": MERCATOR,
+            "BBOX": box,
+            "WIDTH": str(w),
+            "HEIGHT": str(h),
+        }
+        yield Block(column, row, w, h, _with_query(provider.url, request_parameters))
 
 
 def _statics(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[Block]:
@@ -296,9 +302,9 @@ class Fetcher:
                 raise
 
     def _one(self, client: httpx.Client, block: Block, deadline: float, room: _Room) -> bytes | None:
-        known = self._cached(block)
-        if known is not None:
-            return known
+        cached = self._cached(block)
+        if cached is not None:
+            return cached
         for k in range(self.provider.tries):
             try:
                 data = self._asked(client, block, deadline, room)
@@ -341,11 +347,11 @@ class Fetcher:
         return url.replace("{token}", token)
 
     def _led_to(self, url: str, location: str) -> str:
-        there = urljoin(url, location)
-        old, new = urlsplit(url), urlsplit(there)
+        target = urljoin(url, location)
+        old, new = urlsplit(url), urlsplit(target)
         if (old.scheme, old.netloc) != (new.scheme, new.netloc):
             raise self._wrong("redirects to another host, which is not followed")
-        return there
+        return target
 
     def _body(self, answer: httpx.Response, deadline: float, room: _Room) -> bytes | None:
         status = answer.status_code
@@ -354,8 +360,10 @@ class Fetcher:
         if status in (401, 403):
             raise self._wrong(f"refuses ({status}): check FLEETMAP_IMAGERY_TOKEN and what it allows")
         if status == 429 or status >= 500:
-            said = answer.headers.get("retry-after", "")
-            raise _AgainError(f"answers {status}", float(said) if said.isascii() and said.isdigit() else 0.0)
+            retry_after = answer.headers.get("retry-after", "")
+            raise _AgainError(
+                f"answers {status}", float(retry_after) if retry_after.isascii() and retry_after.isdigit() else 0.0
+            )
         if status != 200:
             raise self._wrong(f"answers {status}")
         kind = answer.headers.get("content-type", "").partition(";")[0].strip().lower()[:80]
@@ -383,8 +391,8 @@ class Fetcher:
         return CannotDerive(f"the imagery provider {self.provider.host} {problem}", step=METHOD)
 
     def _too_large(self) -> CannotDerive:
-        most = self.provider.max_bytes
-        return self._wrong(f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({most}): ask for a coarser resolution")
+        max_bytes = self.provider.max_bytes
+        return self._wrong(f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({max_bytes}): ask for a coarser resolution")
 
     # --- what was fetched before ---
     def _file(self, block: Block) -> Path | None:
@@ -418,8 +426,8 @@ class Fetcher:
 class _Room:
     """Bytes that all answers of a picture together may have."""
 
-    def __init__(self, most: int) -> None:
-        self._left, self._lock = most, threading.Lock()
+    def __init__(self, max_bytes: int) -> None:
+        self._left, self._lock = max_bytes, threading.Lock()
         self.stopped = threading.Event()
 
     def take(self, count: int) -> bool:
@@ -429,15 +437,15 @@ class _Room:
             return self._left >= 0
 
 
-def _trim(folder: Path, most: int) -> None:
-    known = []
+def _trim(folder: Path, max_bytes: int) -> None:
+    entries = []
     for file in folder.iterdir():
         with contextlib.suppress(OSError):
-            said = file.stat()
-            known.append((said.st_mtime_ns, said.st_size, file))
-    total = sum(size for _, size, _ in known)
-    for _, size, file in sorted(known):
-        if total <= most:
+            status = file.stat()
+            entries.append((status.st_mtime_ns, status.st_size, file))
+    total = sum(size for _, size, _ in entries)
+    for _, size, file in sorted(entries):
+        if total <= max_bytes:
             return
         with contextlib.suppress(OSError):
             file.unlink()
@@ -477,25 +485,25 @@ def prepare_picture(
 
 
 def put_together(
-    asked: Sheet, answers: Iterable[bytes | None], attribution: tuple[str, ...], limits: Limits
+    mosaic: Sheet, answers: Iterable[bytes | None], attribution: tuple[str, ...], limits: Limits
 ) -> tuple[Picture, int]:
     """(the picture, how many of its parts the provider does not have). CannotDerive where it has none."""
-    pixels = np.zeros((asked.height, asked.width, 4), np.uint8)
+    pixels = np.zeros((mosaic.height, mosaic.width, 4), np.uint8)
     missing = 0
-    for block, data in zip(asked.blocks, answers, strict=True):
+    for block, data in zip(mosaic.blocks, answers, strict=True):
         if data is None:
             missing += 1
             continue
         shown = _decoded(block, data, limits)
         row, column = max(block.row, 0), max(block.column, 0)
-        end, right = min(block.row + block.height, asked.height), min(block.column + block.width, asked.width)
+        end, right = min(block.row + block.height, mosaic.height), min(block.column + block.width, mosaic.width)
         inner = shown[row - block.row : end - block.row, column - block.column : right - block.column]
         pixels[row:end, column:right] = inner
-    if missing == len(asked.blocks):
+    if missing == len(mosaic.blocks):
         raise CannotDerive("the imagery provider has no picture of this place at this resolution", step=METHOD)
-    said = {"attribution": list(attribution)} if attribution else {}
-    whole = pixels if (pixels[..., 3] < 255).any() else np.ascontiguousarray(pixels[..., :3])
-    return Picture(whole, asked.transform, MERCATOR, said), missing
+    properties = {"attribution": list(attribution)} if attribution else {}
+    image = pixels if (pixels[..., 3] < 255).any() else np.ascontiguousarray(pixels[..., :3])
+    return Picture(image, mosaic.transform, MERCATOR, properties), missing
 
 
 def _decoded(block: Block, data: bytes, limits: Limits) -> NDArray[np.uint8]:

@@ -70,48 +70,52 @@ def prepare_upload(
     store = open_store(database_url, blob_dir)
     uploaded = {name: path.read_bytes() for name, path in paths.items()}
     files = bundle.unpack(uploaded, limits)
-    told = bundle.read(files, hints, Known(base.datum, fence_of(store, base)), limits)
+    upload_bundle = bundle.read(files, hints, Known(base.datum, fence_of(store, base)), limits)
     renamed: dict[str, dict[str, str]] = {}
     # Sorted, so objects come before the topology that was drawn from them.
     operations: list[Operation] = [
-        operation_for(store, base, told, key, mode, files, renamed) for key in sorted(told.parts)
+        operation_for(store, base, upload_bundle, key, mode, files, renamed) for key in sorted(upload_bundle.parts)
     ]
-    operations += _stale_clouds(base, told)
-    warnings = [*told.warnings, *_idle(hints, told)]
-    warnings += far_away(told, told.datum or base.datum)
+    operations += _stale_clouds(base, upload_bundle)
+    warnings = [*upload_bundle.warnings, *_idle(hints, upload_bundle)]
+    warnings += far_away(upload_bundle, upload_bundle.datum or base.datum)
     datum: Any = KEEP
-    if told.datum is not None and told.datum != base.datum:
-        datum = told.datum
-        warnings += moved(base, told.datum)
+    if upload_bundle.datum is not None and upload_bundle.datum != base.datum:
+        datum = upload_bundle.datum
+        warnings += moved(base, upload_bundle.datum)
     levels: Any = KEEP
-    known = join_levels(base.levels, told.levels)
-    listed = {level.name for level in known}
+    joined_levels = join_levels(base.levels, upload_bundle.levels)
+    listed = {level.name for level in joined_levels}
     # A level that only the upload's ``level`` names lies at 0 m until something tells its elevation.
-    known = join_levels(known, [Level(name) for name in sorted({key.level for key in told.parts} - listed)])
-    if known != base.levels:
-        levels = known
+    joined_levels = join_levels(
+        joined_levels, [Level(name) for name in sorted({key.level for key in upload_bundle.parts} - listed)]
+    )
+    if joined_levels != base.levels:
+        levels = joined_levels
     prepared = store.prepare(base, Changes(tuple(operations), datum, levels))
-    notes = [FileNote(name, use.format, use.used) for name, use in told.files.items()]
+    notes = [FileNote(name, use.format, use.used) for name, use in upload_bundle.files.items()]
     notes += [FileNote(name, "zip", True) for name in uploaded.keys() - files.keys()]
     members = {name: files[name] for name in files.keys() - uploaded.keys()}
     return Proposal(prepared, tuple(sorted(notes, key=lambda n: n.name)), tuple(warnings), members)
 
 
-def _stale_clouds(base: Version, told: Bundle) -> list[Drop]:
+def _stale_clouds(base: Version, upload_bundle: Bundle) -> list[Drop]:
     """A voxel map that another file replaces leaves the point cloud behind that it was made of."""
-    held = {entry.key for entry in base.parts}
-    clouds = [PartKey("resources", k.level, cloud_name(k.name)) for k in sorted(told.parts) if k.layer == "voxels"]
-    return [Drop(key) for key in clouds if key in held and key not in told.parts]
+    existing_keys = {entry.key for entry in base.parts}
+    clouds = [
+        PartKey("resources", k.level, cloud_name(k.name)) for k in sorted(upload_bundle.parts) if k.layer == "voxels"
+    ]
+    return [Drop(key) for key in clouds if key in existing_keys and key not in upload_bundle.parts]
 
 
-def _idle(hints: Hints, told: Bundle) -> list[Problem]:
+def _idle(hints: Hints, upload_bundle: Bundle) -> list[Problem]:
     """What the sender said and nothing came of, so that a misunderstanding is noticed."""
     out = []
     drawings = {f.name for f in formats.all_formats().values() if f.drawing}
-    if hints.layer is not None and not any(use.format in drawings for use in told.files.values()):
+    if hints.layer is not None and not any(use.format in drawings for use in upload_bundle.files.values()):
         told_for = ", ".join(sorted(drawings))
         out.append(Problem(f"it is for drawings ({told_for}), and there is none in the upload", where="layer"))
-    if hints.grid is not None and not any(key.layer == "occupancy" for key in told.parts):
+    if hints.grid is not None and not any(key.layer == "occupancy" for key in upload_bundle.parts):
         out.append(Problem("there is no grid in the upload to be called so", where="grid"))
     return out
 
@@ -126,10 +130,10 @@ FAR_METRES = 100_000.0
 _EARTH_RADIUS = 6_371_000.0
 
 
-def far_away(told: Bundle, datum: Datum | None) -> list[Problem]:
+def far_away(upload_bundle: Bundle, datum: Datum | None) -> list[Problem]:
     """Parts whose nearest corner is far from the datum: swapped coordinates, or the wrong environment."""
     out = []
-    for key, part in sorted(told.parts.items()):
+    for key, part in sorted(upload_bundle.parts.items()):
         if not isinstance(part, Features) or not len(part):
             continue
         metres = []
@@ -138,25 +142,28 @@ def far_away(told: Bundle, datum: Datum | None) -> list[Problem]:
             metres.append(float(np.hypot(max(west, 0.0, -east), max(south, 0.0, -north))))
         if datum is not None and not part.local.all():
             metres.append(_metres_to(shapely.total_bounds(part.geometry[~part.local]), datum))
-        known = [m for m in metres if np.isfinite(m)]
-        if known and min(known) > FAR_METRES:
-            where = f"{key.layer} {key.level}/{key.name}"
+        distances = [m for m in metres if np.isfinite(m)]
+        if distances and min(distances) > FAR_METRES:
+            location = f"{key.layer} {key.level}/{key.name}"
             reason = (
-                f"lies about {min(known) / 1000:.0f} km from the datum: is it the right environment, and are no "
+                f"lies about {min(distances) / 1000:.0f} km from the datum: is it the right environment, and are no "
                 "coordinates swapped?"
             )
-            files, _ = told.origin.get(key, ((), ""))
-            out.append(Problem(reason, files[0] if files else None, where=where))
+            files, _ = upload_bundle.origin.get(key, ((), ""))
+            out.append(Problem(reason, files[0] if files else None, where=location))
     return out
 
 
 def _metres_to(box: NDArray[np.float64], datum: Datum) -> float:
     """From a datum to the nearest point of a box in degrees [west, south, east, north], about, on a sphere."""
     west, south, east, north = box
-    here, lat = np.radians(datum.latitude), np.radians(np.clip(datum.latitude, south, north))
+    datum_latitude, lat = np.radians(datum.latitude), np.radians(np.clip(datum.latitude, south, north))
     turn = min(abs((datum.longitude - edge + 180.0) % 360.0 - 180.0) for edge in (west, east))
     turn = 0.0 if west <= datum.longitude <= east else turn
-    half = np.sin((lat - here) / 2) ** 2 + np.cos(here) * np.cos(lat) * np.sin(np.radians(turn) / 2) ** 2
+    half = (
+        np.sin((lat - datum_latitude) / 2) ** 2
+        + np.cos(datum_latitude) * np.cos(lat) * np.sin(np.radians(turn) / 2) ** 2
+    )
     return float(2 * _EARTH_RADIUS * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0))))
 
 
@@ -187,7 +194,7 @@ def fence_of(store: Store, base: Version) -> shapely.Polygon | None:
 def operation_for(
     store: Store,
     base: Version,
-    told: Bundle,
+    upload_bundle: Bundle,
     key: PartKey,
     mode: Mode,
     files: Mapping[str, bytes],
@@ -195,25 +202,25 @@ def operation_for(
 ) -> Replace | Put:
     """What becomes of one part. renamed: by level, objects that took a stored one's id; what was drawn from them
     follows."""
-    part = told.parts[key]
-    names, origin = told.origin[key]
+    part = upload_bundle.parts[key]
+    names, origin = upload_bundle.origin[key]
     digest = hashlib.sha256()
     for name in names:
         digest.update(hashlib.sha256(files[name]).digest())
-    provenance = Provenance("raw", origin, names, digest.hexdigest(), attribution=told.credit(key))
-    held = any(e.key == key for e in base.parts)
+    provenance = Provenance("raw", origin, names, digest.hexdigest(), attribution=upload_bundle.credit(key))
+    is_stored = any(e.key == key for e in base.parts)
     if isinstance(part, Features):
         if key.layer == "topology" and key.level in renamed:
             part = _drawn_from(part, renamed[key.level])
-        if held and key.layer in ("topology", "objects", "zones") and origin not in OWN_IDS:
+        if is_stored and key.layer in ("topology", "objects", "zones") and origin not in OWN_IDS:
             ids = part.ids
             with contextlib.suppress(Damaged):  # then nothing is there to compare with, and the upload's ids stay
                 part = match_ids(store, base, key, part)
             if key.layer == "objects":
                 renamed.setdefault(key.level, {}).update((a, b) for a, b in zip(ids, part.ids, strict=True) if a != b)
         if mode == "merge":
-            return Put(key, _joined(store, base, key, part) if held else part, provenance)
-    elif mode == "merge" and held:
+            return Put(key, _joined(store, base, key, part) if is_stored else part, provenance)
+    elif mode == "merge" and is_stored:
         old = store.load(base, [key]).parts[key]
         if isinstance(part, OccupancyGrid) and isinstance(old, OccupancyGrid):
             part = merge_grids(old, part, key.name)
@@ -235,8 +242,10 @@ def _joined(store: Store, base: Version, key: PartKey, part: Features) -> Featur
     bounds around both, and the drawings of both with their styles, also where two have one name."""
     old = store.load(base, [key]).parts[key]
     assert isinstance(old, Features)
-    for family, said in part.document.items():
-        stored, new = (d.get("documents") if isinstance(d, Mapping) else None for d in (old.document.get(family), said))
+    for family, new_document in part.document.items():
+        stored, new = (
+            d.get("documents") if isinstance(d, Mapping) else None for d in (old.document.get(family), new_document)
+        )
         if isinstance(stored, Mapping) and isinstance(new, Mapping):
             part = _rename_documents(part, family, _free_names(stored, new))
     out = merge_documents(old.document, part.document)
@@ -265,16 +274,16 @@ def _free_names(stored: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
 def _rename_documents(part: Features, family: str, names: Mapping[str, str]) -> Features:
     if not names:
         return part
-    said = part.document[family]
-    documents = {names.get(name, name): value for name, value in said["documents"].items()}
+    source_document = part.document[family]
+    documents = {names.get(name, name): value for name, value in source_document["documents"].items()}
 
     def renamed(properties: Mapping[str, Any]) -> Mapping[str, Any]:
-        own = properties.get(family)
-        if not isinstance(own, Mapping) or own.get("document") not in names:
+        source_properties = properties.get(family)
+        if not isinstance(source_properties, Mapping) or source_properties.get("document") not in names:
             return properties
-        return {**properties, family: {**own, "document": names[own["document"]]}}
+        return {**properties, family: {**source_properties, "document": names[source_properties["document"]]}}
 
-    document = {**part.document, family: {**said, "documents": documents}}
+    document = {**part.document, family: {**source_document, "documents": documents}}
     return replace(part, properties=tuple(renamed(p) for p in part.properties), document=document)
 
 

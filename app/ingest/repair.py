@@ -81,16 +81,16 @@ def repair(
         hit = [blobs[n] for n in lost_blobs] + [chunks[n] for n in lost_chunks]
         if not any(place in finding.versions for finding in hit):
             continue
-        where = f"the uploads of {environment} {number}"
+        origin = f"the uploads of {environment} {number}"
         arguments = (store.database_url, str(store.blob_dir), environment, number, lost_chunks, lost_blobs, limits)
         try:
             rebuilt: Rebuilt = run(read_again, *arguments)
         except FleetMapError:
             continue  # its uploads cannot be read: the finding stays
         for data in rebuilt.blobs.values():
-            healed["blob", store.blobs.put(data)] = where
+            healed["blob", store.blobs.put(data)] = origin
         store.heal_chunks(rebuilt.chunks)
-        healed |= {("chunk", name): where for name in rebuilt.chunks}
+        healed |= {("chunk", name): origin for name in rebuilt.chunks}
     return healed
 
 
@@ -110,46 +110,46 @@ def read_again(
     """
     store = open_store(database_url, blob_dir)
     version, base = store.version_and_base(environment, number)
-    files, found = _uploads(store, version, lost_blobs)
+    files, contents = _uploads(store, version, lost_blobs)
     chunks: dict[str, bytes] = {}
     for hints in _ways(version.parts):
-        if len(chunks) == len(lost_chunks) and len(found) == len(lost_blobs):
+        if len(chunks) == len(lost_chunks) and len(contents) == len(lost_blobs):
             break
         with contextlib.suppress(FleetMapError):
             for draft, blobs in _composed(store, version, base, files, hints, limits):
                 chunks |= {n: draft.stream([bytes.fromhex(n)])[bytes.fromhex(n)] for n in _made(draft, lost_chunks)}
-                found |= {n: data for n, data in blobs.items() if n in lost_blobs}
-    return Rebuilt(chunks, found)
+                contents |= {n: data for n, data in blobs.items() if n in lost_blobs}
+    return Rebuilt(chunks, contents)
 
 
 def _uploads(store: Store, version: Version, lost: Collection[str]) -> tuple[dict[str, bytes], dict[str, bytes]]:
     """The version's uploaded files, unpacked; and the lost ones that its archives have."""
     files: dict[str, bytes] = {}
-    found: dict[str, bytes] = {}
+    contents: dict[str, bytes] = {}
     for source in version.sources:
         with contextlib.suppress(Damaged, NotFound):
             data = store.blobs.get(source.sha256)
             if source.format == "zip":
-                found |= _members(data, {s.sha256: s.size for s in version.sources if s.sha256 in lost})
+                contents |= _members(data, {s.sha256: s.size for s in version.sources if s.sha256 in lost})
             else:
                 files[source.name] = data
     for source in version.sources:
-        if source.sha256 in found:
-            files[source.name] = found[source.sha256]
-    return files, found
+        if source.sha256 in contents:
+            files[source.name] = contents[source.sha256]
+    return files, contents
 
 
-def _members(data: bytes, wanted: Mapping[str, int]) -> dict[str, bytes]:
+def _members(data: bytes, sizes: Mapping[str, int]) -> dict[str, bytes]:
     """The members of an archive that have one of these hashes (hash -> size)."""
     out = {}
     unreadable = (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError, OSError)
     with contextlib.suppress(*unreadable), zipfile.ZipFile(io.BytesIO(data)) as archive:
         for info in archive.infolist():
-            if info.file_size in wanted.values():
+            if info.file_size in sizes.values():
                 with archive.open(info) as member:
                     content = member.read(info.file_size)
                 digest = hashlib.sha256(content).hexdigest()
-                if digest in wanted:
+                if digest in sizes:
                     out[digest] = content
     return out
 
@@ -176,18 +176,18 @@ def _composed(
 ) -> Iterator[tuple[Draft, Mapping[str, bytes]]]:
     """The chunks and blobs of the parts that files are read as, replaced or merged."""
     start = version if base is None else base
-    told = bundle.read(files, hints, Known(start.datum or version.datum, fence_of(store, start)), limits)
+    upload_bundle = bundle.read(files, hints, Known(start.datum or version.datum, fence_of(store, start)), limits)
     entries: Mapping[PartKey, PartEntry] = {} if base is None else {e.key: e for e in base.parts}
     for mode in ("replace", "merge"):
         renamed: dict[str, dict[str, str]] = {}
-        for key in sorted(told.parts):
+        for key in sorted(upload_bundle.parts):
             with contextlib.suppress(FleetMapError):
-                operation = operation_for(store, start, told, key, mode, files, renamed)
+                operation = operation_for(store, start, upload_bundle, key, mode, files, renamed)
                 draft = store.draft()
-                kept = {key: entries[key]} if isinstance(operation, Put) and key in entries else {}
-                made = compose_operation(draft, dict(kept), operation)
-                yield draft, made.blobs if made is not None else {}
+                stored_entries = {key: entries[key]} if isinstance(operation, Put) and key in entries else {}
+                encoded_part = compose_operation(draft, dict(stored_entries), operation)
+                yield draft, encoded_part.blobs if encoded_part is not None else {}
 
 
-def _made(draft: Draft, wanted: Collection[str]) -> list[str]:
-    return [n for n in wanted if bytes.fromhex(n) in draft.new or bytes.fromhex(n) in draft.stored]
+def _made(draft: Draft, hashes: Collection[str]) -> list[str]:
+    return [n for n in hashes if bytes.fromhex(n) in draft.new or bytes.fromhex(n) in draft.stored]

@@ -20,36 +20,39 @@ class TemplateWish:
     clear: bool = False
     dry_run: bool = False
 
-    def checked(self, where: str = "body.formats.{}") -> TemplateWish:
+    def checked(self, location: str = "body.formats.{}") -> TemplateWish:
         """The same with typed values. NotFound for a format, Invalid for a set or values that there are none of.
 
-        where: the place of a format's templates in the request.
+        location: the place of a format's templates in the request.
         """
         if self.set is not None:
             templates.check_set(self.set, "body.set")
         out = {}
-        for name, own in self.formats.items():
-            known, place = templates.check_format(name), where.format(name)
-            if own.set is not None:
-                templates.check_set(own.set, f"{place}.set")
-            out[name] = Own(own.set, templates.check_values(known, own.values, f"{place}.values"))
+        for name, format_template in self.formats.items():
+            fmt, place = templates.check_format(name), location.format(name)
+            if format_template.set is not None:
+                templates.check_set(format_template.set, f"{place}.set")
+            out[name] = Own(format_template.set, templates.check_values(fmt, format_template.values, f"{place}.values"))
         return TemplateWish(self.set, out, self.clear, self.dry_run)
 
     def applied(self, old: Templates) -> Templates:
         """What holds then."""
         new = Templates() if self.clear else old
         new = Templates(self.set or new.set, new.formats)
-        for name, own in self.formats.items():
-            new = templates.with_own(new, name, own)
+        for name, format_template in self.formats.items():
+            new = templates.with_own(new, name, format_template)
         return new
 
     def told(self) -> str:
         """In a few words, for the history."""
-        said = [] if self.set is None else [f"the set {self.set}"]
-        said += [name if own.as_dict() else f"{name} taken back" for name, own in sorted(self.formats.items())]
-        return f"Templates: {', '.join(said) or ('taken back' if self.clear else 'as before')}"
+        parts = [] if self.set is None else [f"the set {self.set}"]
+        parts += [
+            name if format_template.as_dict() else f"{name} taken back"
+            for name, format_template in sorted(self.formats.items())
+        ]
+        return f"Templates: {', '.join(parts) or ('taken back' if self.clear else 'as before')}"
 
     def as_dict(self) -> dict[str, Any]:
         """For a fingerprint of the request."""
-        own = {name: said.as_dict() for name, said in self.formats.items()}
-        return {"set": self.set, "formats": own, "clear": self.clear}
+        format_templates = {name: format_template.as_dict() for name, format_template in self.formats.items()}
+        return {"set": self.set, "formats": format_templates, "clear": self.clear}

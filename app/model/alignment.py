@@ -92,33 +92,33 @@ def of_grids(
     grid shows nothing.
     """
     near = max(near, moving.resolution, onto.resolution)
-    own, theirs = _outline(moving), _outline(onto)
-    for points, which in ((own, "that is moved"), (theirs, "that it is moved onto")):
+    moving_points, onto_points = _outline(moving), _outline(onto)
+    for points, role in ((moving_points, "that is moved"), (onto_points, "that it is moved onto")):
         if len(points) < 3:
-            raise CannotConvert(f"the grid {which} has {len(points)} occupied cells at borders: nothing to align by")
-    middle = own.mean(axis=0)
-    search = _Search(own - middle, theirs, near)
+            raise CannotConvert(f"the grid {role} has {len(points)} occupied cells at borders: nothing to align by")
+    middle = moving_points.mean(axis=0)
+    search = _Search(moving_points - middle, onto_points, near)
     limit = math.inf if reach is None else reach
-    found: list[Fit] = []
+    fits: list[Fit] = []
     from scipy.spatial import cKDTree
 
-    tree, judge = cKDTree(theirs), cKDTree(_all(onto))
+    tree, judge = cKDTree(onto_points), cKDTree(_all(onto))
     every = _some(_all(moving), 20_000)
-    here = _some(own)
+    sample = _some(moving_points)
     for yaw, shift in search.places(angle, limit, middle):
         at = Fit(*_carried(shift, yaw, middle), yaw, 0.0, 0.0)
-        refined = _refined(at, here, tree, 3 * search.cell, near)
-        gone = float(np.linalg.norm(refined.of(middle[None])[0] - middle))
-        if abs(refined.yaw) <= angle + 1e-3 and gone <= limit + near:
-            found.append(_judged(refined, every, judge, onto, near))
-    found = _distinct(sorted(found, key=lambda f: (-f.score, abs(f.yaw))), middle, near)
-    if not found:
+        refined = _refined(at, sample, tree, 3 * search.cell, near)
+        distance = float(np.linalg.norm(refined.of(middle[None])[0] - middle))
+        if abs(refined.yaw) <= angle + 1e-3 and distance <= limit + near:
+            fits.append(_judged(refined, every, judge, onto, near))
+    fits = _distinct(sorted(fits, key=lambda f: (-f.score, abs(f.yaw))), middle, near)
+    if not fits:
         raise CannotConvert("the maps meet nowhere within this angle and reach")
     # Of places that fit as well as the best, the one that moves the map least: sites have symmetries.
-    rivals = [f for f in found if f.score >= found[0].score - _CLOSE]
-    first = min(rivals, key=lambda f: float(np.linalg.norm(f.of(own) - own, axis=1).mean()))
-    polished = _polished(first, _some(own, 2 * POINTS), tree, middle, near)
-    return [_judged(polished, every, judge, onto, near), *(f for f in found if f is not first)]
+    rivals = [f for f in fits if f.score >= fits[0].score - _CLOSE]
+    first = min(rivals, key=lambda f: float(np.linalg.norm(f.of(moving_points) - moving_points, axis=1).mean()))
+    polished = _polished(first, _some(moving_points, 2 * POINTS), tree, middle, near)
+    return [_judged(polished, every, judge, onto, near), *(f for f in fits if f is not first)]
 
 
 def of_pairs(pairs: Array, *, near: float = 0.5) -> tuple[Fit, list[int], float]:
@@ -155,7 +155,7 @@ def _largest(a: Array, b: Array, near: float) -> NDArray[np.bool_]:
     if count > 64:  # RANSAC with a fixed seed: the same answer each time
         chance = np.random.default_rng(0).integers(0, count, (4000, 2))
         seeds = sorted({(min(i, j), max(i, j)) for i, j in chance.tolist() if i != j})
-    best, least = np.zeros(count, bool), math.inf
+    best, best_error = np.zeros(count, bool), math.inf
     for i, j in seeds:
         if np.linalg.norm(a[i] - a[j]) < 1e-6 or np.linalg.norm(b[i] - b[j]) < 1e-6:
             continue
@@ -163,8 +163,8 @@ def _largest(a: Array, b: Array, near: float) -> NDArray[np.bool_]:
         away = np.linalg.norm(a @ _turn(yaw).T + shift - b, axis=1)
         good = away <= near
         error = float(away[good].sum())
-        if (-good.sum(), error) < (-best.sum(), least):
-            best, least = good, error
+        if (-good.sum(), error) < (-best.sum(), best_error):
+            best, best_error = good, error
     if best.sum() < 2:
         reason = f"no two pairs agree within {near:g} m on one motion without a scale"
         raise Invalid(reason, [Problem(reason, where="pairs")])
@@ -177,24 +177,24 @@ def _largest(a: Array, b: Array, near: float) -> NDArray[np.bool_]:
 class _Search:
     """Where points [n, 2] around 0 meet other points [m, 2], coarsely: cells of ``cell`` metres."""
 
-    def __init__(self, own: Array, theirs: Array, near: float) -> None:
+    def __init__(self, points: Array, target_points: Array, near: float) -> None:
         import cv2
 
-        self.radius = float(np.linalg.norm(own, axis=1).max())
-        low, high = theirs.min(axis=0), theirs.max(axis=0)
+        self.radius = float(np.linalg.norm(points, axis=1).max())
+        low, high = target_points.min(axis=0), target_points.max(axis=0)
         self.cell = max(near, float(max((high - low).max(), 2 * self.radius)) / SIDE)
         margin = self.radius + 2 * self.cell
         self.low = low - margin
-        wanted = np.ceil((high - low + 2 * margin) / self.cell).astype(int) + 1
-        self.width, self.height = (cv2.getOptimalDFTSize(int(v)) for v in wanted)
-        there = np.full((self.height, self.width), 255, np.uint8)
-        column, row = ((theirs - self.low) / self.cell).astype(int).T
-        there[row, column] = 0
-        away = cv2.distanceTransform(there, cv2.DIST_L2, 5)
+        min_size = np.ceil((high - low + 2 * margin) / self.cell).astype(int) + 1
+        self.width, self.height = (cv2.getOptimalDFTSize(int(v)) for v in min_size)
+        mask = np.full((self.height, self.width), 255, np.uint8)
+        column, row = ((target_points - self.low) / self.cell).astype(int).T
+        mask[row, column] = 0
+        away = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
         # A cell beside the outline counts half, and one that is two away next to nothing.
         field = np.exp(-0.7 * away.astype(np.float64) ** 2)
         self.field = np.fft.rfft2(field)
-        self.own = own
+        self.own = points
 
     def places(self, angle: float, reach: float, middle: Array) -> list[tuple[float, Array]]:
         """(yaw, where the middle goes) of the best places, apart from each other."""
@@ -202,7 +202,7 @@ class _Search:
         count = math.ceil(min(angle, math.pi) / step)
         turns = np.linspace(-1, 1, 2 * count + 1) * min(angle, math.pi) if count else np.zeros(1)
         allowed = self._allowed(reach, middle)
-        found: list[tuple[float, float, Array]] = []
+        peaks: list[tuple[float, float, Array]] = []
         for yaw in turns.tolist():
             score = self._scores(yaw)
             if allowed is not None:
@@ -212,11 +212,11 @@ class _Search:
                 row, column = divmod(k, self.width)
                 if score[row, column] <= 0:
                     break
-                found.append((float(score[row, column]), yaw, self.low + (np.array([column, row]) + 0.5) * self.cell))
+                peaks.append((float(score[row, column]), yaw, self.low + (np.array([column, row]) + 0.5) * self.cell))
                 score[max(0, row - 3) : row + 4, max(0, column - 3) : column + 4] = 0.0
-        found.sort(key=lambda f: (-f[0], abs(f[1]), f[1]))
+        peaks.sort(key=lambda f: (-f[0], abs(f[1]), f[1]))
         out: list[tuple[float, Array]] = []
-        for _, yaw, at in found:
+        for _, yaw, at in peaks:
             twins = (abs(_angle(yaw - y)) < 2.5 * step and np.linalg.norm(at - a) < 4 * self.cell for y, a in out)
             if not any(twins):
                 out.append((yaw, at))
@@ -242,12 +242,12 @@ class _Search:
 # --- refinement ------------------------------------------------------------------------------------------------------
 
 
-def _refined(start: Fit, own: Array, tree: Any, wide: float, near: float) -> Fit:
+def _refined(start: Fit, points: Array, tree: Any, wide: float, near: float) -> Fit:
     """Closest points, from a wide search to a narrow one."""
     yaw, shift = start.yaw, np.array([start.x, start.y])
     for reach in (wide, wide / 2, 2 * near, near):
         for _ in range(25):
-            placed = own @ _turn(yaw).T + shift
+            placed = points @ _turn(yaw).T + shift
             away, index = tree.query(placed, distance_upper_bound=max(reach, near))
             good = np.isfinite(away)
             if good.sum() < 3:
@@ -259,31 +259,31 @@ def _refined(start: Fit, own: Array, tree: Any, wide: float, near: float) -> Fit
     return Fit(float(shift[0]), float(shift[1]), _angle(yaw), 0.0, 0.0)
 
 
-def _polished(fit: Fit, own: Array, tree: Any, middle: Array, near: float) -> Fit:
+def _polished(fit: Fit, points: Array, tree: Any, middle: Array, near: float) -> Fit:
     """The least distances both ways, cut off at ``near``: closest points rest a little before them, where round things
     may turn or where cells lie on cells. By Nelder and Mead's simplex, from a few turns around the fit."""
     from scipy.optimize import minimize
     from scipy.spatial import cKDTree
 
     theirs = _some(np.asarray(tree.data), 2 * POINTS)
-    centred = own - middle
-    known = cKDTree(centred)
+    centred = points - middle
+    moving_tree = cKDTree(centred)
     size = float(np.sqrt((centred**2).sum(axis=1).mean()))  # a turn in metres, as far as it moves a usual point
 
     def cost(v: Array) -> float:
         turn, at = _turn(float(v[0]) / size), v[1:]
         away, _ = tree.query(centred @ turn.T + at, distance_upper_bound=near)
-        back, _ = known.query((theirs - at) @ turn, distance_upper_bound=near)
+        back, _ = moving_tree.query((theirs - at) @ turn, distance_upper_bound=near)
         return float((np.minimum(away, near) ** 2).mean() + (np.minimum(back, near) ** 2).mean())
 
-    def least(start: Array, step: float, tries: int) -> Any:
+    def minimise(start: Array, step: float, tries: int) -> Any:
         simplex = start + step * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
         options = {"initial_simplex": simplex, "maxfev": tries, "xatol": near / 200, "fatol": 0.0}
         return minimize(cost, start, method="Nelder-Mead", options=options)
 
     start = np.array([fit.yaw * size, *fit.of(middle[None])[0]])
-    tried = [least(start + np.array([k * near / 2, 0.0, 0.0]), near / 2, 30) for k in (0, 1, -1, 2, -2, 3, -3)]
-    best = least(min(tried, key=lambda found: float(found.fun)).x, near / 8, 100).x
+    tried = [minimise(start + np.array([k * near / 2, 0.0, 0.0]), near / 2, 30) for k in (0, 1, -1, 2, -2, 3, -3)]
+    best = minimise(min(tried, key=lambda result: float(result.fun)).x, near / 8, 100).x
     yaw = _angle(float(best[0]) / size)
     return Fit(*_carried(best[1:], yaw, middle), yaw, 0.0, 0.0)
 
@@ -306,9 +306,10 @@ def _judged(fit: Fit, every: Array, judge: Any, onto: OccupancyGrid, near: float
 def _distinct(fits: list[Fit], middle: Array, near: float) -> list[Fit]:
     out: list[Fit] = []
     for fit in fits:
-        here = fit.of(middle[None])[0]
+        moved_middle = fit.of(middle[None])[0]
         if fit.score > 0 and not any(
-            abs(_angle(fit.yaw - o.yaw)) < 0.05 and np.linalg.norm(here - o.of(middle[None])[0]) < 4 * near for o in out
+            abs(_angle(fit.yaw - o.yaw)) < 0.05 and np.linalg.norm(moved_middle - o.of(middle[None])[0]) < 4 * near
+            for o in out
         ):
             out.append(fit)
     return out
@@ -338,9 +339,9 @@ def _carried(at: Array, yaw: float, middle: Array) -> tuple[float, float]:
     return x, y
 
 
-def _some(points: Array, most: int = POINTS) -> Array:
+def _some(points: Array, limit: int = POINTS) -> Array:
     """At most so many of the points, evenly taken."""
-    return points if len(points) <= most else points[np.linspace(0, len(points) - 1, most).astype(int)]
+    return points if len(points) <= limit else points[np.linspace(0, len(points) - 1, limit).astype(int)]
 
 
 def _all(grid: OccupancyGrid) -> Array:

@@ -91,8 +91,8 @@ def _is_edge(properties: Properties) -> bool:
 
 def is_identified(properties: Properties, name: str | None) -> bool:
     """Whether the edge has an id in this format's file."""
-    known = properties.get(name) if name is not None else None
-    return isinstance(known, Mapping) and known.get("id") is not None
+    identity = properties.get(name) if name is not None else None
+    return isinstance(identity, Mapping) and identity.get("id") is not None
 
 
 @dataclass(slots=True)
@@ -118,22 +118,24 @@ def _split_part(part: Features, places: NDArray[np.intp], frame: LocalFrame | No
     lines: dict[tuple[str, str], dict[bytes, _Course]] = defaultdict(dict)
     for course in courses:
         lines[course.ends].setdefault(course.key, course)
-    wanted: list[str] = []
+    name_candidates: list[str] = []
     columns = _Columns()
     first: dict[tuple[tuple[str, str], bytes], int] = {}
-    for ends, found in lines.items():
-        for key, course in found.items():
+    for ends, course_by_key in lines.items():
+        for key, course in course_by_key.items():
             base = f"{ends[0]}~{ends[1]}"
-            if len(found) > 1:  # parallel edges: each line has a name of its own, whatever their order
+            if len(course_by_key) > 1:  # parallel edges: each line has a name of its own, whatever their order
                 base += f"~{hashlib.sha256(key).hexdigest()[:6]}"
-            first[ends, key] = len(wanted)
+            first[ends, key] = len(name_candidates)
             inner = course.at[1:-1]
-            wanted += [_numbered(base, n + 1) for n in range(len(inner))]
+            name_candidates += [_numbered(base, n + 1) for n in range(len(inner))]
             columns.geometry += list(shapely.points(inner))
             columns.local += [bool(part.local[course.place])] * len(inner)
-    names = unique_ids(wanted, set(part.ids))
-    known = [p for found in lines.values() for course in found.values() for p in _known_nodes(part, course)]
-    columns.properties += [{"name": name, **p, "kind": "node"} for name, p in zip(names, known, strict=True)]
+    names = unique_ids(name_candidates, set(part.ids))
+    node_properties = [
+        p for course_by_key in lines.values() for course in course_by_key.values() for p in _known_nodes(part, course)
+    ]
+    columns.properties += [{"name": name, **p, "kind": "node"} for name, p in zip(names, node_properties, strict=True)]
     pieces: list[str] = []
     for course in courses:
         begin = first[course.ends, course.key]
@@ -141,9 +143,9 @@ def _split_part(part: Features, places: NDArray[np.intp], frame: LocalFrame | No
         p = part.properties[course.place]
         pieces += [_numbered(part.ids[course.place], n + 1) for n in range(len(between) + 1)]
         columns.add_pieces(course, between, without_identity(p), local=bool(part.local[course.place]))
-    kept = np.ones(len(part), bool)
-    kept[[course.place for course in courses]] = False
-    rest = part.take(kept)
+    mask = np.ones(len(part), bool)
+    mask[[course.place for course in courses]] = False
+    rest = part.take(mask)
     columns.ids = [*names, *unique_ids(pieces, {*rest.ids, *names})]
     return columns.after(rest), Split(len(courses), len(names))
 
@@ -151,9 +153,13 @@ def _split_part(part: Features, places: NDArray[np.intp], frame: LocalFrame | No
 def _known_nodes(part: Features, course: _Course) -> list[Properties]:
     """What a file that was read said of the nodes at an edge's bends."""
     count = len(course.at) - 2
-    known = part.properties[course.place].get(BENDS)
-    if isinstance(known, list) and len(known) == count and all(isinstance(p, Mapping) for p in known):
-        return known
+    node_properties = part.properties[course.place].get(BENDS)
+    if (
+        isinstance(node_properties, list)
+        and len(node_properties) == count
+        and all(isinstance(p, Mapping) for p in node_properties)
+    ):
+        return node_properties
     return [{}] * count
 
 
@@ -200,9 +206,9 @@ def _courses(part: Features, places: NDArray[np.intp], frame: LocalFrame | None)
             if node is None or node[2] != part.local[k]:
                 continue
             if np.hypot(*(node[1] - metres[end])) > TOLERANCE_METRES:  # the node is where the edge begins, or ends
-                where = len(at) if end else 0
-                at = np.insert(at, where, node[0][: at.shape[1]], axis=0)
-                metres = np.insert(metres, where, node[1], axis=0)
+                index = len(at) if end else 0
+                at = np.insert(at, index, node[0][: at.shape[1]], axis=0)
+                metres = np.insert(metres, index, node[1], axis=0)
         ends = (p["source"], p["target"])
         backward = ends[0] > ends[1] or (ends[0] == ends[1] and metres.tolist() > metres[::-1].tolist())
         if backward:
@@ -226,13 +232,13 @@ def _node_positions(
 def _bends(metres: NDArray[np.float64]) -> NDArray[np.intp]:
     """Places of a line's ends and of the vertices that a line within the tolerance needs."""
     line = shapely.simplify(shapely.linestrings(metres), TOLERANCE_METRES, preserve_topology=False)
-    wanted = shapely.get_coordinates(line)
-    if len(wanted) < 2:
+    vertices = shapely.get_coordinates(line)
+    if len(vertices) < 2:
         return np.array([0, len(metres) - 1], np.intp)
-    found = [0]
-    for vertex in wanted[1:-1]:
-        found.append(found[-1] + 1 + int((metres[found[-1] + 1 :] == vertex).all(axis=1).argmax()))
-    return np.array([*found, len(metres) - 1], np.intp)
+    indices = [0]
+    for vertex in vertices[1:-1]:
+        indices.append(indices[-1] + 1 + int((metres[indices[-1] + 1 :] == vertex).all(axis=1).argmax()))
+    return np.array([*indices, len(metres) - 1], np.intp)
 
 
 def without_identity(properties: Properties) -> dict[str, Any]:
@@ -265,9 +271,9 @@ def join(layers: Layers) -> Layers:
 def _join_part(part: Features) -> Features:
     chains: dict[str, dict[int, int]] = defaultdict(dict)
     for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
-        found = _bend_of(i, p) if p.get("kind") == "node" else None
-        if found is not None:
-            chains[found[0]][found[1]] = k
+        bend = _bend_of(i, p) if p.get("kind") == "node" else None
+        if bend is not None:
+            chains[bend[0]][bend[1]] = k
     if not chains:
         return part
     network = _Network(part)
@@ -280,9 +286,9 @@ def _join_part(part: Features) -> Features:
 def _bend_of(i: str, p: Properties) -> tuple[str, int] | None:
     """The base and the number in a bend's name; None for other nodes."""
     for name in (i, p.get("name")):
-        found = NAMED.match(name) if isinstance(name, str) and "~" in name else None
-        if found is not None and "~" in found[1]:
-            return found[1], int(found[2])
+        match = NAMED.match(name) if isinstance(name, str) and "~" in name else None
+        if match is not None and "~" in match[1]:
+            return match[1], int(match[2])
     return None
 
 
@@ -312,28 +318,30 @@ class _Network:
         if chain is None or len(pairs) < len(near):
             return
         runs = []
-        for way in [chain] if chain == chain[::-1] else [chain, chain[::-1]]:
-            steps = [step for step in pairwise(way) if step in pairs]
-            if steps and len(steps) < len(way) - 1:
+        for path in [chain] if chain == chain[::-1] else [chain, chain[::-1]]:
+            steps = [step for step in pairwise(path) if step in pairs]
+            if steps and len(steps) < len(path) - 1:
                 return
             if steps:
-                runs.append((way, [pairs[step] for step in steps]))
+                runs.append((path, [pairs[step] for step in steps]))
         if sum(len(run) for _, run in runs) < len(near) or not all(self._alike(run) for _, run in runs):
             return
         if any(part.local[k] != part.local[bends[0]] for _, run in runs for k in run):
             return
         self.gone |= {*bends, *near}
-        known = [{w: v for w, v in part.properties[k].items() if v and (w, v) != ("name", part.ids[k])} for k in bends]
-        for p in known:
+        bend_properties = [
+            {w: v for w, v in part.properties[k].items() if v and (w, v) != ("name", part.ids[k])} for k in bends
+        ]
+        for p in bend_properties:
             del p["kind"]
-        for way, run in runs:
-            self._add(way, run, {BENDS: known} if any(known) else {})
+        for path, run in runs:
+            self._add(path, run, {BENDS: bend_properties} if any(bend_properties) else {})
 
     def _chain(self, base: str, ids: Sequence[str], pairs: Mapping[tuple[str, str], int]) -> list[str] | None:
         """The nodes from one end over the bends to the other end; None where these are not the ends."""
         inner = set(ids)
         firsts, lasts = (
-            {other for a, b in pairs for here, other in ((a, b), (b, a)) if here == end} - inner
+            {other for a, b in pairs for node, other in ((a, b), (b, a)) if node == end} - inner
             for end in (ids[0], ids[-1])
         )
         for first in sorted(firsts):
@@ -352,19 +360,19 @@ class _Network:
     def _alike(self, run: Sequence[int]) -> bool:
         """Whether the pieces differ only in their ends: else somebody has edited them one by one."""
         ends = {"source", "target"}
-        kept = [without_identity(self.part.properties[k]) for k in run]
-        first, *others = ({name: v for name, v in p.items() if name not in ends} for p in kept)
+        run_properties = [without_identity(self.part.properties[k]) for k in run]
+        first, *others = ({name: v for name, v in p.items() if name not in ends} for p in run_properties)
         return all(other == first for other in others)
 
-    def _add(self, way: Sequence[str], run: Sequence[int], known: Properties) -> None:
+    def _add(self, path: Sequence[str], run: Sequence[int], extra_properties: Properties) -> None:
         part = self.part
         numbers = [NAMED.match(part.ids[k]) for k in run]
         names = {m[1] for n, m in enumerate(numbers) if m is not None and int(m[2]) == n + 1}
-        i = next(iter(names)) if len(names) == 1 and None not in numbers else f"{way[0]}_{way[-1]}"
+        i = next(iter(names)) if len(names) == 1 and None not in numbers else f"{path[0]}_{path[-1]}"
         steps = [shapely.get_coordinates(part.geometry[k], include_z=True) for k in run]
         at = np.concatenate([steps[0][:1], *(step[-1:] for step in steps)])
         line = shapely.linestrings(at[:, :2] if np.isnan(at[:, 2]).any() else at)
-        p = {**without_identity(part.properties[run[0]]), "source": way[0], "target": way[-1], **known}
+        p = {**without_identity(part.properties[run[0]]), "source": path[0], "target": path[-1], **extra_properties}
         self.whole.ids.append(i)
         self.whole.geometry.append(line)
         self.whole.properties.append(p)

@@ -112,13 +112,13 @@ class Features:
 
     def take(self, index: NDArray[np.bool_] | NDArray[np.intp] | Sequence[int]) -> Features:
         """The features at these places (a boolean mask or indexes), with the same document."""
-        where = np.asarray(index)
-        where = np.flatnonzero(where) if where.dtype == bool else where.astype(np.intp)
+        indices = np.asarray(index)
+        indices = np.flatnonzero(indices) if indices.dtype == bool else indices.astype(np.intp)
         return Features(
-            tuple(self.ids[k] for k in where),
-            self.geometry[where],
-            tuple(self.properties[k] for k in where),
-            self.local[where],
+            tuple(self.ids[k] for k in indices),
+            self.geometry[indices],
+            tuple(self.properties[k] for k in indices),
+            self.local[indices],
             self.document,
         )
 
@@ -214,9 +214,9 @@ def merge_documents(a: Properties, b: Properties) -> dict[str, Any]:
     """
     out = dict(a)
     for key, value in b.items():
-        known = out.get(key)
-        nested = isinstance(known, Mapping) and isinstance(value, Mapping)
-        out[key] = merge_documents(known, value) if nested and known is not None else value
+        old_value = out.get(key)
+        nested = isinstance(old_value, Mapping) and isinstance(value, Mapping)
+        out[key] = merge_documents(old_value, value) if nested and old_value is not None else value
     return out
 
 

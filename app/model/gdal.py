@@ -60,14 +60,14 @@ PIECE = 2**24
 def taken(buffer: memoryview) -> bytes:
     """The content of a file that GDAL has made in memory and nobody reads again: its pages are given back to the system
     as they are copied, so that a large one is not in memory twice. The buffer holds nothing after that."""
-    whole = np.frombuffer(buffer, np.uint8)
+    content = np.frombuffer(buffer, np.uint8)
     free = _free()
-    page, start = mmap.PAGESIZE, whole.__array_interface__["data"][0]
+    page, start = mmap.PAGESIZE, content.__array_interface__["data"][0]
     out = io.BytesIO()
-    for k in range(0, len(whole), PIECE):
-        out.write(whole[k : k + PIECE].data)
-        low, high = -(-(start + k) // page) * page, (start + min(k + PIECE, len(whole))) // page * page
-        if free is not None and k + PIECE <= len(whole):
+    for k in range(0, len(content), PIECE):
+        out.write(content[k : k + PIECE].data)
+        low, high = -(-(start + k) // page) * page, (start + min(k + PIECE, len(content))) // page * page
+        if free is not None and k + PIECE <= len(content):
             free(low, high - low)
     return out.getvalue()
 

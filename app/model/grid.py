@@ -105,12 +105,12 @@ def packed_cells(chosen: NDArray[np.bool_]) -> dict[str, Any]:
 
 def unknown_grey(grid: OccupancyGrid) -> NDArray[np.bool_] | None:
     """The free cells of a grid that have the grey of unknown ones; None where there are none."""
-    known = grid.properties.get(UNKNOWN_GREY)
-    if not isinstance(known, Mapping) or [known.get("height"), known.get("width")] != [grid.height, grid.width]:
+    record = grid.properties.get(UNKNOWN_GREY)
+    if not isinstance(record, Mapping) or [record.get("height"), record.get("width")] != [grid.height, grid.width]:
         return None
     size = (grid.cells.size + 7) // 8
     try:
-        bits = zlib.decompressobj().decompress(base64.b64decode(str(known.get("bits"))), size)
+        bits = zlib.decompressobj().decompress(base64.b64decode(str(record.get("bits"))), size)
     except (ValueError, zlib.error):
         return None
     if len(bits) != size:

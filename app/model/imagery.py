@@ -66,24 +66,24 @@ class Picture:
     def colours(self) -> tuple[str, ...]:
         """What each band is."""
         count = int(self.pixels.shape[2])
-        said = self.properties.get("bands")
-        if isinstance(said, list | tuple) and len(said) == count and all(isinstance(b, Mapping) for b in said):
-            return tuple(str(b.get("colour", "undefined")) for b in said)
+        bands = self.properties.get("bands")
+        if isinstance(bands, list | tuple) and len(bands) == count and all(isinstance(b, Mapping) for b in bands):
+            return tuple(str(b.get("colour", "undefined")) for b in bands)
         return USUAL_COLOURS.get(count, ("gray",) + ("undefined",) * (count - 1))
 
     @property
     def nodata(self) -> float | int | None:
         """The value of pixels that hold nothing; None where there is no such value."""
-        said = self.properties.get("nodata")
-        if isinstance(said, str):
-            return float(said) if said in ("nan", "inf", "-inf") else None
-        return said if isinstance(said, int | float) and not isinstance(said, bool) else None
+        value = self.properties.get("nodata")
+        if isinstance(value, str):
+            return float(value) if value in ("nan", "inf", "-inf") else None
+        return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
     @property
     def attribution(self) -> tuple[str, ...]:
         """Licences and credits of the picture."""
-        said = self.properties.get("attribution")
-        return tuple(text for text in said if isinstance(text, str)) if isinstance(said, list | tuple) else ()
+        texts = self.properties.get("attribution")
+        return tuple(text for text in texts if isinstance(text, str)) if isinstance(texts, list | tuple) else ()
 
     def outline(self, steps: int = 1) -> NDArray[np.float64]:
         """Points (x, y) along the border, from the upper left corner on clockwise: float64 [4 · steps, 2]."""
@@ -129,20 +129,20 @@ def displayed(picture: Picture) -> NDArray[np.uint8]:
     for y in range(0, height, rows):
         block = pixels[y : y + rows]
         values = block[..., shown]
-        known = _known(values, nodata)
+        valid = _known(values, nodata)
         if table is not None:
             index = np.clip(values[..., 0], 0, 255).astype(np.uint8)
             out[y : y + rows] = table[index]
-            out[y : y + rows, :, 3][~known] = 0
+            out[y : y + rows, :, 3][~valid] = 0
         elif pixels.dtype == np.uint8:
             out[y : y + rows, :, : len(shown)] = values
         else:
             # Halved, since the distance of two float64 may be beyond float64.
-            scaled = np.where(known[..., None], values, low).astype(np.float64) / 2 - low / 2
+            scaled = np.where(valid[..., None], values, low).astype(np.float64) / 2 - low / 2
             scaled = scaled / (high / 2 - low / 2) * 255.0
             out[y : y + rows, :, : len(shown)] = np.clip(np.round(scaled), 0, 255)
         if holes:
-            opaque = np.where(known, 255, 0).astype(np.uint8)
+            opaque = np.where(valid, 255, 0).astype(np.uint8)
             if clear is not None:
                 opaque = np.minimum(opaque, _opacity(block[..., clear], colours[clear]))
             last = out[y : y + rows, :, -1]
@@ -152,10 +152,10 @@ def displayed(picture: Picture) -> NDArray[np.uint8]:
 
 def _known(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.bool_]:
     """Which pixels hold something: [rows, columns] of values [rows, columns, bands]."""
-    known = np.isfinite(values).all(axis=-1) if values.dtype.kind == "f" else np.ones(values.shape[:-1], bool)
+    valid = np.isfinite(values).all(axis=-1) if values.dtype.kind == "f" else np.ones(values.shape[:-1], bool)
     if nodata is not None and math.isfinite(nodata):
-        known &= ~(values == nodata).all(axis=-1)
-    return known
+        valid &= ~(values == nodata).all(axis=-1)
+    return valid
 
 
 def _range(picture: Picture, shown: list[int], rows: int) -> tuple[float, float]:
@@ -176,18 +176,18 @@ def _opacity(values: NDArray[Any], colour: str) -> NDArray[np.uint8]:
         return np.where(values != 0, 255, 0).astype(np.uint8)
     if values.dtype == np.uint8:
         return values
-    most = float(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else 1.0
-    shares = np.clip(np.nan_to_num(values.astype(np.float64) / most, nan=0.0), 0.0, 1.0)  # no number is no picture
+    maximum = float(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else 1.0
+    shares = np.clip(np.nan_to_num(values.astype(np.float64) / maximum, nan=0.0), 0.0, 1.0)  # no number is no picture
     return np.round(shares * 255.0).astype(np.uint8)
 
 
 def _palette(picture: Picture) -> NDArray[np.uint8] | None:
     """RGBA [256, 4] of the values, where the picture has a palette of that size."""
-    said = picture.properties.get("palette")
-    if "palette" not in picture.colours or not isinstance(said, list | tuple) or picture.pixels.dtype != np.uint8:
+    palette = picture.properties.get("palette")
+    if "palette" not in picture.colours or not isinstance(palette, list | tuple) or picture.pixels.dtype != np.uint8:
         return None
     table = np.zeros((256, 4), np.uint8)
     table[:, 3] = 255
-    entries = np.array(said[:256], np.uint8).reshape(-1, 4)
+    entries = np.array(palette[:256], np.uint8).reshape(-1, 4)
     table[: len(entries)] = entries
     return table

@@ -75,9 +75,9 @@ class PartKey:
     def __post_init__(self) -> None:
         if self.layer not in LAYERS:
             raise Invalid(f"no layer is called {self.layer!r}; there are {', '.join(LAYERS)}")
-        for what, text in (("level", self.level), ("name", self.name)):
+        for label, text in (("level", self.level), ("name", self.name)):
             if not text or len(text) > 256 or not is_writable(text):
-                raise Invalid(f"a {what} must have 1 to 256 characters and no control characters, got {text[:80]!r}")
+                raise Invalid(f"a {label} must have 1 to 256 characters and no control characters, got {text[:80]!r}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +132,7 @@ class Layers:
 
     def elevation(self, level: str) -> float:
         """Metres of a level's floor above the local origin; 0 where it is not stated."""
-        return next((known.elevation for known in self.levels if known.name == level), 0.0)
+        return next((candidate.elevation for candidate in self.levels if candidate.name == level), 0.0)
 
 
 def is_empty(part: Part) -> bool:
@@ -142,7 +142,7 @@ def is_empty(part: Part) -> bool:
     return isinstance(part, Resources) and not part.files
 
 
-def join_levels(known: Iterable[Level], new: Iterable[Level]) -> tuple[Level, ...]:
+def join_levels(old: Iterable[Level], new: Iterable[Level]) -> tuple[Level, ...]:
     """Levels of both, the new elevations win, sorted by elevation and name."""
-    levels = {level.name: level for level in known} | {level.name: level for level in new}
+    levels = {level.name: level for level in old} | {level.name: level for level in new}
     return tuple(sorted(levels.values(), key=lambda level: (level.elevation, level.name)))

@@ -45,15 +45,15 @@ def params(name: str, info: Info) -> dict[str, Any]:
     """The parameter file of a mask that has none: of its filter info server and its map server. name: of the grid."""
     word = re.sub(r"[^A-Za-z0-9_]", "_", name)
     topic = f"/{word}_filter_mask"
-    told = {**info.as_dict(), "filter_info_topic": f"/{word}_costmap_filter_info", "mask_topic": topic}
+    filter_parameters = {**info.as_dict(), "filter_info_topic": f"/{word}_costmap_filter_info", "mask_topic": topic}
     server = {"frame_id": "map", "topic_name": topic, "yaml_filename": f"{name}.yaml"}
-    return {NODE: {PARAMETERS: told}, "filter_mask_server": {PARAMETERS: server}}
+    return {NODE: {PARAMETERS: filter_parameters}, "filter_mask_server": {PARAMETERS: server}}
 
 
 def is_filter_info(name: str, node: Any) -> bool:
     """Whether this entry of a parameter file is a filter info server's."""
-    said = node.get(PARAMETERS) if isinstance(node, Mapping) else None
-    return isinstance(said, Mapping) and ("mask_topic" in said or NODE in name)
+    parameters = node.get(PARAMETERS) if isinstance(node, Mapping) else None
+    return isinstance(parameters, Mapping) and ("mask_topic" in parameters or NODE in name)
 
 
 def servers(document: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:

@@ -60,8 +60,8 @@ class Mesh:
             chosen = [k for k, names in enumerate(self.names) if submesh in names[:1]]
             chosen = chosen or [k for k, names in enumerate(self.names) if submesh in names]
             if not chosen:
-                known = ", ".join(dict.fromkeys(names[0] for names in self.names if names[0])) or "none"
-                raise Invalid(f"there is no submesh {submesh[:80]!r}; there are: {known[:400]}")
+                submeshes = ", ".join(dict.fromkeys(names[0] for names in self.names if names[0])) or "none"
+                raise Invalid(f"there is no submesh {submesh[:80]!r}; there are: {submeshes[:400]}")
             faces = faces[np.isin(self.part, chosen)]
         out: Array = self.vertices[faces]
         if centre and len(out):
@@ -70,17 +70,17 @@ class Mesh:
         return out
 
 
-def read_mesh(data: bytes, name: str, most: int = MOST_FACES) -> Mesh:
+def read_mesh(data: bytes, name: str, max_faces: int = MOST_FACES) -> Mesh:
     """A mesh file by its name's ending: .stl, .obj or .dae.
 
-    Raises Invalid (TooLarge beyond ``most`` triangles) that names the file.
+    Raises Invalid (TooLarge beyond ``max_faces`` triangles) that names the file.
     """
     ending = PurePosixPath(name).suffix.lower()
     reader = _READERS.get(ending)
     if reader is None:
         _refuse(name, f"is no mesh that can be read: {', '.join(sorted(_READERS))} can")
     try:
-        vertices, faces, part, names = reader(data, most)
+        vertices, faces, part, names = reader(data, max_faces)
     except TooLarge as error:
         raise TooLarge(f"{name} {error.detail}", [Problem(error.detail, name)]) from error
     except (ValueError, LookupError, ArithmeticError, RecursionError, etree.LxmlError) as error:
@@ -96,9 +96,9 @@ def read_mesh(data: bytes, name: str, most: int = MOST_FACES) -> Mesh:
     return Mesh(vertices, faces, part, names)
 
 
-def load_mesh(data: bytes, name: str, most: int = MOST_FACES) -> tuple[Array, Faces]:
+def load_mesh(data: bytes, name: str, max_faces: int = MOST_FACES) -> tuple[Array, Faces]:
     """(vertices float64 [n, 3] in metres, faces int64 [m, 3]) of a mesh file; see ``read_mesh``."""
-    mesh = read_mesh(data, name, most)
+    mesh = read_mesh(data, name, max_faces)
     return mesh.vertices, mesh.faces
 
 
@@ -109,21 +109,21 @@ def _refuse(name: str, reason: str) -> NoReturn:
     raise Invalid(f"{name} {reason}", [Problem(reason, name)])
 
 
-def _enough(count: int, most: int) -> None:
-    if count > most:
-        raise TooLarge(f"has {count} triangles; the limit is {most}")
+def _enough(count: int, max_faces: int) -> None:
+    if count > max_faces:
+        raise TooLarge(f"has {count} triangles; the limit is {max_faces}")
 
 
-def _numbers(text: str, what: str) -> Array:
+def _numbers(text: str, label: str) -> Array:
     """The decimal numbers of a text; ValueError where there is anything else."""
     if not text.isascii() or "_" in text:
-        raise ValueError(f"{what} must be numbers")
+        raise ValueError(f"{label} must be numbers")
     return np.array(text.split(), np.float64)
 
 
-def _integers(text: str, what: str) -> NDArray[np.int64]:
+def _integers(text: str, label: str) -> NDArray[np.int64]:
     if not text.isascii() or "_" in text:
-        raise ValueError(f"{what} must be whole numbers")
+        raise ValueError(f"{label} must be whole numbers")
     return np.array(text.split(), np.int64)
 
 
@@ -135,25 +135,25 @@ _STL_VERTEX = re.compile(rb"vertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 _STL_FACET = re.compile(rb"^\s*facet\b", re.IGNORECASE | re.MULTILINE)
 
 
-def _stl(data: bytes, most: int) -> _Read:
+def _stl(data: bytes, max_faces: int) -> _Read:
     """Binary where the count in its head fits its size (also behind a head that starts with ``solid``), else text."""
     count = int.from_bytes(data[80:_STL_HEAD], "little") if len(data) >= _STL_HEAD else -1
     fits = _STL_HEAD + count * _STL_FACE.itemsize
     if count >= 0 and fits <= len(data) and (fits == len(data) or not _is_text(data)):
-        _enough(count, most)
+        _enough(count, max_faces)
         corners = np.frombuffer(data, _STL_FACE, count, _STL_HEAD)["corners"].astype(np.float64)
     elif _is_text(data):
-        _enough(len(data) // 40, 16 * most)  # no face is said in fewer than 40 characters
+        _enough(len(data) // 40, 16 * max_faces)  # no face is said in fewer than 40 characters
         facets = sum(1 for _ in _STL_FACET.finditer(data))
-        _enough(facets, most)
+        _enough(facets, max_faces)
         rows = b" ".join(_STL_VERTEX.findall(data)).decode("ascii")
         flat = _numbers(rows, "vertices")
         if len(flat) != 9 * facets:
             raise ValueError(f"{facets} facets need {3 * facets} vertices, but there are {len(flat) // 3}")
         corners = flat.reshape(-1, 3, 3)
     else:
-        whole = max(0, len(data) - _STL_HEAD) // _STL_FACE.itemsize
-        raise ValueError(f"its head says {max(count, 0)} triangles, but there are {whole}")
+        face_count = max(0, len(data) - _STL_HEAD) // _STL_FACE.itemsize
+        raise ValueError(f"its head says {max(count, 0)} triangles, but there are {face_count}")
     faces = np.arange(3 * len(corners), dtype=np.int64).reshape(-1, 3)
     return corners.reshape(-1, 3), faces, np.zeros(len(faces), np.int64), (("",),)
 
@@ -165,7 +165,7 @@ def _is_text(data: bytes) -> bool:
 # --- OBJ -------------------------------------------------------------------------------------------------------------
 
 
-def _obj(data: bytes, most: int) -> _Read:
+def _obj(data: bytes, max_faces: int) -> _Read:
     """``v`` and ``f`` lines; ``o`` and ``g`` name the parts. Indexes count from 1, negative ones from the end."""
     text = data.decode("utf-8", "replace").replace("\\\n", " ").replace("\\\r\n", " ")
     rows: list[str] = []
@@ -173,14 +173,14 @@ def _obj(data: bytes, most: int) -> _Read:
     sizes: list[int] = []
     parts: list[int] = []
     names: list[tuple[str, ...]] = [("",)]
-    here, thing, count = 0, "", 0
+    current, thing, count = 0, "", 0
     for line in text.splitlines():
         word, rest = (*line.split(None, 1), "", "")[:2]
         if word == "v":
-            said = rest.split(None, 3)
-            if len(said) < 3:
+            tokens = rest.split(None, 3)
+            if len(tokens) < 3:
                 raise ValueError("a vertex needs three numbers")
-            rows += said[:3]
+            rows += tokens[:3]
         elif word == "f":
             face = [int(corner.partition("/")[0]) for corner in rest.split()]
             if len(face) < 3:
@@ -190,13 +190,13 @@ def _obj(data: bytes, most: int) -> _Read:
                 raise ValueError("a face names a vertex that is not there")
             corners += [v - 1 if v > 0 else n + v for v in face]
             sizes.append(len(face))
-            parts.append(here)
+            parts.append(current)
             count += len(face) - 2
-            _enough(count, most)
+            _enough(count, max_faces)
         elif word in ("o", "g"):
             thing = rest.strip() if word == "o" else thing
             names.append(tuple(dict.fromkeys(filter(None, (rest.strip(), thing)))) or ("",))
-            here = len(names) - 1
+            current = len(names) - 1
     vertices = _numbers(" ".join(rows), "vertices").reshape(-1, 3)
     faces, owner = _fans(np.array(corners, np.int64), np.array(sizes, np.int64))
     return vertices, faces, np.array(parts, np.int64)[owner], tuple(names)
@@ -215,7 +215,7 @@ def _fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[Faces, 
 # --- COLLADA ---------------------------------------------------------------------------------------------------------
 
 
-def _dae(data: bytes, most: int) -> _Read:
+def _dae(data: bytes, max_faces: int) -> _Read:
     """The triangles of the scene, or of all geometries where there is no scene."""
     check_prolog(data)
     # Real number arrays are longer than libxml2's usual bound for a text; without a DOCTYPE there is nothing to unfold.
@@ -233,7 +233,7 @@ def _dae(data: bytes, most: int) -> _Read:
         raise ValueError("a DOCTYPE is not accepted: remove it")
     if etree.QName(root).localname != "COLLADA":
         raise ValueError("the root element is not COLLADA")
-    scene = _Scene(root, most)
+    scene = _Scene(root, max_faces)
     scene.walk()
     return scene.result()
 
@@ -241,8 +241,8 @@ def _dae(data: bytes, most: int) -> _Read:
 class _Scene:
     """A COLLADA document being read: what has an id, and the triangles that the scene places."""
 
-    def __init__(self, root: etree._Element, most: int) -> None:
-        self.root, self.most, self.count = root, most, 0
+    def __init__(self, root: etree._Element, max_faces: int) -> None:
+        self.root, self.most, self.count = root, max_faces, 0
         self.by_id: dict[str, etree._Element] = {}
         for element in root.iter(etree.Element):
             i = element.get("id")
@@ -278,24 +278,24 @@ class _Scene:
             if visited > MOST_NODES or depth > DEEPEST:
                 raise ValueError(f"its scene has more than {MOST_NODES} elements, or {DEEPEST} within each other")
             named = node.get("name") or node.get("id") or named
-            here = above @ _transform(node)
+            placement = above @ _transform(node)
             further: list[tuple[etree._Element, Array, str, int]] = []
             for child in node.iterchildren(etree.Element):
                 kind = etree.QName(child).localname
                 if kind == "node":
-                    further.append((child, here, named, depth + 1))
+                    further.append((child, placement, named, depth + 1))
                 elif kind == "instance_node":
                     target = self._target(child)
                     if target is not None:
-                        further.append((target, here, named, depth + 1))
+                        further.append((target, placement, named, depth + 1))
                 elif kind == "instance_geometry":
                     geometry = self._target(child)
                     if geometry is not None:
-                        self._place(geometry, here, named)
+                        self._place(geometry, placement, named)
                 elif kind == "instance_controller":
                     skin = self._skin(self._target(child))
                     if skin is not None:
-                        self._place(skin[0], here @ skin[1], named)
+                        self._place(skin[0], placement @ skin[1], named)
             stack += reversed(further)
 
     def result(self) -> _Read:
@@ -315,8 +315,8 @@ class _Scene:
         geometry = self._target(skin, "source")
         if skin is None or geometry is None:
             return None
-        said = skin.findtext("{*}bind_shape_matrix")
-        return geometry, np.eye(4) if said is None else _numbers(said, "bind_shape_matrix").reshape(4, 4)
+        matrix_text = skin.findtext("{*}bind_shape_matrix")
+        return geometry, np.eye(4) if matrix_text is None else _numbers(matrix_text, "bind_shape_matrix").reshape(4, 4)
 
     def _place(self, geometry: etree._Element, transform: Array, named: str) -> None:
         if geometry not in self.geometries:
@@ -338,7 +338,7 @@ class _Scene:
         vertices: list[Array] = []
         faces: list[Faces] = []
         offset = 0
-        known: dict[etree._Element, tuple[Array, int]] = {}
+        arrays: dict[etree._Element, tuple[Array, int]] = {}
         for mesh in geometry.findall("{*}mesh"):
             for primitive in mesh.iterchildren(etree.Element):
                 cut = _PRIMITIVES.get(etree.QName(primitive).localname)
@@ -350,17 +350,17 @@ class _Scene:
                 width = max((_offset(i) for i in inputs), default=0) + 1
                 if width > 64:
                     raise ValueError("a primitive has more than 64 inputs")
-                made = np.concatenate([np.empty((0, 3), np.int64), *cut(primitive, width, _offset(place["VERTEX"]))])
-                _enough(len(made), self.most)
-                if source not in known:
+                indices = np.concatenate([np.empty((0, 3), np.int64), *cut(primitive, width, _offset(place["VERTEX"]))])
+                _enough(len(indices), self.most)
+                if source not in arrays:
                     at = self._source(source)
-                    known[source] = at, offset
+                    arrays[source] = at, offset
                     vertices.append(at)
                     offset += len(at)
-                at, start = known[source]
-                if len(made) and (int(made.min()) < 0 or int(made.max()) >= len(at)):
+                at, start = arrays[source]
+                if len(indices) and (int(indices.min()) < 0 or int(indices.max()) >= len(at)):
                     raise ValueError("a face names a vertex that is not there")
-                faces.append(made + start)
+                faces.append(indices + start)
         if not faces:
             return np.empty((0, 3)), np.empty((0, 3), np.int64)
         return np.concatenate(vertices), np.concatenate(faces)
@@ -476,13 +476,13 @@ def _transform(node: etree._Element) -> Array:
     return out
 
 
-def _rotation(said: Array) -> Array:
+def _rotation(axis_angle: Array) -> Array:
     """Rotation about an axis (x, y, z) by an angle in degrees (Rodrigues)."""
-    length = float(np.linalg.norm(said[:3]))
+    length = float(np.linalg.norm(axis_angle[:3]))
     if not length or not math.isfinite(length):
         return np.eye(3)
-    x, y, z = said[:3] / length
-    angle = math.radians(float(said[3]))
+    x, y, z = axis_angle[:3] / length
+    angle = math.radians(float(axis_angle[3]))
     k: Any = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * (k @ k), np.float64)
 

@@ -44,11 +44,11 @@ def nearest(name: str, choices: Iterable[str], *, similarity: float = NEAR) -> s
     lowered: dict[str, str] = {}
     for choice in list(choices)[:MAX_COMPARED]:
         lowered.setdefault(choice.lower(), choice)
-    found = difflib.get_close_matches(name[:MAX_NAME].lower(), lowered, n=1, cutoff=similarity)
-    return lowered[found[0]] if found else None
+    matches = difflib.get_close_matches(name[:MAX_NAME].lower(), lowered, n=1, cutoff=similarity)
+    return lowered[matches[0]] if matches else None
 
 
 def did_you_mean(name: str, choices: Iterable[str]) -> str:
     """Return ` (did you mean NAME?)` for an error about an unknown name, or an empty text if none is near."""
-    found = nearest(name, choices)
-    return f" (did you mean {found}?)" if found is not None else ""
+    suggestion = nearest(name, choices)
+    return f" (did you mean {suggestion}?)" if suggestion is not None else ""

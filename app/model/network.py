@@ -84,8 +84,8 @@ def _find(value: Any, depth: int) -> Any:
             return value["value"]
     nested = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
     for inner in nested if depth else ():
-        if isinstance(inner, Mapping | list) and (found := _find(inner, depth - 1)) is not None:
-            return found
+        if isinstance(inner, Mapping | list) and (inner_value := _find(inner, depth - 1)) is not None:
+            return inner_value
     return None
 
 
@@ -193,18 +193,18 @@ def _cluster(xy: Metres, join: float, fixed: int) -> Places:
     for k, (i, j), (x, y) in zip(
         heads[crowded].tolist(), cell[crowded].tolist(), xy[heads[crowded]].tolist(), strict=True
     ):
-        best, where = limit, k
+        best, nearest = limit, k
         if k >= fixed:
             for a in (i - 1, i, i + 1):
                 for b in (j - 1, j, j + 1):
                     for other in taken.get((a, b), ()):
                         distance = (xy[other, 0] - x) ** 2 + (xy[other, 1] - y) ** 2
                         if distance < best:
-                            best, where = distance, other
-        if where == k:
+                            best, nearest = distance, other
+        if nearest == k:
             taken.setdefault((i, j), []).append(k)
         else:
-            moved[k] = where
+            moved[k] = nearest
     if moved:
         jump = np.arange(n)
         jump[list(moved)] = list(moved.values())
@@ -217,21 +217,21 @@ def _crowded(cell: NDArray[np.int64]) -> Places:
     row, column = _compact(cell[:, 0]), _compact(cell[:, 1])
     width = int(column.max()) + 3
     key = (row + 1) * width + column + 1
-    known, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
+    cells, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
     near = counts > 1
     for step in (1, width - 1, width, width + 1):
-        at = np.searchsorted(known, known + step)
-        found = at < len(known)
-        found[found] = known[at[found]] == known[found] + step
-        near[found] = True
-        near[at[found]] = True
+        at = np.searchsorted(cells, cells + step)
+        matched = at < len(cells)
+        matched[matched] = cells[at[matched]] == cells[matched] + step
+        near[matched] = True
+        near[at[matched]] = True
     return np.flatnonzero(near[inverse])
 
 
 def _compact(values: NDArray[np.int64]) -> NDArray[np.int64]:
     """Small numbers in the same order that are neighbours exactly where the values are: no key can overflow."""
-    known, inverse = np.unique(values, return_inverse=True)
-    rank = np.concatenate([np.zeros(1, np.int64), np.minimum(np.diff(known), 2).cumsum()])
+    distinct, inverse = np.unique(values, return_inverse=True)
+    rank = np.concatenate([np.zeros(1, np.int64), np.minimum(np.diff(distinct), 2).cumsum()])
     return np.asarray(rank[inverse], np.int64)
 
 
@@ -274,19 +274,19 @@ def _split(drawing: _Drawing, xy: Metres, node: Places, join: float) -> tuple[Pl
 def _near(points: NDArray[np.object_], lines: NDArray[np.object_], distance: float) -> tuple[Places, Places]:
     """Pairs (point, line) within a distance, sorted; in portions, so that a hostile drawing cannot fill the memory."""
     tree = shapely.STRtree(lines)
-    most = 1_000_000 + 10 * (len(points) + len(lines))
+    limit = 1_000_000 + 10 * (len(points) + len(lines))
     portion = max(1, 50_000_000 // len(lines))
-    found: list[NDArray[np.intp]] = []
+    pair_blocks: list[NDArray[np.intp]] = []
     total = 0
     for begin in range(0, len(points), portion):
         pairs = tree.query(points[begin : begin + portion], predicate="dwithin", distance=distance)
         total += pairs.shape[1]
-        if total > most:
+        if total > limit:
             reason = "too many lines lie on each other: draw each path once, or use a smaller join distance"
             raise Invalid(reason, [Problem(reason)])
         pairs[0] += begin
-        found.append(pairs)
-    pairs = np.concatenate(found, axis=1)
+        pair_blocks.append(pairs)
+    pairs = np.concatenate(pair_blocks, axis=1)
     order = np.lexsort((pairs[1], pairs[0]))
     return pairs[0][order], pairs[1][order]
 
@@ -303,9 +303,11 @@ def _assemble(
     ids = unique_ids(names)
     properties: list[Properties] = []
     for k, i in zip(owners[:pois], ids, strict=False):
-        own = objects.properties[k]
-        named = own.get("name")
-        properties.append({**own, "kind": "node", "name": named if named else i, "drawn_from": origins[k]})
+        object_properties = objects.properties[k]
+        named = object_properties.get("name")
+        properties.append(
+            {**object_properties, "kind": "node", "name": named if named else i, "drawn_from": origins[k]}
+        )
     properties += [
         {"kind": "node", "name": i, "drawn_from": origins[k]} for k, i in zip(owners[pois:], ids[pois:], strict=True)
     ]
@@ -337,13 +339,13 @@ def _assemble(
 
 def _directed(objects: Features, start: Places, end: Places, owner: Places) -> tuple[list[int], list[int], list[int]]:
     """(from, to, object) of all directed edges, each pair of nodes once, the first in drawing order."""
-    ways = {k: direction(objects.properties[k]) for k in set(owner.tolist())}
+    directions = {k: direction(objects.properties[k]) for k in set(owner.tolist())}
     pairs: dict[tuple[int, int], int] = {}
     for p, q, k in zip(start.tolist(), end.tolist(), owner.tolist(), strict=True):
-        way = ways[k]
-        if way != "backward":
+        heading = directions[k]
+        if heading != "backward":
             pairs.setdefault((p, q), k)
-        if way != "forward":
+        if heading != "forward":
             pairs.setdefault((q, p), k)
     return [p for p, _ in pairs], [q for _, q in pairs], list(pairs.values())
 
@@ -362,8 +364,8 @@ def _geometries(coordinates: Metres, make: Any) -> NDArray[np.object_]:
     return out
 
 
-def _short(text: str, most: int) -> str:
+def _short(text: str, limit: int) -> str:
     """The text, or where it is too long for an id its beginning and a hash of all of it."""
-    if len(text) <= most:
+    if len(text) <= limit:
         return text
-    return f"{text[: most - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"
+    return f"{text[: limit - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"

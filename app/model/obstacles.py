@@ -194,14 +194,14 @@ def surroundings_of(properties: Properties, geometry: Any, radius: float) -> Any
     return shapely.union_all(shapely.buffer(places, reach)) if places else None
 
 
-def footprint_of(properties: Properties, geometry: Any, known: solids.Solids) -> Any | None:
+def footprint_of(properties: Properties, geometry: Any, solid_reader: solids.Solids) -> Any | None:
     """The ground that an object covers, whatever its height: polygons in metres; None where it stands in no way.
 
     geometry: in local metres. Raises Invalid or BadUpload where its solids cannot be read.
     """
     role = role_of(properties)
     if role == "solids":
-        shadow = known.footprint(properties)
+        shadow = solid_reader.footprint(properties)
         return None if shadow.is_empty else shadow
     body = body_of(properties, geometry) if role == "outline" else None
     return None if body is None else body.area
@@ -213,8 +213,8 @@ def _cabin(p: Properties, geometry: Any) -> Body | None:
 
     Source: rmf_building_map_tools, lift.py (doors: x, y in the cabin's frame, width along motion_axis_orientation).
     """
-    size, own = size_of(p), p.get("openrmf")
-    says = own.get("says") if isinstance(own, Mapping) else None
+    size, source_properties = size_of(p), p.get("openrmf")
+    says = source_properties.get("says") if isinstance(source_properties, Mapping) else None
     doors = says.get("doors") if isinstance(says, Mapping) else None
     if size is None or not isinstance(doors, Mapping):
         return None
@@ -256,8 +256,8 @@ def _pose(p: Properties, geometry: Any) -> tuple[float, ...] | None:
 
 
 def _tags(p: Properties) -> Mapping[str, Any]:
-    own = p.get("osm")
-    tags = own.get("tags") if isinstance(own, Mapping) else None
+    source_properties = p.get("osm")
+    tags = source_properties.get("tags") if isinstance(source_properties, Mapping) else None
     return tags if isinstance(tags, Mapping) else {}
 
 
@@ -278,8 +278,8 @@ def width_of(properties: Properties) -> float | None:
             return None
         values = OF_OSM[key]
         width = values.get(str(tags[key]), values.get("*", 0.0))
-        said = _positive(p.get("width")) or osm_tags.width(tags) or width
-        return min(said, WIDEST) if width else None
+        value = _positive(p.get("width")) or osm_tags.width(tags) or width
+        return min(value, WIDEST) if width else None
     width = min(_positive(p.get("width")) or 0.0, WIDEST)
     if kind in OBSTACLES and not tags:
         return width or OBSTACLES[kind]
@@ -336,9 +336,9 @@ def _positive(value: Any) -> float | None:
 
 def size_of(p: Properties) -> tuple[float, ...] | None:
     """[x, y(, z)] of a box; None where nothing says so."""
-    said = p.get("size")
-    if not isinstance(said, (list, tuple)) or len(said) < 2:
+    size = p.get("size")
+    if not isinstance(size, (list, tuple)) or len(size) < 2:
         return None
-    numbers = [_positive(v) for v in said[:3]]
-    found = tuple(v for v in numbers if v is not None)
-    return found if len(found) == len(numbers) and found[0] > 0 and found[1] > 0 else None
+    numbers = [_positive(v) for v in size[:3]]
+    sides = tuple(v for v in numbers if v is not None)
+    return sides if len(sides) == len(numbers) and sides[0] > 0 and sides[1] > 0 else None

@@ -24,21 +24,21 @@ LINES = frozenset({"barrier", "waterway", "highway"})
 
 def is_multipolygon(properties: Properties) -> bool:
     """Whether an object is a relation that says that it is an area."""
-    own = properties.get("osm")
-    tags = own.get("tags") if isinstance(own, Mapping) else None
+    source_properties = properties.get("osm")
+    tags = source_properties.get("tags") if isinstance(source_properties, Mapping) else None
     return isinstance(tags, Mapping) and tags.get("type") == "multipolygon"
 
 
 def areas_of(part: Features, rows: Iterable[int]) -> dict[int, Any | None]:
     """The area of each multipolygon among these rows, in the coordinates of its ways; None where its rings do not
     close. Ways that are missing are left out."""
-    wanted = [k for k in rows if part.ids[k].startswith("r") and is_multipolygon(part.properties[k])]
-    index = part.index() if wanted else {}
+    relation_rows = [k for k in rows if part.ids[k].startswith("r") and is_multipolygon(part.properties[k])]
+    index = part.index() if relation_rows else {}
     out: dict[int, Any | None] = {}
-    for k in wanted:
-        ways = [index.get(way, -1) for way, _ in _ways(part.properties[k])]
-        lines = [shapely.get_coordinates(part.geometry[row]) for row in ways if row >= 0]
-        complete = not any(part.properties[row]["osm"].get("missing") for row in ways if row >= 0)
+    for k in relation_rows:
+        way_rows = [index.get(way, -1) for way, _ in _ways(part.properties[k])]
+        lines = [shapely.get_coordinates(part.geometry[row]) for row in way_rows if row >= 0]
+        complete = not any(part.properties[row]["osm"].get("missing") for row in way_rows if row >= 0)
         out[k] = assembled(lines) if complete else None
     return out
 
@@ -56,9 +56,9 @@ def incomplete_areas(part: Features, rows: Iterable[int]) -> dict[int, Any]:
     for k in chosen:
         p = part.properties[k]
         if is_multipolygon(p) and part.ids[k].startswith("r"):
-            ways = [(index.get(way, -1), role) for way, role in _ways(p)]
-            if (k in areas and areas[k] is None) or any(row < 0 and role != "inner" for row, role in ways):
-                out[k] = shapely.geometrycollections([part.geometry[row] for row, _ in ways if row >= 0])
+            way_rows = [(index.get(way, -1), role) for way, role in _ways(p)]
+            if (k in areas and areas[k] is None) or any(row < 0 and role != "inner" for row, role in way_rows):
+                out[k] = shapely.geometrycollections([part.geometry[row] for row, _ in way_rows if row >= 0])
         elif _lacks_nodes(p["osm"]):
             out[k] = shapely.geometrycollections([part.geometry[k]])
     return out
@@ -97,11 +97,11 @@ def _ways(p: Properties) -> list[tuple[str, Any]]:
     ]
 
 
-def _lacks_nodes(own: Mapping[str, Any]) -> bool:
+def _lacks_nodes(source_properties: Mapping[str, Any]) -> bool:
     """Whether a way goes around an area and some of its nodes have no place."""
-    refs, tags = own.get("refs"), own.get("tags")
+    refs, tags = source_properties.get("refs"), source_properties.get("tags")
     is_ring = isinstance(refs, (list, tuple)) and len(refs) > 3 and refs[0] == refs[-1]
-    return is_ring and bool(own.get("missing")) and isinstance(tags, Mapping) and not LINES & tags.keys()
+    return is_ring and bool(source_properties.get("missing")) and isinstance(tags, Mapping) and not LINES & tags.keys()
 
 
 def assembled(lines: Lines) -> Any | None:
@@ -110,8 +110,8 @@ def assembled(lines: Lines) -> Any | None:
     if not rings:
         return None
     areas = [shapely.make_valid(shapely.Polygon(ring)) for ring in rings]
-    whole = reduce(shapely.symmetric_difference, areas)
-    flat = [g for g in shapely.get_parts(shapely.get_parts(whole)) if shapely.get_type_id(g) == 3]
+    area = reduce(shapely.symmetric_difference, areas)
+    flat = [g for g in shapely.get_parts(shapely.get_parts(area)) if shapely.get_type_id(g) == 3]
     if not flat:
         return None
     return flat[0] if len(flat) == 1 else shapely.multipolygons(flat)

@@ -39,35 +39,35 @@ _SPEEDS: Mapping[str | None, float] = {
 _COUNT = re.compile(r"\s*(\d{1,3}(?:\.\d{1,3})?)\s*", re.ASCII)
 
 
-def metres(said: Any) -> float | None:
+def metres(text: Any) -> float | None:
     """A length; None where it is none."""
-    if not isinstance(said, str) or len(said) > 40:
+    if not isinstance(text, str) or len(text) > 40:
         return None
-    if match := _FEET.fullmatch(said):
+    if match := _FEET.fullmatch(text):
         value = int(match[1]) * 0.3048 + float(match[2]) * 0.0254
-    elif match := _LENGTH.fullmatch(said):
+    elif match := _LENGTH.fullmatch(text):
         value = float(match[1].replace(",", ".")) * _UNITS[match[2]]
     else:
         return None
     return round(value, 9) if value <= WIDEST else None
 
 
-def speed(said: Any) -> float | None:
+def speed(value: Any) -> float | None:
     """A speed limit in m/s, of several the lowest; None for what is none (``none``, ``RO:urban``, a condition)."""
-    if not isinstance(said, str) or len(said) > 80:
+    if not isinstance(value, str) or len(value) > 80:
         return None
-    found = []
-    for one in said.split(";"):
+    speeds = []
+    for one in value.split(";"):
         if one.strip() == "walk":
-            found.append(round(WALK, 9))
+            speeds.append(round(WALK, 9))
         elif match := _SPEED.fullmatch(one):
-            found.append(round(float(match[1]) * _SPEEDS[match[2]], 9))
-    return min((v for v in found if v > 0), default=None)
+            speeds.append(round(float(match[1]) * _SPEEDS[match[2]], 9))
+    return min((v for v in speeds if v > 0), default=None)
 
 
-def count(said: Any) -> float | None:
+def count(value: Any) -> float | None:
     """A number of storeys or lanes; None where it is none."""
-    match = _COUNT.fullmatch(said) if isinstance(said, str) and len(said) < 40 else None
+    match = _COUNT.fullmatch(value) if isinstance(value, str) and len(value) < 40 else None
     return None if match is None else float(match[1])
 
 
@@ -79,42 +79,42 @@ def is_understood(key: str, value: Any) -> bool:
 
 def width(tags: Mapping[str, Any]) -> float | None:
     """Metres across a line or a point: ``width``, ``est_width``, what its ``diameter`` or ``circumference`` says."""
-    found = metres(tags.get("width")) or metres(tags.get("est_width"))
-    if not found and tags.get("natural") == "tree":
-        found = metres(tags.get("diameter"))
-        if not found and (around := metres(tags.get("circumference"))):
-            found = round(around / math.pi, 9)
-    return found or None
+    value = metres(tags.get("width")) or metres(tags.get("est_width"))
+    if not value and tags.get("natural") == "tree":
+        value = metres(tags.get("diameter"))
+        if not value and (around := metres(tags.get("circumference"))):
+            value = round(around / math.pi, 9)
+    return value or None
 
 
 def way_width(tags: Mapping[str, Any]) -> float | None:
     """Metres across a way that is driven or walked on: its width, else its lanes'."""
-    found = width(tags)
-    if found:
-        return found
+    value = width(tags)
+    if value:
+        return value
     lanes = count(tags.get("lanes"))
     return round(lanes * LANE, 9) if lanes else None
 
 
 def height(tags: Mapping[str, Any]) -> float | None:
     """Metres of the top above the ground: ``height``, else its storeys'."""
-    found = metres(tags.get("height"))
-    if not found and (storeys := count(tags.get("building:levels"))):
-        found = round(storeys * LEVEL_HEIGHT, 9)
-    return found or None
+    value = metres(tags.get("height"))
+    if not value and (storeys := count(tags.get("building:levels"))):
+        value = round(storeys * LEVEL_HEIGHT, 9)
+    return value or None
 
 
 def base(tags: Mapping[str, Any]) -> float | None:
     """Metres of the underside above the ground: ``min_height``, else the storeys that are left out."""
-    found = metres(tags.get("min_height"))
-    if found is None and (storeys := count(tags.get("building:min_level"))) is not None:
-        found = round(storeys * LEVEL_HEIGHT, 9)
-    return found or None
+    value = metres(tags.get("min_height"))
+    if value is None and (storeys := count(tags.get("building:min_level"))) is not None:
+        value = round(storeys * LEVEL_HEIGHT, 9)
+    return value or None
 
 
-def speed_limit(tags: Mapping[str, Any], way: Literal["forward", "backward"]) -> float | None:
+def speed_limit(tags: Mapping[str, Any], direction: Literal["forward", "backward"]) -> float | None:
     """Metres per second along a way's direction or against it; that of the direction wins."""
-    return speed(tags.get(f"maxspeed:{way}")) or speed(tags.get("maxspeed"))
+    return speed(tags.get(f"maxspeed:{direction}")) or speed(tags.get("maxspeed"))
 
 
 _NO_LIMIT = frozenset({"none", "signals", "variable"})

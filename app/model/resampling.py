@@ -148,13 +148,18 @@ def _warped(
     options: dict[str, Any] = {}
     added = clear is None and nodata is None and kind.kind != "f"
     if clear is not None:
-        most = _opaque(pixels[..., clear], colours[clear])
-        options = {"src_alpha": clear + 1, "dst_alpha": clear + 1, "SRC_ALPHA_MAX": most, "DST_ALPHA_MAX": most}
+        max_alpha = _opaque(pixels[..., clear], colours[clear])
+        options = {
+            "src_alpha": clear + 1,
+            "dst_alpha": clear + 1,
+            "SRC_ALPHA_MAX": max_alpha,
+            "DST_ALPHA_MAX": max_alpha,
+        }
     elif added:
-        most = 127 if kind == np.int8 else 255
-        options = {"add_alpha": True, "DST_ALPHA_MAX": most}
-        said = properties.get("bands") or [{"colour": colour} for colour in colours]
-        properties["bands"] = [*said, {"colour": "alpha" if kind == np.uint8 else "mask"}]
+        max_alpha = 127 if kind == np.int8 else 255
+        options = {"add_alpha": True, "DST_ALPHA_MAX": max_alpha}
+        bands = properties.get("bands") or [{"colour": colour} for colour in colours]
+        properties["bands"] = [*bands, {"colour": "alpha" if kind == np.uint8 else "mask"}]
     else:
         if nodata is None:
             nodata, properties["nodata"] = math.nan, "nan"

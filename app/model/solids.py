@@ -94,42 +94,42 @@ class Solids:
 
         Raises Invalid that names the file or the shape; the detail says what to supply for a missing file.
         """
-        found, unreadable = self.read(properties)
+        triangles, unreadable = self.read(properties)
         if unreadable:
             raise unreadable[0].error
-        return found
+        return triangles
 
     def read(self, properties: Properties) -> tuple[Array, list[Unreadable]]:
         """Those of an object's solids that can be read, as ``triangles`` gives them, and those that cannot.
 
         Raises Invalid or TooLarge where that is so of the object as a whole.
         """
-        own = matrix(pose_of(properties))
-        found: list[Array] = []
+        placement = matrix(pose_of(properties))
+        arrays: list[Array] = []
         unreadable: list[Unreadable] = []
         total = 0
         for k, shape in enumerate(shapes_of(properties)):
             if not self._counts(shape):
                 continue
             try:
-                found.append(self.shape(shape, f"shapes[{k}]"))
+                arrays.append(self.shape(shape, f"shapes[{k}]"))
             except (Invalid, TooLarge) as error:
-                unreadable.append(Unreadable(error, _origin(own, shape)))
+                unreadable.append(Unreadable(error, _origin(placement, shape)))
                 continue
-            total += len(found[-1])
+            total += len(arrays[-1])
             if total > MOST_TRIANGLES:
                 raise TooLarge(f"an object has more than {MOST_TRIANGLES} triangles")
-        return (_checked(_moved(np.concatenate(found), own), "pose") if found else _NOTHING), unreadable
+        return (_checked(_moved(np.concatenate(arrays), placement), "pose") if arrays else _NOTHING), unreadable
 
     def footprint(self, properties: Properties) -> Any:
         """The ground that an object's solids stand over: a valid shapely geometry, metres, local frame; empty where it
         has none. Of a mesh with very many triangles it is the convex hull."""
         outlines = []
-        own = matrix(pose_of(properties))
+        placement = matrix(pose_of(properties))
         for k, shape in enumerate(shapes_of(properties)):
             if self._counts(shape):
                 corners = self.shape(shape, f"shapes[{k}]")
-                outlines.append(_shadow(_checked(_moved(corners, own), "pose")[:, :, :2]))
+                outlines.append(_shadow(_checked(_moved(corners, placement), "pose")[:, :, :2]))
         return shapely.union_all(outlines) if outlines else shapely.Polygon()
 
     def bounds(self, properties: Properties) -> tuple[float, float, float, float, float, float] | None:
@@ -145,15 +145,15 @@ class Solids:
         b = self.bounds({key: value for key, value in properties.items() if key != "pose"})
         return None if b is None else (b[3] - b[0], b[4] - b[1], b[5] - b[2])
 
-    def shape(self, shape: Mapping[str, Any], where: str = "shape") -> Array:
+    def shape(self, shape: Mapping[str, Any], location: str = "shape") -> Array:
         """One shape as triangles in its object's frame, float64 [n, 3, 3]."""
         kind = shape.get("type")
         make = _MAKERS.get(kind) if isinstance(kind, str) else None
         if "file" not in shape and isinstance(shape.get("uri"), str):
             _refuse_absent(str(shape["uri"]))
         if make is None:
-            _refuse(f"has the type {str(kind)[:80]!r}; there are {', '.join(_MAKERS)}", where)
-        return _checked(_moved(make(self, shape, where), matrix(pose_of(shape, where))), where)
+            _refuse(f"has the type {str(kind)[:80]!r}; there are {', '.join(_MAKERS)}", location)
+        return _checked(_moved(make(self, shape, location), matrix(pose_of(shape, location))), location)
 
     def mesh(self, file: str) -> meshes.Mesh:
         """A mesh file, read once. Raises Invalid that names it."""
@@ -164,10 +164,10 @@ class Solids:
                 self._read[file] = error
             except TooLarge as error:
                 self._read[file] = Invalid(error.detail, error.problems)
-        known = self._read[file]
-        if isinstance(known, Invalid):
-            raise known
-        return known
+        cached = self._read[file]
+        if isinstance(cached, Invalid):
+            raise cached
+        return cached
 
     def file(self, path: str) -> bytes:
         """A resource's bytes; Invalid says that it is to be supplied."""
@@ -210,24 +210,24 @@ def size(
 
 def shapes_of(properties: Properties) -> Sequence[Mapping[str, Any]]:
     """An object's shapes; empty where it says none. Raises Invalid where they are no list of mappings."""
-    said = properties.get("shapes")
-    if said is None:
+    shapes = properties.get("shapes")
+    if shapes is None:
         return []
-    if not isinstance(said, (list, tuple)) or not all(isinstance(shape, Mapping) for shape in said):
+    if not isinstance(shapes, (list, tuple)) or not all(isinstance(shape, Mapping) for shape in shapes):
         _refuse("must be a list of mappings with a type", "shapes")
-    if len(said) > MOST_SHAPES:
-        _refuse(f"are {len(said)}; the limit is {MOST_SHAPES}", "shapes")
-    return said
+    if len(shapes) > MOST_SHAPES:
+        _refuse(f"are {len(shapes)}; the limit is {MOST_SHAPES}", "shapes")
+    return shapes
 
 
-def pose_of(said: Mapping[str, Any], where: str = "pose") -> tuple[float, ...]:
+def pose_of(members: Mapping[str, Any], location: str = "pose") -> tuple[float, ...]:
     """[x, y, z, roll, pitch, yaw]; missing ones are 0. Raises Invalid where it is no list of finite numbers."""
-    pose = said.get("pose")
+    pose = members.get("pose")
     if pose is None:
         return (0.0,) * 6
     if not isinstance(pose, (list, tuple)) or len(pose) > 6:
-        _refuse("must be [x, y, z, roll, pitch, yaw]", f"{where}.pose")
-    numbers = [_number(value, f"{where}.pose", MAX_METRES) for value in pose]
+        _refuse("must be [x, y, z, roll, pitch, yaw]", f"{location}.pose")
+    numbers = [_number(value, f"{location}.pose", MAX_METRES) for value in pose]
     return (*numbers, *([0.0] * (6 - len(numbers))))
 
 
@@ -262,9 +262,9 @@ def _moved(corners: Array, transform: Array) -> Array:
     return np.asarray(corners @ transform[:3, :3].T + transform[:3, 3], np.float64)
 
 
-def _checked(corners: Array, where: str) -> Array:
+def _checked(corners: Array, location: str) -> Array:
     if not bool((np.abs(corners) <= MAX_METRES).all()):
-        _refuse(f"gives coordinates that are not finite metres within ±{MAX_METRES:g}", where)
+        _refuse(f"gives coordinates that are not finite metres within ±{MAX_METRES:g}", location)
     return corners
 
 
@@ -286,39 +286,39 @@ def _shadow(corners: Array) -> Any:
 # --- the shapes ------------------------------------------------------------------------------------------------------
 
 
-def _box(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001 - one signature for all shapes
-    return _unit_box() * _vector(shape, "size", 3, where)
+def _box(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001 - one signature for all shapes
+    return _unit_box() * _vector(shape, "size", 3, location)
 
 
-def _sphere(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
-    radius = _length(shape, "radius", where)
+def _sphere(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
+    radius = _length(shape, "radius", location)
     return _turned(*_arc(radius, 0.0), _sides(radius))
 
 
-def _ellipsoid(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
-    radii = _vector(shape, "radii", 3, where)
+def _ellipsoid(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
+    radii = _vector(shape, "radii", 3, location)
     sides = _sides(float(radii.max()))
     return _turned(*_arc(1.0, 0.0, sides), sides) * radii
 
 
-def _capsule(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
-    radius = _length(shape, "radius", where)
-    return _turned(*_arc(radius, _length(shape, "length", where)), _sides(radius))
+def _capsule(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
+    radius = _length(shape, "radius", location)
+    return _turned(*_arc(radius, _length(shape, "length", location)), _sides(radius))
 
 
-def _cylinder(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
-    radius, half = _length(shape, "radius", where), _length(shape, "length", where) / 2.0
+def _cylinder(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
+    radius, half = _length(shape, "radius", location), _length(shape, "length", location) / 2.0
     return _turned(np.array([0.0, radius, radius, 0.0]), np.array([-half, -half, half, half]), _sides(radius))
 
 
-def _plane(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
+def _plane(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
     """A rectangle of the plane's size, turned from +z to its normal the shortest way."""
-    x, y = _vector(shape, "size", 2, where, (1.0, 1.0)) / 2.0
+    x, y = _vector(shape, "size", 2, location, (1.0, 1.0)) / 2.0
     flat = np.array([[[-x, -y, 0], [x, -y, 0], [x, y, 0]], [[-x, -y, 0], [x, y, 0], [-x, y, 0]]], np.float64)
-    normal = _vector(shape, "normal", 3, where, (0.0, 0.0, 1.0), least=-MAX_METRES)
+    normal = _vector(shape, "normal", 3, location, (0.0, 0.0, 1.0), minimum=-MAX_METRES)
     length = float(np.linalg.norm(normal))
     if not length:
-        _refuse("must not be zero", f"{where}.normal")
+        _refuse("must not be zero", f"{location}.normal")
     a, b, c = normal / length
     if c < -1.0 + 1e-12:
         return np.asarray(flat * np.array([1.0, -1.0, -1.0]), np.float64)
@@ -327,21 +327,21 @@ def _plane(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # no
     return np.asarray(flat @ turn.T, np.float64)
 
 
-def _polyline(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
+def _polyline(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
     rings = shape.get("points")
     if not isinstance(rings, (list, tuple)) or not rings:
-        _refuse("must be a list of rings of [x, y]", f"{where}.points")
+        _refuse("must be a list of rings of [x, y]", f"{location}.points")
     area = shapely.Polygon()
     for ring in rings:
-        at = _points(ring, f"{where}.points")
+        at = _points(ring, f"{location}.points")
         if len(at) >= 3:
             area = shapely.symmetric_difference(area, shapely.make_valid(shapely.Polygon(at)))
-    return extruded(area, 0.0, _length(shape, "height", where))
+    return extruded(area, 0.0, _length(shape, "height", location))
 
 
 def extruded(area: Any, low: float, high: float) -> Array:
     """A polygon or several (shapely, metres), from one height to another, as closed triangles: float64 [n, 3, 3]."""
-    found = []
+    faces = []
     for polygon in shapely.get_parts(shapely.get_parts(area)):  # a collection may hold several polygons in one part
         if shapely.get_type_id(polygon) != 3 or shapely.is_empty(polygon):
             continue
@@ -351,22 +351,22 @@ def extruded(area: Any, low: float, high: float) -> Array:
         a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
         back = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
         flat[back] = flat[back][:, ::-1]
-        found += [_at_height(flat, high), _at_height(flat[:, ::-1], low)]
+        faces += [_at_height(flat, high), _at_height(flat[:, ::-1], low)]
         for ring in (oriented.exterior, *oriented.interiors):
             at = shapely.get_coordinates(ring)
             a3, b3 = (np.column_stack([p, np.full(len(p), low)]) for p in (at[:-1], at[1:]))
             up = np.array([0.0, 0.0, high - low])
-            found += [np.stack([a3, b3, b3 + up], axis=1), np.stack([a3, b3 + up, a3 + up], axis=1)]
-    return np.concatenate(found) if found else _NOTHING
+            faces += [np.stack([a3, b3, b3 + up], axis=1), np.stack([a3, b3 + up, a3 + up], axis=1)]
+    return np.concatenate(faces) if faces else _NOTHING
 
 
-def _mesh(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:
+def _mesh(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:
     file, part = shape.get("file"), shape.get("submesh")
     if not isinstance(file, str) or not file:
-        _refuse("must be the path of a mesh among the files of the objects", f"{where}.file")
+        _refuse("must be the path of a mesh among the files of the objects", f"{location}.file")
     if part is not None and not isinstance(part, str):
-        _refuse("must be a name", f"{where}.submesh")
-    scale = _vector(shape, "scale", 3, where, (1.0, 1.0, 1.0), least=-MAX_METRES)
+        _refuse("must be a name", f"{location}.submesh")
+    scale = _vector(shape, "scale", 3, location, (1.0, 1.0, 1.0), minimum=-MAX_METRES)
     try:
         corners = solids.mesh(file).triangles(part or None, centre=shape.get("center") is True) * scale
     except Invalid as error:
@@ -374,19 +374,19 @@ def _mesh(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:
     return corners[:, ::-1] if np.prod(scale) < 0 else corners  # a mirror turns the inside out
 
 
-def _heightmap(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:
+def _heightmap(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:
     """A closed solid from a picture: its brightest pixel at the full height, black at 0, the top row at the largest y.
 
     Source: gz-common ImageHeightmap and HeightmapShape (a pixel over the picture's maximum, times the size's z).
     """
     file = shape.get("file")
     if not isinstance(file, str) or not file:
-        _refuse("must be the path of a picture among the files of the objects", f"{where}.file")
-    extent = _vector(shape, "size", 3, where, (1.0, 1.0, 1.0))
-    position = _vector(shape, "position", 3, where, (0.0, 0.0, 0.0), least=-MAX_METRES)
+        _refuse("must be the path of a picture among the files of the objects", f"{location}.file")
+    extent = _vector(shape, "size", 3, location, (1.0, 1.0, 1.0))
+    position = _vector(shape, "position", 3, location, (0.0, 0.0, 0.0), minimum=-MAX_METRES)
     grey = _highest(_picture(solids.file(file), file))
-    most = float(grey.max())
-    z = grey[::-1] / (most or 1.0) * extent[2]
+    maximum = float(grey.max())
+    z = grey[::-1] / (maximum or 1.0) * extent[2]
     rows, columns = z.shape
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, columns) * extent[0], np.linspace(-0.5, 0.5, rows) * extent[1])
     top = np.stack([x, y, z], axis=-1)
@@ -468,8 +468,8 @@ def _unit_box() -> Array:
 def _sides(radius: float) -> int:
     """Flat sides of a circle, a multiple of 4 so that the extremes on the axes are exact."""
     ratio = TOLERANCE / radius if radius > 0 else 1.0
-    wanted = math.pi / math.acos(1.0 - ratio) if ratio < 1.0 else 0.0
-    return int(min(max(4 * math.ceil(wanted / 4.0), 16), 128))
+    side_count = math.pi / math.acos(1.0 - ratio) if ratio < 1.0 else 0.0
+    return int(min(max(4 * math.ceil(side_count / 4.0), 16), 128))
 
 
 def _arc(radius: float, length: float, sides: int = 0) -> tuple[Array, Array]:
@@ -500,12 +500,12 @@ def _at_height(flat: Array, z: float) -> Array:
     return np.concatenate([flat, np.full((*flat.shape[:-1], 1), z)], axis=-1)
 
 
-def _origin(own: Array, shape: Mapping[str, Any]) -> tuple[float, float]:
+def _origin(placement: Array, shape: Mapping[str, Any]) -> tuple[float, float]:
     """A shape's origin seen from above, in the frame around its object; the object's own where its pose is invalid."""
     try:
-        at = (own @ matrix(pose_of(shape)))[:2, 3]
+        at = (placement @ matrix(pose_of(shape)))[:2, 3]
     except Invalid:
-        at = own[:2, 3]
+        at = placement[:2, 3]
     return float(at[0]), float(at[1])
 
 
@@ -514,32 +514,32 @@ def _refuse_absent(path: str) -> NoReturn:
     raise Invalid(reason, [Problem(reason, path[:200])])
 
 
-def _refuse(reason: str, where: str) -> NoReturn:
-    raise Invalid(f"{where} {reason}", [Problem(reason, where=where)])
+def _refuse(reason: str, location: str) -> NoReturn:
+    raise Invalid(f"{location} {reason}", [Problem(reason, where=location)])
 
 
-def _number(value: Any, where: str, most: float, least: float | None = None) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
-        _refuse(f"must be a finite number of at most {most:g}, got {str(value)[:80]}", where)
-    if least is not None and value < least:
-        _refuse(f"must be at least {least:g}, got {value:g}", where)
+def _number(value: Any, location: str, maximum: float, minimum: float | None = None) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= maximum:
+        _refuse(f"must be a finite number of at most {maximum:g}, got {str(value)[:80]}", location)
+    if minimum is not None and value < minimum:
+        _refuse(f"must be at least {minimum:g}, got {value:g}", location)
     return float(value)
 
 
-def _length(shape: Mapping[str, Any], word: str, where: str) -> float:
-    return _number(shape.get(word), f"{where}.{word}", MAX_METRES, 0.0)
+def _length(shape: Mapping[str, Any], word: str, location: str) -> float:
+    return _number(shape.get(word), f"{location}.{word}", MAX_METRES, 0.0)
 
 
 def _vector(
-    shape: Mapping[str, Any], word: str, n: int, where: str, otherwise: Any = None, least: float = 0.0
+    shape: Mapping[str, Any], word: str, n: int, location: str, otherwise: Any = None, minimum: float = 0.0
 ) -> Array:
-    said = shape.get(word, otherwise)
-    if not isinstance(said, (list, tuple)) or len(said) != n:
-        _refuse(f"must be {n} numbers", f"{where}.{word}")
-    return np.array([_number(v, f"{where}.{word}", MAX_METRES, least) for v in said])
+    values = shape.get(word, otherwise)
+    if not isinstance(values, (list, tuple)) or len(values) != n:
+        _refuse(f"must be {n} numbers", f"{location}.{word}")
+    return np.array([_number(v, f"{location}.{word}", MAX_METRES, minimum) for v in values])
 
 
-def _points(ring: Any, where: str) -> Array:
+def _points(ring: Any, location: str) -> Array:
     if not isinstance(ring, (list, tuple)) or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in ring):
-        _refuse("must be a list of rings of [x, y]", where)
-    return np.array([[_number(v, where, MAX_METRES) for v in p] for p in ring], np.float64).reshape(-1, 2)
+        _refuse("must be a list of rings of [x, y]", location)
+    return np.array([[_number(v, location, MAX_METRES) for v in p] for p in ring], np.float64).reshape(-1, 2)

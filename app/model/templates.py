@@ -44,19 +44,19 @@ class Templates:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-like members in one order; empty where nothing was ever said."""
-        own = {name: said.as_dict() for name, said in sorted(self.formats.items())}
-        own = {name: said for name, said in own.items() if said}
+        format_values = {name: template.as_dict() for name, template in sorted(self.formats.items())}
+        format_values = {name: template for name, template in format_values.items() if template}
         out: dict[str, Any] = {} if self.set == DEFAULT_SET else {"set": self.set}
-        return out | ({"formats": own} if own else {})
+        return out | ({"formats": format_values} if format_values else {})
 
     @classmethod
     def from_dict(cls, members: Mapping[str, Any]) -> Templates:
         """The reverse of ``as_dict``."""
-        own = {
-            str(name): Own(said.get("set"), dict(said.get("values", {})))
-            for name, said in members.get("formats", {}).items()
+        format_templates = {
+            str(name): Own(template.get("set"), dict(template.get("values", {})))
+            for name, template in members.get("formats", {}).items()
         }
-        return cls(members.get("set", DEFAULT_SET), own)
+        return cls(members.get("set", DEFAULT_SET), format_templates)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Templates) and self.as_dict() == other.as_dict()

@@ -161,12 +161,12 @@ def morton(x: NDArray[np.int64], y: NDArray[np.int64], z: NDArray[np.int64]) -> 
     return code
 
 
-def expanded(voxels: VoxelMap, which: NDArray[np.bool_]) -> tuple[Codes, NDArray[np.intp]]:
+def expanded(voxels: VoxelMap, mask: NDArray[np.bool_]) -> tuple[Codes, NDArray[np.intp]]:
     """All smallest voxels of some leaves: their codes at depth 16, ascending, uint64 [m], and the leaf of each.
 
-    which: bool [n]. The caller bounds m (``voxel_counts``): a leaf at depth 1 has 2^45 of them.
+    mask: bool [n]. The caller bounds m (``voxel_counts``): a leaf at depth 1 has 2^45 of them.
     """
-    rows = np.flatnonzero(which)
+    rows = np.flatnonzero(mask)
     size = np.int64(1) << _bits_below(voxels.depth[rows]).astype(np.int64)
     total = int(size.sum())
     within = np.arange(total, dtype=np.int64) - np.repeat(np.cumsum(size) - size, size)
@@ -237,13 +237,13 @@ def coarser(voxels: VoxelMap, depth: int) -> VoxelMap:
     return replace(voxels, depth=depths, code=code, log_odds=odds, colour=colour)
 
 
-def cut(voxels: VoxelMap, box: Box3, most: int = 2**24) -> VoxelMap:
+def cut(voxels: VoxelMap, box: Box3, limit: int = 2**24) -> VoxelMap:
     """The smallest voxels that meet a box (metres, local; a touching face does not count), large leaves cut into
-    pieces where its faces cross them. Invalid where that would give more than ``most`` leaves."""
+    pieces where its faces cross them. Invalid where that would give more than ``limit`` leaves."""
     low, high = _voxel_range(box, voxels.resolution)
     depth, code = voxels.depth, voxels.code
     source = np.arange(len(voxels), dtype=np.intp)
-    kept: list[tuple[NDArray[np.uint8], Codes, NDArray[np.intp]]] = []
+    pieces: list[tuple[NDArray[np.uint8], Codes, NDArray[np.intp]]] = []
     total = 0
     while len(code):
         meets, inside = np.ones(len(code), bool), np.ones(len(code), bool)
@@ -253,20 +253,20 @@ def cut(voxels: VoxelMap, box: Box3, most: int = 2**24) -> VoxelMap:
             end = start + (np.int64(1) << up)
             meets &= (start < high[k]) & (end > low[k])
             inside &= (start >= low[k]) & (end <= high[k])
-        whole = meets & inside
-        kept.append((depth[whole], code[whole], source[whole]))
+        contained = meets & inside
+        pieces.append((depth[contained], code[contained], source[contained]))
         crossed = meets & ~inside
-        total += int(np.count_nonzero(whole))
-        if total + 8 * int(np.count_nonzero(crossed)) > most:
-            raise Invalid(f"cutting to this box would give more than {most} voxels: ask for a smaller box")
+        total += int(np.count_nonzero(contained))
+        if total + 8 * int(np.count_nonzero(crossed)) > limit:
+            raise Invalid(f"cutting to this box would give more than {limit} voxels: ask for a smaller box")
         depth = np.repeat(depth[crossed] + np.uint8(1), 8)
         octants = np.tile(np.arange(8, dtype=np.uint64), int(np.count_nonzero(crossed)))
         code = np.repeat(code[crossed] << np.uint64(3), 8) | octants
         source = np.repeat(source[crossed], 8)
-    if not kept:
+    if not pieces:
         return voxels
-    depth, code, source = (np.concatenate(columns) for columns in zip(*kept, strict=True))
-    if len(kept) > 1:
+    depth, code, source = (np.concatenate(columns) for columns in zip(*pieces, strict=True))
+    if len(pieces) > 1:
         order = np.argsort(code << _bits_below(depth))
         depth, code, source = depth[order], code[order], source[order]
     colour = None if voxels.colour is None else voxels.colour[source]
@@ -323,5 +323,5 @@ def _voxel_range(box: Box3, resolution: float) -> tuple[list[int], list[int]]:
 
 def _near(value: float) -> float:
     """A whole number where it is one but for the rounding of a division (0.3 / 0.1)."""
-    whole = round(value)
-    return float(whole) if abs(value - whole) < 1e-6 else value
+    integer = round(value)
+    return float(integer) if abs(value - integer) < 1e-6 else value

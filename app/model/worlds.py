@@ -27,36 +27,36 @@ def rank(name: str, entry: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def names(part: Features) -> list[str]:
     """The worlds of a part, the one that is meant where nobody says so first."""
-    said = part.document.get(FAMILY)
-    known = said.get("worlds") if isinstance(said, Mapping) else None
-    if not isinstance(known, Mapping):
+    document = part.document.get(FAMILY)
+    worlds = document.get("worlds") if isinstance(document, Mapping) else None
+    if not isinstance(worlds, Mapping):
         return []
     used = {world_of(p) for p in part.properties}
-    there = {str(k): w for k, w in known.items() if isinstance(w, Mapping) and ("sdf" in w or str(k) in used)}
-    return sorted(there, key=lambda name: rank(name, there[name]))
+    used_worlds = {str(k): w for k, w in worlds.items() if isinstance(w, Mapping) and ("sdf" in w or str(k) in used)}
+    return sorted(used_worlds, key=lambda name: rank(name, used_worlds[name]))
 
 
 def world_of(properties: Properties) -> str | None:
     """The world that an object belongs to; None: each."""
-    own = properties.get(FAMILY)
-    name = own.get("world") if isinstance(own, Mapping) else None
+    source_properties = properties.get(FAMILY)
+    name = source_properties.get("world") if isinstance(source_properties, Mapping) else None
     return None if name is None else str(name)
 
 
-def chosen(part: Features, wanted: str | None) -> tuple[Features, list[str]]:
+def chosen(part: Features, world: str | None) -> tuple[Features, list[str]]:
     """The objects of one world, by its path or its file's name, else of the first; and the other worlds.
 
     NotFound tells the known ones.
     """
-    known = names(part)
-    if wanted is not None and known:
-        found = [name for name in known if wanted in (name, PurePosixPath(name).name)]
-        if not found:
+    worlds = names(part)
+    if world is not None and worlds:
+        matches = [name for name in worlds if world in (name, PurePosixPath(name).name)]
+        if not matches:
             raise NotFound(
-                f"there is no world {wanted[:200]!r}{did_you_mean(wanted, known)}; there are: {', '.join(known)}"
+                f"there is no world {world[:200]!r}{did_you_mean(world, worlds)}; there are: {', '.join(worlds)}"
             )
-        known = [found[0], *(name for name in known if name != found[0])]
-    if len(known) < 2:
+        worlds = [matches[0], *(name for name in worlds if name != matches[0])]
+    if len(worlds) < 2:
         return part, []
-    others = frozenset(known[1:])
-    return part.take([k for k, p in enumerate(part.properties) if world_of(p) not in others]), known[1:]
+    others = frozenset(worlds[1:])
+    return part.take([k for k, p in enumerate(part.properties) if world_of(p) not in others]), worlds[1:]

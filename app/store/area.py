@@ -150,8 +150,8 @@ def _floors(entries: Iterable[PartEntry], datum: Datum | None) -> list[PartEntry
     """The parts that may hold floor."""
     if _frame(datum) is None:
         return []
-    found = [e for e in entries if e.count and e.key.layer in AREA_LAYERS - {"location"}]
-    return [e for e in found if e.key.layer != "occupancy" or e.key.name not in masks.MASKS]
+    floor_entries = [e for e in entries if e.count and e.key.layer in AREA_LAYERS - {"location"}]
+    return [e for e in floor_entries if e.key.layer != "occupancy" or e.key.name not in masks.MASKS]
 
 
 def _guess(draft: Draft, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
@@ -225,9 +225,9 @@ def free_rectangle(draft: Draft, grid: PartRoot) -> Any:
             boxes += _free_boxes(header, parts.tile_cells(raw) == FREE, codes[name])
     if not boxes:
         return None
-    found = np.array(boxes, np.float64)
-    u0, v0 = found[:, :2].min(axis=0).tolist()
-    u1, v1 = found[:, 2:].max(axis=0).tolist()
+    bounds = np.array(boxes, np.float64)
+    u0, v0 = bounds[:, :2].min(axis=0).tolist()
+    u1, v1 = bounds[:, 2:].max(axis=0).tolist()
     x, y, yaw = header["origin"]
     along, across = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
     corners = np.array([along * u + across * v for u, v in ((u0, v0), (u1, v0), (u1, v1), (u0, v1))])
@@ -267,21 +267,21 @@ def area_on_earth(by: Literal["fence", "floor", "datum"], shape: Any, size: floa
     for turn in (-360.0, 0.0, 360.0):
         cut = shapely.intersection(shape, shapely.box(-180.0 + turn, -90.0, 180.0 + turn, 90.0))
         pieces.append(shapely.transform(cut, lambda xy, turn=turn: xy - np.array([turn, 0.0])))
-    whole = _polygonal(shapely.union_all(pieces))
-    if whole is None:
+    union = _polygonal(shapely.union_all(pieces))
+    if union is None:
         return NO_AREA
-    west, _, east, _ = whole.bounds
+    west, _, east, _ = union.bounds
     if east - west > 180.0:
         halves = [
-            _polygonal(shapely.intersection(whole, shapely.box(w, -90.0, w + 180.0, 90.0))) for w in (-180.0, 0.0)
+            _polygonal(shapely.intersection(union, shapely.box(w, -90.0, w + 180.0, 90.0))) for w in (-180.0, 0.0)
         ]
     else:
-        halves = [whole]
-    found = [half for half in halves if half is not None]
+        halves = [union]
+    areas = [half for half in halves if half is not None]
     return Area(
         by,
-        round(sum(surface(half) for half in found) if size is None else size, 1),
-        tuple((_box(half), bytes(to_wkb(np.array([half], object))[0])) for half in found),
+        round(sum(surface(half) for half in areas) if size is None else size, 1),
+        tuple((_box(half), bytes(to_wkb(np.array([half], object))[0])) for half in areas),
     )
 
 

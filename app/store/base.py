@@ -42,10 +42,10 @@ def utcnow() -> datetime:
     return datetime.now(UTC)
 
 
-def text(value: str, what: str, longest: int = MAX_TEXT) -> str:
+def text(value: str, label: str, longest: int = MAX_TEXT) -> str:
     """A text that both databases can keep: no NUL, no lone surrogate, not too long; else Invalid."""
     if len(value) > longest or "\x00" in value or any("\ud800" <= c <= "\udfff" for c in value):
-        raise Invalid(f"{what} must have at most {longest} characters, none of them NUL or half of a surrogate pair")
+        raise Invalid(f"{label} must have at most {longest} characters, none of them NUL or half of a surrogate pair")
     return value
 
 

@@ -142,19 +142,23 @@ class Blobs:
                 large[name] = data
             sizes[name] = size
             names.append(name)
-        known = self._touch(sizes)
-        lost = {n for n in sizes if n not in known or self._problem(n, known[n]) is not None}
+        stored_rows = self._touch(sizes)
+        lost = {n for n in sizes if n not in stored_rows or self._problem(n, stored_rows[n]) is not None}
         if lost:
             with self._workspace() as workspace:
                 self._write_large(workspace, {n: d for n, d in large.items() if n in lost})
                 rows = self._write_packs(workspace, {n: d for n, d in small.items() if n in lost})
             rows += [{"sha256": n, "size": sizes[n], "pack": None, "start": 0} for n in large if n in lost]
             with self._database.write(upkeep=True) as connection:
-                _upsert(connection, [r for r in rows if r["sha256"] not in known])
+                _upsert(connection, [r for r in rows if r["sha256"] not in stored_rows])
                 # A row whose file was lost: the content is back, at a new place.
                 _relocate(
                     connection,
-                    [{"name": r["sha256"], "to": r["pack"], "at": r["start"]} for r in rows if r["sha256"] in known],
+                    [
+                        {"name": r["sha256"], "to": r["pack"], "at": r["start"]}
+                        for r in rows
+                        if r["sha256"] in stored_rows
+                    ],
                 )
         return names
 
@@ -182,14 +186,14 @@ class Blobs:
                 while left and (block := file.read(min(BLOCK, left))):
                     digest.update(block)
                     left -= len(block)
-                whole = not left and (row.pack is not None or not file.read(1))
+                complete = not left and (row.pack is not None or not file.read(1))
         except FileNotFoundError:
             return "lost"
         except OSError as error:
             if error.errno not in BROKEN:
                 raise _unreadable(error) from error
             return "damaged"
-        return None if whole and digest.hexdigest() == name else "damaged"
+        return None if complete and digest.hexdigest() == name else "damaged"
 
     def _write_large(self, workspace: Path, files: Mapping[str, bytes | Path]) -> None:
         folders: set[Path] = set()
@@ -231,12 +235,12 @@ class Blobs:
         return rows
 
     def _write_pack(self, workspace: Path, files: Mapping[str, bytes]) -> list[dict[str, object]]:
-        whole = b"".join(files.values())
+        content = b"".join(files.values())
         # Two packs with the same content in another order of names are two files: no row ever changes its meaning.
-        pack = hashlib.sha256(whole + secrets.token_bytes(16)).hexdigest()
+        pack = hashlib.sha256(content + secrets.token_bytes(16)).hexdigest()
         temporary = workspace / pack
         with temporary.open("wb") as out:
-            out.write(whole)
+            out.write(content)
             out.flush()
             os.fsync(out.fileno())
         temporary.replace(self._packs / pack)
@@ -256,11 +260,11 @@ class Blobs:
 
     def get_many(self, hashes: Sequence[str]) -> dict[str, bytes]:
         """SHA-256 -> content, all hashed again."""
-        wanted = list(dict.fromkeys(hashes))
+        names = list(dict.fromkeys(hashes))
         with self._database.read() as connection:
-            rows = self._rows(connection, wanted)
+            rows = self._rows(connection, names)
         out: dict[str, bytes] = {}
-        for name in wanted:
+        for name in names:
             if name not in rows:
                 raise NotFound(f"there is no stored file {name}")
             data = self._read(name, rows[name])
@@ -357,9 +361,9 @@ class Blobs:
             for folder in self._temporary.iterdir():
                 count += folder.is_dir() and _remove_abandoned(folder)
         with self._database.read() as connection:
-            known = set(connection.execute(select(blob.c.pack).where(blob.c.pack.is_not(None)).distinct()).scalars())
+            packs = set(connection.execute(select(blob.c.pack).where(blob.c.pack.is_not(None)).distinct()).scalars())
         for path in self._packs.iterdir():
-            if path.name not in known:
+            if path.name not in packs:
                 count += _unlink_if_older(path, limit)
         return count
 
@@ -378,12 +382,12 @@ class Blobs:
         for start in range(0, len(names), BATCH):
             some = names[start : start + BATCH]
             with self._database.write(upkeep=True) as connection:
-                gone = connection.execute(
+                deleted_rows = connection.execute(
                     delete(blob)
                     .where(blob.c.sha256.in_(some), blob.c.used < before)
                     .returning(blob.c.sha256, blob.c.size, blob.c.pack)
                 ).all()
-                for row in gone:
+                for row in deleted_rows:
                     count += 1
                     freed += row.size
                     if row.pack is None:
@@ -418,9 +422,9 @@ class Blobs:
                 continue
             files = [path for path in folder.iterdir() if _NAME.fullmatch(path.name)]
             with self._database.read() as connection:
-                known = self._rows(connection, [path.name for path in files])
+                rows = self._rows(connection, [path.name for path in files])
             for path in files:
-                if path.name not in known:
+                if path.name not in rows:
                     _unlink_if_older(path, before)
 
     def verify(self) -> list[str]:

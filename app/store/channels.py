@@ -82,20 +82,20 @@ class Channels(Base):
                 query = select(version.c.sequence).where(version.c.environment_id == row.id, version.c.number == number)
                 sequence = connection.execute(query).scalar()
             else:
-                known = connection.execute(
+                channel_row = connection.execute(
                     select(table.c.version, table.c.sequence).where(
                         table.c.environment_id == row.id, table.c.name == ref
                     )
                 ).one_or_none()
-                if known is None or known.version is None:
+                if channel_row is None or channel_row.version is None:
                     near = nearest_channel(connection, row, ref)
                     raise NotFound(f"{environment} has no channel {ref!r} that points to a version{near}")
-                number, sequence = known.version, known.sequence
-            found, sequence = read_version(connection, row, number), int(sequence or 0)
+                number, sequence = channel_row.version, channel_row.sequence
+            stored_version, sequence = read_version(connection, row, number), int(sequence or 0)
             if mode == "ignore":
-                return found, sequence
+                return stored_version, sequence
             in_force = closures_in_force(connection, row).in_mode(mode)
-            return replace(found, closures=in_force), max(sequence, int(row.closures_sequence))
+            return replace(stored_version, closures=in_force), max(sequence, int(row.closures_sequence))
 
     def set_channel(
         self,
@@ -118,29 +118,29 @@ class Channels(Base):
             raise Invalid("activate_at needs a time zone, for example 2026-05-01T04:00:00Z")
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            now, who = utcnow(), text(author, "an author")
+            now, author_name = utcnow(), text(author, "an author")
             if rollout is not None:
                 root = read_version(connection, row, version).root
                 rollout = replace(rollout, version=version, root=root, activate_at=activate_at, started=now)
             if activate_at is None and (rollout is None or rollout.ready is None):
-                _move(connection, row, channel, version, who, now, rollout=rollout)
+                _move(connection, row, channel, version, author_name, now, rollout=rollout)
             else:
-                _plan(connection, row, channel, version, who, activate_at, rollout)
+                _plan(connection, row, channel, version, author_name, activate_at, rollout)
             return _read(connection, row, channel)
 
     def cancel_planned(self, environment: str, channel: str, author: str) -> Channel:
         """Forget a planned move; NotFound where there is none."""
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            known = _row(connection, row, channel)
-            if known is None or known.planned_version is None:
+            channel_row = _row(connection, row, channel)
+            if channel_row is None or channel_row.planned_version is None:
                 raise NotFound(f"channel {channel!r} of {environment} has no planned move")
-            why, who = "the plan was cancelled", text(author, "an author")
-            if known.rollout_state == "waiting":
-                _end(connection, row, known, "cancelled", why, who)
+            why, author_name = "the plan was cancelled", text(author, "an author")
+            if channel_row.rollout_state == "waiting":
+                _end(connection, row, channel_row, "cancelled", why, author_name)
             else:
-                _store(connection, row, channel, known, **_NO_PLAN)
-                _tell_dropped(connection, row, known, why, who)
+                _store(connection, row, channel, channel_row, **_NO_PLAN)
+                _tell_dropped(connection, row, channel_row, why, author_name)
             return _read(connection, row, channel)
 
     def apply_due(self, now: datetime) -> list[tuple[str, Channel]]:
@@ -159,12 +159,12 @@ class Channels(Base):
         for environment, name in due:
             with self._database.write() as connection:
                 row = environment_row(connection, environment, lock=True)
-                known = _row(connection, row, name)
-                if known is None or known.planned_at is None or known.planned_at > now:
+                channel_row = _row(connection, row, name)
+                if channel_row is None or channel_row.planned_at is None or channel_row.planned_at > now:
                     continue
-                if known.rollout_state == "waiting":
+                if channel_row.rollout_state == "waiting":
                     continue
-                _move(connection, row, name, known.planned_version, known.planned_author or "", now)
+                _move(connection, row, name, channel_row.planned_version, channel_row.planned_author or "", now)
                 out.append((environment, _read(connection, row, name)))
         return out
 
@@ -185,16 +185,16 @@ class Channels(Base):
             rows = connection.execute(query).all()
             due = [r for r in rows if _next(connection, r, now, decide) is not None]
         out = []
-        for found in due:
+        for due_row in due:
             with self._database.write() as connection:
-                row = environment_row(connection, found.environment, lock=True)
-                known = _row(connection, row, found.name)
-                if known is None or known.rollout_state not in OPEN_ROLLOUTS:
+                row = environment_row(connection, due_row.environment, lock=True)
+                channel_row = _row(connection, row, due_row.name)
+                if channel_row is None or channel_row.rollout_state not in OPEN_ROLLOUTS:
                     continue
-                step = _next(connection, known, now, decide)
+                step = _next(connection, channel_row, now, decide)
                 if step is not None:
-                    _take(connection, row, known, step, now)
-                    out.append((found.environment, _read(connection, row, found.name)))
+                    _take(connection, row, channel_row, step, now)
+                    out.append((due_row.environment, _read(connection, row, due_row.name)))
         return out
 
 
@@ -207,8 +207,8 @@ def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Deci
 
 def _marked(connection: Connection, environment: Row[Any], channel: str, rollout: Rollout) -> Rollout:
     """The roll-out at the beginning of a stage: which robots said before it that they failed with this version."""
-    said = (r for r in robots_of(connection, environment.id, channel) if r.failed_with(rollout.root))
-    return replace(rollout, said_before={r.robot: rfc3339(r.time) for r in said})
+    failed_robots = (r for r in robots_of(connection, environment.id, channel) if r.failed_with(rollout.root))
+    return replace(rollout, said_before={r.robot: rfc3339(r.time) for r in failed_robots})
 
 
 def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step: Step, now: datetime) -> None:
@@ -285,9 +285,9 @@ def _as_channel(
     return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time, rollout, *more)
 
 
-def _store(connection: Connection, environment: Row[Any], channel: str, known: object, **values: Any) -> None:
+def _store(connection: Connection, environment: Row[Any], channel: str, channel_row: object, **values: Any) -> None:
     table = tables.channel
-    if known is None:
+    if channel_row is None:
         connection.execute(insert(table).values(environment_id=environment.id, name=channel, **values))
     else:
         connection.execute(
@@ -309,11 +309,11 @@ def _move(
 ) -> None:
     """Move a channel. rollout: what it belongs to; with a share of failures to look out for it is watched from now."""
     target = read_version(connection, environment, number)
-    known = _row(connection, environment, channel)
+    channel_row = _row(connection, environment, channel)
     nothing: dict[str, Any] = {**_NO_PLAN}
     before = None
-    if known is not None and known.version is not None:
-        before = read_version(connection, environment, known.version)
+    if channel_row is not None and channel_row.version is not None:
+        before = read_version(connection, environment, channel_row.version)
     if rollout is not None and rollout.state in OPEN_ROLLOUTS:
         watched = rollout.failed is not None and before is not None and before.number != number
         state: RolloutState = "watching" if watched else "done"
@@ -323,16 +323,16 @@ def _move(
     if rollout is not None:
         nothing |= {"rollout": rollout.as_row(), "rollout_state": rollout.state}
     if before is not None and before.number == number:
-        _store(connection, environment, channel, known, **nothing)
-        if known is not None and known.planned_version not in (None, number):
-            _tell_dropped(connection, environment, known, "the channel stays where it is", author)
+        _store(connection, environment, channel, channel_row, **nothing)
+        if channel_row is not None and channel_row.planned_version not in (None, number):
+            _tell_dropped(connection, environment, channel_row, "the channel stays where it is", author)
         return
     sequence = environment.sequence + 1
     _store(
         connection,
         environment,
         channel,
-        known,
+        channel_row,
         version=number,
         sequence=sequence,
         author=author,
@@ -356,19 +356,19 @@ def _plan(
     rollout: Rollout | None,
 ) -> None:
     target = read_version(connection, environment, number)
-    known = _row(connection, environment, channel)
+    channel_row = _row(connection, environment, channel)
     now = utcnow()
     before = None
-    if known is not None and known.version is not None:
-        before = read_version(connection, environment, known.version)
+    if channel_row is not None and channel_row.version is not None:
+        before = read_version(connection, environment, channel_row.version)
     if rollout is not None:
         rollout = _marked(connection, environment, channel, rollout)
     sequence = environment.sequence + 1
     plan: dict[str, Any] = {"planned_version": number, "planned_at": at, "planned_author": author}
     plan |= {"rollout": rollout and rollout.as_row(), "rollout_state": rollout and rollout.state}
-    if known is None:
+    if channel_row is None:
         plan |= {"version": None, "sequence": 0, "author": author, "time": now}
-    _store(connection, environment, channel, known, **plan)
+    _store(connection, environment, channel, channel_row, **plan)
     _bump(connection, environment, sequence)
     about: dict[str, Any] = {"sequence": sequence, "author": author, "time": now}
     if at is not None:

@@ -35,10 +35,10 @@ class Chunks:
         out: dict[bytes, bytes] = {}
         with self._lock:
             for h in hashes:
-                known = self._cache.get(h)
-                if known is not None:
+                chunk = self._cache.get(h)
+                if chunk is not None:
                     self._cache.move_to_end(h)
-                    out[h] = known
+                    out[h] = chunk
         missing = [h for h in dict.fromkeys(hashes) if h not in out]
         if missing:
             read = self._query(missing)

@@ -84,7 +84,7 @@ class Collection(Base):
 
     def _tidy(self) -> None:
         now = utcnow()
-        known, keys, jobs = tables.event, tables.idempotency, tables.job
+        events, keys, jobs = tables.event, tables.idempotency, tables.job
         with self._database.write(upkeep=True) as connection:
             connection.execute(delete(keys).where(keys.c.time < now - timedelta(days=IDEMPOTENCY_DAYS)))
             silent = now - timedelta(days=ROBOT_DAYS)
@@ -96,8 +96,8 @@ class Collection(Base):
             finished = jobs.c.state.in_(("done", "failed", "cancelled"))
             connection.execute(delete(jobs).where(finished, jobs.c.updated < now - timedelta(days=JOB_DAYS)))
             connection.execute(
-                delete(known).where(
-                    known.c.time < now - timedelta(days=EVENT_DAYS),
-                    known.c.environment_id.not_in(select(tables.environment.c.id)),
+                delete(events).where(
+                    events.c.time < now - timedelta(days=EVENT_DAYS),
+                    events.c.environment_id.not_in(select(tables.environment.c.id)),
                 )
             )

@@ -64,8 +64,8 @@ class Content(Base):
             frame = None if version.datum is None else local_frame(version.datum)
             items = parts.features_in_box(draft, root, bbox, crs, frame)
             if ids is not None:
-                wanted = set(ids)
-                items = {i: item for i, item in items.items() if i in wanted}
+                selected_ids = set(ids)
+                items = {i: item for i, item in items.items() if i in selected_ids}
         return parts.features_of(items, parts.read_document(draft, root))
 
     def get(self, version: Version, key: PartKey, ids: Collection[str]) -> Features:
@@ -144,8 +144,8 @@ def _grid_delta(draft: Draft, key: PartKey, old: PartRoot | None, new: PartRoot 
 
 
 def _missing(version: Version, key: PartKey) -> str:
-    known = ", ".join(f"{e.key.layer}/{e.key.level}/{e.key.name}" for e in version.parts) or "nothing"
+    contents = ", ".join(f"{e.key.layer}/{e.key.level}/{e.key.name}" for e in version.parts) or "nothing"
     return (
         f"version {version.number} of {version.environment} has no {key.layer} {key.name!r} on level {key.level!r}; it "
-        f"has {known}"
+        f"has {contents}"
     )

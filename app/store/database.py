@@ -71,10 +71,10 @@ def engine(url: str, *, readonly: bool) -> Engine:
     if parsed.get_backend_name() == "sqlite":
         if parsed.database and parsed.database != ":memory:" and not readonly:
             Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
-        made = create_engine(parsed, **options)
-        event.listen(made, "connect", _sqlite_connected(readonly))
-        event.listen(made, "begin", _sqlite_begin)
-        return made
+        sql_engine = create_engine(parsed, **options)
+        event.listen(sql_engine, "connect", _sqlite_connected(readonly))
+        event.listen(sql_engine, "begin", _sqlite_begin)
+        return sql_engine
     if parsed.get_backend_name() == "postgresql":
         settings = "-c synchronous_commit=on -c jit=off" + (" -c default_transaction_read_only=on" if readonly else "")
         connect = {"connect_timeout": 5, "application_name": "fleetmap", "options": settings}
@@ -278,8 +278,8 @@ class Database:
         try:
             inode = self.file.stat().st_ino
         except OSError as error:
-            what = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
-            problem = f"the database {self._name} {what}: stop the server, put the file back or restore a backup"
+            fault = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+            problem = f"the database {self._name} {fault}: stop the server, put the file back or restore a backup"
         else:
             problem = f"the database {self._name} was replaced while the server runs: restart the server"
             problem = "" if inode == self._inode else problem

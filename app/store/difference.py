@@ -316,7 +316,7 @@ class _Voxels(NamedTuple):
 def _voxels(draft: Draft, names: Sequence[bytes], root: PartRoot | None) -> _Voxels:
     colour = root is not None and bool(root.header["colour"])
     record = np.dtype([("odds", "<f4"), ("colour", "u1", 3), ("coloured", "u1")])
-    keys, said = [np.empty(0, np.uint64)], [np.empty(0, record)]
+    keys, records = [np.empty(0, np.uint64)], [np.empty(0, record)]
     for start in range(0, len(names), parts.TILE_BATCH):
         some = names[start : start + parts.TILE_BATCH]
         raws = draft.stream(some)
@@ -328,15 +328,15 @@ def _voxels(draft: Draft, names: Sequence[bytes], root: PartRoot | None) -> _Vox
             rows["odds"] = log_odds
             if shades is not None:
                 rows["colour"], rows["coloured"] = shades, 1
-            said.append(rows)
-    return _Voxels(np.concatenate(keys), np.concatenate(said).view("V8"))
+            records.append(rows)
+    return _Voxels(np.concatenate(keys), np.concatenate(records).view("V8"))
 
 
 def _voxel_changes(before: _Voxels, after: _Voxels) -> dict[str, Any]:
     """How many came, changed and went; millions of them take no object each."""
     at = np.searchsorted(before.key, after.key)
-    known = at < len(before.key)
-    known[known] = before.key[at[known]] == after.key[known]
-    shared = int(np.count_nonzero(known))
-    changed = int(np.count_nonzero(before.said[at[known]] != after.said[known]))
+    common = at < len(before.key)
+    common[common] = before.key[at[common]] == after.key[common]
+    shared = int(np.count_nonzero(common))
+    changed = int(np.count_nonzero(before.said[at[common]] != after.said[common]))
     return {"added": len(after.key) - shared, "changed": changed, "deleted": len(before.key) - shared}

@@ -150,21 +150,21 @@ def array_header(n: int) -> bytes:
     return b"\xdd" + n.to_bytes(4, "big")
 
 
-def pack_value(value: Any, where: str) -> bytes:
+def pack_value(value: Any, location: str) -> bytes:
     """Canonical bytes of a JSON-like value; Invalid tells where something cannot be stored."""
     try:
         packed = ormsgpack.packb(value, default=_plain, option=OPTIONS)
     except (TypeError, ValueError, RecursionError) as error:
         reason = f"this cannot be stored: {error}"
-        raise Invalid(f"{where}: {reason}", [Problem(reason, where=where)]) from error
+        raise Invalid(f"{location}: {reason}", [Problem(reason, where=location)]) from error
     if _BINARY.search(packed):
         try:
             orjson.dumps(value, default=_plain)
         except TypeError as error:
             reason = f"this cannot be stored: {error}"
-            raise Invalid(f"{where}: {reason}", [Problem(reason, where=where)]) from error
+            raise Invalid(f"{location}: {reason}", [Problem(reason, where=location)]) from error
     if _SUSPECT.search(packed):
-        packed = ormsgpack.packb(_normalised(value, where), default=_plain, option=OPTIONS)
+        packed = ormsgpack.packb(_normalised(value, location), default=_plain, option=OPTIONS)
     return packed
 
 
@@ -175,13 +175,13 @@ def pack_properties(ids: Sequence[str], properties: Sequence[Properties]) -> lis
         packed = [packb(p, default=_plain, option=OPTIONS) for p in properties]
     except (TypeError, ValueError, RecursionError):
         return [pack_value(p, i) for i, p in zip(ids, properties, strict=True)]
-    whole = b"".join(packed)
-    if _BINARY.search(whole):
+    content = b"".join(packed)
+    if _BINARY.search(content):
         try:
             orjson.dumps(properties, default=_plain)
         except TypeError:
             return [pack_value(p, i) for i, p in zip(ids, properties, strict=True)]
-    if _SUSPECT.search(whole):
+    if _SUSPECT.search(content):
         packed = [pack_value(properties[k], ids[k]) if _SUSPECT.search(one) else one for k, one in enumerate(packed)]
     return packed
 
@@ -195,18 +195,18 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is no JSON value")
 
 
-def _normalised(value: Any, where: str) -> Any:
+def _normalised(value: Any, location: str) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
         if not np.isfinite(value):
             reason = f"a number must be finite, got {value}"
-            raise Invalid(f"{where}: {reason}", [Problem(reason, where=where)])
+            raise Invalid(f"{location}: {reason}", [Problem(reason, where=location)])
         return value + 0.0
     if isinstance(value, Mapping):
-        return {key: _normalised(member, where) for key, member in value.items()}
+        return {key: _normalised(member, location) for key, member in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_normalised(member, where) for member in value]
+        return [_normalised(member, location) for member in value]
     return value
 
 
@@ -268,16 +268,16 @@ def wkb_bounds(wkb: Sequence[bytes]) -> NDArray[np.float64]:
     lengths = np.fromiter(map(len, wkb), np.intp, len(wkb))
     rest = np.ones(len(wkb), bool)
     for length, kind, first in ((21, 1, 5), (41, 2, 9)):
-        where = np.flatnonzero(lengths == length)
-        if not len(where):
+        indices = np.flatnonzero(lengths == length)
+        if not len(indices):
             continue
-        rows = np.frombuffer(b"".join([wkb[k] for k in where.tolist()]), np.uint8).reshape(len(where), length)
+        rows = np.frombuffer(b"".join([wkb[k] for k in indices.tolist()]), np.uint8).reshape(len(indices), length)
         plain = np.ascontiguousarray(rows[:, 1:5]).view("<u4")[:, 0] == kind
-        rows, where = rows[plain], where[plain]
-        xy = np.ascontiguousarray(rows[:, first:]).view("<f8").reshape(len(where), -1, 2)
-        out[where, :2] = xy.min(axis=1)
-        out[where, 2:] = xy.max(axis=1)
-        rest[where] = False
+        rows, indices = rows[plain], indices[plain]
+        xy = np.ascontiguousarray(rows[:, first:]).view("<f8").reshape(len(indices), -1, 2)
+        out[indices, :2] = xy.min(axis=1)
+        out[indices, 2:] = xy.max(axis=1)
+        rest[indices] = False
     others = np.flatnonzero(rest)
     if len(others):
         out[others] = bounds(from_wkb([wkb[k] for k in others.tolist()]))

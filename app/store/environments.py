@@ -65,10 +65,10 @@ class Environments(Base):
         now = utcnow()
         with self._database.write() as connection:
             new = secrets.token_hex(16)
-            known = connection.execute(
+            last_sequence = connection.execute(
                 select(tables.retired.c.sequence).where(tables.retired.c.name == name)
             ).scalar_one_or_none()
-            sequence = int(known or 0) + 1
+            sequence = int(last_sequence or 0) + 1
             values = {
                 "id": new,
                 "name": name,
@@ -307,7 +307,7 @@ def _first_version(
         base = read_version(connection, origin, clone.number)
         place, parts, levels, sources = datum or base.datum, base.parts, base.levels, base.sources
         message = f"cloned from {clone.environment}, version {clone.number}"
-    made = Version(
+    version = Version(
         environment=row.name,
         number=1,
         root=version_root(parts, place, levels, base.templates),
@@ -323,7 +323,7 @@ def _first_version(
         parts=parts,
         templates=base.templates,
     )
-    return made, message
+    return version, message
 
 
 def _tell(
@@ -368,9 +368,9 @@ def filters(*, q: str | None, bbox: Box | None, deleted: bool, dialect: str) -> 
     out: list[ColumnElement[bool]] = [table.c.deleted.is_not(None) if deleted else table.c.deleted.is_(None)]
     if q:
         columns = (table.c.name, table.c.title, table.c.description)
-        found = [func.lower(c).contains(q.lower(), autoescape=True) for c in columns]
-        found.append(func.lower(cast(table.c.tags, Text)).contains(q.lower(), autoescape=True))
-        out.append(or_(*found))
+        conditions = [func.lower(c).contains(q.lower(), autoescape=True) for c in columns]
+        conditions.append(func.lower(cast(table.c.tags, Text)).contains(q.lower(), autoescape=True))
+        out.append(or_(*conditions))
     if bbox is not None:
         out.append(meets(table, table.c.extent, _checked(bbox), dialect))
     return out

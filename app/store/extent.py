@@ -50,11 +50,11 @@ def geometry(box: Box | None) -> bytes | None:
     if box is None:
         return None
     shapes = [_shape(one) for one in split_box(box)]
-    whole = shapes[0] if len(shapes) == 1 else shapely.GeometryCollection(shapes)
+    shape = shapes[0] if len(shapes) == 1 else shapely.GeometryCollection(shapes)
     if len(shapes) == 2 and all(s.geom_type == "Polygon" for s in shapes):
-        whole = shapely.MultiPolygon(shapes)
+        shape = shapely.MultiPolygon(shapes)
     column = shapely.empty(1)
-    column[0] = whole
+    column[0] = shape
     return bytes(to_wkb(column)[0])
 
 

@@ -42,7 +42,7 @@ def apply(connection: Connection, environment_id: str, rows: Sequence[IndexRows]
     """Bring the index to what these changes say."""
     table = tables.place
     for one in rows:
-        here = and_(
+        condition = and_(
             table.c.environment_id == environment_id,
             table.c.layer == one.key.layer,
             table.c.level == one.key.level,
@@ -50,7 +50,7 @@ def apply(connection: Connection, environment_id: str, rows: Sequence[IndexRows]
         )
         for start in range(0, len(one.removed), BATCH):
             some = list(one.removed[start : start + BATCH])
-            connection.execute(delete(table).where(here, table.c.feature.in_(some)))
+            connection.execute(delete(table).where(condition, table.c.feature.in_(some)))
         if one.put:
             connection.execute(
                 insert(table),

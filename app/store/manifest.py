@@ -43,8 +43,14 @@ def pack_manifest(
     ]
     place = datum.as_dict() if datum else None
     storeys = [[v.name, v.elevation] for v in levels]
-    said = templates.as_dict()
-    return compress(pack([WITH_TEMPLATES, place, storeys, rows, said] if said else [MANIFEST, place, storeys, rows]))
+    template_values = templates.as_dict()
+    return compress(
+        pack(
+            [WITH_TEMPLATES, place, storeys, rows, template_values]
+            if template_values
+            else [MANIFEST, place, storeys, rows]
+        )
+    )
 
 
 def _listed(box: Box | None) -> list[float] | None:

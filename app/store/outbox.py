@@ -103,12 +103,12 @@ class Outbox(Base):
                 query = query.where(table.c.position > since).order_by(table.c.position)
             else:
                 try:
-                    own = table.c.environment_id == environment_row(connection, environment, deleted=True).id
+                    condition = table.c.environment_id == environment_row(connection, environment, deleted=True).id
                 except NotFound:
-                    own = (table.c.environment == environment) & (table.c.position > _reach(connection))
-                    if connection.execute(query.where(own, table.c.sequence > since).limit(1)).first() is None:
+                    condition = (table.c.environment == environment) & (table.c.position > _reach(connection))
+                    if connection.execute(query.where(condition, table.c.sequence > since).limit(1)).first() is None:
                         raise
-                query = query.where(own, table.c.sequence > since).order_by(table.c.sequence)
+                query = query.where(condition, table.c.sequence > since).order_by(table.c.sequence)
             rows = connection.execute(query.limit(limit)).all()
         return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
 
@@ -120,23 +120,23 @@ class Outbox(Base):
     def relayed(self) -> int:
         """The position up to which events were handed to the bus."""
         with self._database.read() as connection:
-            found = connection.execute(select(tables.relay.c.position).where(tables.relay.c.id == 1)).scalar()
-        return int(found or 0)
+            position = connection.execute(select(tables.relay.c.position).where(tables.relay.c.id == 1)).scalar()
+        return int(position or 0)
 
     def set_relayed(self, position: int) -> None:
         """Note that events up to this position were handed over. It never goes back."""
         table = tables.relay
         with self._database.write(tell=False, upkeep=True) as connection:
-            known = connection.execute(select(table.c.position).where(table.c.id == 1)).scalar()
-            if known is None:
+            stored_position = connection.execute(select(table.c.position).where(table.c.id == 1)).scalar()
+            if stored_position is None:
                 connection.execute(insert(table).values(id=1, position=position))
-            elif known < position:
+            elif stored_position < position:
                 connection.execute(update(table).where(table.c.id == 1).values(position=position))
 
-    def last_events(self, position: int, each: int, most: int) -> list[Event]:
+    def last_events(self, position: int, each: int, limit: int) -> list[Event]:
         """The last ``each`` events up to a position of all environments, purged ones too, in the order of the log.
 
-        Where those are more than ``most``, each environment has fewer; where not even the last one of each fits, the
+        Where those are more than ``limit``, each environment has fewer; where not even the last one of each fits, the
         environments that were silent longest have none.
         """
         table = tables.event
@@ -150,7 +150,7 @@ class Outbox(Base):
             select(recent.c.position)
             .where(recent.c.rank <= each)
             .order_by(recent.c.rank, recent.c.position.desc())
-            .limit(most)
+            .limit(limit)
         )
         query = select(table).where(table.c.position.in_(chosen)).order_by(table.c.position)
         with self._database.read() as connection:

@@ -153,16 +153,16 @@ class Overlays(Base):
         )
         with self._database.read() as connection:
             due = connection.execute(query).all()
-        for found in due:
+        for due_row in due:
             with suppress(NotFound), self._database.write(upkeep=True) as connection:
-                row = environment_row(connection, found.environment, lock=True)
-                stored = _read(connection, row, found.id)
-                if stored.state != found.state or stored.expires > now:
+                row = environment_row(connection, due_row.environment, lock=True)
+                stored = _read(connection, row, due_row.id)
+                if stored.state != due_row.state or stored.expires > now:
                     continue  # another process was faster, or the end has moved
                 state: OverlayState = "expired" if stored.state == "pending" else "ended"
                 event: EventType = "overlay.expired" if stored.state == "pending" else "overlay.ended"
-                connection.execute(update(table).where(table.c.id == found.id).values(state=state, decided=now))
-                _append_event(connection, row, _read(connection, row, found.id), event, stored.decided_by or "", now)
+                connection.execute(update(table).where(table.c.id == due_row.id).values(state=state, decided=now))
+                _append_event(connection, row, _read(connection, row, due_row.id), event, stored.decided_by or "", now)
 
     def note_kept_overlay(self, environment: str, id: str, version: int) -> Overlay:
         """Record the version that made an overlay permanent. It stays in force until its end."""
@@ -185,14 +185,14 @@ def closures_in_force(connection: Connection, environment: Row[Any]) -> Closures
     """
     key = (str(environment.id), int(environment.closures_sequence))
     with _known_lock:
-        known = _known.get(key)
-    if known is None:
-        known = _read_closures(connection, environment)
+        closures = _known.get(key)
+    if closures is None:
+        closures = _read_closures(connection, environment)
         with _known_lock:
-            _known[key] = known
+            _known[key] = closures
             while len(_known) > MAX_KNOWN:
                 _known.popitem(last=False)
-    return known
+    return closures
 
 
 def _read_closures(connection: Connection, environment: Row[Any]) -> Closures:
@@ -217,13 +217,13 @@ def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overla
     """The id of the same reporter's same report that still waits. Raises Conflict if too many wait."""
     table = tables.overlay
     pending = (table.c.environment_id == environment.id, table.c.state == "pending")
-    own = select(table).where(*pending, table.c.reporter == overlay.reporter, table.c.expires > overlay.created)
-    theirs = connection.execute(own).all()
-    for row in theirs:
+    query = select(table).where(*pending, table.c.reporter == overlay.reporter, table.c.expires > overlay.created)
+    rows = connection.execute(query).all()
+    for row in rows:
         same = (row.kind, row.level, row.polygon, row.edge, row.crs)
         if same == (overlay.kind, overlay.level, overlay.polygon, overlay.edge, overlay.crs):
             return str(row.id)
-    if len(theirs) >= MAX_OF_ONE:
+    if len(rows) >= MAX_OF_ONE:
         raise Conflict(f"{overlay.reporter} has {MAX_OF_ONE} pending overlays, the maximum: wait for an editor")
     waiting = select(func.count()).select_from(table).where(*pending)
     if connection.execute(waiting).scalar_one() >= MAX_PENDING:
@@ -243,7 +243,7 @@ def _append_event(
         values["closures_sequence"] = sequence
         more["overlays_digest"] = _read_closures(connection, environment).digest
     connection.execute(update(owner).where(owner.c.id == environment.id).values(values))
-    what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
+    obstruction = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
     outbox.append(
         connection,
         environment_id=environment.id,
@@ -254,7 +254,7 @@ def _append_event(
         root=environment.root,
         previous=None,
         layers=[],
-        message=f"{what}, reported as {overlay.kind}" + (f": {overlay.detail}" if overlay.detail else ""),
+        message=f"{obstruction}, reported as {overlay.kind}" + (f": {overlay.detail}" if overlay.detail else ""),
         author=author,
         time=now,
         **more,

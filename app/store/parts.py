@@ -241,15 +241,15 @@ def compose(draft: Draft, part: Part, base: PartRoot | None, base_digest: str) -
 def _compose_features(draft: Draft, part: Features, base_digest: str) -> Made | None:
     document = put_document(draft, part.document)
     table = columns(part)
-    known = table.digest(pack(document))
-    if base_digest and known == base_digest:
+    digest = table.digest(pack(document))
+    if base_digest and digest == base_digest:
         return None
     trees: dict[str, Node | None] = {}
     for name, mask in (("local", table.local), ("wgs84", ~table.local)):
         trees[name] = _build_features(draft, table, np.flatnonzero(mask))
     trees["ids"] = _build_ids(draft, table)
     root = put_root(draft, "features", {"document": document}, trees)
-    return Made(root, len(part), feature_bounds(draft, trees, part), known)
+    return Made(root, len(part), feature_bounds(draft, trees, part), digest)
 
 
 def _build_features(draft: Draft, table: Columns, index: NDArray[np.intp]) -> Node | None:
@@ -335,7 +335,7 @@ def _dtype_name(dtype: np.dtype[Any]) -> str:
     return f"{dtype.kind}{dtype.itemsize}"
 
 
-def _build_tiles(draft: Draft, cells: NDArray[Any], known: Container[bytes]) -> Node | None:
+def _build_tiles(draft: Draft, cells: NDArray[Any], existing_names: Container[bytes]) -> Node | None:
     little = cells.dtype.newbyteorder("<")
     rows, cols = tile_counts(cells.shape[0], cells.shape[1])
     code = interleave(
@@ -347,7 +347,7 @@ def _build_tiles(draft: Draft, cells: NDArray[Any], known: Container[bytes]) -> 
         r, c = divmod(k, cols)
         block = cells[r * TILE : (r + 1) * TILE, c * TILE : (c + 1) * TILE]
         raw = pack([ENCODING, "tile", np.ascontiguousarray(block, little).tobytes()])
-        names.append(draft.put_big(raw, known))
+        names.append(draft.put_big(raw, existing_names))
     codes = code[order].astype(">u8").tobytes()
     keys = [codes[8 * k : 8 * k + 8] for k in range(len(names))]
     return tree.build(
@@ -503,31 +503,31 @@ def crossing_box(points: NDArray[np.float64]) -> Box:
 # --- edits by id ---
 
 
-def edit_features(draft: Draft, root: PartRoot, put: Features | None, deleted: Collection[str], what: str) -> Made:
+def edit_features(draft: Draft, root: PartRoot, put: Features | None, deleted: Collection[str], label: str) -> Made:
     """A collection with features put (added, or replaced by id) and others deleted; NotFound names unknown ids."""
     table = columns(put) if put is not None and len(put) else None
     touched = sorted({*(table.ids if table else ()), *deleted})
     places = find_places(draft, root, touched)
     missing = [i for i in deleted if i not in places]
     if missing:
-        raise NotFound(f"{what} has no feature {', '.join(map(repr, missing[:10]))}")
+        raise NotFound(f"{label} has no feature {', '.join(map(repr, missing[:10]))}")
     puts: tuple[dict[bytes, Any], dict[bytes, Any]] = ({}, {})
-    gone: tuple[set[bytes], set[bytes]] = (set(), set())
+    removals: tuple[set[bytes], set[bytes]] = (set(), set())
     new_places: dict[bytes, bytes] = {}
     for i in touched:
         if i in places:
-            gone[places[i][0]].add(places[i][1:] + i.encode())
+            removals[places[i][0]].add(places[i][1:] + i.encode())
     if table:
         for i, place, wkb, packed in zip(table.ids, _places(table), table.wkb, table.packed, strict=True):
             key = place[1:] + i.encode()
             puts[place[0]][key] = (wkb, packed)
-            gone[place[0]].discard(key)
+            removals[place[0]].discard(key)
             if places.get(i) != place:
                 new_places[i.encode()] = place
     leaf = FeatureLeaf()
     trees = {
-        "local": tree.edit(draft, leaf, root.trees["local"], puts[0], gone[0]),
-        "wgs84": tree.edit(draft, leaf, root.trees["wgs84"], puts[1], gone[1]),
+        "local": tree.edit(draft, leaf, root.trees["local"], puts[0], removals[0]),
+        "wgs84": tree.edit(draft, leaf, root.trees["wgs84"], puts[1], removals[1]),
         "ids": tree.edit(draft, IdLeaf(), root.trees["ids"], new_places, {i.encode() for i in deleted}),
     }
     header = dict(root.header)
@@ -549,10 +549,10 @@ def find_places(draft: Draft, root: PartRoot, ids: Sequence[str]) -> dict[str, b
     out: dict[str, bytes] = {}
     for name in tree.paths(draft, root.trees["ids"], keys):
         # Code points sort like their UTF-8.
-        known, places = _members(draft.read(name), "ids")
-        for i in ids[bisect_left(ids, known[0]) : bisect_right(ids, known[-1])]:
-            k = bisect_left(known, i)
-            if known[k] == i:
+        member_ids, places = _members(draft.read(name), "ids")
+        for i in ids[bisect_left(ids, member_ids[0]) : bisect_right(ids, member_ids[-1])]:
+            k = bisect_left(member_ids, i)
+            if member_ids[k] == i:
                 out[i] = places[9 * k : 9 * k + 9]
     return out
 
@@ -600,12 +600,12 @@ def trusted(
     document: Mapping[str, Any],
 ) -> Features:
     """A collection without the checks: its columns were checked before they were stored, and their hashes agree."""
-    made = object.__new__(Features)
+    features = object.__new__(Features)
     geometry.flags.writeable = False
     local.flags.writeable = False
     for name, value in zip(Features.__slots__, (ids, geometry, properties, local, document), strict=True):
-        object.__setattr__(made, name, value)
-    return made
+        object.__setattr__(features, name, value)
+    return features
 
 
 # --- box queries ---
@@ -747,10 +747,10 @@ class _Columns:
     local: int = 0
 
 
-def load(draft: Draft, wanted: Mapping[Any, bytes], fetch: FetchBlobs) -> dict[Any, Part]:
+def load(draft: Draft, root_hashes: Mapping[Any, bytes], fetch: FetchBlobs) -> dict[Any, Part]:
     """Parts by their hashes, with few queries for all of them together."""
-    draft.read_many(list(wanted.values()))
-    roots = {key: read_root(draft, name) for key, name in wanted.items()}
+    draft.read_many(list(root_hashes.values()))
+    roots = {key: read_root(draft, name) for key, name in root_hashes.items()}
     with no_garbage_collection():
         out: dict[Any, Part] = dict(_load_collections(draft, {k: r for k, r in roots.items() if r.type == "features"}))
     for key, root in roots.items():
@@ -762,7 +762,7 @@ def load(draft: Draft, wanted: Mapping[Any, bytes], fetch: FetchBlobs) -> dict[A
             out[key] = _load_voxels(draft, root)
         elif root.type == "resources":
             out[key] = _load_resources(draft, root, fetch)
-    return {key: out[key] for key in wanted}
+    return {key: out[key] for key in root_hashes}
 
 
 def _load_collections(draft: Draft, roots: Mapping[Any, PartRoot]) -> Iterator[tuple[Any, Features]]:
@@ -937,13 +937,13 @@ def _load_resources(draft: Draft, root: PartRoot, fetch: FetchBlobs) -> Resource
     return Resources({path: contents[h] for path, _, h in rows})
 
 
-def all_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[set[bytes], set[str]]:
+def all_chunks(draft: Draft, name: bytes, existing_names: Container[bytes]) -> tuple[set[bytes], set[str]]:
     """Everything a part refers to, but what is below known nodes: hashes of its chunks, and of its blobs (hex)."""
     root = read_root(draft, name)
     out = {name, *document_chunks(root)}
     blobs: set[str] = set()
     for node in root.trees.values():
-        out |= tree.names(draft, node, known)
+        out |= tree.names(draft, node, existing_names)
     if root.type in ("grid", "picture"):
         out |= _tile_names(draft, root)
     elif root.type == "resources":
@@ -951,7 +951,7 @@ def all_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[set[
     return out, blobs
 
 
-def new_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[list[bytes], list[bytes]]:
+def new_chunks(draft: Draft, name: bytes, existing_names: Container[bytes]) -> tuple[list[bytes], list[bytes]]:
     """The draft's own chunks that a part needs: (nodes and documents, tiles). known: chunks that the base has."""
     root = read_root(draft, name)
     nodes = [h for h in (name, *document_chunks(root)) if h in draft.new and not draft.was_read(h)]
@@ -960,7 +960,7 @@ def new_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[list
     raster = root.type in ("grid", "picture")
     while todo:
         node = todo.pop()
-        if node.hash not in draft.new or node.hash in known or draft.was_read(node.hash):
+        if node.hash not in draft.new or node.hash in existing_names or draft.was_read(node.hash):
             continue
         nodes.append(node.hash)
         if node.level:

@@ -76,9 +76,9 @@ class Position(Base):
         def page(connection: Connection) -> tuple[list[tuple[Environment, Match]], str | None]:
             hits = [h for h in self._hits(connection, latitude, longitude, conditions) if reaches(allowed, h.rank[3])]
             hits = sorted((h for h in hits if after is None or h.rank > after), key=lambda h: h.rank)
-            found = _environments(connection, [h.id for h in hits[:limit]])
+            environments = _environments(connection, [h.id for h in hits[:limit]])
             following = _cursor(hits[limit - 1].rank) if len(hits) > limit else None
-            return [(found[h.id], h.match) for h in hits[:limit] if h.id in found], following
+            return [(environments[h.id], h.match) for h in hits[:limit] if h.id in environments], following
 
         with self._database.read() as connection:
             if self.readonly or not _stale(connection):
@@ -194,5 +194,5 @@ def _rank(cursor: str) -> Rank:
         guessed, size, away, name = cursor.split(" ")
         return int(guessed), float(size), float(away), name
     except ValueError:
-        what = [Problem("from the last page's Link header", where="cursor")]
-        raise Invalid("cursor is not one of this list: take it from the last page's Link header", what) from None
+        problems = [Problem("from the last page's Link header", where="cursor")]
+        raise Invalid("cursor is not one of this list: take it from the last page's Link header", problems) from None

@@ -47,9 +47,9 @@ def _prepare(draft: Draft, base: Version, changes: Changes, is_intact: IsIntact)
         key = operation.key
         if isinstance(operation, Replace) and key in before and not is_intact(before[key].hash):
             del before[key], entries[key]  # it cannot be compared with, and none of its chunks counts as stored
-        made = compose_operation(draft, entries, operation)
-        if made is not None:
-            blobs.update(made.blobs)
+        encoded_part = compose_operation(draft, entries, operation)
+        if encoded_part is not None:
+            blobs.update(encoded_part.blobs)
         if isinstance(operation, Replace):
             replaced[operation.key] = operation
         else:
@@ -65,10 +65,10 @@ def _prepare(draft: Draft, base: Version, changes: Changes, is_intact: IsIntact)
     if root == base.root and not renewed:
         same = Prepared(base.number, root, fresh, base.parts, datum, levels, templates, {}, changed=False, area=KEEP)
         return replace(same, blobs=blobs)
-    what, features = summarise(draft, before, entries, replaced)
-    what |= frame_changes(base.datum, datum, base.levels, levels)
-    what |= template_changes(base.templates, templates)
-    what |= {"renewed": renewed} if renewed else {}
+    summary, features = summarise(draft, before, entries, replaced)
+    summary |= frame_changes(base.datum, datum, base.levels, levels)
+    summary |= template_changes(base.templates, templates)
+    summary |= {"renewed": renewed} if renewed else {}
     index = None
     if datum == base.datum and not damaged:
         index = index_rows(features, datum)
@@ -80,7 +80,7 @@ def _prepare(draft: Draft, base: Version, changes: Changes, is_intact: IsIntact)
         datum,
         levels,
         templates,
-        what,
+        summary,
         changed=True,
         blobs=blobs,
         index=index,
@@ -126,39 +126,46 @@ def compose_operation(draft: Draft, entries: dict[PartKey, PartEntry], operation
     """Carry out an operation on a version's entries: its chunks are in the draft; None where there are none."""
     key = operation.key
     entry = entries.get(key)
-    what = f"{key.layer} {key.name!r} on level {key.level!r}"
+    label = f"{key.layer} {key.name!r} on level {key.level!r}"
     if isinstance(operation, Drop):
         if entry is None:
-            raise NotFound(f"there is no {what}")
+            raise NotFound(f"there is no {label}")
         del entries[key]
         return None
     root = parts.read_root(draft, bytes.fromhex(entry.hash)) if entry else None
     if isinstance(operation, Replace):
         if not isinstance(operation.part, PART_TYPES[key.layer]):
-            raise Invalid(f"{what} must be {PART_TYPES[key.layer].__name__}, got {type(operation.part).__name__}")
-        made = parts.compose(draft, operation.part, root, entry.digest if entry else "")
-        if made is None and entry is not None:
+            raise Invalid(f"{label} must be {PART_TYPES[key.layer].__name__}, got {type(operation.part).__name__}")
+        encoded_part = parts.compose(draft, operation.part, root, entry.digest if entry else "")
+        if encoded_part is None and entry is not None:
             entries[key] = replace(entry, provenance=operation.provenance)
             return None
-        assert made is not None
+        assert encoded_part is not None
         entries[key] = PartEntry(
-            key, made.hash.hex(), made.count, made.bounds, operation.provenance, digest=made.digest
+            key,
+            encoded_part.hash.hex(),
+            encoded_part.count,
+            encoded_part.bounds,
+            operation.provenance,
+            digest=encoded_part.digest,
         )
-        return made
+        return encoded_part
     if key.layer not in VECTOR_LAYERS:
-        raise Invalid(f"{what} has no features to put or delete: replace it as a whole")
+        raise Invalid(f"{label} has no features to put or delete: replace it as a whole")
     if isinstance(operation, Delete):
         if entry is None or root is None:
-            raise NotFound(f"there is no {what}")
-        made = parts.edit_features(draft, root, None, set(operation.ids), what)
+            raise NotFound(f"there is no {label}")
+        encoded_part = parts.edit_features(draft, root, None, set(operation.ids), label)
         provenance = entry.provenance.marked()
     else:
         root = root or parts.read_root(draft, parts.empty_features(draft))
-        made = parts.edit_features(draft, root, operation.features, (), what)
+        encoded_part = parts.edit_features(draft, root, operation.features, (), label)
         provenance = joined(entry.provenance, operation.provenance) if entry else operation.provenance
-    digest = entry.digest if entry and made.hash.hex() == entry.hash else ""
-    entries[key] = PartEntry(key, made.hash.hex(), made.count, made.bounds, provenance, digest=digest)
-    return made
+    digest = entry.digest if entry and encoded_part.hash.hex() == entry.hash else ""
+    entries[key] = PartEntry(
+        key, encoded_part.hash.hex(), encoded_part.count, encoded_part.bounds, provenance, digest=digest
+    )
+    return encoded_part
 
 
 def joined(old: Provenance, new: Provenance) -> Provenance:
@@ -249,14 +256,14 @@ def summarise(
 def cells_added(grid: OccupancyGrid) -> CellChanges:
     """The changes that a new grid is: every known cell was unknown before."""
     out = CellChanges()
-    known = grid.cells != UNKNOWN
-    total = int(known.sum())
+    known_cells = grid.cells != UNKNOWN
+    total = int(known_cells.sum())
     out.freed = int((grid.cells == FREE).sum())
     out.blocked = int((grid.cells == OCCUPIED).sum())
     out.other = total - out.freed - out.blocked
     if total:
-        rows = np.flatnonzero(known.any(axis=1))
-        columns = np.flatnonzero(known.any(axis=0))
+        rows = np.flatnonzero(known_cells.any(axis=1))
+        columns = np.flatnonzero(known_cells.any(axis=0))
         header = {"origin": list(grid.origin), "resolution": grid.resolution}
         out.box = difference.cell_box(
             header, float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
@@ -283,13 +290,13 @@ def frame_changes(
 
 
 def index_rows(
-    changed: Mapping[PartKey, FeatureChanges] | None, datum: Datum | None, most: int | None = MAX_INDEX_ROWS
+    changed: Mapping[PartKey, FeatureChanges] | None, datum: Datum | None, limit: int | None = MAX_INDEX_ROWS
 ) -> tuple[IndexRows, ...] | None:
-    """The changes to the head's index, None where they are more than ``most``."""
+    """The changes to the head's index, None where they are more than ``limit``."""
     if changed is None:
         return None
     count = sum(len(c.added) + len(c.changed) + len(c.deleted) for c in changed.values())
-    if most is not None and count > most:
+    if limit is not None and count > limit:
         return None
     out = []
     for key in sorted(changed):
@@ -332,11 +339,11 @@ def _fresh(draft: Draft, before: Mapping[PartKey, PartEntry], after: Mapping[Par
         if entry is None:
             continue
         old = roots_of(draft, key, before)
-        known: set[bytes] = set()
+        existing_names: set[bytes] = set()
         if old is not None:
             for node in old.trees.values():
-                known |= tree.names(draft, node)
-        new, tiles = parts.new_chunks(draft, bytes.fromhex(entry.hash), known)
+                existing_names |= tree.names(draft, node)
+        new, tiles = parts.new_chunks(draft, bytes.fromhex(entry.hash), existing_names)
         for name in new:
             if name not in out:
                 out[name] = compress(draft.new[name])

@@ -92,11 +92,11 @@ class Robots(Base):
                     if not slash:
                         raise Invalid("the cursor is not one that a page's Link header gave")
                     page = query.where(tuple_(owner.c.name, table.c.robot) > tuple_(place, robot))
-                found = [_as_robot(row) for row in connection.execute(page.limit(many))]
-                out += [r for r in found if allowed is None or fnmatchcase(r.environment, allowed)]
-                if len(found) < many:
+                robots = [_as_robot(row) for row in connection.execute(page.limit(many))]
+                out += [r for r in robots if allowed is None or fnmatchcase(r.environment, allowed)]
+                if len(robots) < many:
                     break
-                cursor = _cursor(found[-1])
+                cursor = _cursor(robots[-1])
         return out[:limit], _cursor(out[limit - 1]) if len(out) > limit else None
 
     def robot_history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, Report]]:
@@ -117,24 +117,24 @@ class Robots(Base):
         with self._database.write(tell=False) as connection:
             row = environment_row(connection, environment)
             for table in (tables.robot_history, tables.robot):
-                gone = connection.execute(
+                deleted_count = connection.execute(
                     delete(table).where(table.c.environment_id == row.id, table.c.robot == robot)
                 ).rowcount
-            if not gone:
+            if not deleted_count:
                 raise NotFound(f"no robot {robot[:80]!r} has reported in {environment}")
 
-    def note_presence(self, there: Collection[str], gone: Collection[str], now: datetime) -> None:
+    def note_presence(self, present_robots: Collection[str], absent_robots: Collection[str], now: datetime) -> None:
         """Robots that are on the bus at this moment, and robots that have left it."""
         table = tables.presence
         with self._database.write(tell=False, upkeep=True) as connection:
             room = MAX_PRESENT - int(connection.execute(select(func.count()).select_from(table)).scalar_one())
             make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
-            rows = sorted([(name, True) for name in there] + [(name, False) for name in gone])
-            for name, is_there in rows:
+            rows = sorted([(name, True) for name in present_robots] + [(name, False) for name in absent_robots])
+            for name, is_present in rows:
                 if room < len(rows):  # full: who is known stays known
-                    connection.execute(update(table).where(table.c.robot == name).values(there=is_there, time=now))
+                    connection.execute(update(table).where(table.c.robot == name).values(there=is_present, time=now))
                     continue
-                statement = make(table).values(robot=name, there=is_there, time=now)
+                statement = make(table).values(robot=name, there=is_present, time=now)
                 connection.execute(
                     statement.on_conflict_do_update(
                         index_elements=["robot"],
@@ -166,9 +166,9 @@ class Robots(Base):
 
 def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMapError | None:
     table, report = tables.robot, heard.report
-    own = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
-    known = connection.execute(select(table).where(*own).with_for_update()).one_or_none()
-    said: dict[str, Any] = {
+    conditions = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
+    row = connection.execute(select(table).where(*conditions).with_for_update()).one_or_none()
+    report_columns: dict[str, Any] = {
         "channel": report.channel,
         "version": report.version,
         "root": report.root,
@@ -177,17 +177,19 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
         "sequence": report.sequence,
         "overlays": report.overlays,
     }
-    values: dict[str, Any] = {**said, "said": report.said, "time": heard.time}
-    again = known is not None and all(getattr(known, name) == value for name, value in said.items())
-    if known is not None and not again and _told_before(connection, environment_id, heard, said):
-        connection.execute(update(table).where(*own).values(time=heard.time, vouched=known.vouched or heard.vouched))
+    values: dict[str, Any] = {**report_columns, "said": report.said, "time": heard.time}
+    again = row is not None and all(getattr(row, name) == value for name, value in report_columns.items())
+    if row is not None and not again and _told_before(connection, environment_id, heard, report_columns):
+        connection.execute(
+            update(table).where(*conditions).values(time=heard.time, vouched=row.vouched or heard.vouched)
+        )
         return None
     if not again:
         values["since"] = heard.time
-    values["vouched"] = heard.vouched or (known is not None and known.vouched)
-    values |= _held_values(report, known, heard.time)
-    if known is not None:
-        connection.execute(update(table).where(*own).values(values))
+    values["vouched"] = heard.vouched or (row is not None and row.vouched)
+    values |= _held_values(report, row, heard.time)
+    if row is not None:
+        connection.execute(update(table).where(*conditions).values(values))
     else:
         others = select(func.count()).select_from(table).where(table.c.environment_id == environment_id)
         if connection.execute(others).scalar_one() >= MAX_ROBOTS:
@@ -198,11 +200,11 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
             statement.on_conflict_do_update(index_elements=["environment_id", "robot"], set_=values)  # a race's winner
         )
     if not again:
-        _remember(connection, environment_id, heard, said)
+        _remember(connection, environment_id, heard, report_columns)
     return None
 
 
-def _held_values(report: Report, known: Row[Any] | None, time: datetime) -> dict[str, Any]:
+def _held_values(report: Report, row: Row[Any] | None, time: datetime) -> dict[str, Any]:
     """What a robot runs, from its report: columns that change. Its own statement counts, whatever the report is about:
     a status may be lost, so that a failure of the next version is the first that is received after a switch.
     """
@@ -212,13 +214,13 @@ def _held_values(report: Report, known: Row[Any] | None, time: datetime) -> dict
     version, root = holds
     if root == NO_ROOT:
         return dict.fromkeys(("held_version", "held_root", "held_sequence", "held_since", "held_overlays"))
-    same = known is not None and (known.held_root, known.held_overlays) == (root, report.overlays)
-    since = known.held_since if same and known is not None else time
+    same = row is not None and (row.held_root, row.held_overlays) == (root, report.overlays)
+    since = row.held_since if same and row is not None else time
     values = {"held_version": version, "held_root": root, "held_sequence": report.sequence, "held_since": since}
     return {**values, "held_overlays": report.overlays}
 
 
-def _told_before(connection: Connection, environment_id: str, heard: Heard, said: dict[str, Any]) -> bool:
+def _told_before(connection: Connection, environment_id: str, heard: Heard, report_columns: dict[str, Any]) -> bool:
     """Whether this very report came before, by another way: robots tell over Zenoh and HTTP, and one may be late."""
     table = tables.robot_history
     if heard.report.said is None:
@@ -227,23 +229,23 @@ def _told_before(connection: Connection, environment_id: str, heard: Heard, said
         table.c.environment_id == environment_id,
         table.c.robot == heard.robot,
         table.c.said == heard.report.said,
-        *(table.c[name].is_not_distinct_from(value) for name, value in said.items()),
+        *(table.c[name].is_not_distinct_from(value) for name, value in report_columns.items()),
     )
     return connection.execute(query.limit(1)).scalar_one_or_none() is not None
 
 
-def _remember(connection: Connection, environment_id: str, heard: Heard, said: dict[str, Any]) -> None:
+def _remember(connection: Connection, environment_id: str, heard: Heard, report_columns: dict[str, Any]) -> None:
     table = tables.robot_history
     connection.execute(
         insert(table).values(
-            environment_id=environment_id, robot=heard.robot, said=heard.report.said, time=heard.time, **said
+            environment_id=environment_id, robot=heard.robot, said=heard.report.said, time=heard.time, **report_columns
         )
     )
-    own = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
-    oldest = select(table.c.id).where(*own).order_by(table.c.id.desc()).offset(HISTORY).limit(1)
+    conditions = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
+    oldest = select(table.c.id).where(*conditions).order_by(table.c.id.desc()).offset(HISTORY).limit(1)
     last = connection.execute(oldest).scalar_one_or_none()
     if last is not None:
-        connection.execute(delete(table).where(*own, table.c.id <= last))
+        connection.execute(delete(table).where(*conditions, table.c.id <= last))
 
 
 def _robots() -> Select[Any]:
@@ -271,9 +273,9 @@ def _cursor(robot: Robot) -> str:
 
 
 def _as_robot(row: Row[Any]) -> Robot:
-    held = None
+    active_map = None
     if row.held_root is not None:
-        held = Held(row.held_version, row.held_root, row.held_sequence, row.held_since, row.held_overlays)
+        active_map = Held(row.held_version, row.held_root, row.held_sequence, row.held_since, row.held_overlays)
     return Robot(
-        row.robot, row.environment, _as_report(row), row.time, row.since, held, row.there, row.seen, row.vouched
+        row.robot, row.environment, _as_report(row), row.time, row.since, active_map, row.there, row.seen, row.vouched
     )

@@ -31,10 +31,10 @@ def config() -> Config:
     """Alembic's settings, without a file. (It is imported late: worker processes never need it.)"""
     from alembic.config import Config
 
-    made = Config()
-    made.set_main_option("script_location", str(folder()).replace("%", "%%"))
-    made.set_main_option("path_separator", "os")
-    return made
+    alembic_config = Config()
+    alembic_config.set_main_option("script_location", str(folder()).replace("%", "%%"))
+    alembic_config.set_main_option("path_separator", "os")
+    return alembic_config
 
 
 def comparison(dialect: str) -> dict[str, Any]:

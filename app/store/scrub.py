@@ -55,8 +55,8 @@ def read_state(folder: Path) -> ScrubState:
     """The state that whichever process scrubs has left in a blob folder."""
     try:
         members = json.loads((folder / STATE).read_bytes())
-        known = {f.name for f in fields(ScrubState)}
-        return ScrubState(**{name: value for name, value in members.items() if name in known})
+        field_names = {f.name for f in fields(ScrubState)}
+        return ScrubState(**{name: value for name, value in members.items() if name in field_names})
     except (OSError, ValueError, TypeError, AttributeError):
         return ScrubState()
 
@@ -120,8 +120,8 @@ class Scrub:
         if not self._state.started and time.time() - self._state.completed < self._every:
             return
         if not self._state.started:
-            kept = (self._state.completed, self._state.findings)
-            self._state = ScrubState(started=time.time(), completed=kept[0], findings=kept[1])
+            last_pass = (self._state.completed, self._state.findings)
+            self._state = ScrubState(started=time.time(), completed=last_pass[0], findings=last_pass[1])
         steps = (self._pages, self._chunks, self._versions, self._blobs, self._cache)
         restarting: dict[Callable[[], None], Kind] = {self._versions: "version", self._cache: "cache"}
         while self._state.step < len(steps):

@@ -136,15 +136,15 @@ class Store(
         with self._database.write() as connection:
             insert(connection, {name: compress(raw) for name, raw in chunks.items()})
 
-    def remove_unused_chunks(self, found: Verified) -> set[str]:
+    def remove_unused_chunks(self, verification: Verified) -> set[str]:
         """Remove damaged chunks that no version has; their hashes. For when all others were healed.
 
         A check takes minutes: a chunk that was used or healed since it started stays.
         """
-        names = [bytes.fromhex(f.name) for f in found.findings if f.kind == "chunk" and not f.versions]
+        names = [bytes.fromhex(f.name) for f in verification.findings if f.kind == "chunk" and not f.versions]
         with self._database.write() as connection:
             damaged = [name for name, data in select_rows(connection, names) if problem(name, data) is not None]
-            return {name.hex() for name in delete(connection, damaged, int(found.started))}
+            return {name.hex() for name in delete(connection, damaged, int(verification.started))}
 
     def recover(self) -> None:
         """At start: remove what a killed upload left behind. Safe beside other processes that are at work."""

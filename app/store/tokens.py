@@ -99,19 +99,19 @@ class Tokens(Base):
         """The token with this secret, unless unknown or expired."""
         if len(text) > 4096:
             return None
-        wanted = _hash(text)
+        digest = _hash(text)
         with self._database.read() as connection:
-            row = connection.execute(select(tables.token).where(tables.token.c.hash == wanted)).one_or_none()
-        if row is None or not hmac.compare_digest(row.hash, wanted):
+            row = connection.execute(select(tables.token).where(tables.token.c.hash == digest)).one_or_none()
+        if row is None or not hmac.compare_digest(row.hash, digest):
             return None
-        found = _as_token(row)
-        if found.ended is None and found.expires is not None and found.expires <= utcnow():
+        token = _as_token(row)
+        if token.ended is None and token.expires is not None and token.expires <= utcnow():
             try:
                 self.end_expired_tokens()
             except Unavailable as error:  # it is refused all the same, and noted when it is seen again
                 log.warning("tokens: the end of an expired token could not be stored (%s)", error.detail)
             return None
-        return None if found.ended is not None else found
+        return None if token.ended is not None else token
 
     def end_expired_tokens(self) -> int:
         """Note which tokens have expired, and return how many: they stay so, also where the clock is set back."""

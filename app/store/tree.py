@@ -140,10 +140,10 @@ class Draft:
         self.new[name] = raw
         return name
 
-    def put_big(self, raw: bytes, known: Container[bytes]) -> bytes:
+    def put_big(self, raw: bytes, existing_names: Container[bytes]) -> bytes:
         """Keep a chunk compressed, unless its hash is among the known ones; its hash."""
         name = digest(raw)
-        if name not in known and name not in self.stored:
+        if name not in existing_names and name not in self.stored:
             self.stored[name] = compress(raw)
         return name
 
@@ -173,10 +173,10 @@ class Draft:
 
     def inner(self, name: bytes) -> Inner:
         """One inner node."""
-        known = self._inner.get(name)
-        if known is None:
-            known = self._inner[name] = decode_inner(self.read(name))
-        return known
+        node = self._inner.get(name)
+        if node is None:
+            node = self._inner[name] = decode_inner(self.read(name))
+        return node
 
 
 # --- where to cut ---
@@ -298,9 +298,11 @@ def leaves(draft: Draft, roots: Sequence[Node]) -> list[list[bytes]]:
     return [[node.hash for node in nodes] for nodes in frontier]
 
 
-def select(draft: Draft, root: Node | None, wanted: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> list[bytes]:
+def select(
+    draft: Draft, root: Node | None, predicate: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+) -> list[bytes]:
     """The hashes of the leaves whose box passes: wanted(boxes float64 [n, 4]) -> bool [n]."""
-    if root is None or not bool(wanted(np.array([root.box]))[0]):
+    if root is None or not bool(predicate(np.array([root.box]))[0]):
         return []
     nodes = [root.hash]
     for _ in range(root.level):
@@ -308,7 +310,7 @@ def select(draft: Draft, root: Node | None, wanted: Callable[[NDArray[np.float64
         chosen: list[bytes] = []
         for name in nodes:
             inner = draft.inner(name)
-            chosen.extend(inner.hashes[k] for k in np.flatnonzero(wanted(inner.boxes)).tolist())
+            chosen.extend(inner.hashes[k] for k in np.flatnonzero(predicate(inner.boxes)).tolist())
         nodes = chosen
     return nodes
 
@@ -353,12 +355,12 @@ def differing(draft: Draft, a: Node | None, b: Node | None) -> tuple[list[bytes]
         )
 
 
-def names(draft: Draft, root: Node | None, known: Container[bytes] = ()) -> set[bytes]:
+def names(draft: Draft, root: Node | None, existing_names: Container[bytes] = ()) -> set[bytes]:
     """The hashes of all nodes of a tree, but of known ones and what is below them. Leaves are not read."""
     out: set[bytes] = set()
     nodes = [root] if root else []
     while nodes:
-        nodes = [n for n in nodes if n.hash not in known]
+        nodes = [n for n in nodes if n.hash not in existing_names]
         out.update(n.hash for n in nodes)
         inner = [n for n in nodes if n.level]
         draft.read_many([n.hash for n in inner])
@@ -391,14 +393,14 @@ def edit(
     draft: Draft, codec: LeafCodec, root: Node | None, put: Mapping[bytes, Any], removed: Iterable[bytes]
 ) -> Node | None:
     """The tree with items put (added or replaced by key) and keys removed: the very tree that building anew gives."""
-    gone = set(removed) - put.keys()
-    if not put and not gone:
+    deletions = set(removed) - put.keys()
+    if not put and not deletions:
         return root
     if root is None:
         keys = sorted(put)
         items = [put[k] for k in keys]
         return build(draft, keys, codec.bits, lambda s, e: codec.encode(keys[s:e], items[s:e]), codec.boxes(items))
-    touched = sorted(gone | put.keys())
+    touched = sorted(deletions | put.keys())
     paths(draft, root, touched)
 
     def regroup_leaves(old: Sequence[Node], lo: bytes | None, hi: bytes | None) -> list[Node]:
@@ -424,7 +426,7 @@ def edit(
             for s, e, box in zip(starts, ends, around, strict=True)
         ]
 
-    new, old_keys, all_nodes = _edit_level(draft, root, 0, codec.bits, touched, gone, regroup_leaves)
+    new, old_keys, all_nodes = _edit_level(draft, root, 0, codec.bits, touched, deletions, regroup_leaves)
     level = 0
     while level < root.level:
         level += 1
@@ -475,7 +477,7 @@ def _edit_level(
     level: int,
     bits: int,
     touched: Sequence[bytes],
-    gone: set[bytes],
+    deletions: set[bytes],
     regroup: Callable[[Sequence[Node], bytes | None, bytes | None], list[Node]],
 ) -> tuple[list[Node], set[bytes], bool]:
     """Regroup the runs of nodes of a level that these sorted keys touch.
@@ -497,7 +499,7 @@ def _edit_level(
         run = [first]
         while (before := _before(draft, root, level, run[0].key)) and not ends_node(before.key, level, bits):
             run.insert(0, before)
-        while not (ends_node(run[-1].key, level, bits) and run[-1].key not in gone):
+        while not (ends_node(run[-1].key, level, bits) and run[-1].key not in deletions):
             after = _first(draft, root, level, run[-1].key, strict=True)
             if after is None:
                 break
@@ -537,9 +539,9 @@ def _before(draft: Draft, root: Node, level: int, key: bytes) -> Node | None:
         if node.level == level + 1:
             return node.child(k - 1) if k else None
         if k < len(node.keys):
-            found = search(draft.inner(node.hashes[k]))
-            if found:
-                return found
+            last_node = search(draft.inner(node.hashes[k]))
+            if last_node:
+                return last_node
         return _last(draft, node.child(k - 1), level) if k else None
 
     return search(draft.inner(root.hash))

@@ -191,8 +191,8 @@ class PartEntry:
 
 def datum_information(datum: Datum, parts: Iterable[PartEntry]) -> Information:
     """Whether people told the datum, or a generator made it up with one of the parts."""
-    said = datum.as_dict()
-    made_up = any(step.get("datum") == said for e in parts for step in e.provenance.steps)
+    datum_values = datum.as_dict()
+    made_up = any(step.get("datum") == datum_values for e in parts for step in e.provenance.steps)
     return "generated" if made_up else "raw"
 
 
@@ -245,8 +245,12 @@ class Version:
             layers |= {layer for step in steps for layer in step.get("also", ())}
             if any("location" in step.get("from", ()) for step in steps):
                 layers.add("location")  # the one layer that a step may have done without: a datum is location enough
-            own = (entry.key.layer, entry.key.level, entry.key.name)
-            new = [k for k in now if k[0] in layers and k not in used and k != own] if entry.provenance.inputs else []
+            identity = (entry.key.layer, entry.key.level, entry.key.name)
+            new = (
+                [k for k in now if k[0] in layers and k not in used and k != identity]
+                if entry.provenance.inputs
+                else []
+            )
             changed += [f"{layer} {level}/{name}" for layer, level, name in new]
             if changed:
                 out[entry.key] = tuple(changed)

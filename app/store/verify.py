@@ -205,30 +205,30 @@ class _Walk:
             return _Below(frozenset({name.hex()}), _NOTHING)
         draft = Draft(self._chunks)
         root = parts.read_root(draft, name)
-        found = [self._node(draft, node, root.type) for node in root.trees.values() if node is not None]
+        subtrees = [self._node(draft, node, root.type) for node in root.trees.values() if node is not None]
         documents = {h.hex() for h in parts.document_chunks(root) if self._is_bad(h)}
-        return _joined(found, documents)
+        return _joined(subtrees, documents)
 
     def _node(self, draft: Draft, node: Node, kind: str) -> _Below:
-        known = self._nodes.get(node.hash)
-        if known is not None:
-            return known
+        cached = self._nodes.get(node.hash)
+        if cached is not None:
+            return cached
         if self._is_bad(node.hash):
-            found = _Below(frozenset({node.hash.hex()}), _NOTHING)
+            below = _Below(frozenset({node.hash.hex()}), _NOTHING)
         elif node.level:
             children = draft.inner(node.hash).children()
-            found = _joined([self._node(draft, child, kind) for child in children], set())
+            below = _joined([self._node(draft, child, kind) for child in children], set())
         elif kind in ("grid", "picture"):
             (raw,) = draft.stream([node.hash]).values()
-            found = _joined([], {tile.hex() for _, tile in parts.tile_leaf(raw) if self._is_bad(tile)})
+            below = _joined([], {tile.hex() for _, tile in parts.tile_leaf(raw) if self._is_bad(tile)})
         elif kind == "resources":
             (raw,) = draft.stream([node.hash]).values()
-            found = _Below(_NOTHING, frozenset(h for _, _, h in parts.file_leaf(raw)))
+            below = _Below(_NOTHING, frozenset(h for _, _, h in parts.file_leaf(raw)))
         else:
-            found = _Below(_NOTHING, _NOTHING)
-        self._nodes[node.hash] = found
-        return found
+            below = _Below(_NOTHING, _NOTHING)
+        self._nodes[node.hash] = below
+        return below
 
 
-def _joined(found: list[_Below], bad: set[str]) -> _Below:
-    return _Below(frozenset(bad).union(*(b.bad for b in found)), _NOTHING.union(*(b.blobs for b in found)))
+def _joined(subtrees: list[_Below], bad: set[str]) -> _Below:
+    return _Below(frozenset(bad).union(*(b.bad for b in subtrees)), _NOTHING.union(*(b.blobs for b in subtrees)))

@@ -36,14 +36,14 @@ def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> in
         return int(ref)
     table = tables.channel
     query = select(table.c.version).where(table.c.environment_id == environment.id, table.c.name == ref)
-    found = connection.execute(query).scalar_one_or_none()
-    if found is None:
+    number = connection.execute(query).scalar_one_or_none()
+    if number is None:
         near = nearest_channel(connection, environment, ref)
         raise NotFound(
             f"{environment.name} has no version or channel {ref[:80]!r}{near}: ask for a number, latest, or a channel "
             "that was set"
         )
-    return int(found)
+    return int(number)
 
 
 def insert_version(
@@ -140,13 +140,13 @@ def hold_blobs(connection: Connection, hashes: set[str]) -> None:
     now = int(utcnow().timestamp())
     names = sorted(hashes)
     for start in range(0, len(names), 500):
-        some = names[start : start + 500]
-        query = select(tables.blob.c.sha256).where(tables.blob.c.sha256.in_(some)).order_by(tables.blob.c.sha256)
-        found = set(connection.execute(query.with_for_update()).scalars())
-        missing = [n for n in some if n not in found]
+        batch = names[start : start + 500]
+        query = select(tables.blob.c.sha256).where(tables.blob.c.sha256.in_(batch)).order_by(tables.blob.c.sha256)
+        stored_names = set(connection.execute(query.with_for_update()).scalars())
+        missing = [n for n in batch if n not in stored_names]
         if missing:
             raise Unavailable(f"the uploaded file {missing[0]} is not in the store (any more): send it again")
-        connection.execute(update(tables.blob).where(tables.blob.c.sha256.in_(some)).values(used=now))
+        connection.execute(update(tables.blob).where(tables.blob.c.sha256.in_(batch)).values(used=now))
 
 
 class Versions(Base):
@@ -208,10 +208,10 @@ class Versions(Base):
             self.blobs.put_many(list(prepared.blobs.values()))
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            known = _replayed(connection, row, idempotency)
-            if known is not None:
+            previous_number = _replayed(connection, row, idempotency)
+            if previous_number is not None:
                 changes_nothing()
-                return read_version(connection, row, known)
+                return read_version(connection, row, previous_number)
             _check_head(row, prepared.base)
             now = utcnow()
             if not prepared.changed:
@@ -246,7 +246,7 @@ class Versions(Base):
                 area=prepared.area,
             )
             _remember(connection, row.id, idempotency, number, now)
-            made = read_version(connection, row, number)
+            version = read_version(connection, row, number)
             outbox.append(
                 connection,
                 environment_id=row.id,
@@ -261,7 +261,7 @@ class Versions(Base):
                 author=author,
                 time=now,
             )
-        return made
+        return version
 
     def add_sources(self, environment: str, version: int, sources: Sequence[Source]) -> Version:
         """Keep further files with a version: what was uploaded but changed nothing. The version with all of them."""
@@ -289,8 +289,8 @@ class Versions(Base):
             target = self.version(environment, to)
             head = self.version(environment)
             if expected is not None and head.number != expected:
-                known = self.idempotent(environment, idempotency.key) if idempotency else None
-                if known is None:
+                record = self.idempotent(environment, idempotency.key) if idempotency else None
+                if record is None:
                     raise StaleParent(f"the head of {environment} is version {head.number}, not {expected}")
             try:
                 return self.commit(
@@ -315,8 +315,8 @@ class Versions(Base):
             changes, _ = summarise(Draft(self._chunks), before, after)
             changes |= frame_changes(head.datum, target.datum, head.levels, target.levels)
             changes |= template_changes(head.templates, target.templates)
-        kept = (target.parts, target.datum, target.levels, target.templates)
-        return Prepared(head.number, target.root, {}, *kept, changes, changed=changed, area=area)
+        contents = (target.parts, target.datum, target.levels, target.templates)
+        return Prepared(head.number, target.root, {}, *contents, changes, changed=changed, area=area)
 
     def idempotent(self, environment: str, key: str) -> tuple[str, int] | None:
         """(fingerprint, version number) of the request that used this key, or None."""
@@ -326,8 +326,8 @@ class Versions(Base):
             query = select(table.c.fingerprint, table.c.version).where(
                 table.c.environment_id == row.id, table.c.key == key
             )
-            found = connection.execute(query).one_or_none()
-        return None if found is None else (found.fingerprint, found.version)
+            record = connection.execute(query).one_or_none()
+        return None if record is None else (record.fingerprint, record.version)
 
 
 def _check_head(row: Row[Any], base: int) -> None:
@@ -343,12 +343,12 @@ def _replayed(connection: Connection, row: Row[Any], idempotency: Idempotency | 
         return None
     table = tables.idempotency
     query = select(table).where(table.c.environment_id == row.id, table.c.key == idempotency.key)
-    known = connection.execute(query).one_or_none()
-    if known is None:
+    record = connection.execute(query).one_or_none()
+    if record is None:
         return None
-    if known.fingerprint != idempotency.fingerprint:
+    if record.fingerprint != idempotency.fingerprint:
         raise Conflict(f"the Idempotency-Key {idempotency.key!r} was used for another request: choose a new one")
-    return int(known.version)
+    return int(record.version)
 
 
 def _remember(
@@ -370,8 +370,12 @@ def _remember(
 
 def _append_sources(connection: Connection, environment_id: str, number: int, sources: Sequence[Source]) -> None:
     table = tables.source
-    known = read_sources(connection, environment_id, [number])[number]
-    new = [s for s in dict.fromkeys(sources) if not any(s.name == k.name and s.sha256 == k.sha256 for k in known)]
+    existing_sources = read_sources(connection, environment_id, [number])[number]
+    new = [
+        s
+        for s in dict.fromkeys(sources)
+        if not any(s.name == k.name and s.sha256 == k.sha256 for k in existing_sources)
+    ]
     last = connection.execute(
         select(func.max(table.c.position)).where(table.c.environment_id == environment_id, table.c.number == number)
     ).scalar_one()

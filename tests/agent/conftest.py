@@ -131,9 +131,9 @@ class Robot:
         """Until such a line came."""
         with self._news:
             self._news.wait_for(lambda: self.saw(event, after, **members) or not self._reader.is_alive(), seconds)
-        found = self.saw(event, after, **members)
-        assert found, f"no {event} {members}; printed:\n" + "\n".join(map(str, self.lines))
-        return found
+        line = self.saw(event, after, **members)
+        assert line, f"no {event} {members}; printed:\n" + "\n".join(map(str, self.lines))
+        return line
 
     @property
     def standing(self) -> dict[str, Any]:
@@ -173,9 +173,9 @@ def whole(into: Path) -> dict[str, Any]:
     for file in manifest["files"]:
         data = (version / file["format"] / file["name"]).read_bytes()
         assert (len(data), hashlib.sha256(data).hexdigest()) == (file["size"], file["sha256"]), file
-    there = {str(p.relative_to(version)) for p in version.rglob("*") if p.is_file()}
-    told = {f"{f['format']}/{f['name']}" for f in manifest["files"]}
-    assert there == told | {"manifest.json", "manifest.sig", "environment.sh", "closures.json", "levels.json"}
+    files = {str(p.relative_to(version)) for p in version.rglob("*") if p.is_file()}
+    expected = {f"{f['format']}/{f['name']}" for f in manifest["files"]}
+    assert files == expected | {"manifest.json", "manifest.sig", "environment.sh", "closures.json", "levels.json"}
     return manifest
 
 
@@ -189,9 +189,9 @@ def robot(api: Api, place: str, tmp_path: Path) -> Iterator[Start]:
 
     def start(*more: str, name: str = "robot", server: str | None = None, **rest: Any) -> Robot:
         env = rest.pop("env", place)
-        made = Robot(server or api.url, env, tmp_path / name, *more, **rest)
-        started.append(made)
-        return made
+        new_robot = Robot(server or api.url, env, tmp_path / name, *more, **rest)
+        started.append(new_robot)
+        return new_robot
 
     yield start
     for one in started:
@@ -281,6 +281,6 @@ class Gate:
 
 @pytest.fixture
 def gate(api: Api) -> Iterator[Gate]:
-    made = Gate(api.url)
-    yield made
-    made.close()
+    proxy = Gate(api.url)
+    yield proxy
+    proxy.close()

@@ -221,7 +221,7 @@ class One:
         self.into = into
         self.lines: list[dict[str, Any]] = []
         options = Options(fake.url, PLACE, formats, into, robot="robot", on_change=on_change, **more)
-        self.agent = Agent(options, lambda what, **members: self.lines.append({"event": what, **members}), clock)
+        self.agent = Agent(options, lambda event, **members: self.lines.append({"event": event, **members}), clock)
 
     def once(self) -> bool:
         """Take the folder, sync once, let go."""

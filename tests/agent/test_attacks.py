@@ -34,7 +34,7 @@ class Once:
             Options(
                 server=server, environment=env, formats=("tmap2",), into=into, robot=into.name, token=ADMIN, key=key
             ),
-            lambda what, **members: self.lines.append({"event": what, **members}),
+            lambda event, **members: self.lines.append({"event": event, **members}),
         )
         try:
             agent.open()
@@ -96,9 +96,9 @@ def attacked(
     gate.statuses.clear()
     one = robot(server=gate.url, **rest)
     assert not one.good, one.lines
-    said = one.saw("refused")
-    assert said, one.lines
-    assert word in said["detail"], said
+    refusal = one.saw("refused")
+    assert refusal, one.lines
+    assert word in refusal["detail"], refusal
     assert gate.statuses[-1]["state"] == "failed"
     assert word in gate.statuses[-1]["detail"]
     if holds is None:
@@ -242,9 +242,9 @@ def test_a_foreign_key_is_refused(held: str, robot: Start, gate: Gate, tmp_path:
 
     def change(path: str, status: int, headers: dict[str, str], body: bytes) -> Changed:
         if path.endswith("/keys"):
-            own = foreign.public()[0].as_dict()
+            foreign_key = foreign.public()[0].as_dict()
             endorsed = {"endorsed_by": json.loads(body)[0]["id"], "endorsement": base64.b64encode(bytes(64)).decode()}
-            return 200, headers, json.dumps([{**own, **endorsed}, *json.loads(body)]).encode()
+            return 200, headers, json.dumps([{**foreign_key, **endorsed}, *json.loads(body)]).encode()
         return sign(path, status, headers, body)
 
     gate.change = change
@@ -269,12 +269,12 @@ def test_a_rotated_key_is_followed_and_the_old_one_forgotten(
 
 
 def test_the_key_can_be_given(api: Api, place: str, robot: Start, gate: Gate) -> None:
-    told = api.get("keys").json()[0]
+    key = api.get("keys").json()[0]
     attacked(robot, gate, key="0" * 16, word="does not vouch", holds=None)
     other = base64.b64encode(bytes(range(32))).decode()
     attacked(robot, gate, key=other, word="does not vouch", holds=None)
-    assert robot(key=f" {told['id']}\n", name="by-id").good
-    assert robot(key=told["public_key"], name="by-key").good
+    assert robot(key=f" {key['id']}\n", name="by-id").good
+    assert robot(key=key["public_key"], name="by-key").good
     with pytest.raises(Untrusted, match="--key takes"):
         robot(key="nonsense", name="wrong")
 
@@ -283,15 +283,15 @@ def test_it_asks_anew_where_its_manifest_has_expired(api: Api, place: str, robot
     one = robot(server=gate.url)
     assert one.good
 
-    def asked() -> list[bool]:
+    def conditional_requests() -> list[bool]:
         gate.requests.clear()
         assert robot(server=gate.url).good
         return ["if-none-match" in sent for _, path, sent, _ in gate.requests if "/manifest" in path]
 
-    assert asked() == [True]
+    assert conditional_requests() == [True]
     state = json.loads((one.into / "state.json").read_text())
     (one.into / "state.json").write_text(json.dumps({**state, "expires": 1.0}))
-    assert asked() == [False], "else a 304 for ever would hold back all changes"
+    assert conditional_requests() == [False], "else a 304 for ever would hold back all changes"
 
 
 def test_the_token_is_not_told(place: str, robot: Start, gate: Gate) -> None:

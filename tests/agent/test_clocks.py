@@ -23,17 +23,17 @@ Make = Callable[[float], Agent]
 @pytest.fixture
 def agent(place: str, gate: Gate, tmp_path: Path) -> Iterator[Make]:
     """An agent in this process, whose clock is so many seconds fast."""
-    made: list[Agent] = []
+    agents: list[Agent] = []
 
     def make(fast: float) -> Agent:
         options = Options(gate.url, place, ("tmap2",), tmp_path / "robot", token=ADMIN, robot="robot")
         one = Agent(options, lambda *_, **__: None, clock=lambda: time.time() + fast)
         one.open()
-        made.append(one)
+        agents.append(one)
         return one
 
     yield make
-    for one in made:
+    for one in agents:
         one.close()
 
 
@@ -55,11 +55,11 @@ def test_activation_comes_at_the_servers_time(
     assert datetime.now(timezone.utc) >= at
     assert one.once()
     assert whole(tmp_path / "robot")["version"] == 2
-    told = api.get(f"robots/robot?environment={place}").json()
-    assert told["online"]
-    assert told["lag"]["events"] == 0
-    own, heard = datetime.fromisoformat(told["time"]), datetime.fromisoformat(told["received"])
-    assert abs((own - heard).total_seconds() - fast) < 30, "the robot's clock shows, and decides nothing"
+    status = api.get(f"robots/robot?environment={place}").json()
+    assert status["online"]
+    assert status["lag"]["events"] == 0
+    robot_time, heard = datetime.fromisoformat(status["time"]), datetime.fromisoformat(status["received"])
+    assert abs((robot_time - heard).total_seconds() - fast) < 30, "the robot's clock shows, and decides nothing"
 
 
 def _stands(api: Api, channel: str) -> Any:

@@ -25,11 +25,11 @@ Robot = Callable[..., One]
 
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Fake]:
-    made = Fake(tmp_path / "keys")
-    made.put(A)
-    made.close_edges()
-    yield made
-    made.close()
+    server = Fake(tmp_path / "keys")
+    server.put(A)
+    server.close_edges()
+    yield server
+    server.close()
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def robot(fake: Fake, tmp_path: Path) -> Robot:
     return lambda *on_change, **more: One(fake, tmp_path / "robot", *on_change, **more)
 
 
-def held(one: One) -> tuple[bytes, dict[str, Any]]:
+def map_and_closures(one: One) -> tuple[bytes, dict[str, Any]]:
     """The map's bytes and closures.json of what stands."""
     current = one.into / "current"
     whole(one.into)
@@ -50,13 +50,13 @@ def test_closure_comes_and_goes_with_an_event(fake: Fake, robot: Robot, tmp_path
     fake.move("production", 1)
     with run(one):
         eventually(lambda: one.saw("active", version=1))
-        assert held(one)[1] == {"digest": fake.digest, "closures": []}
+        assert map_and_closures(one)[1] == {"digest": fake.digest, "closures": []}
         root, name = whole(one.into)["root"], (one.into / "current").readlink().name
         assert name == f"1-{root[:8]}"
         fake.close_edges("e7")
         one.agent._heard(event(fake.sequence, type="overlay.accepted", overlay="x"))
         eventually(lambda: fake.statuses[-1].get("overlays") == fake.digest and fake.statuses[-1]["state"] == "active")
-        data, closures = held(one)
+        data, closures = map_and_closures(one)
         assert data.endswith(b"ae7")
         assert [c["edge"] for c in closures["closures"]] == ["e7"]
         assert json.loads((tmp_path / "closures").read_text()) == closures
@@ -66,7 +66,7 @@ def test_closure_comes_and_goes_with_an_event(fake: Fake, robot: Robot, tmp_path
         fake.close_edges()
         one.agent._heard(event(fake.sequence, type="overlay.ended"))
         eventually(lambda: fake.statuses[-1]["overlays"] == fake.digest and fake.statuses[-1]["state"] == "active")
-        assert held(one)[0] == A["kml/map.kml"]
+        assert map_and_closures(one)[0] == A["kml/map.kml"]
         assert (one.into / "current").readlink().name == name
         fake.asked.clear()
         for kind in ("overlay.created", "overlay.rejected", "overlay.expired"):
@@ -84,7 +84,7 @@ def test_closures_without_any_changed_file_are_a_switch(fake: Fake, robot: Robot
     fake.more = {"overlays": [{"id": "p", "kind": "keepout", "level": "ground"}], "overlays_digest": digest}
     one = robot(f"echo $FLEETMAP_CHANGED. >> {tmp_path}/log")
     assert one.once()
-    assert held(one)[1]["digest"] == digest
+    assert map_and_closures(one)[1]["digest"] == digest
     assert (tmp_path / "log").read_text().split() == ["x", "."]
     assert fake.asked[-1].endswith("formats=kml"), "no file is fetched"
 
@@ -104,7 +104,7 @@ def test_closures_that_change_during_a_download_are_no_error(fake: Fake, robot: 
     fake.instead = change
     one = robot()
     assert one.once(), one.lines
-    assert held(one)[0].endswith(b"be0")
+    assert map_and_closures(one)[0].endswith(b"be0")
     assert not one.saw("refused")
     assert not one.saw("failed")
     assert all("closures=apply" in path for path in fake.asked if "/maps/" in path)
@@ -131,20 +131,20 @@ def test_closures_that_never_agree_are_an_error(fake: Fake, robot: Robot, monkey
     monkeypatch.setattr(core, "CLOSURES_SECONDS", 0.001)
     assert robot().once()
     fake.put(B)
-    asked = 0
+    request_count = 0
 
     def change(handler: BaseHTTPRequestHandler) -> bool:
-        nonlocal asked
+        nonlocal request_count
         if "/maps/" in handler.path:
-            asked += 1
-            fake.close_edges(f"e{asked}")
+            request_count += 1
+            fake.close_edges(f"e{request_count}")
         return False
 
     fake.instead = change
     one = robot()
     assert not one.once()
     assert "other closures than the manifest" in one.detail
-    assert asked <= 2 * (core.MAX_CLOSURE_CHANGES + 1)
+    assert request_count <= 2 * (core.MAX_CLOSURE_CHANGES + 1)
     assert whole(one.into)["version"] == 1
     fake.instead = lambda _: False
     assert robot().once()
@@ -170,7 +170,7 @@ def test_planned_version_is_fetched_with_closures(fake: Fake, robot: Robot) -> N
     fake.asked.clear()
     one = robot()
     assert one.once()
-    assert held(one)[0].endswith(b"be8")
+    assert map_and_closures(one)[0].endswith(b"be8")
     assert not [path for path in fake.asked if "/maps/" in path], "it was fetched before, with the new closure"
 
 
@@ -181,7 +181,7 @@ def test_server_without_closures_gets_no_new_parameters(fake: Fake, robot: Robot
     fake.planned["production"] = {"version": 2}
     one = robot()
     assert one.once()
-    assert held(one)[1] == {"digest": "", "closures": []}
+    assert map_and_closures(one)[1] == {"digest": "", "closures": []}
     assert not [path for path in fake.asked if "closures" in path]
     assert not [status for status in fake.statuses if "overlays" in status]
     fake.close_edges()
@@ -194,7 +194,7 @@ def test_before_switch_is_asked_for_closures(fake: Fake, robot: Robot) -> None:
     one = robot(before_switch=("grep -q e7 $FLEETMAP_CLOSURES_FILE && exit 75",))
     assert not one.once()
     assert fake.statuses[-1]["state"] == "ready"
-    assert held(one)[0] == A["kml/map.kml"]
+    assert map_and_closures(one)[0] == A["kml/map.kml"]
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ def test_other_closures_under_one_sequence_are_refused(fake: Fake, robot: Robot)
     one = robot()
     assert not one.once()
     assert "under the same number" in one.detail
-    assert held(one)[0].endswith(b"ae7")
+    assert map_and_closures(one)[0].endswith(b"ae7")
     fake.close_edges()
     assert robot().once()
 
@@ -295,7 +295,7 @@ def test_first_digest_under_one_sequence_is_accepted(fake: Fake, robot: Robot) -
 
 def closed(one: One) -> list[str]:
     """Edges that are closed in what the robot drives by."""
-    return [closure["edge"] for closure in held(one)[1]["closures"]]
+    return [closure["edge"] for closure in map_and_closures(one)[1]["closures"]]
 
 
 def test_closure_reaches_a_robot_whose_hook_fails_for_the_newer_version(

@@ -112,8 +112,8 @@ def test_forged_events_cost_little_and_change_nothing(
             time.sleep(0.01)
     finally:
         session.close()  # type: ignore[no-untyped-call]
-    asked = [path for _, path, _, _ in gate.requests if "/manifest" in path]
-    assert len(asked) < 30, len(asked)
+    manifest_paths = [path for _, path, _, _ in gate.requests if "/manifest" in path]
+    assert len(manifest_paths) < 30, len(manifest_paths)
     assert one.standing["version"] == 1
     api.upload(place, {"n.tmap2.yaml": network(1)})
     one.wait("active", 15, version=2)

@@ -145,21 +145,21 @@ def test_one_folder_has_one_agent_and_one_environment(api: Api, place: str, robo
 
 
 def test_the_hook_has_what_changed(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
-    told = tmp_path / "told"
-    command = f'env | grep ^FLEETMAP_ > {told}.new; cat "$FLEETMAP_CURRENT"/tmap2/* > /dev/null && mv {told}.new {told}'
+    file = tmp_path / "told"
+    command = f'env | grep ^FLEETMAP_ > {file}.new; cat "$FLEETMAP_CURRENT"/tmap2/* > /dev/null && mv {file}.new {file}'
     one = robot("--poll", "3600", "--on-change", command)
     one.wait("hook", version=1)
     one.wait("connected")
     api.upload(place, {"n.tmap2.yaml": network(1)})
     one.wait("hook", version=2)
-    said = told.read_text()
-    assert f"FLEETMAP_ENVIRONMENT={place}\n" in said
-    assert "FLEETMAP_VERSION=2\n" in said
-    assert f"FLEETMAP_ROOT={one.standing['root']}\n" in said
-    assert "FLEETMAP_CHANNEL=latest\n" in said
-    assert f"FLEETMAP_CURRENT={one.into}/current\n" in said
-    assert "FLEETMAP_CHANGED=tmap2/network.tmap2.yaml\n" in said
-    assert "FLEETMAP_LAYERS=topology\n" in said
+    output = file.read_text()
+    assert f"FLEETMAP_ENVIRONMENT={place}\n" in output
+    assert "FLEETMAP_VERSION=2\n" in output
+    assert f"FLEETMAP_ROOT={one.standing['root']}\n" in output
+    assert "FLEETMAP_CHANNEL=latest\n" in output
+    assert f"FLEETMAP_CURRENT={one.into}/current\n" in output
+    assert "FLEETMAP_CHANGED=tmap2/network.tmap2.yaml\n" in output
+    assert "FLEETMAP_LAYERS=topology\n" in output
     assert one.stop() == 0
 
 
@@ -187,17 +187,17 @@ def test_environment_sh(api: Api, place: str, robot: Start) -> None:
     one = robot("--once", formats="tmap2,occupancy_grid")
     assert one.end() == 0
     script = 'set -eu; . "$1"; echo "$TMAP_FILE|$COSTMAP_YAML_FILE|$DATUM_FILE|$FLEETMAP_VERSION"'
-    told = subprocess.run(
+    output = subprocess.run(
         ["sh", "-c", script, "sh", one.into / "current" / "environment.sh"], capture_output=True, text=True, check=True
     ).stdout
     current = one.into / "current"
-    assert told == f"{current}/tmap2/network.tmap2.yaml|{current}/occupancy_grid/map.yaml||2\n"
+    assert output == f"{current}/tmap2/network.tmap2.yaml|{current}/occupancy_grid/map.yaml||2\n"
 
 
 def test_environment_sh_says_what_the_place_is_called(api: Api, place: str, robot: Start) -> None:
-    said = b"export FARM_NAME='It'\\''s a \"yard\"; $(touch x)'\nexport FIELD_ID=p1\n"
-    said += b"export TMAP_FILE=/nowhere\nexport LD_PRELOAD=/x\n"
-    api.upload(place, {"config/properties.sh": said, "config/topological/n.tmap2.yaml": network(1)})
+    properties = b"export FARM_NAME='It'\\''s a \"yard\"; $(touch x)'\nexport FIELD_ID=p1\n"
+    properties += b"export TMAP_FILE=/nowhere\nexport LD_PRELOAD=/x\n"
+    api.upload(place, {"config/properties.sh": properties, "config/topological/n.tmap2.yaml": network(1)})
     one = robot("--once")
     assert one.end() == 0
 
@@ -208,7 +208,7 @@ def test_environment_sh_says_what_the_place_is_called(api: Api, place: str, robo
 
     file = str(one.into / "current" / "tmap2" / "network.tmap2.yaml")
     assert sourced() == ['It\'s a "yard"; $(touch x)', "p1", "", file, "", ""]
-    api.upload(place, {"config/properties.sh": said.replace(b"p1", b"p2")})
+    api.upload(place, {"config/properties.sh": properties.replace(b"p1", b"p2")})
     assert robot("--once").end() == 0
     assert sourced()[1] == "p2"
     api.post(f"environments/{place}/versions", {"revert_to": 1})
@@ -226,12 +226,12 @@ def test_two_robots_hold_the_same_root(api: Api, place: str, robot: Start) -> No
     for one in robots:
         one.wait("active", version=6)
     assert len({json.dumps(one.standing["files"]) + one.standing["root"] for one in robots}) == 1
-    told = api.get(f"robots?environment={place}").json()
-    assert {r["robot"] for r in told} == {"robot-1", "robot-2"}
+    robot_rows = api.get(f"robots?environment={place}").json()
+    assert {r["robot"] for r in robot_rows} == {"robot-1", "robot-2"}
 
     def agree() -> bool:
-        told = api.get(f"environments/{place}/channels").json()[0]["robots"]
-        return bool(told["holding"] == told["total"] == told["online"] == 2 and told["since"])
+        robots = api.get(f"environments/{place}/channels").json()[0]["robots"]
+        return bool(robots["holding"] == robots["total"] == robots["online"] == 2 and robots["since"])
 
     eventually(agree)
     for one in robots:
@@ -269,13 +269,13 @@ def test_a_robot_that_fails_takes_the_fleet_back(api: Api, place: str, robot: St
 
 
 def test_a_robots_token_is_enough(api: Api, place: str, robot: Start) -> None:
-    made = api.post("tokens", {"name": "r", "role": "robot", "robot": "robot", "environments": place}).json()
-    one = robot("--once", "--on-change", "true", FLEETMAP_TOKEN=made["token"])
+    token = api.post("tokens", {"name": "r", "role": "robot", "robot": "robot", "environments": place}).json()
+    one = robot("--once", "--on-change", "true", FLEETMAP_TOKEN=token["token"])
     assert one.end() == 0, one.lines
     assert one.saw("status") is None
     assert api.get(f"robots/robot?environment={place}").json()["state"] == "active"
     api.upload(place, {"n.tmap2.yaml": network(1)})
-    again = robot("--once", "--on-change", "true", FLEETMAP_TOKEN=made["token"])
+    again = robot("--once", "--on-change", "true", FLEETMAP_TOKEN=token["token"])
     assert again.end() == 0
     assert again.saw("layers") is None
     wrong = robot("--once", name="wrong", FLEETMAP_TOKEN="nonsense")

@@ -25,11 +25,11 @@ Robot = Callable[..., One]
 
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Fake]:
-    made = Fake(tmp_path / "keys")
-    made.put(A)
-    made.close_edges()
-    yield made
-    made.close()
+    server = Fake(tmp_path / "keys")
+    server.put(A)
+    server.close_edges()
+    yield server
+    server.close()
 
 
 @pytest.fixture

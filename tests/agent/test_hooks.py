@@ -124,13 +124,13 @@ def test_they_are_found_by_name() -> None:
 def test_nav2_loads_what_changed(ros: Path, current: Path) -> None:
     changed = ["occupancy_grid/map.pgm", "occupancy_grid/keepout.yaml", "nav2_route/graph.geojson", "kml/map.kml"]
     assert hooks.run("nav2", {"FLEETMAP_CURRENT": str(current), "FLEETMAP_CHANGED": "\n".join(changed)}) is None
-    where = str(current.resolve()).replace("'", "''")
+    folder = str(current.resolve()).replace("'", "''")
     assert ros.read_text().splitlines() == [
-        f"service call /map_server/load_map nav2_msgs/srv/LoadMap {{map_url: '{where}/occupancy_grid/map.yaml'}}",
+        f"service call /map_server/load_map nav2_msgs/srv/LoadMap {{map_url: '{folder}/occupancy_grid/map.yaml'}}",
         "service call /keepout_filter_mask_server/load_map nav2_msgs/srv/LoadMap "
-        f"{{map_url: '{where}/occupancy_grid/keepout.yaml'}}",
+        f"{{map_url: '{folder}/occupancy_grid/keepout.yaml'}}",
         "service call /route_server/set_route_graph nav2_msgs/srv/SetRouteGraph "
-        f"{{graph_filepath: '{where}/nav2_route/graph.geojson'}}",
+        f"{{graph_filepath: '{folder}/nav2_route/graph.geojson'}}",
     ]
 
 
@@ -146,15 +146,17 @@ def test_each_step_is_reported(ros: Path, current: Path) -> None:
 def test_a_grid_or_graph_that_is_gone_is_a_failure(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (current / "occupancy_grid" / "map.yaml").unlink()
     (current / "nav2_route" / "graph.geojson").unlink()
-    gone = variables(current, "occupancy_grid/map.yaml", "occupancy_grid/speed.pgm", "nav2_route/graph.geojson")
-    told = hooks.run("nav2", gone)
-    assert told is not None
-    assert "the grid map is no longer part of the map" in told
-    assert "the route graph is no longer part of the map" in told
+    hook_variables = variables(
+        current, "occupancy_grid/map.yaml", "occupancy_grid/speed.pgm", "nav2_route/graph.geojson"
+    )
+    problem = hooks.run("nav2", hook_variables)
+    assert problem is not None
+    assert "the grid map is no longer part of the map" in problem
+    assert "the route graph is no longer part of the map" in problem
     assert steps(ros) == [("map", "failed"), ("speed", "done"), ("route graph", "failed")], "the rest is loaded"
     monkeypatch.setenv("FLEETMAP_NAV2_MAP_SERVER", "")
     monkeypatch.setenv("FLEETMAP_NAV2_ROUTE_SERVER", "")
-    assert hooks.run("nav2", gone) is None
+    assert hooks.run("nav2", hook_variables) is None
 
 
 def test_a_mask_without_a_mask_server_is_no_failure(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,9 +165,9 @@ def test_a_mask_without_a_mask_server_is_no_failure(ros: Path, current: Path, mo
     assert hooks.run("nav2", changed) is None
     assert steps(ros) == [("map", "done"), ("keepout", "skipped"), ("speed", "skipped")]
     monkeypatch.setenv("FLEETMAP_NAV2_KEEPOUT_SERVER", "/keepout_filter_mask_server")
-    told = hooks.run("nav2", changed)
-    assert told is not None, "an operator who names a server wants it"
-    assert "there is no service /keepout_filter_mask_server/load_map" in told
+    problem = hooks.run("nav2", changed)
+    assert problem is not None, "an operator who names a server wants it"
+    assert "there is no service /keepout_filter_mask_server/load_map" in problem
 
 
 def test_a_mask_that_is_gone_gives_way_to_an_empty_one(ros: Path, current: Path) -> None:
@@ -186,9 +188,9 @@ def test_a_mask_that_is_gone_gives_way_to_an_empty_one(ros: Path, current: Path)
 
 def test_the_map_server_must_be_there(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ABSENT", "/map_server/load_map")
-    told = hooks.run("nav2", variables(current, "occupancy_grid/map.yaml"))
-    assert told is not None
-    assert "there is no service /map_server/load_map: start Nav2, or set FLEETMAP_NAV2_MAP_SERVER" in told
+    problem = hooks.run("nav2", variables(current, "occupancy_grid/map.yaml"))
+    assert problem is not None
+    assert "there is no service /map_server/load_map: start Nav2, or set FLEETMAP_NAV2_MAP_SERVER" in problem
 
 
 def test_a_grid_of_any_name(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,16 +199,16 @@ def test_a_grid_of_any_name(ros: Path, current: Path, monkeypatch: pytest.Monkey
     assert hooks.run("nav2", variables(current, "occupancy_grid/hall.pgm")) is None
     assert "occupancy_grid/hall.yaml" in called(ros)[0], "the only grid that is no mask"
     put(current, "occupancy_grid/annex.yaml")
-    told = hooks.run("nav2", variables(current, "occupancy_grid/hall.pgm"))
-    assert told is not None
-    assert "there are the grids annex, hall: name one with FLEETMAP_NAV2_GRID" in told
+    problem = hooks.run("nav2", variables(current, "occupancy_grid/hall.pgm"))
+    assert problem is not None
+    assert "there are the grids annex, hall: name one with FLEETMAP_NAV2_GRID" in problem
     monkeypatch.setenv("FLEETMAP_NAV2_GRID", "annex")
     assert hooks.run("nav2", variables(current, "occupancy_grid/annex.yaml")) is None
     assert "occupancy_grid/annex.yaml" in called(ros)[0]
     monkeypatch.setenv("FLEETMAP_NAV2_GRID", "cellar")
-    told = hooks.run("nav2", variables(current, "occupancy_grid/annex.yaml"))
-    assert told is not None
-    assert "there is no grid cellar here, only annex, hall" in told
+    problem = hooks.run("nav2", variables(current, "occupancy_grid/annex.yaml"))
+    assert problem is not None
+    assert "there is no grid cellar here, only annex, hall" in problem
 
 
 def test_another_level(ros: Path, current: Path) -> None:
@@ -227,9 +229,9 @@ def test_another_level(ros: Path, current: Path) -> None:
     assert hooks.run("nav2", variables(current, FLEETMAP_LEVEL="ground")) is None
     assert len(called(ros)) == 2, "both again, though no file changed"
     for level, reason in (("L3", "the map has no level 'L3'; it has ground, L2, roof"), ("roof", "no files of level")):
-        told = hooks.run("nav2", variables(current, FLEETMAP_LEVEL=level))
-        assert told is not None
-        assert reason in told
+        problem = hooks.run("nav2", variables(current, FLEETMAP_LEVEL=level))
+        assert problem is not None
+        assert reason in problem
 
 
 def test_level_whose_folder_has_another_name(ros: Path, current: Path) -> None:
@@ -267,9 +269,9 @@ def test_closed_edges_are_closed_and_opened_again(ros: Path, current: Path, monk
     assert f"{adjust} {{closed_edges: [], opened_edges: [7], adjust_edges: []}}" in called(ros)
     monkeypatch.setenv("ABSENT", adjust)
     put(current, "nav2_route/graph.geojson", graph(6))
-    told = hooks.run("nav2", changed)
-    assert told is not None
-    assert "add DynamicEdgesScorer to the route server's edge_cost_functions" in told
+    problem = hooks.run("nav2", changed)
+    assert problem is not None
+    assert "add DynamicEdgesScorer to the route server's edge_cost_functions" in problem
     assert not any("set_route_graph" in line for line in called(ros)), "an edge that cannot be closed is not set open"
 
 
@@ -277,15 +279,15 @@ def test_nav2_reports_what_was_refused(ros: Path, current: Path, monkeypatch: py
     changed = variables(current, "occupancy_grid/map.yaml")
     for result, reason in (("1", "does not exist"), ("255", "undefined failure"), ("10", "no result")):
         monkeypatch.setenv("RESULT", result)
-        told = hooks.run("nav2", changed)
-        assert told is not None
-        assert f"(result={result})" in told
-        assert reason in told
+        problem = hooks.run("nav2", changed)
+        assert problem is not None
+        assert f"(result={result})" in problem
+        assert reason in problem
     monkeypatch.setenv("LARGE", "1")
     monkeypatch.setenv("RESULT", "2")
-    told = hooks.run("nav2", changed)
-    assert told is not None, "an answer of megabytes"
-    assert "invalid map data (result=2)" in told
+    problem = hooks.run("nav2", changed)
+    assert problem is not None, "an answer of megabytes"
+    assert "invalid map data (result=2)" in problem
     monkeypatch.delenv("RESULT")
     monkeypatch.setenv("FLEETMAP_NAV2_MAP_SERVER", "/r1/map_server")
     assert hooks.run("nav2", changed) is None
@@ -295,15 +297,15 @@ def test_nav2_reports_what_was_refused(ros: Path, current: Path, monkeypatch: py
 def test_a_service_that_hangs_is_given_up(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HANG", "1")
     changed = variables(current, "occupancy_grid/map.yaml", "occupancy_grid/keepout.yaml")
-    told = hooks.run("nav2", {**changed, "FLEETMAP_ROS_SECONDS": "1"})
-    assert told is not None
-    assert "/map_server/load_map gave no answer within 1 seconds" in told
-    told = hooks.run("nav2", {**changed, "FLEETMAP_HOOK_SECONDS": "1.5"})
-    assert told is not None
-    assert "no time is left" in told
-    told = hooks.run("nav2", {**changed, "FLEETMAP_ROS_SECONDS": "soon"})
-    assert told is not None
-    assert "FLEETMAP_ROS_SECONDS must be a number of seconds, got 'soon'" in told
+    problem = hooks.run("nav2", {**changed, "FLEETMAP_ROS_SECONDS": "1"})
+    assert problem is not None
+    assert "/map_server/load_map gave no answer within 1 seconds" in problem
+    problem = hooks.run("nav2", {**changed, "FLEETMAP_HOOK_SECONDS": "1.5"})
+    assert problem is not None
+    assert "no time is left" in problem
+    problem = hooks.run("nav2", {**changed, "FLEETMAP_ROS_SECONDS": "soon"})
+    assert problem is not None
+    assert "FLEETMAP_ROS_SECONDS must be a number of seconds, got 'soon'" in problem
 
 
 def published(ros: Path, *maps: object) -> None:
@@ -321,27 +323,27 @@ def test_topological(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) 
     assert ros.read_text() == "", "the network did not change"
     changed = variables(current, "tmap2/network.tmap2.yaml")
     file = current / "tmap2" / "network.tmap2.yaml"
-    wanted = loading.read_network(file)
-    assert (wanted.nodes, wanted.edges) == ({"A", "B"}, {"A_B"})
-    right = {**tmap2("A", "B"), "name": wanted.name, "pointset": wanted.pointset}
+    expected_network = loading.read_network(file)
+    assert (expected_network.nodes, expected_network.edges) == ({"A", "B"}, {"A_B"})
+    right = {**tmap2("A", "B"), "name": expected_network.name, "pointset": expected_network.pointset}
     published(ros, {}, tmap2("old"), right)
     assert hooks.run("topological", changed) is None
-    where = str(file.resolve()).replace("'", "''")
+    path = str(file.resolve()).replace("'", "''")
     assert ros.read_text() == (
         "service call /topological_map_manager2/switch_topological_map "
         "topological_navigation_msgs/srv/WriteTopologicalMap "
-        f"{{filename: '{where}', no_alias: false}}\n"
+        f"{{filename: '{path}', no_alias: false}}\n"
     )
     monkeypatch.setenv("SUCCESS", "False")
-    told = hooks.run("topological", changed)
-    assert told is not None
-    assert "switch_topological_map refused tmap2/network.tmap2.yaml" in told
+    problem = hooks.run("topological", changed)
+    assert problem is not None
+    assert "switch_topological_map refused tmap2/network.tmap2.yaml" in problem
 
 
 def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> None:
     changed = variables(current, "tmap2/network.tmap2.yaml")
-    wanted = loading.read_network(current / "tmap2" / "network.tmap2.yaml")
-    right = {**tmap2("A", "B"), "name": wanted.name, "pointset": wanted.pointset}
+    expected_network = loading.read_network(current / "tmap2" / "network.tmap2.yaml")
+    right = {**tmap2("A", "B"), "name": expected_network.name, "pointset": expected_network.pointset}
     for last, reason in (
         ({}, "its name is '', not"),
         ({**right, "nodes": right["nodes"][:1]}, "it has 1 nodes, not 2; for example it lacks 'B'"),
@@ -349,10 +351,10 @@ def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> 
     ):
         ros.write_text("")
         published(ros, right, last)
-        told = hooks.run("topological", changed)
-        assert told is not None
-        assert "reported success, but /topological_map_2 does not hold tmap2/network.tmap2.yaml" in told
-        assert reason in told
+        problem = hooks.run("topological", changed)
+        assert problem is not None
+        assert "reported success, but /topological_map_2 does not hold tmap2/network.tmap2.yaml" in problem
+        assert reason in problem
         assert "../../" in called(ros)[1], "a manager that puts its own folder before the name is helped"
 
 
@@ -377,8 +379,8 @@ def test_networks_are_read_as_the_server_writes_them(tmp_path: Path) -> None:
     ]
     frames = {"child": "topo_map", "parent": "map", "rotation": pose["orientation"], "translation": pose["position"]}
     body = {"meta": {}, "name": "it's: m", "metric_map": "m", "pointset": "p", "transformation": frames, "nodes": nodes}
-    made = offline({"n.tmap2.yaml": yaml.safe_dump(body).encode()}, "tmap2", hints=Hints("tmap2"))
-    (data,) = made.files.values()
+    converted = offline({"n.tmap2.yaml": yaml.safe_dump(body).encode()}, "tmap2", hints=Hints("tmap2"))
+    (data,) = converted.files.values()
     (tmp_path / "n.yaml").write_bytes(data)
     network = loading.read_network(tmp_path / "n.yaml")
     assert network == loading.network_of(json.dumps(yaml.safe_load(data)))
@@ -391,28 +393,28 @@ def edge_of(source: str, target: str) -> dict[str, Any]:
 
 def test_without_ros_it_fails_and_says_so(current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEETMAP_PYTHON", sys.executable)
-    told = hooks.run("nav2", variables(current, "occupancy_grid/map.yaml"))
-    assert told is not None
-    assert "source the setup.bash of ROS 2" in told
+    problem = hooks.run("nav2", variables(current, "occupancy_grid/map.yaml"))
+    assert problem is not None
+    assert "source the setup.bash of ROS 2" in problem
 
 
 def test_a_hanging_hook_is_ended(tmp_path: Path) -> None:
-    told = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, seconds=0.5)
-    assert told is not None
-    assert "took more than 0.5 seconds" in told
+    problem = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, seconds=0.5)
+    assert problem is not None
+    assert "took more than 0.5 seconds" in problem
     pid = int((tmp_path / "pid").read_text())
     eventually(lambda: _ended(pid))  # what was killed takes a moment to end on a busy machine
 
 
 def test_a_hook_that_prints_without_end_fills_nothing() -> None:
     before = tracemalloc_peak(lambda: None)
-    told: list[str | None] = []
+    problems: list[str | None] = []
     peak = tracemalloc_peak(
-        lambda: told.append(hooks.run("head -c 50000000 /dev/zero | tr '\\0' x; echo; echo the end; exit 3", {}))
+        lambda: problems.append(hooks.run("head -c 50000000 /dev/zero | tr '\\0' x; echo; echo the end; exit 3", {}))
     )
-    assert told[0] is not None
-    assert told[0].endswith("the end")
-    assert len(told[0]) < 2000
+    assert problems[0] is not None
+    assert problems[0].endswith("the end")
+    assert len(problems[0]) < 2000
     assert peak - before < 2**20
 
 
@@ -435,9 +437,9 @@ def test_what_a_hook_leaves_in_the_background_lives_on(tmp_path: Path) -> None:
 def test_a_hook_ends_with_the_agent(tmp_path: Path) -> None:
     stopping = threading.Event()
     threading.Timer(0.2, stopping.set).start()
-    told = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, stopping=stopping)
-    assert told is not None
-    assert "was ended with the agent" in told
+    problem = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, stopping=stopping)
+    assert problem is not None
+    assert "was ended with the agent" in problem
     pid = int((tmp_path / "pid").read_text())
     eventually(lambda: _ended(pid))
 

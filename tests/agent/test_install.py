@@ -72,44 +72,46 @@ def test_the_base_is_small() -> None:
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["agent", "--help"], ["promote", "--help"]])
 def test_help_needs_no_server(arguments: list[str]) -> None:
-    told = without_server(*arguments)
-    assert told.returncode == 0, told.stderr
+    process = without_server(*arguments)
+    assert process.returncode == 0, process.stderr
 
 
 def test_a_robot_syncs_without_the_server_packages(api: Api, place: str, tmp_path: Path) -> None:
-    told = without_server("agent", "-s", api.url, "-e", place, "-f", "tmap2", "--into", str(tmp_path / "r"), "--once")
-    assert told.returncode == 0, told.stderr
+    process = without_server(
+        "agent", "-s", api.url, "-e", place, "-f", "tmap2", "--into", str(tmp_path / "r"), "--once"
+    )
+    assert process.returncode == 0, process.stderr
     assert whole_map(tmp_path / "r")["version"] == 1
 
 
 @pytest.mark.parametrize("arguments", [["serve"], ["migrate"]])
 def test_other_commands_say_what_to_install(arguments: list[str], tmp_path: Path) -> None:
-    told = without_server(*arguments)
-    assert told.returncode == 1
-    assert 'pip install "fleet-map-server[server]"' in told.stderr, told.stderr
+    process = without_server(*arguments)
+    assert process.returncode == 1
+    assert 'pip install "fleet-map-server[server]"' in process.stderr, process.stderr
 
 
 def robot_modules() -> list[str]:
     """ROBOT of the Makefile: what `make lint` checks for Python 3.10."""
     text = (ROOT / "Makefile").read_text().replace("\\\n", " ")
-    found = re.search(r"^ROBOT := (.+)$", text, re.MULTILINE)
-    assert found is not None
-    return found[1].split()
+    match = re.search(r"^ROBOT := (.+)$", text, re.MULTILINE)
+    assert match is not None
+    return match[1].split()
 
 
 def imported(path: Path) -> set[str]:
     """Modules of ours that are imported with this file: not those within a function or below TYPE_CHECKING."""
-    found: set[str] = set()
+    names: set[str] = set()
     todo: list[ast.AST] = [ast.parse(path.read_text())]
     while todo:
         node = todo.pop()
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
+            names |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
         elif isinstance(node, ast.Import):
-            found |= {one.name for one in node.names}
+            names |= {one.name for one in node.names}
         lazy = isinstance(node, ast.FunctionDef) or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node))
         todo += [] if lazy and "app/agent" not in path.as_posix() else list(ast.iter_child_nodes(node))
-    return {name for name in found if name.partition(".")[0] == "app"}
+    return {name for name in names if name.partition(".")[0] == "app"}
 
 
 def file_of(module: str) -> Path | None:

@@ -63,8 +63,8 @@ def test_office_comes_with_both_levels(site: Callable[[str], str], robot: Start)
     assert "map.yaml" in levels["ground"]["files"]["occupancy_grid"]
     assert f"{upper}/map.yaml" in levels[upper]["files"]["occupancy_grid"]
     for folder in ("", f"{upper}/"):
-        told = yaml.safe_load((current / "occupancy_grid" / f"{folder}map.yaml").read_text())
-        assert (current / "occupancy_grid" / folder / told["image"]).stat().st_size > 10_000
+        map_yaml = yaml.safe_load((current / "occupancy_grid" / f"{folder}map.yaml").read_text())
+        assert (current / "occupancy_grid" / folder / map_yaml["image"]).stat().st_size > 10_000
     assert variable(one, "COSTMAP_YAML_FILE") == str(current / "occupancy_grid" / "map.yaml")
 
 
@@ -106,8 +106,8 @@ def test_accepted_report_stops_a_robot_and_frees_it_at_its_end(
     eventually(lambda: edges(one) == before, 60)
     assert lines(one) == graph
 
-    def held() -> bool:
+    def is_released() -> bool:
         channel = next(c for c in api.get(f"environments/{name}/channels").json() if c["channel"] == "production")
         return bool(channel["robots"]["holding"] >= 1 and channel["overlays"]["count"] == 0)
 
-    eventually(held, 90)
+    eventually(is_released, 90)

@@ -37,11 +37,11 @@ Robot = Callable[..., One]
 
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Fake]:
-    made = Fake(tmp_path / "keys")
-    made.put(SITE)
-    made.levels = LEVELS
-    yield made
-    made.close()
+    server = Fake(tmp_path / "keys")
+    server.put(SITE)
+    server.levels = LEVELS
+    yield server
+    server.close()
 
 
 @pytest.fixture

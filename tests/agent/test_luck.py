@@ -35,10 +35,10 @@ A, B = {"kml/map.kml": b"a" * 5000}, {"kml/map.kml": b"b" * 6000}
 
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Fake]:
-    made = Fake(tmp_path / "keys")
-    made.put(A)
-    yield made
-    made.close()
+    server = Fake(tmp_path / "keys")
+    server.put(A)
+    yield server
+    server.close()
 
 
 @pytest.fixture
@@ -221,9 +221,9 @@ def test_models_are_found_by_gazebo(fake: Fake, robot: Robot) -> None:
     assert one.once()
     script = 'set -eu; . "$1"; printf "%s\n" "$GAZEBO_MODEL_PATH"; . "$1"; printf "%s\n" "$GAZEBO_MODEL_PATH"'
     command = ["env", "-u", "GAZEBO_MODEL_PATH", "sh", "-c", script, "sh", one.into / "current" / "environment.sh"]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    search_paths = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     models = str(one.into / "current" / "gazebo" / "models")
-    assert told == [models, f"{models}:{models}"], "no empty place in it, which would be wherever one is"
+    assert search_paths == [models, f"{models}:{models}"], "no empty place in it, which would be wherever one is"
 
 
 def test_a_moved_folder_has_its_paths_put_right(fake: Fake, robot: Robot, tmp_path: Path) -> None:
@@ -234,8 +234,8 @@ def test_a_moved_folder_has_its_paths_put_right(fake: Fake, robot: Robot, tmp_pa
     one = One(fake, tmp_path / "elsewhere")
     one.agent.open()
     one.agent.close()
-    said = (tmp_path / "elsewhere" / "current" / "environment.sh").read_text()
-    assert f"FLEETMAP_CURRENT={tmp_path}/elsewhere/current" in said, "also without a server"
+    script = (tmp_path / "elsewhere" / "current" / "environment.sh").read_text()
+    assert f"FLEETMAP_CURRENT={tmp_path}/elsewhere/current" in script, "also without a server"
     assert whole(tmp_path / "elsewhere")["version"] == 1
 
 
@@ -342,7 +342,7 @@ def test_a_server_that_answers_slowly_for_ever_is_given_up(
 ) -> None:
     monkeypatch.setattr(web, "HEAD_SECONDS", 0.2)
     monkeypatch.setattr(web, "PACE_SECONDS", 0.2)
-    gone = threading.Event()
+    stop = threading.Event()
 
     def slow(handler: BaseHTTPRequestHandler) -> bool:
         if part not in handler.path:
@@ -352,7 +352,7 @@ def test_a_server_that_answers_slowly_for_ever_is_given_up(
             handler.send_header("content-length", "5000")
             handler.end_headers()
         with contextlib.suppress(OSError):
-            while not gone.wait(0.02):
+            while not stop.wait(0.02):
                 handler.wfile.write(b"H")
                 handler.wfile.flush()
         handler.close_connection = True
@@ -362,26 +362,26 @@ def test_a_server_that_answers_slowly_for_ever_is_given_up(
     one = robot()
     assert not one.once()
     assert one.saw("failed")
-    gone.set()
+    stop.set()
     fake.instead = lambda _: False
     assert robot().once()
 
 
 @pytest.mark.parametrize("part", ["/channels", "/manifest", "/maps/", "/status"])
 def test_it_ends_at_once_while_a_server_hangs(fake: Fake, robot: Robot, part: str) -> None:
-    hangs, gone = threading.Event(), threading.Event()
+    hangs, stop = threading.Event(), threading.Event()
 
     def hang(handler: BaseHTTPRequestHandler) -> bool:
         if part in handler.path:
             hangs.set()
-            gone.wait(50)
+            stop.wait(50)
         return part in handler.path
 
     fake.instead = hang
     one = robot()
     with run(one):
         assert hangs.wait(20)
-    gone.set()
+    stop.set()
     assert not one.saw("failed"), "to end is no failure"
 
 
@@ -558,10 +558,10 @@ def test_a_server_that_was_set_up_anew(fake: Fake, robot: Robot, tmp_path: Path)
 def test_names_that_are_one_on_this_file_system(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     fake.put({"kml/Map.kml": b"a", "kml/map.kml": b"b"})
 
-    def there(path: Path) -> bool:
+    def exists_in_any_case(path: Path) -> bool:
         return path.name.lower() in {p.name.lower() for p in path.parent.iterdir()}
 
-    monkeypatch.setattr(os.path, "lexists", there)
+    monkeypatch.setattr(os.path, "lexists", exists_in_any_case)
     one = robot()
     assert not one.once()
     assert "have one name on the file system" in one.detail
@@ -622,16 +622,16 @@ def test_what_lies_ready_is_looked_at_again(fake: Fake, robot: Robot) -> None:
 
 def test_links_of_others_are_not_followed(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     assert robot().once()
-    into, mine = robot().into, tmp_path / "mine"
-    mine.write_text("mine")
+    into, target = robot().into, tmp_path / "mine"
+    target.write_text("mine")
     fake.put(B)
-    (into / ".state.json.new").symlink_to(mine)
-    (into / ".current.new").symlink_to(mine)
-    (into / ".changed.new").symlink_to(mine)
+    (into / ".state.json.new").symlink_to(target)
+    (into / ".current.new").symlink_to(target)
+    (into / ".changed.new").symlink_to(target)
     (into / "partial" / (hashlib.sha256(B["kml/map.kml"]).hexdigest() + ".part")).symlink_to(tmp_path / "absent")
     assert robot("true").once()
     assert whole(into)["version"] == 2
-    assert mine.read_text() == "mine"
+    assert target.read_text() == "mine"
     assert not (tmp_path / "absent").exists()
 
 
@@ -641,7 +641,7 @@ def test_a_log_that_takes_nothing_stops_nobody(fake: Fake, tmp_path: Path) -> No
     os.close(reader)
     with Path("/dev/full").open("w") as full, os.fdopen(nobody, "w") as closed:
         for log, more in ((full, []), (full, ["--json"]), (closed, []), (closed, ["--json"])):
-            told = subprocess.run(
+            process = subprocess.run(
                 [sys.executable, "-m", "app.cli", *arguments, *more],
                 env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
                 stdout=log,
@@ -649,7 +649,7 @@ def test_a_log_that_takes_nothing_stops_nobody(fake: Fake, tmp_path: Path) -> No
                 timeout=60,
                 check=False,
             )
-            assert whole(tmp_path / "robot")["version"] == len(fake.versions), told
+            assert whole(tmp_path / "robot")["version"] == len(fake.versions), process
             assert fake.statuses[-1]["state"] == "active", "and it said so"
             fake.put({"kml/map.kml": bytes(len(fake.versions))})
 
@@ -716,15 +716,15 @@ def test_it_says_why_it_hears_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     from app.agent import ear
 
     monkeypatch.setattr(ear, "CONNECT_MS", 100)
-    said: list[str] = []
+    problems: list[str] = []
     port = free_port()
-    one = Ear(PLACE, "robot", heard=lambda _: None, back=lambda: None, lost=said.append)
+    one = Ear(PLACE, "robot", heard=lambda _: None, back=lambda: None, lost=problems.append)
     try:
         one.aim(f"tcp/127.0.0.1:{port}", "fleetmap")
-        eventually(lambda: said)
+        eventually(lambda: problems)
     finally:
         one.close()
-    assert f"no router at tcp/127.0.0.1:{port}" in said[0]
+    assert f"no router at tcp/127.0.0.1:{port}" in problems[0]
 
 
 def test_a_folder_of_someone_else(fake: Fake, robot: Robot) -> None:

@@ -34,10 +34,10 @@ Attack = Callable[[Fake, Path], None]
 
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Fake]:
-    made = Fake(tmp_path / "keys")
-    made.put(A)
-    yield made
-    made.close()
+    server = Fake(tmp_path / "keys")
+    server.put(A)
+    yield server
+    server.close()
 
 
 @pytest.fixture

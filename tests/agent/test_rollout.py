@@ -24,8 +24,8 @@ def test_a_fleet_moves_together_and_back(api: Api, place: str, robot: Start, tmp
     fleet = [robot("--on-change", hook, name=name) for name in names]
 
     def all_here() -> bool:  # the fleet is who has told so far: not all start in the same moment
-        told = channel()["robots"]
-        return (told["total"], told["holding"], told["online"]) == (3, 3, 3) and bool(told["since"])
+        robots = channel()["robots"]
+        return (robots["total"], robots["holding"], robots["online"]) == (3, 3, 3) and bool(robots["since"])
 
     eventually(all_here, 60)
 
@@ -46,6 +46,6 @@ def test_a_fleet_moves_together_and_back(api: Api, place: str, robot: Start, tmp
     settled = eventually(lambda: (c := channel())["robots"]["since"] and c, 60)
     assert (settled["robots"]["holding"], settled["robots"]["total"]) == (3, 3)
     eventually(lambda: [agent.standing["version"] for agent in fleet] == [2, 2, 2], 60)
-    told = [(h["state"], h["version"], h["time"]) for h in api.get(f"robots/{names[0]}?limit=200").json()["history"]]
-    assert len(told) == len(set(told)), "what came over Zenoh and over HTTP counts once"
-    assert {("ready", 2), ("active", 2), ("ready", 3)} <= {line[:2] for line in told}
+    history = [(h["state"], h["version"], h["time"]) for h in api.get(f"robots/{names[0]}?limit=200").json()["history"]]
+    assert len(history) == len(set(history)), "what came over Zenoh and over HTTP counts once"
+    assert {("ready", 2), ("active", 2), ("ready", 3)} <= {line[:2] for line in history}

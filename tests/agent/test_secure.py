@@ -114,31 +114,31 @@ def test_an_agent_believes_no_other_authority(secure: Api, tmp_path: Path) -> No
 
 
 def test_what_an_agent_is_given_is_looked_at_first(authority: Authority, tmp_path: Path) -> None:
-    gone = tmp_path / "gone.pem"
+    missing_file = tmp_path / "gone.pem"
     key = tmp_path / "no.pem"
     key.write_text("no certificate")
     cases: list[tuple[dict[str, Any], str]] = [
-        ({"ca": gone}, "gone.pem"),
+        ({"ca": missing_file}, "gone.pem"),
         ({"ca": key}, "no certificate of a certification authority"),
-        ({"zenoh_login": Login(ca=gone)}, "gone.pem cannot be read"),
+        ({"zenoh_login": Login(ca=missing_file)}, "gone.pem cannot be read"),
         ({"zenoh_login": Login(certificate=authority.pem)}, "needs its key"),
         ({"zenoh_login": Login(user="tractor")}, "needs a password"),
     ]
-    for more, told in cases:
-        with pytest.raises(Invalid, match=told):
+    for more, reason in cases:
+        with pytest.raises(Invalid, match=reason):
             Agent(Options("https://127.0.0.1:1", "farm", ("tmap2",), tmp_path / "robot", **more), lambda *_, **__: None)
 
 
 def test_the_command_line_over_https(secure: Api, authority: Authority) -> None:
     clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
-    known = {**clean, "FLEETMAP_SERVER": secure.url, "FLEETMAP_TOKEN": ADMIN, "PYTHONPATH": str(ROOT)}
+    variables = {**clean, "FLEETMAP_SERVER": secure.url, "FLEETMAP_TOKEN": ADMIN, "PYTHONPATH": str(ROOT)}
     for more, status in (({"FLEETMAP_CA": str(authority.pem)}, 0), ({}, 1)):
-        told = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", "app.cli", "versions", "--json"],
-            env={**known, **more},
+            env={**variables, **more},
             capture_output=True,
             text=True,
             timeout=60,
             check=False,
         )
-        assert told.returncode == status, told.stderr
+        assert process.returncode == status, process.stderr

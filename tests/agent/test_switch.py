@@ -27,10 +27,10 @@ Robot = Callable[..., One]
 
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[Fake]:
-    made = Fake(tmp_path / "keys")
-    made.put(A)
-    yield made
-    made.close()
+    server = Fake(tmp_path / "keys")
+    server.put(A)
+    yield server
+    server.close()
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_before_switch_delays_until_it_agrees(fake: Fake, robot: Robot, tmp_path
     with run(one):
         eventually(lambda: calls(status).count("2") >= 3)
         assert whole(one.into)["version"] == 1
-        asked = [path for path in fake.asked if "/manifest" in path]
+        manifest_paths = [path for path in fake.asked if "/manifest" in path]
         eventually(lambda: fake.statuses[-1]["state"] == "ready")
         assert fake.statuses[-1]["version"] == 2
         assert fake.statuses[-1]["sequence"] == 1, "of what it drives by"
@@ -88,7 +88,9 @@ def test_before_switch_delays_until_it_agrees(fake: Fake, robot: Robot, tmp_path
         count = len(fake.statuses)
         eventually(lambda: calls(status).count("2") >= 6)
         assert len(fake.statuses) == count, "each refusal is not another status"
-        assert [path for path in fake.asked if "/manifest" in path] == asked, "the server is not asked each time"
+        assert [path for path in fake.asked if "/manifest" in path] == manifest_paths, (
+            "the server is not asked each time"
+        )
         status.write_text("0")
         eventually(lambda: one.saw("active", version=2))
         eventually(lambda: fake.statuses[-1]["state"] == "active")

@@ -20,7 +20,7 @@ EDGES = (("gate", "barn"), ("barn", "gate"), ("barn", "field"))
 
 def tmap2(nodes: dict[str, tuple[float, float]] | None = None, edges: tuple[tuple[str, str], ...] = EDGES) -> bytes:
     """A network in the local frame, as topological_navigation keeps it."""
-    known = nodes or NODES
+    positions = nodes or NODES
     lines = [
         "meta:",
         "  last_updated: 2026-01-02_03-04-05",
@@ -34,7 +34,7 @@ def tmap2(nodes: dict[str, tuple[float, float]] | None = None, edges: tuple[tupl
         "  translation: {x: 0.0, y: 0.0, z: 0.0}",
         "nodes:",
     ]
-    for name, (x, y) in known.items():
+    for name, (x, y) in positions.items():
         lines += [
             "- meta:",
             "    map: farm",
@@ -52,9 +52,9 @@ def tmap2(nodes: dict[str, tuple[float, float]] | None = None, edges: tuple[tupl
             "    localise_by_topic: ''",
             "    verts: []",
         ]
-        mine = [(a, b) for a, b in edges if a == name]
-        lines += ["    edges: []" if not mine else "    edges:"]
-        for a, b in mine:
+        node_edges = [(a, b) for a, b in edges if a == name]
+        lines += ["    edges: []" if not node_edges else "    edges:"]
+        for a, b in node_edges:
             lines += [
                 "    - action: move_base",
                 "      action_type: move_base_msgs/MoveBaseGoal",

@@ -50,8 +50,8 @@ class Row:
 
 def rows(scope: Scope, **roles: str) -> list[Row]:
     """Rows without bodies: ``role="METHOD path, METHOD path"``."""
-    known: dict[str, Role] = {role: role for role in get_args(Role)}
-    return [Row(line.strip(), known.get(role), scope) for role, text in roles.items() for line in text.split(",")]
+    role_names: dict[str, Role] = {role: role for role in get_args(Role)}
+    return [Row(line.strip(), role_names.get(role), scope) for role, text in roles.items() for line in text.split(",")]
 
 
 E = f"{API}/environments/{{env}}"
@@ -117,15 +117,15 @@ class Site:
         job = ""
         if "{job}" in row.request:
             job = self.api.app.state.services.store.create_job("another token").id
-        known, path = row.request.split(" ")
+        row_method, path = row.request.split(" ")
         values = {**VALUES, "env": env, "job": job}
-        path = re.sub(r"\{(\w+)\}", lambda found: values[found[1]], path)
+        path = re.sub(r"\{(\w+)\}", lambda match: values[match[1]], path)
         query = f"?{row.query.replace('{env}', env)}" if row.query else ""
         content = None if row.body is None else json.dumps(row.body).replace("{env}", env)
         headers = {"content-type": "application/json"} if content else {}
         if caller in self.bearer:
             headers["authorization"] = f"Bearer {self.bearer[caller]}"
-        answer = self.nobody.request(method or known, path + query, content=content, headers=headers)
+        answer = self.nobody.request(method or row_method, path + query, content=content, headers=headers)
         self.text = answer.text.replace(env, "{env}")
         return answer
 
@@ -174,7 +174,7 @@ def hidden(routes: list[Any]) -> Iterator[str]:
 
 def test_every_route_has_a_row(site: Site) -> None:
     app = site.api.app
-    found = {
+    routes = {
         f"{method.upper()} {path}"
         for path, operations in app.openapi()["paths"].items()
         for method in operations
@@ -182,10 +182,10 @@ def test_every_route_has_a_row(site: Site) -> None:
     }
     for route in app.routes:
         if isinstance(route, Route):
-            found |= {f"{m} {route.path.replace(':path', '')}" for m in (route.methods or ()) if m != "HEAD"}
+            routes |= {f"{m} {route.path.replace(':path', '')}" for m in (route.methods or ()) if m != "HEAD"}
         else:
             assert not list(hidden(route.original_router.routes)), "not in OpenAPI, so not in this table"
-    assert {row.request.replace("{job}", "{id}") for row in ROWS} == found
+    assert {row.request.replace("{job}", "{id}") for row in ROWS} == routes
 
 
 def test_each_route_answers_each_caller_as_the_table_says(site: Site) -> None:
@@ -231,8 +231,10 @@ def test_foreign_jobs_are_not_found(site: Site) -> None:
     job = store.create_job("another token").id
     for caller in ("viewer", "editor", "admin" + LIMITED):
         header = {"Authorization": f"Bearer {site.bearer[caller]}"}
-        found, absent = (site.nobody.get(f"{API}/jobs/{number}", headers=header) for number in (job, "0" * 32))
-        assert (found.status_code, found.text.replace(job, "0" * 32)) == (absent.status_code, absent.text) != (200, "")
+        foreign, absent = (site.nobody.get(f"{API}/jobs/{number}", headers=header) for number in (job, "0" * 32))
+        assert (
+            (foreign.status_code, foreign.text.replace(job, "0" * 32)) == (absent.status_code, absent.text) != (200, "")
+        )
     assert store.job(job)
 
 

@@ -44,20 +44,20 @@ def align(api: Api, env: str, expect: int = 201, **body: Any) -> Any:
 
 
 def test_a_grid_is_laid_onto_another_and_keeps_its_cells(api: Api, env: str) -> None:
-    told = align(api, env, 200, onto={"name": "map"}, dry_run=True)
-    assert told["version"] is None
+    preview = align(api, env, 200, onto={"name": "map"}, dry_run=True)
+    assert preview["version"] is None
     assert origin(api, env, "other") == [4.0, -1.0, 0.3], "a dry run changes nothing"
     before = api.get(f"environments/{env}/versions/latest/maps/occupancy_grid/other.pgm").content
-    made = align(api, env, onto={"name": "map"}, message="by its walls")
-    found = made["alignment"]
-    assert found == told["alignment"]
-    assert made["version"]["message"] == "by its walls"
-    assert found["yaw"] == pytest.approx(-0.3, abs=math.radians(0.2))
-    assert (found["agreement"], found["overlap"]) == (1.0, pytest.approx(1.0, abs=0.02))
-    assert found["before"] == [4.0, -1.0, 0.3]
+    result = align(api, env, onto={"name": "map"}, message="by its walls")
+    alignment = result["alignment"]
+    assert alignment == preview["alignment"]
+    assert result["version"]["message"] == "by its walls"
+    assert alignment["yaw"] == pytest.approx(-0.3, abs=math.radians(0.2))
+    assert (alignment["agreement"], alignment["overlap"]) == (1.0, pytest.approx(1.0, abs=0.02))
+    assert alignment["before"] == [4.0, -1.0, 0.3]
     assert origin(api, env, "other") == pytest.approx([-3.0, 2.0, 0.0], abs=0.05)
     assert api.get(f"environments/{env}/versions/latest/maps/occupancy_grid/other.pgm").content == before
-    assert any("keep their place" in w["problem"] for w in made["warnings"])
+    assert any("keep their place" in w["problem"] for w in result["warnings"])
     layers = api.get(f"environments/{env}/versions/latest/layers").json()
     assert next(row for row in layers if row["name"] == "other")["information"] == "raw"
     report = api.get(f"environments/{env}/versions/latest/reports/occupancy_grid?grid=other").json()
@@ -89,8 +89,8 @@ def test_onto_a_slice_of_the_objects(api: Api, env: str) -> None:
     body = ",".join(wall % line for line in lines)
     text = f'{{"type":"FeatureCollection","coordRefSys":"{crs}","features":[{body}]}}'
     api.upload(env, {"walls.geojson": text.encode()})
-    made = align(api, env, onto={"layer": "objects", "parameters": {"resolution": 0.1}}, near=0.15)
-    assert made["alignment"]["origin"] == pytest.approx([-3.0, 2.0, 0.0], abs=0.1)
+    result = align(api, env, onto={"layer": "objects", "parameters": {"resolution": 0.1}}, near=0.15)
+    assert result["alignment"]["origin"] == pytest.approx([-3.0, 2.0, 0.0], abs=0.1)
     refused = align(api, env, 422, onto={"layer": "objects", "parameters": {"colour": 1}})
     assert refused["errors"][0]["where"] == "body.onto.parameters.colour"
 
@@ -108,5 +108,5 @@ def test_what_cannot_be_aligned(api: Api, env: str) -> None:
     assert align(api, env, 422, onto={}, angle=1, reach=0)["detail"]
     pairs = [[[4, -1], [0, 0]], [[5, -1], [1, 0]], [[4, 3], [0, 4]], [[0, 0], [9, 9]]]
     assert "do not fit" in align(api, env, 422, pairs=pairs, least=0.9)["detail"]
-    told = align(api, env, 200, pairs=pairs, least=0.9, dry_run=True)
-    assert any("do not fit" in w["problem"] for w in told["warnings"])
+    preview = align(api, env, 200, pairs=pairs, least=0.9, dry_run=True)
+    assert any("do not fit" in w["problem"] for w in preview["warnings"])

@@ -28,7 +28,7 @@ LICENSE = b"\n                MIT License\n\nCopyright (c) 2024 A Farm\n\nPermis
 MIT = "MIT License, Copyright (c) 2024 A Farm (LICENSE)"
 
 
-def said(name: str, files: dict[str, bytes]) -> str:
+def attribution_of(name: str, files: dict[str, bytes]) -> str:
     """What a map shows of its attribution, read by another parser than ours."""
     data = next(iter(files.values()))
     if name == "kmz":
@@ -50,14 +50,17 @@ WITH_A_PLACE = ("osm", "kml", "kmz", "geojson", "tmap2", "nav2_route")
 
 @pytest.mark.parametrize("name", WITH_A_PLACE)
 def test_a_format_with_a_place_carries_the_credits_and_gives_them_back(name: str) -> None:
-    made = offline({"a.osm": OSM}, name, datum=HERE)
-    assert sorted(made.report["attribution"]) == sorted(CREDIT)
-    assert all(text in said(name, made.files) for text in CREDIT)
+    converted = offline({"a.osm": OSM}, name, datum=HERE)
+    assert sorted(converted.report["attribution"]) == sorted(CREDIT)
+    assert all(text in attribution_of(name, converted.files) for text in CREDIT)
     # Read back they are known again: to the report, and to the next format.
-    again = offline(made.files, name, hints=Hints(name), datum=HERE)
-    assert again.files == made.files
+    again = offline(converted.files, name, hints=Hints(name), datum=HERE)
+    assert again.files == converted.files
     assert all(text in "; ".join(again.report["attribution"]) for text in CREDIT)
-    assert all(text in said("kml", offline(made.files, "kml", hints=Hints(name), datum=HERE).files) for text in CREDIT)
+    assert all(
+        text in attribution_of("kml", offline(converted.files, "kml", hints=Hints(name), datum=HERE).files)
+        for text in CREDIT
+    )
 
 
 @pytest.mark.parametrize("name", WITH_A_PLACE)
@@ -65,15 +68,15 @@ def test_nothing_is_made_up_where_nobody_claims_anything(name: str) -> None:
     bare = OSM.replace(b'attribution="OpenStreetMap &amp; contributors"', b"").replace(
         f'license="{ODBL}"'.encode(), b""
     )
-    made = offline({"a.osm": bare}, name, datum=HERE)
-    assert made.report["attribution"] == []
-    assert said(name, made.files).strip("; ") == ""
+    converted = offline({"a.osm": bare}, name, datum=HERE)
+    assert converted.report["attribution"] == []
+    assert attribution_of(name, converted.files).strip("; ") == ""
 
 
 def test_a_licence_file_is_named_with_what_lies_beside_and_below_it() -> None:
     files = {"a/LICENSE": LICENSE, "a/maps/gate.kml": KML, "b/field.osm": OSM}
-    told = offline(files, "geojson", datum=HERE)
-    lines = {(line["layer"], line["name"]): line["attribution"] for line in told.report["layers"]}
+    converted = offline(files, "geojson", datum=HERE)
+    lines = {(line["layer"], line["name"]): line["attribution"] for line in converted.report["layers"]}
     assert lines["objects", "kml"] == ["MIT License, Copyright (c) 2024 A Farm (a/LICENSE)"]
     assert lines["topology", "network"] == CREDIT
 
@@ -93,22 +96,22 @@ def test_a_licence_file_is_named_with_what_lies_beside_and_below_it() -> None:
     ],
 )
 def test_what_a_licence_file_says_in_a_line(name: str, text: bytes, expected: str | None) -> None:
-    made = offline({name: text, "gate.kml": KML}, "kml", datum=HERE)
-    assert made.report["attribution"] == ([expected] if expected else [])
+    converted = offline({name: text, "gate.kml": KML}, "kml", datum=HERE)
+    assert converted.report["attribution"] == ([expected] if expected else [])
 
 
 def test_a_drawing_with_a_licence_shows_it_and_comes_back_as_it_was() -> None:
-    made = offline({"LICENSE": LICENSE, "gate.kml": KML}, "kml", hints=Hints())
-    assert said("kml", made.files) == MIT
-    assert offline(made.files, "kml").files == made.files, "read back and written, the same bytes"
+    converted = offline({"LICENSE": LICENSE, "gate.kml": KML}, "kml", hints=Hints())
+    assert attribution_of("kml", converted.files) == MIT
+    assert offline(converted.files, "kml").files == converted.files, "read back and written, the same bytes"
     alone = offline({"gate.kml": KML}, "kml")
-    assert said("kml", alone.files) == ""
+    assert attribution_of("kml", alone.files) == ""
 
 
 def test_a_drawing_that_says_its_credit_itself_is_left_as_it_is() -> None:
-    known = KML.replace(b"<Document>", f"<Document><description>{MIT}</description>".encode())
-    made = offline({"LICENSE": LICENSE, "gate.kml": known}, "kml")
-    assert made.files == offline({"gate.kml": known}, "kml").files
+    kml = KML.replace(b"<Document>", f"<Document><description>{MIT}</description>".encode())
+    converted = offline({"LICENSE": LICENSE, "gate.kml": kml}, "kml")
+    assert converted.files == offline({"gate.kml": kml}, "kml").files
 
 
 def test_credits_are_part_of_what_a_stored_map_is(api: Api) -> None:
@@ -116,10 +119,10 @@ def test_credits_are_part_of_what_a_stored_map_is(api: Api) -> None:
     tags = []
     for env, files in (("bare", {"gate.kml": KML}), ("licensed", {"gate.kml": KML, "LICENSE": LICENSE})):
         api.post("environments", {"name": env})
-        made = api.upload(env, files).json()
-        kept = {s["name"] for s in api.get(f"environments/{env}/versions/1/sources").json()}
-        assert kept == set(files), "the licence file is kept as a source"
-        assert made["version"] == 1
+        version = api.upload(env, files).json()
+        sources = {s["name"] for s in api.get(f"environments/{env}/versions/1/sources").json()}
+        assert sources == set(files), "the licence file is kept as a source"
+        assert version["version"] == 1
         answer = api.get(f"/maps/{env}/kml")
         tags.append(answer.headers["etag"])
         assert (MIT in answer.text) == ("LICENSE" in files)
@@ -132,6 +135,6 @@ def test_credits_are_part_of_what_a_stored_map_is(api: Api) -> None:
 
 def test_every_format_that_is_told_a_credit_still_reads_back() -> None:
     for name in WITH_A_PLACE:
-        made = offline({"LICENSE": LICENSE, "a.osm": OSM}, name, datum=HERE)
-        groups, _ = formats.group(made.files)
+        converted = offline({"LICENSE": LICENSE, "a.osm": OSM}, name, datum=HERE)
+        groups, _ = formats.group(converted.files)
         assert name in {g.format.name for g in groups}

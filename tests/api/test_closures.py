@@ -22,11 +22,11 @@ SQUARE = {"type": "Polygon", "coordinates": [[[4, -1], [6, -1], [6, 1], [4, 1], 
 NO_CLOSURES = digest_of([])
 
 
-def close(api: Api, env: str, **what: Any) -> dict[str, Any]:
-    made: dict[str, Any] = api.post(
-        f"environments/{env}/overlays", {"kind": "blocked", "state": "accepted", **what}
+def close(api: Api, env: str, **fields: Any) -> dict[str, Any]:
+    overlay: dict[str, Any] = api.post(
+        f"environments/{env}/overlays", {"kind": "blocked", "state": "accepted", **fields}
     ).json()
-    return made
+    return overlay
 
 
 def end(api: Api, env: str, overlay: dict[str, Any]) -> None:
@@ -107,8 +107,8 @@ def test_manifest_signs_what_was_requested(api: Api, farm: str) -> None:
     assert api.get(f"{place}tmap2&closures=ignore").json()["closures"] == "ignore"
     assert api.get(f"environments/{farm}/versions/3/manifest?formats=tmap2").json()["closures"] == "ignore"
     assert "closures" not in api.get(f"environments/{farm}/versions/3/manifest?formats=tmap2&closures=apply").json()
-    asked = api.get(f"{place}tmap2%3Fclosures%3Dmark,geojson,occupancy_grid%3Fgrid%3Dmap%26derive%3Dfalse").json()
-    assert asked["parameters"] == {
+    body = api.get(f"{place}tmap2%3Fclosures%3Dmark,geojson,occupancy_grid%3Fgrid%3Dmap%26derive%3Dfalse").json()
+    assert body["parameters"] == {
         "tmap2": {"closures": "mark"}, "occupancy_grid": {"grid": "map", "derive": "false"}
     }  # fmt: skip
 
@@ -200,8 +200,8 @@ def test_closing_an_edge_gives_the_map_that_deleting_it_gives(api: Api, farm: st
     other = fresh()
     api.post("environments", {"name": other, "clone": {"environment": farm, "version": 3}})
     close(api, farm, edge="gate_barn")
-    gone = {"op": "delete", "layer": "topology", "id": "gate_barn"}
-    api.post(f"environments/{other}/edits", {"changes": [gone]})
+    deletion = {"op": "delete", "layer": "topology", "id": "gate_barn"}
+    api.post(f"environments/{other}/edits", {"changes": [deletion]})
     ours, theirs = (api.get(f"/maps/{env}/{name}").content for env in (farm, other))
     assert ours.replace(farm.encode(), b"NAME") == theirs.replace(other.encode(), b"NAME")
 
@@ -225,8 +225,8 @@ def test_channels_count_root_and_closures(api: Api, farm: str) -> None:
 
     def production() -> dict[str, Any]:
         listed = api.get(f"environments/{farm}/channels").json()
-        found: dict[str, Any] = next(c for c in listed if c["channel"] == "production")
-        return found
+        channel: dict[str, Any] = next(c for c in listed if c["channel"] == "production")
+        return channel
 
     report(None)
     assert production()["robots"]["holding"] == 1, "a robot that knows of no closures holds the map without any"
@@ -255,8 +255,8 @@ def test_live_requests_for_planners(api: Api, farm: str) -> None:
         {"graph": "0.yaml", "message": {"fleet_name": "mowers", "open_lanes": [], "close_lanes": lanes[0]["message"][
             "close_lanes"]}}
     ]  # fmt: skip
-    whole = yaml.safe_load(api.get(f"/maps/{farm}/rmf_nav_graph?closures=mark").text)["levels"]
-    (level,) = whole.values()
+    levels = yaml.safe_load(api.get(f"/maps/{farm}/rmf_nav_graph?closures=mark").text)["levels"]
+    (level,) = levels.values()
     ends = [level["lanes"][k][:2] for k in lanes[0]["message"]["close_lanes"]]
     named = [[level["vertices"][v][2]["name"] for v in pair] for pair in ends]
     assert sorted(named) == [["barn", "gate"], ["gate", "barn"]]
@@ -279,8 +279,8 @@ def test_live_requests_for_planners(api: Api, farm: str) -> None:
 
 def pgm(data: bytes) -> np.ndarray[Any, Any]:
     """The pixels of a binary PGM, row 0 on top."""
-    magic, width, height, most, rest = data.split(maxsplit=4)
-    assert (magic, most) == (b"P5", b"255")
+    magic, width, height, maximum, rest = data.split(maxsplit=4)
+    assert (magic, maximum) == (b"P5", b"255")
     count = int(width) * int(height)
     return np.frombuffer(rest[-count:] if len(rest) >= count else data[-count:], np.uint8).reshape(
         int(height), int(width)

@@ -127,8 +127,8 @@ def test_an_upload_heals_damaged_files_and_chunks_of_all_versions(own: tuple[Api
     with contextlib.closing(sqlite3.connect(folder / "fleetmap.sqlite3")) as database, database:
         database.execute("UPDATE chunk SET data = zeroblob(length(data))")
     forget(api)
-    made = api.upload(farm, {NETWORK: other}).json()["version"]
-    api.get(f"environments/{farm}/versions/{made}/maps/tmap2")  # another upload goes on over the damage
+    version = api.upload(farm, {NETWORK: other}).json()["version"]
+    api.get(f"environments/{farm}/versions/{version}/maps/tmap2")  # another upload goes on over the damage
 
 
 # --- the database's own file ---

@@ -61,8 +61,8 @@ def check(api: Api, env: str, since: int, to: int, crs: str, grids: tuple[str, .
     delta = api.get(f"environments/{env}/versions/{to}/delta?since={since}&crs={crs}").json()
     have = features_of(api, env, since, crs) if not (crs == "wgs84" and since == 0) else {}
     for layer, change in delta["layers"].items():
-        for gone in change["deleted"]:
-            del have[layer, gone["level"], gone["part"], gone["id"]]
+        for item in change["deleted"]:
+            del have[layer, item["level"], item["part"], item["id"]]
         for f in change["put"]["features"]:
             have[layer, f["level"], f["part"], f["id"]] = f
     assert have == features_of(api, env, to, crs)
@@ -144,8 +144,8 @@ def test_a_new_frame_means_the_whole_grid(api: Api) -> None:
     delta = check(api, "yard", 1, 2, "local")
     assert delta["grids"][0]["whole"] is True
     check(api, "yard", 2, 1, "local")
-    gone = check(api, "yard", 2, 0, "local")
-    assert gone["grids"] == [
+    frame_delta = check(api, "yard", 2, 0, "local")
+    assert frame_delta["grids"] == [
         {"name": "map", "level": "ground", "deleted": True, "whole": False, "frame": None, "updates": []}
     ]
 

@@ -30,16 +30,16 @@ def derive(api: Api, env: str, expect: int | None = 201, **body: Any) -> Any:
 
 
 def nodes(api: Api, env: str, version: str = "latest") -> int:
-    found = api.get(f"environments/{env}/versions/{version}/layers/topology").json()["features"]
-    return sum(f["properties"]["kind"] == "node" for f in found)
+    features = api.get(f"environments/{env}/versions/{version}/layers/topology").json()["features"]
+    return sum(f["properties"]["kind"] == "node" for f in features)
 
 
 def test_a_derived_layer_is_a_version_that_says_how_it_came(api: Api, env: str) -> None:
-    made = derive(api, env, parameters={"join": 0.5}, message="for the tractors")
-    assert made["version"] == 3
-    assert made["information"]["topology"] == "derived"
-    assert made["stale"] == []
-    assert made["message"] == "for the tractors"
+    version = derive(api, env, parameters={"join": 0.5}, message="for the tractors")
+    assert version["version"] == 3
+    assert version["information"]["topology"] == "derived"
+    assert version["stale"] == []
+    assert version["message"] == "for the tractors"
     assert nodes(api, env) == 2
     report = api.get(f"environments/{env}/versions/3/reports/tmap2").json()
     line = next(line for line in report["layers"] if line["layer"] == "topology")
@@ -80,9 +80,9 @@ def test_what_comes_out_the_same_is_no_longer_stale(api: Api, env: str) -> None:
     api.upload(env, named)
     stale = api.get(f"environments/{env}/versions/latest").json()
     assert [s["changed"] for s in stale["stale"]] == [["objects ground/kml"]]
-    made = derive(api, env, parameters={"join": 0.5})
-    assert (made["version"], made["root"], made["stale"]) == (5, stale["root"], [])
-    assert made["changes"] == {"renewed": [{"layer": "topology", "level": "ground", "name": "network"}]}
+    version = derive(api, env, parameters={"join": 0.5})
+    assert (version["version"], version["root"], version["stale"]) == (5, stale["root"], [])
+    assert version["changes"] == {"renewed": [{"layer": "topology", "level": "ground", "name": "network"}]}
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
     assert not any("derive it anew" in w["problem"] for w in report["warnings"])
     assert api.get(f"environments/{env}/diff?from=4&to=5").json()["layers"] == {}
@@ -147,6 +147,6 @@ def test_conditions_and_keys(api: Api, env: str) -> None:
 
 
 def test_the_list(api: Api) -> None:
-    known = {d["id"]: d for d in api.get("derivations").json()}
-    assert known["objects_to_topology"]["gives"] == "topology"
-    assert [p["name"] for p in known["objects_to_topology"]["parameters"]] == ["join", "outlines"]
+    derivations = {d["id"]: d for d in api.get("derivations").json()}
+    assert derivations["objects_to_topology"]["gives"] == "topology"
+    assert [p["name"] for p in derivations["objects_to_topology"]["parameters"]] == ["join", "outlines"]

@@ -32,15 +32,15 @@ gnss_fence:
 """
 
 
-def made(api: Api, env: str, query: str = "") -> tuple[Any, dict[str, Any]]:
+def fetch_grid(api: Api, env: str, query: str = "") -> tuple[Any, dict[str, Any]]:
     """(cells as grey values, top row first; what the YAML says)"""
     answer = api.get(f"environments/{env}/versions/latest/maps/occupancy_grid{query}")
     with zipfile.ZipFile(io.BytesIO(answer.content)) as z:
-        said = yaml.safe_load(z.read("map.yaml"))
-        return np.asarray(Image.open(io.BytesIO(z.read(said["image"])))), said
+        map_yaml = yaml.safe_load(z.read("map.yaml"))
+        return np.asarray(Image.open(io.BytesIO(z.read(map_yaml["image"])))), map_yaml
 
 
-def told(api: Api, env: str, query: str = "") -> dict[str, Any]:
+def fetch_report(api: Api, env: str, query: str = "") -> dict[str, Any]:
     report: dict[str, Any] = api.get(f"environments/{env}/versions/latest/reports/occupancy_grid{query}").json()
     return report
 
@@ -52,15 +52,15 @@ def test_a_town_alone_gives_a_grid(api: Api) -> None:
     assert rows["occupancy_grid"]["state"] == "derivable"
     assert [s["step"] for s in rows["occupancy_grid"]["chain"]] == ["objects_to_occupancy"]
     assert rows["octomap"]["state"] == "derivable"
-    grey, said = made(api, "hamlet")
-    assert said["resolution"] == 0.05
+    grey, map_yaml = fetch_grid(api, "hamlet")
+    assert map_yaml["resolution"] == 0.05
     assert (grey == 0).sum() * 0.05**2 == pytest.approx(6.864 * 11.127, rel=0.03), "a house of 6.86 m × 11.13 m"
-    report = told(api, "hamlet")
+    report = fetch_report(api, "hamlet")
     line = next(line for line in report["layers"] if line["layer"] == "occupancy")
     assert line["information"] == "derived"
     assert line["sources"] == ["map.osm"]
     assert line["steps"][0]["step"] == "objects_to_occupancy"
-    _, coarse = made(api, "hamlet", "?resolution=0.5&inflate=1")
+    _, coarse = fetch_grid(api, "hamlet", "?resolution=0.5&inflate=1")
     assert coarse["resolution"] == 0.5
     assert api.get("/maps/hamlet/octomap").content.startswith(b"# Octomap OcTree binary file")
     for wrong in ("?resolution=0.0001", "?band=3,1", "?height=1&band=0,1", "?height=-5", "?doors=ajar"):
@@ -72,18 +72,18 @@ def test_a_town_alone_gives_a_grid(api: Api) -> None:
 def test_a_fence_alone_gives_a_blank_grid_and_bounds_a_derived_one(api: Api) -> None:
     api.post("environments", {"name": "paddock"})
     api.upload("paddock", {"datum.yaml": FENCE})
-    grey, _ = made(api, "paddock")
+    grey, _ = fetch_grid(api, "paddock")
     assert set(np.unique(grey)) <= {205, 254}
-    assert any("blank" in w["problem"] for w in told(api, "paddock")["warnings"])
+    assert any("blank" in w["problem"] for w in fetch_report(api, "paddock")["warnings"])
     api.upload("paddock", {"map.osm": TOWN})
-    grey, said = made(api, "paddock")
-    assert said["origin"] == [0, 0, 0]
+    grey, map_yaml = fetch_grid(api, "paddock")
+    assert map_yaml["origin"] == [0, 0, 0]
     assert (grey.shape[1] * 0.05, grey.shape[0] * 0.05) == (
         pytest.approx(13.73, abs=0.1),
         pytest.approx(22.25, abs=0.1),
     )
     assert (grey == 0).sum() > 10_000
-    line = next(line for line in told(api, "paddock")["layers"] if line["layer"] == "occupancy")
+    line = next(line for line in fetch_report(api, "paddock")["layers"] if line["layer"] == "occupancy")
     assert sorted(line["sources"]) == ["datum.yaml", "map.osm"]
 
 
@@ -99,9 +99,9 @@ def test_a_committed_grid_goes_stale_with_a_fence_that_comes_later(api: Api) -> 
 </Placemark></Document></kml>"""
     head = api.upload("yard", {"fence.kml": fence}, layer="location").json()
     assert [(s["layer"], s["changed"]) for s in head["stale"]] == [("occupancy", ["location ground/site"])]
-    _, said = made(api, "yard")
-    assert said["resolution"] == 0.1, "a map is made from what is there now, with the parameters of the stored one"
-    report = next(line for line in told(api, "yard")["layers"] if line["layer"] == "occupancy")
+    _, map_yaml = fetch_grid(api, "yard")
+    assert map_yaml["resolution"] == 0.1, "a map is made from what is there now, with the parameters of the stored one"
+    report = next(line for line in fetch_report(api, "yard")["layers"] if line["layer"] == "occupancy")
     assert sorted(report["sources"]) == ["fence.kml", "map.osm"]
     assert report["steps"][0]["also"] == ["location", "resources"]
 
@@ -109,13 +109,13 @@ def test_a_committed_grid_goes_stale_with_a_fence_that_comes_later(api: Api) -> 
 def test_server_and_offline_conversion_give_equal_cells(api: Api) -> None:
     """Of a world whose walls are a mesh, beside a box, with the mesh and without it."""
     api.post("environments", {"name": "house"})
-    whole = {**house(WALLS, CRATE), "datum.yaml": FENCE}
-    api.upload("house", whole)
-    grey, _ = made(api, "house")
+    files = {**house(WALLS, CRATE), "datum.yaml": FENCE}
+    api.upload("house", files)
+    grey, _ = fetch_grid(api, "house")
     assert (grey == 0).sum() > 400, "a quarter of the house lies in the fence"
-    alone = direct.offline(whole, "occupancy_grid")
+    alone = direct.offline(files, "occupancy_grid")
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(alone.files["map.pgm"]))), grey)
-    posted = api("POST", "convert", 200, files=parts(whole), data={"to": "occupancy_grid"})
+    posted = api("POST", "convert", 200, files=parts(files), data={"to": "occupancy_grid"})
     with zipfile.ZipFile(io.BytesIO(posted.content)) as z:
         assert z.read("map.pgm") == alone.files["map.pgm"]
     # Without the mesh there is one crate, and what stands around it is not known: no blank grid of the fence either.
@@ -131,14 +131,14 @@ def test_server_and_offline_conversion_give_equal_cells(api: Api) -> None:
             rows = {r["format"]: r for r in api.get("environments/ruin/versions/latest/maps").json()}
             assert rows["occupancy_grid"]["state"] == "missing"
             assert "walls.stl" in str(rows["occupancy_grid"]["missing"])
-    grey, _ = made(api, "ruin")
+    grey, _ = fetch_grid(api, "ruin")
     assert np.array_equal(
         grey, np.asarray(Image.open(io.BytesIO(direct.offline(lost, "occupancy_grid").files["map.pgm"])))
     )
     assert (grey == 205).sum() * 0.05**2 > 0.2 * math.pi * 5.0**2, (
         "a quarter of the disc around the house lies in the fence"
     )
-    assert any("house" in w["problem"] and "walls.stl" in w["problem"] for w in told(api, "ruin")["warnings"])
+    assert any("house" in w["problem"] and "walls.stl" in w["problem"] for w in fetch_report(api, "ruin")["warnings"])
 
 
 def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
@@ -147,8 +147,8 @@ def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
     files = {**house(None), "map.osm": path.replace(b"natural", b"note"), "datum.yaml": FENCE}
     api.post("environments", {"name": "lane"})
     api.upload("lane", files)
-    made(api, "lane")
-    for report in (told(api, "lane"), direct.offline(files, "occupancy_grid").report):
+    fetch_grid(api, "lane")
+    for report in (fetch_report(api, "lane"), direct.offline(files, "occupancy_grid").report):
         line = next(line for line in report["layers"] if line["layer"] == "occupancy")
         assert [s["step"] for s in line["steps"]] == ["topology_to_occupancy"]
         (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].startswith("made another way")]
@@ -183,9 +183,9 @@ def test_real_buildings_and_towns(api: Api, shared: Path) -> None:
         level = "?level=L2" if name == "hotel" else ""
         if name == "netherlands":  # nothing encloses a town
             level = "?outside_free=true&resolution=0.2"
-            grey, _ = made(api, name, "?resolution=0.2")
+            grey, _ = fetch_grid(api, name, "?resolution=0.2")
             assert (grey == 254).sum() < 0.01 * (grey == 205).sum()
-        grey, _ = made(api, name, level)
+        grey, _ = fetch_grid(api, name, level)
         assert (grey == 0).sum() > 1000
         assert (grey == 254).sum() > 10_000
 
@@ -195,13 +195,13 @@ def test_a_world_alone_gives_a_slice(api: Api, shared: Path) -> None:
     files = [p for p in root.rglob("*") if p.is_file() and "maps" not in p.parts]
     api.post("environments", {"name": "arena"})
     api.upload("arena", {p.relative_to(root).as_posix(): p.read_bytes() for p in files})
-    grey, said = made(api, "arena", "?height=0.18")
-    low, _ = (np.argwhere(grey[::-1] == 0).min(axis=0) * 0.05 + said["origin"][1::-1]).tolist()
+    grey, map_yaml = fetch_grid(api, "arena", "?height=0.18")
+    low, _ = (np.argwhere(grey[::-1] == 0).min(axis=0) * 0.05 + map_yaml["origin"][1::-1]).tolist()
     assert low == pytest.approx(-3.3985, abs=0.05), "the slice that facts.json counts"
-    line = next(line for line in told(api, "arena", "?height=0.18")["layers"] if line["layer"] == "occupancy")
+    line = next(line for line in fetch_report(api, "arena", "?height=0.18")["layers"] if line["layer"] == "occupancy")
     assert line["steps"][0]["parameters"]["height"] == 0.18
     assert any(name.endswith("wall.dae") for name in line["sources"])
-    dropped = {d["what"]: d["why"] for d in told(api, "arena")["dropped"]}
+    dropped = {d["what"]: d["why"] for d in fetch_report(api, "arena")["dropped"]}
     assert dropped["objects include"] == "nothing in a robot's way", "the ground plane, which is on another server"
     assert api.get("/maps/arena/octomap?resolution=0.2").content.startswith(b"# Octomap")
     problem: Any = api.get("/maps/arena/occupancy_grid?height=20", expect=None)

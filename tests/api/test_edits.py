@@ -22,8 +22,8 @@ DRAWING = b"""\
 
 
 def features(api: Api, env: str, layer: str, **query: str) -> dict[str, Json]:
-    found = api.get(f"environments/{env}/versions/latest/layers/{layer}", params=query).json()["features"]
-    return {f["id"]: f for f in found}
+    items = api.get(f"environments/{env}/versions/latest/layers/{layer}", params=query).json()["features"]
+    return {f["id"]: f for f in items}
 
 
 def edit(api: Api, env: str, *changes: Json, expect: int = 201) -> Json:
@@ -53,9 +53,9 @@ def test_an_edited_item_keeps_its_anchor(api: Api, farm: str) -> None:
     edit(api, farm, put("topology", node, crs="wgs84"))
     (entry,) = [e for e in api.get(f"environments/{farm}/versions/4/layers").json() if e["layer"] == "topology"]
     assert entry["bounds"]["wgs84"] is None
-    here = features(api, farm, "topology", crs="local")
-    assert here["barn"]["place"]["coordinates"] == pytest.approx([10.0, 1.113], abs=1e-3)
-    assert here["gate_barn"]["place"]["coordinates"][-1] == here["barn"]["place"]["coordinates"]
+    items = features(api, farm, "topology", crs="local")
+    assert items["barn"]["place"]["coordinates"] == pytest.approx([10.0, 1.113], abs=1e-3)
+    assert items["gate_barn"]["place"]["coordinates"][-1] == items["barn"]["place"]["coordinates"]
 
 
 def test_the_datum_is_edited_with_the_fence(api: Api, farm: str) -> None:
@@ -106,9 +106,9 @@ def test_items_have_the_geometry_of_their_kind(
 ) -> None:
     feature = {"type": "Feature", "id": "new", "geometry": geometry, "properties": properties}
     change = put(layer, feature, crs="local")
-    found = api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": [change]})
-    assert said in found["detail"]
-    assert found["errors"][0]["where"] == "changes[0]"
+    problem = api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": [change]})
+    assert said in problem["detail"]
+    assert problem["errors"][0]["where"] == "changes[0]"
 
 
 def placemarks(api: Api, env: str) -> list[str]:
@@ -125,12 +125,12 @@ def test_an_edited_network_is_not_hidden_behind_its_drawing(api: Api, bare: str)
     assert node["properties"]["drawn_from"] == "lane"
     node["geometry"]["coordinates"][1] += 1e-4
     edit(api, bare, put("topology", node))
-    told = placemarks(api, bare)
-    assert node["id"] in told
-    assert {"lane", "other"} <= set(told)
+    marks = placemarks(api, bare)
+    assert node["id"] in marks
+    assert {"lane", "other"} <= set(marks)
     of_other = [i for i, f in network.items() if f["properties"]["drawn_from"] == "other"]
     assert of_other
-    assert not set(of_other) & set(told)
+    assert not set(of_other) & set(marks)
     after = features(api, bare, "topology")
     assert {i for i, f in after.items() if "drawn_from" in f["properties"]} == set(of_other)
 

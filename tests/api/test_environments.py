@@ -32,11 +32,11 @@ def test_made_empty_or_with_a_datum(api: Api, fresh: Fresh) -> None:
     assert body["bounds"] is None
     assert (body["title"], body["description"], body["tags"]) == ("T", "D", ["a", "b"])
     other = fresh()
-    made = api.post(
+    environment = api.post(
         "environments", {"name": other, "datum": {"latitude": 53.0, "longitude": -0.5, "heading": 10}}
     ).json()
-    assert made["version"] == 1
-    assert made["datum"] == {"latitude": 53.0, "longitude": -0.5, "altitude": 0.0, "heading": 10.0}
+    assert environment["version"] == 1
+    assert environment["datum"] == {"latitude": 53.0, "longitude": -0.5, "altitude": 0.0, "heading": 10.0}
 
 
 @pytest.mark.parametrize(
@@ -150,11 +150,11 @@ def test_deleted_restored_purged(api: Api, farm: str) -> None:
 
 def test_cloned(api: Api, farm: str, fresh: Fresh) -> None:
     name = fresh()
-    made = api.post("environments", {"name": name, "clone": {"environment": farm, "version": 2}}).json()
-    assert made["version"] == 1
-    assert made["root"] == api.get(f"environments/{farm}/versions/2").json()["root"]
-    mine = api.get(f"environments/{name}/versions/1/maps/tmap2").content
-    assert mine == api.get(f"environments/{farm}/versions/2/maps/tmap2").content
+    environment = api.post("environments", {"name": name, "clone": {"environment": farm, "version": 2}}).json()
+    assert environment["version"] == 1
+    assert environment["root"] == api.get(f"environments/{farm}/versions/2").json()["root"]
+    copy = api.get(f"environments/{name}/versions/1/maps/tmap2").content
+    assert copy == api.get(f"environments/{farm}/versions/2/maps/tmap2").content
     api.problem("POST", "environments", 404, json={"name": fresh(), "clone": {"environment": "nowhere"}})
     api.problem("POST", "environments", 404, json={"name": fresh(), "clone": {"environment": farm, "version": 99}})
     both = {"name": fresh(), "clone": {"environment": farm}, "datum": {"latitude": 0, "longitude": 0}}
@@ -162,24 +162,24 @@ def test_cloned(api: Api, farm: str, fresh: Fresh) -> None:
 
 
 def test_which_map_am_i_on(api: Api, farm: str) -> None:
-    here = {"contains": "53.2687,-0.5246", "limit": "1000"}
-    assert farm in [e["name"] for e in api.get("environments", params=here).json()]
-    found = next(e for e in api.get("environments", params=here).json() if e["name"] == farm)
-    assert found["match"]["by"] == "fence"
-    assert found["match"]["area_m2"] == pytest.approx(66.7 * 66.8, rel=0.01)
-    assert found["match"]["distance_m"] == pytest.approx(math.hypot(6.7, 11.1), rel=0.02)
+    query = {"contains": "53.2687,-0.5246", "limit": "1000"}
+    assert farm in [e["name"] for e in api.get("environments", params=query).json()]
+    environment = next(e for e in api.get("environments", params=query).json() if e["name"] == farm)
+    assert environment["match"]["by"] == "fence"
+    assert environment["match"]["area_m2"] == pytest.approx(66.7 * 66.8, rel=0.01)
+    assert environment["match"]["distance_m"] == pytest.approx(math.hypot(6.7, 11.1), rel=0.02)
     assert "match" not in api.get(f"environments/{farm}").json()
     assert all("match" not in e for e in api.get("environments", params={"bbox": "-0.6,53.2,-0.4,53.3"}).json())
-    there = {"contains": "-53.2687,-0.5246"}
-    assert farm not in [e["name"] for e in api.get("environments", params=there).json()]
+    far_query = {"contains": "-53.2687,-0.5246"}
+    assert farm not in [e["name"] for e in api.get("environments", params=far_query).json()]
     box = {"bbox": "-0.6,53.2,-0.4,53.3", "limit": "1000"}
     assert farm in [e["name"] for e in api.get("environments", params=box).json()]
     assert farm not in [e["name"] for e in api.get("environments", params={"bbox": "10,53.2,11,53.3"}).json()]
     for bad in ("1", "", "a,b", "91,0", "0,181", "1,2,3", "nan,1", "1,NaN", "inf,1"):
-        told = api.problem("GET", "environments", 422, params={"contains": bad})
-        assert "LAT,LON" in told["detail"]
-    told = api.problem("GET", "environments", 422, params={**here, "cursor": farm})
-    assert "Link header" in told["detail"]
+        problem = api.problem("GET", "environments", 422, params={"contains": bad})
+        assert "LAT,LON" in problem["detail"]
+    problem = api.problem("GET", "environments", 422, params={**query, "cursor": farm})
+    assert "Link header" in problem["detail"]
     for bad in ("1,2,3", "0,2,1,1", "0,0,200,1"):
         api.problem("GET", "environments", 422, params={"bbox": bad})
 
@@ -193,40 +193,40 @@ FIELDS = {
 
 
 def test_fields_of_one_farm_answer_for_their_own(api: Api, fresh: Fresh, shared: Path) -> None:
-    made: dict[str, str] = {}
+    names: dict[str, str] = {}
     rings: dict[str, shapely.Polygon] = {}
     for field in FIELDS:
-        made[field] = fresh()
+        names[field] = fresh()
         root = shared / "data" / "environment_template" / field
-        api.post("environments", {"name": made[field]})
+        api.post("environments", {"name": names[field]})
         files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w") as archive:
             for name, data in files.items():
                 archive.writestr(name, data)
-        api.upload(made[field], {"field.zip": packed.getvalue()})
+        api.upload(names[field], {"field.zip": packed.getvalue()})
         text = files.get("config/location/datum.yaml", files["config/location/datum_autogen.yaml"]).decode()
         coordinates = re.search(r"gnss_fence_coords: (\[\[.*?\]\])", text, re.DOTALL)
         assert coordinates is not None
         rings[field] = shapely.Polygon([(x, y) for y, x in json.loads(coordinates[1])])
-    boxes = [api.get(f"environments/{name}").json()["bounds"] for name in made.values()]
+    boxes = [api.get(f"environments/{name}").json()["bounds"] for name in names.values()]
 
     def answers(latitude: float, longitude: float) -> list[dict[str, Any]]:
-        found = api.get("environments", params={"contains": f"{latitude},{longitude}", "limit": 1000}).json()
-        return [e for e in found if e["name"] in made.values()]
+        environments = api.get("environments", params={"contains": f"{latitude},{longitude}", "limit": 1000}).json()
+        return [e for e in environments if e["name"] in names.values()]
 
     for field, position in FIELDS.items():
         latitude, longitude = map(float, position.split(","))
         assert sum(w <= longitude <= e and s <= latitude <= n for w, s, e, n in boxes) > 1, "boxes would not tell"
         (hit,) = answers(latitude, longitude)
-        assert hit["name"] == made[field]
+        assert hit["name"] == names[field]
         area, _ = Geod(ellps="WGS84").geometry_area_perimeter(rings[field])
         assert hit["match"]["by"] == "fence"
         assert hit["match"]["area_m2"] == pytest.approx(abs(area), rel=0.01)
     # What a hundred positions in and around the farm say, by the fences of the files.
     for longitude, latitude in np.random.default_rng(1).uniform((-0.5260, 53.2678), (-0.5230, 53.2692), (100, 2)):
         inside = {
-            made[field]
+            names[field]
             for field, ring in rings.items()
             if shapely.make_valid(ring).covers(shapely.Point(longitude, latitude))
         }

@@ -19,14 +19,14 @@ def stream(api: Api, **query: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
     with api.http.stream("GET", f"{API}/events", params=query, headers=headers, timeout=30) as answer:
         assert answer.status_code == 200, answer.read()
         assert answer.headers["content-type"].startswith("text/event-stream")
-        told: dict[str, str] = {}
+        fields: dict[str, str] = {}
         for line in answer.iter_lines():
-            if not line and "data" in told:
-                yield int(told["id"]), told["event"], json.loads(told["data"])
-                told = {}
+            if not line and "data" in fields:
+                yield int(fields["id"]), fields["event"], json.loads(fields["data"])
+                fields = {}
             elif not line.startswith(":"):
                 name, _, value = line.partition(": ")
-                told[name] = value
+                fields[name] = value
 
 
 def test_what_happened_and_what_happens(api: Api, bare: str) -> None:
@@ -72,18 +72,18 @@ def test_the_end_of_a_name_is_told_under_it(api: Api, fresh: Any) -> None:
     assert [(n, b["environment"]) for n, _, b in stream(other, environment=new, since=0, follow="false")] == [(3, new)]
     api("DELETE", f"environments/{new}", 204)
     api.post(f"environments/{new}/purge", expect=204)
-    told = list(stream(api, environment=new, since=3, follow="false"))
-    assert [(n, kind) for n, kind, _ in told] == [(4, "environment.deleted")]
+    events = list(stream(api, environment=new, since=3, follow="false"))
+    assert [(n, kind) for n, kind, _ in events] == [(4, "environment.deleted")]
     api.post("environments", {"name": new})
-    told = list(stream(api, environment=new, headers={"last-event-id": "4"}, follow="false"))
-    assert [(n, kind) for n, kind, _ in told] == [(5, "environment.created")]
+    events = list(stream(api, environment=new, headers={"last-event-id": "4"}, follow="false"))
+    assert [(n, kind) for n, kind, _ in events] == [(5, "environment.created")]
 
 
 def test_a_stream_ends_with_its_token(api: Api, bare: str) -> None:
-    made = api.post("tokens", {"name": "seer", "role": "viewer"}).json()
-    following = stream(api.as_(made["token"]), environment=bare, since=0)
+    token = api.post("tokens", {"name": "seer", "role": "viewer"}).json()
+    following = stream(api.as_(token["token"]), environment=bare, since=0)
     assert next(following)[1] == "environment.created"
-    api("DELETE", f"tokens/{made['id']}", 204)
+    api("DELETE", f"tokens/{token['id']}", 204)
     api.upload(bare, samples.grid())
     assert list(following) == []
     soon = (datetime.now(UTC) + timedelta(seconds=1)).isoformat()
@@ -100,13 +100,13 @@ def test_streams_at_one_place_share_a_look(api: Api, bare: str, monkeypatch: pyt
         return quick(self, environment, since, limit)
 
     count = 30
-    begun, told = threading.Barrier(count + 1), []
+    begun, versions = threading.Barrier(count + 1), []
 
     def follow(client: Api) -> None:
         following = stream(client, environment=bare, since=0)
         next(following)
         begun.wait(30)
-        told.append(next(following)[2]["version"])
+        versions.append(next(following)[2]["version"])
 
     threads = [threading.Thread(target=follow, args=(api.as_(api.token),)) for _ in range(count)]
     for thread in threads:
@@ -116,7 +116,7 @@ def test_streams_at_one_place_share_a_look(api: Api, bare: str, monkeypatch: pyt
     api.upload(bare, samples.grid())
     for thread in threads:
         thread.join(30)
-    assert told == [1] * count
+    assert versions == [1] * count
     assert looks.count((bare, 1)) < count / 2
 
 

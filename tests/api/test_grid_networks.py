@@ -92,8 +92,8 @@ def test_the_command_line_does_the_same(files: dict[str, bytes], tmp_path: Path)
         "-o",
         str(out),
     ]
-    told = subprocess.run([*command, "-O", "robot_radius=0.7"], capture_output=True, text=True)
-    assert told.returncode == 0, told.stderr
+    process = subprocess.run([*command, "-O", "robot_radius=0.7"], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
     assert 100 < len(network_in(out.read_bytes())) < 2000
 
 

@@ -39,9 +39,9 @@ def test_a_large_picture_goes_in_and_comes_out(api: Api, fresh: Callable[[], str
     rows, columns = np.mgrid[0:2500, 0:3000]
     pixels = np.stack([rows % 251, columns % 241, (rows + columns) % 255], axis=-1).astype(np.uint8)
     data = geotiff(pixels, attribution=["© Survey"], satellite={"tags": {"TIFFTAG_COPYRIGHT": "© Survey"}})
-    made = api.upload(env, {"field.tif": data}).json()
-    assert made["information"]["imagery"] == "raw"
-    assert made["warnings"] == []
+    version = api.upload(env, {"field.tif": data}).json()
+    assert version["information"]["imagery"] == "raw"
+    assert version["warnings"] == []
     about = api.get(f"environments/{env}/versions/latest/layers/imagery", headers={"Accept": "application/json"}).json()
     assert (about["width"], about["height"], about["bands"], about["type"]) == (3000, 2500, 3, "uint8")
     assert about["crs"] == "EPSG:32630"
@@ -103,10 +103,12 @@ def test_damaged_tiles_are_422_with_the_reason(api: Api, fresh: Callable[[], str
 
 
 def test_a_grid_is_served_as_a_picture(api: Api) -> None:
-    said = b"image: map.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    map_yaml = (
+        b"image: map.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
     cells = bytes(254 if k % 7 else 0 for k in range(200))
     api.post("environments", {"name": "drawn-plan"})
-    api.upload("drawn-plan", {"map.yaml": said, "map.pgm": b"P5\n20 10\n255\n" + cells})
+    api.upload("drawn-plan", {"map.yaml": map_yaml, "map.pgm": b"P5\n20 10\n255\n" + cells})
     rows = {row["format"]: row for row in api.get("environments/drawn-plan/versions/latest/maps").json()}
     assert [step["step"] for step in rows["satellite"]["chain"]] == ["occupancy_to_imagery"]
     assert api.get("/maps/drawn-plan/satellite/satellite.png").content[:4] == b"\x89PNG"

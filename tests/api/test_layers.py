@@ -191,9 +191,9 @@ def test_voxels(api: Api, bare: str) -> None:
     shed = (OCTOMAP / "shed.bt").read_bytes()
     api.upload(bare, {"shed.bt": shed})
     url = f"environments/{bare}/versions/latest/layers/voxels"
-    told = api.get(url).json()
-    assert told.pop("leaves") == {"occupied": 908, "free": 1042}
-    assert told == {
+    body = api.get(url).json()
+    assert body.pop("leaves") == {"occupied": 908, "free": 1042}
+    assert body == {
         "name": "shed",
         "level": "ground",
         "resolution": 0.25,
@@ -223,9 +223,9 @@ def test_voxels_as_a_bt_whatever_was_uploaded(api: Api, bare: str) -> None:
     api.upload(bare, {"map.ot": shelf})
     latest = f"environments/{bare}/versions/latest"
     assert api.get(f"{latest}/layers/voxels", headers=BYTES).content.startswith(b"# Octomap OcTree binary file")
-    whole = api.get(f"{latest}/maps/octomap")
-    assert whole.content == shelf
-    assert 'filename="map.ot"' in whole.headers["content-disposition"]
+    response = api.get(f"{latest}/maps/octomap")
+    assert response.content == shelf
+    assert 'filename="map.ot"' in response.headers["content-disposition"]
     assert api.get(f"{latest}/maps/octomap/map.ot").content == shelf
     binary = api.get(f"{latest}/maps/octomap/map.bt")
     assert binary.content == api.get(f"{latest}/layers/voxels", headers=BYTES).content
@@ -243,8 +243,8 @@ def test_an_octree_without_voxels_comes_back(api: Api, bare: str) -> None:
     assert any("no voxels" in w["problem"] for w in answer["warnings"])
     latest = f"environments/{bare}/versions/latest"
     assert api.get(f"{latest}/maps/octomap").content == empty
-    told = api.get(f"{latest}/layers/voxels").json()
-    assert (told["counts"], told["bounds"]) == ({"occupied": 0, "free": 0}, None)
+    body = api.get(f"{latest}/layers/voxels").json()
+    assert (body["counts"], body["bounds"]) == ({"occupied": 0, "free": 0}, None)
     assert b"size 0" in api.get(f"{latest}/layers/voxels", headers=BYTES).content
 
 

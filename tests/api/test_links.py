@@ -32,19 +32,23 @@ NOW = 1_800_000_000.0
 
 def signed(secret: bytes, path: str, expires: int, **parameters: str) -> links.SignedAddress:
     query = links.sign(secret, "e1", path, parameters, expires)
-    found = links.parse(path, query.encode())
-    assert found is not None
-    return found
+    parsed_link = links.parse(path, query.encode())
+    assert parsed_link is not None
+    return parsed_link
 
 
 def test_signature_holds_for_parameters_in_any_order() -> None:
     query = links.sign(b"k", "e1", "/maps/farm/kml", {"b": "2 &é", "a": "1"}, int(NOW) + 9)
     pairs = parse_qsl(query)
     for order in (pairs, pairs[::-1]):
-        found = links.parse("/maps/farm/kml", urlencode(order).encode())
-        assert found is not None
-        assert (found.query, found.expires, found.environment_id) == (b"a=1&b=2+%26%C3%A9", int(NOW) + 9, "e1")
-        assert links.check([b"other", b"k"], found) == 1
+        parsed_link = links.parse("/maps/farm/kml", urlencode(order).encode())
+        assert parsed_link is not None
+        assert (parsed_link.query, parsed_link.expires, parsed_link.environment_id) == (
+            b"a=1&b=2+%26%C3%A9",
+            int(NOW) + 9,
+            "e1",
+        )
+        assert links.check([b"other", b"k"], parsed_link) == 1
 
 
 def test_signature_covers_path_parameters_expiry_and_environment() -> None:
@@ -142,9 +146,9 @@ def test_rotated_secret_stays_valid_until_its_links_have_ended(tmp_path: Path) -
 
 def link(api: Api, env: str, version: int | str = "latest", **body: Any) -> dict[str, Any]:
     """A new link, as the API returns it but for the server's own address before ``url``."""
-    found: dict[str, Any] = api.post(f"environments/{env}/versions/{version}/links", body).json()
-    assert found["url"].startswith(f"{api.url}/api/v1/environments/{env}/versions/{found['version']}/maps/")
-    return found | {"url": found["url"].removeprefix(api.url)}
+    signed_link: dict[str, Any] = api.post(f"environments/{env}/versions/{version}/links", body).json()
+    assert signed_link["url"].startswith(f"{api.url}/api/v1/environments/{env}/versions/{signed_link['version']}/maps/")
+    return signed_link | {"url": signed_link["url"].removeprefix(api.url)}
 
 
 def altered(url: str, **change: str | None) -> str:
@@ -157,27 +161,32 @@ def altered(url: str, **change: str | None) -> str:
 def test_link_needs_no_token(api: Api, farm: str) -> None:
     nobody = api.as_(None)
     with_token = api.get(f"environments/{farm}/versions/3/maps/occupancy_grid/map.png?file_type=png&grid=map")
-    made = link(api, farm, format="occupancy_grid", file="map.png", parameters={"grid": "map", "file_type": "png"})
-    assert made["url"].startswith(f"/api/v1/environments/{farm}/versions/3/maps/occupancy_grid/map.png?")
-    assert (made["version"], made["name"]) == (3, "map.png")
+    signed_link = link(
+        api, farm, format="occupancy_grid", file="map.png", parameters={"grid": "map", "file_type": "png"}
+    )
+    assert signed_link["url"].startswith(f"/api/v1/environments/{farm}/versions/3/maps/occupancy_grid/map.png?")
+    assert (signed_link["version"], signed_link["name"]) == (3, "map.png")
     for _ in range(3):
-        answer = nobody.get(made["url"])
+        answer = nobody.get(signed_link["url"])
         assert answer.content == with_token.content
         assert (answer.headers["etag"], answer.headers["fleetmap-version"]) == (with_token.headers["etag"], "3")
         assert answer.headers["referrer-policy"] == "no-referrer"
         assert "private" in answer.headers["cache-control"]
-    assert (hashlib.sha256(answer.content).hexdigest(), len(answer.content)) == (made["sha256"], made["size"])
+    assert (hashlib.sha256(answer.content).hexdigest(), len(answer.content)) == (
+        signed_link["sha256"],
+        signed_link["size"],
+    )
     assert "referrer-policy" not in with_token.headers
-    unchanged = nobody.get(made["url"], 304, headers={"If-None-Match": answer.headers["etag"]})
+    unchanged = nobody.get(signed_link["url"], 304, headers={"If-None-Match": answer.headers["etag"]})
     assert unchanged.headers["referrer-policy"] == "no-referrer"
-    head = nobody("HEAD", made["url"], 200)
-    assert (head.content, head.headers["content-length"]) == (b"", str(made["size"]))
-    part = nobody.get(made["url"], 206, headers={"Range": "bytes=2-5"})
+    head = nobody("HEAD", signed_link["url"], 200)
+    assert (head.content, head.headers["content-length"]) == (b"", str(signed_link["size"]))
+    part = nobody.get(signed_link["url"], 206, headers={"Range": "bytes=2-5"})
     assert part.content == answer.content[2:6]
     api.upload(farm, {"more.kml": samples.KML})
-    assert nobody.get(made["url"]).content == answer.content, "it names the version by number"
-    whole = link(api, farm, "latest", format="occupancy_grid")
-    assert nobody.get(whole["url"]).headers["content-type"] == "application/zip"
+    assert nobody.get(signed_link["url"]).content == answer.content, "it names the version by number"
+    zip_link = link(api, farm, "latest", format="occupancy_grid")
+    assert nobody.get(zip_link["url"]).headers["content-type"] == "application/zip"
 
 
 def test_short_address_can_be_signed(api: Api, farm: str) -> None:
@@ -236,18 +245,18 @@ def test_link_opens_nothing_else(api: Api, farm: str) -> None:
 
 def test_link_ends(api: Api, farm: str) -> None:
     nobody = api.as_(None)
-    made = link(api, farm, format="geojson", seconds=2)
-    assert nobody.get(made["url"]).content
+    signed_link = link(api, farm, format="geojson", seconds=2)
+    assert nobody.get(signed_link["url"]).content
     deadline = time.monotonic() + 30
-    while (answer := nobody.get(made["url"], None)).status_code == 200:
+    while (answer := nobody.get(signed_link["url"], None)).status_code == 200:
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    assert datetime.now(UTC) >= datetime.fromisoformat(made["expires"])
+    assert datetime.now(UTC) >= datetime.fromisoformat(signed_link["expires"])
     body = problem(answer)
     assert (answer.status_code, body["type"]) == (403, "urn:fleetmap:problem:expired-link")
     assert body["detail"] == "the link has expired: request a new one"
     for _ in range(40):
-        nobody.problem("GET", made["url"], 403)  # an old link is no guess
+        nobody.problem("GET", signed_link["url"], 403)  # an old link is no guess
 
 
 def test_link_ends_with_its_environment(api: Api, farm: str) -> None:
@@ -289,8 +298,8 @@ def test_link_is_created_by_readers_of_its_environment(api: Api, farm: str, bare
 def test_link_does_not_outlive_the_token_of_its_creator(api: Api, farm: str) -> None:
     ends = datetime.now(UTC) + timedelta(hours=1)
     short = api.token_for("viewer", expires=ends.isoformat())
-    made = link(short, farm, format="geojson")
-    assert datetime.fromisoformat(made["expires"]) <= ends
+    signed_link = link(short, farm, format="geojson")
+    assert datetime.fromisoformat(signed_link["expires"]) <= ends
     left = datetime.fromisoformat(link(api, farm, format="geojson")["expires"]) - datetime.now(UTC)
     assert timedelta(hours=23.9) < left <= timedelta(hours=24), "the default is the maximum"
 

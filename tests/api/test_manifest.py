@@ -32,10 +32,10 @@ def keys(api: Api) -> dict[str, Ed25519PublicKey]:
 def check(api: Api, answer: Any) -> dict[str, Any]:
     """The manifest, its signature verified."""
     key, _, signature = answer.headers["fleetmap-signature"].partition(":")
-    known = keys(api)[key]
-    known.verify(base64.b64decode(signature), answer.content)
+    public_key = keys(api)[key]
+    public_key.verify(base64.b64decode(signature), answer.content)
     with pytest.raises(InvalidSignature):
-        known.verify(base64.b64decode(signature), answer.content + b" ")
+        public_key.verify(base64.b64decode(signature), answer.content + b" ")
     body: dict[str, Any] = answer.json()
     return body
 
@@ -45,12 +45,12 @@ def manifest(api: Api, env: str, version: str, formats: str) -> dict[str, Any]:
 
 
 def test_it_lists_what_is_served(api: Api, farm: str) -> None:
-    told = manifest(api, farm, "latest", "tmap2,occupancy_grid,kml")
-    assert (told["environment"], told["channel"], told["version"]) == (farm, "latest", 3)
-    assert told["root"] == api.get(f"environments/{farm}").json()["root"]
-    assert datetime.fromisoformat(told["expires"]) > datetime.now(UTC)
-    assert [f["name"] for f in told["files"]] == ["map.kml", "map.pgm", "map.yaml", "network.tmap2.yaml"]
-    for file in told["files"]:
+    body = manifest(api, farm, "latest", "tmap2,occupancy_grid,kml")
+    assert (body["environment"], body["channel"], body["version"]) == (farm, "latest", 3)
+    assert body["root"] == api.get(f"environments/{farm}").json()["root"]
+    assert datetime.fromisoformat(body["expires"]) > datetime.now(UTC)
+    assert [f["name"] for f in body["files"]] == ["map.kml", "map.pgm", "map.yaml", "network.tmap2.yaml"]
+    for file in body["files"]:
         got = api.get(f"environments/{farm}/versions/latest/maps/{file['format']}/{file['name']}").content
         assert (file["size"], file["sha256"]) == (len(got), hashlib.sha256(got).hexdigest())
 
@@ -63,15 +63,15 @@ def test_all_grids_are_listed(api: Api, farm: str) -> None:
 
 def test_it_says_what_the_place_is_called(api: Api, farm: str) -> None:
     assert "variables" not in manifest(api, farm, "latest", "tmap2")
-    said = b"export FIELD_ID=p1\nexport FARM_NAME='north farm'\nexport DATUM_FILE=/x\nexport PATH=/x\n"
-    api.upload(farm, {"config/properties.sh": said})
+    properties = b"export FIELD_ID=p1\nexport FARM_NAME='north farm'\nexport DATUM_FILE=/x\nexport PATH=/x\n"
+    api.upload(farm, {"config/properties.sh": properties})
     assert manifest(api, farm, "latest", "tmap2")["variables"] == {"FARM_NAME": "north farm", "FIELD_ID": "p1"}
 
 
 def test_layers_differ_where_their_content_does(api: Api, farm: str) -> None:
     def layers(version: str = "latest") -> dict[str, str]:
-        told: dict[str, str] = manifest(api, farm, version, "tmap2")["layers"]
-        return told
+        hashes: dict[str, str] = manifest(api, farm, version, "tmap2")["layers"]
+        return hashes
 
     def changed(before: dict[str, str]) -> set[str]:
         now = layers()
@@ -114,20 +114,20 @@ def test_unknown_formats_are_refused(api: Api, farm: str, formats: str) -> None:
 
 
 def test_what_cannot_be_made_says_what_to_supply(api: Api, bare: str) -> None:
-    told = api.problem("GET", f"environments/{bare}/versions/latest/manifest?formats=tmap2", 422)
-    assert "supply" in told["detail"]
+    problem = api.problem("GET", f"environments/{bare}/versions/latest/manifest?formats=tmap2", 422)
+    assert "supply" in problem["detail"]
 
 
 def test_a_rotated_key_is_vouched_for(api: Api, farm: str) -> None:
     before = keys(api)
     viewer = api.token_for("viewer")
     assert viewer("POST", "keys").status_code == 403
-    made = api.post("keys").json()
-    old = before[made["endorsed_by"]]
-    old.verify(base64.b64decode(made["endorsement"]), base64.b64decode(made["public_key"]))
-    assert api.get("keys").json()[0]["id"] == made["id"]
+    new_key = api.post("keys").json()
+    old = before[new_key["endorsed_by"]]
+    old.verify(base64.b64decode(new_key["endorsement"]), base64.b64decode(new_key["public_key"]))
+    assert api.get("keys").json()[0]["id"] == new_key["id"]
     answer = api.get(f"environments/{farm}/versions/latest/manifest?formats=tmap2")
-    assert answer.headers["fleetmap-signature"].startswith(made["id"])
+    assert answer.headers["fleetmap-signature"].startswith(new_key["id"])
     check(api, answer)
 
 
@@ -165,11 +165,11 @@ def test_a_delta_is_small_and_exact(api: Api, bare: str) -> None:
     api.upload(bare, {"n.tmap2.yaml": many(0.25)})
     answer, body = raw(api, path, offered(first.content))
     assert answer.headers["content-encoding"] == "dcz"
-    whole = api.get(path)
-    assert whole.content != first.content
-    assert unpack(body, first.content) == whole.content
-    assert len(body) < 500 < len(whole.content)
-    assert answer.headers["etag"] != whole.headers["etag"]
+    response = api.get(path)
+    assert response.content != first.content
+    assert unpack(body, first.content) == response.content
+    assert len(body) < 500 < len(response.content)
+    assert answer.headers["etag"] != response.headers["etag"]
     again, second = raw(api, path, offered(first.content))
     assert second == body
     assert again.headers["etag"] == answer.headers["etag"]
@@ -212,11 +212,11 @@ def test_a_file_too_small_for_a_dictionary_is_none(api: Api, bare: str) -> None:
 )
 def test_without_a_known_dictionary_the_file_comes_whole(api: Api, farm: str, headers: dict[str, str]) -> None:
     path = f"/maps/{farm}/tmap2/network.tmap2.yaml"
-    whole = api.get(path).content
-    answer, body = raw(api, path, {**offered(whole), **headers} if "available-dictionary" not in headers else headers)
+    content = api.get(path).content
+    answer, body = raw(api, path, {**offered(content), **headers} if "available-dictionary" not in headers else headers)
     assert answer.status_code == 200
     assert "content-encoding" not in answer.headers
-    assert body == whole
+    assert body == content
 
 
 def test_a_dictionary_that_comes_late_is_taken() -> None:
@@ -226,13 +226,13 @@ def test_a_dictionary_that_comes_late_is_taken() -> None:
     shelf: dict[str, bytes] = {}
 
     class Shelf:
-        def by_hash(self, sha256: str, most: int) -> bytes | None:
+        def by_hash(self, sha256: str, limit: int) -> bytes | None:
             return shelf.get(sha256)
 
     async def ask() -> bytes | None:
-        return await made.between(names[0], names[1], new)
+        return await deltas.between(names[0], names[1], new)
 
-    made = Deltas(cast(Any, Shelf()))
+    deltas = Deltas(cast(Any, Shelf()))
     assert asyncio.run(ask()) is None
     shelf[names[0]] = old
     delta = asyncio.run(ask())
@@ -244,11 +244,11 @@ def test_a_fleet_that_asks_for_a_new_map_costs_one_conversion(api: Api, bare: st
     """40 robots at once, each for the manifest and the file."""
     api.upload(bare, {"n.tmap2.yaml": samples.tmap2({"here": (0.5, 1.0), "there": (2.5, 1.0)}, (("here", "there"),))})
 
-    def made() -> float:
-        found = re.search(r'conversions_total\{format="tmap2",result="made"\} (\S+)', api.get("/metrics").text)
-        return float(found[1]) if found else 0.0
+    def conversion_count() -> float:
+        match = re.search(r'conversions_total\{format="tmap2",result="made"\} (\S+)', api.get("/metrics").text)
+        return float(match[1]) if match else 0.0
 
-    before = made()
+    before = conversion_count()
     start = threading.Barrier(40)
 
     def ask(_: int) -> str:
@@ -262,22 +262,22 @@ def test_a_fleet_that_asks_for_a_new_map_costs_one_conversion(api: Api, bare: st
 
     with ThreadPoolExecutor(40) as pool:
         assert len(set(pool.map(ask, range(40)))) == 1
-    assert made() - before == 1
+    assert conversion_count() - before == 1
 
 
 def test_what_a_fleet_asks_for_at_once_comes_from_memory_and_is_never_old(api: Api, farm: str) -> None:
     place = f"environments/{farm}"
-    asked = (f"{place}/versions/latest/manifest?formats=tmap2", f"{place}/channels?robots=false")
+    paths = (f"{place}/versions/latest/manifest?formats=tmap2", f"{place}/channels?robots=false")
     hot = api.app.state.services.hot
 
-    def known(path: str) -> bool:
-        where, _, query = f"/api/v1/{path}".partition("?")
-        return hot.get((where.encode(), query.encode())) is not None
+    def is_cached(path: str) -> bool:
+        full_path, _, query = f"/api/v1/{path}".partition("?")
+        return hot.get((full_path.encode(), query.encode())) is not None
 
-    for path in asked:
+    for path in paths:
         first = api.get(path)
         again = api.get(path)
-        assert known(path)
+        assert is_cached(path)
         assert again.content == first.content
         assert {k: v for k, v in again.headers.items() if k != "date"}.items() >= {
             "etag": first.headers["etag"], "content-type": "application/json", "cache-control": "no-cache",
@@ -286,15 +286,15 @@ def test_what_a_fleet_asks_for_at_once_comes_from_memory_and_is_never_old(api: A
         assert api.get(path, 304, headers={"If-None-Match": first.headers["etag"]}).content == b""
         api.as_("none").problem("GET", path, 401)
         api.token_for("viewer", environments="other-*").problem("GET", path, 403)
-    check(api, api.get(asked[0]))
+    check(api, api.get(paths[0]))
     api("PUT", f"{place}/channels/production", 200, json={"version": 2})
-    assert not known(asked[1])
-    assert {c["channel"]: c["version"] for c in api.get(asked[1]).json()} == {"latest": 3, "production": 2}
+    assert not is_cached(paths[1])
+    assert {c["channel"]: c["version"] for c in api.get(paths[1]).json()} == {"latest": 3, "production": 2}
     api.upload(farm, {"n.tmap2.yaml": samples.tmap2({"a": (0.0, 1.0), "b": (5.0, 1.0)}, (("a", "b"),))})
-    assert check(api, api.get(asked[0]))["version"] == 4
-    old = api.get(asked[0]).headers["fleetmap-signature"].partition(":")[0]
+    assert check(api, api.get(paths[0]))["version"] == 4
+    old = api.get(paths[0]).headers["fleetmap-signature"].partition(":")[0]
     new = api.post("keys", expect=201).json()["id"]
-    assert api.get(asked[0]).headers["fleetmap-signature"].partition(":")[0] == new != old
+    assert api.get(paths[0]).headers["fleetmap-signature"].partition(":")[0] == new != old
     assert "robots" in api.get(f"{place}/channels").json()[0]
 
 

@@ -125,15 +125,15 @@ def test_head(api: Api, farm: str) -> None:
 
 def test_ranges(api: Api, farm: str) -> None:
     path = f"/maps/{farm}/tmap2"
-    whole = api.get(path)
-    etag, size = whole.headers["etag"], len(whole.content)
+    response = api.get(path)
+    etag, size = response.headers["etag"], len(response.content)
     part = api.get(path, 206, headers={"Range": "bytes=10-19"})
-    assert part.content == whole.content[10:20]
+    assert part.content == response.content[10:20]
     assert part.headers["content-range"] == f"bytes 10-19/{size}"
     assert part.headers["etag"] == etag
-    assert api.get(path, 206, headers={"Range": "bytes=-7"}).content == whole.content[-7:]
-    assert api.get(path, 206, headers={"Range": "bytes=5-", "If-Range": etag}).content == whole.content[5:]
-    assert api.get(path, 200, headers={"Range": "bytes=5-", "If-Range": '"old"'}).content == whole.content
+    assert api.get(path, 206, headers={"Range": "bytes=-7"}).content == response.content[-7:]
+    assert api.get(path, 206, headers={"Range": "bytes=5-", "If-Range": etag}).content == response.content[5:]
+    assert api.get(path, 200, headers={"Range": "bytes=5-", "If-Range": '"old"'}).content == response.content
     beyond = api.get(path, 416, headers={"Range": f"bytes={size}-"})
     assert beyond.headers["content-range"] == f"bytes */{size}"
     problem(beyond)
@@ -229,12 +229,12 @@ def test_credits_stand_in_reports(api: Api, bare: str) -> None:
         members = {"format", "version", "layers", "attribution", "template", "dropped", "warnings", "closures"}
         assert set(report) == members
         assert report["attribution"] == credit
-        told = {line["layer"]: line["attribution"] for line in report["layers"]}
-        assert told["topology"] == credit
-        assert told["location"] == []
+        summary = {line["layer"]: line["attribution"] for line in report["layers"]}
+        assert summary["topology"] == credit
+        assert summary["location"] == []
     files = [("files", ("area.osm", samples.OSM))]
-    told = api("POST", "convert", 200, files=files, data={"to": "tmap2", "report": "true"}).json()
-    assert told["attribution"] == credit
+    summary = api("POST", "convert", 200, files=files, data={"to": "tmap2", "report": "true"}).json()
+    assert summary["attribution"] == credit
 
 
 def test_merging_keeps_what_both_say_as_a_whole(api: Api, bare: str) -> None:
@@ -258,9 +258,9 @@ def test_merging_keeps_two_drawings_of_one_name(api: Api, bare: str) -> None:
     text = '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>%s</name>%s%s</Document></kml>'
     for name, colour, mode in (("first", "ff0000ff", "replace"), ("second", "ff00ff00", "merge")):
         api.upload(bare, {"d.kml": (text % (name, style % colour, mark % name)).encode()}, mode=mode)
-    made = api.get(f"/maps/{bare}/kml").text
-    for said in ("first", "second", "ff0000ff", "ff00ff00"):
-        assert f">{said}<" in made
+    kml = api.get(f"/maps/{bare}/kml").text
+    for fragment in ("first", "second", "ff0000ff", "ff00ff00"):
+        assert f">{fragment}<" in kml
     again = {"d.kml": (text % ("second", style % "ff00ff00", mark % "second")).encode()}
     assert api.upload(bare, again, expect=None, mode="merge").status_code in (200, 201)
 
@@ -277,9 +277,9 @@ def test_coverage(api: Api, farm: str) -> None:
 
 
 def test_formats_through_each_other(api: Api, farm: str) -> None:
-    made = json.loads(api.get(f"/maps/{farm}/geojson").content) if "geojson" in _formats(api) else None
-    if made is not None:
-        kinds = [f["properties"].get("kind") for f in made["features"]]
+    geojson = json.loads(api.get(f"/maps/{farm}/geojson").content) if "geojson" in _formats(api) else None
+    if geojson is not None:
+        kinds = [f["properties"].get("kind") for f in geojson["features"]]
         assert kinds.count("node") == 3
         assert kinds.count("edge") == 3
     kml = api.get(f"/maps/{farm}/kml").content
@@ -357,31 +357,31 @@ def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
         answer = api.get("/maps/farm/tmap2?", 202)
-        where = answer.headers["location"]
+        location = answer.headers["location"]
         job = answer.json()
-        assert where == f"/api/v1/jobs/{job['id']}"
+        assert location == f"/api/v1/jobs/{job['id']}"
         assert job["state"] == "running"
-        assert api.get("/maps/farm/tmap2", 202).headers["location"] == where, "one job for one who asks again"
-        assert api.get(where).json()["state"] == "running"
+        assert api.get("/maps/farm/tmap2", 202).headers["location"] == location, "one job for one who asks again"
+        assert api.get(location).json()["state"] == "running"
         other = api.token_for("viewer")
         api_other = other.get("/maps/farm/tmap2", 202).headers["location"]
-        assert api_other != where
-        other.problem("GET", where, 404)
-        own, others = (path.rpartition("/")[2] for path in (where, api_other))
+        assert api_other != location
+        other.problem("GET", location, 404)
+        job_id, others = (path.rpartition("/")[2] for path in (location, api_other))
         listed = [[job["id"] for job in client.get("jobs").json()] for client in (api, other)]
-        assert listed == [[others, own], [others]], "newest first"
+        assert listed == [[others, job_id], [others]], "newest first"
         assert api.token_for("admin", environments="farm").get("jobs").json() == []
         assert [job["id"] for job in api.get("jobs?state=running&limit=1").json()] == [others]
         assert api.get("jobs?state=done").json() == []
         gate.set()
         deadline = time.monotonic() + 30
-        while (job := api.get(where).json())["state"] == "running":
+        while (job := api.get(location).json())["state"] == "running":
             assert time.monotonic() < deadline
             time.sleep(0.05)
         assert (job["state"], job["progress"]) == ("done", 1.0)
         assert api.get(job["result"]["location"]).content == api.get("/maps/farm/tmap2").content
-        api("DELETE", where, 204)
-        api.problem("GET", where, 404)
+        api("DELETE", location, 204)
+        api.problem("GET", location, 404)
 
 
 def test_a_job_is_cancelled_or_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -434,16 +434,16 @@ def test_cancelling_stops_the_work_unless_others_wait_for_it(tmp_path: Path, mon
     with running(settings_for(tmp_path, job_seconds=0.2, conversion_workers=1)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
-        mine = api.get("/maps/farm/tmap2", 202).headers["location"]
+        location = api.get("/maps/farm/tmap2", 202).headers["location"]
         other = api.token_for("viewer")
         theirs = other.get("/maps/farm/tmap2", 202).headers["location"]
         assert len(begun) == 1
-        api("DELETE", mine, 204)
-        assert api.get(mine).json()["state"] == "cancelled"
+        api("DELETE", location, 204)
+        assert api.get(location).json()["state"] == "cancelled"
         assert not begun[0].called, "somebody else waits for it"
         assert other.get(theirs).json()["state"] == "running"
         again = api.get("/maps/farm/tmap2", 202).headers["location"]
-        assert again != mine
+        assert again != location
         other("DELETE", theirs, 204)
         assert not begun[0].called
         begin = time.monotonic()
@@ -454,7 +454,7 @@ def test_cancelling_stops_the_work_unless_others_wait_for_it(tmp_path: Path, mon
         while api.get("/maps/farm/tmap2", None).status_code == 202:
             assert time.monotonic() < deadline, "the worker went on with what nobody wants"
             time.sleep(0.1)
-        assert [api.get(where).json()["state"] for where in (mine, theirs, again)] == ["cancelled"] * 3
+        assert [api.get(url).json()["state"] for url in (location, theirs, again)] == ["cancelled"] * 3
         assert 'fleetmap_conversions_total{format="tmap2",result="cancelled"} 1.0' in api.get("/metrics").text
 
 
@@ -476,27 +476,27 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
         job = api.get("/maps/farm/tmap2", 202).json()["id"]
-        here = api.app.state.services
-        here.store.update_job(job, state="cancelled", detail="cancelled")
+        services = api.app.state.services
+        services.store.update_job(job, state="cancelled", detail="cancelled")
         assert not stopped.is_set()
-        here.work.beat()
+        services.work.beat()
         assert stopped.wait(10)
 
 
 def test_coverage_does_not_wait_for_busy_workers(api: Api, farm: str) -> None:
     """The table of content that nobody has looked at, while the only worker is at work."""
-    here = api.app.state.services
+    services = api.app.state.services
     stop = Stop()
-    working = threading.Thread(target=_outlast, args=(here.pool, stop))
+    working = threading.Thread(target=_outlast, args=(services.pool, stop))
     working.start()
     try:
         until = time.monotonic() + 60
-        while not here.pool.is_busy:
+        while not services.pool.is_busy:
             assert time.monotonic() < until
             time.sleep(0.01)
         rows = api.get(f"environments/{farm}/versions/3/maps").json()
         assert any(row["state"] == "derivable" for row in rows)
-        assert here.pool.is_busy, "the worker's job ended before the table was told"
+        assert services.pool.is_busy, "the worker's job ended before the table was told"
     finally:
         stop()
         working.join(60)

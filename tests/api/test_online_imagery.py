@@ -193,9 +193,11 @@ def tiles(at: Misbehaving, **more: Any) -> Provider:
     return Provider(at.url + "/tiles/{z}/{x}/{y}.png?key={token}", "xyz", SECRET, ("© Somebody",), **more)
 
 
-def fetched(known: Provider, resolution: float = 0.5) -> tuple[Picture, int]:
-    asked = sheet(known, BOX, resolution)
-    return put_together(asked, Fetcher(known, sleep=lambda _: None).fetch(asked.blocks), known.attribution, Limits())
+def fetched(provider: Provider, resolution: float = 0.5) -> tuple[Picture, int]:
+    mosaic = sheet(provider, BOX, resolution)
+    return put_together(
+        mosaic, Fetcher(provider, sleep=lambda _: None).fetch(mosaic.blocks), provider.attribution, Limits()
+    )
 
 
 def check(picture: Picture) -> None:
@@ -216,8 +218,8 @@ def check(picture: Picture) -> None:
 @pytest.mark.parametrize("kind", ["xyz", "wms", "mapbox"])
 def test_what_is_fetched_lies_where_it_is_said_to_lie(provider: Misbehaving, kind: Any) -> None:
     url = {"xyz": "/tiles/{z}/{x}/{y}.png", "wms": "/wms?layers=ortho&format=image/png", "mapbox": "/styles/static"}
-    known = Provider(provider.url + url[kind], kind, SECRET)
-    picture, missing = fetched(known)
+    tile_provider = Provider(provider.url + url[kind], kind, SECRET)
+    picture, missing = fetched(tile_provider)
     check(picture)
     assert (picture.crs, missing) == ("EPSG:3857", 0)
     ground = picture.transform[0] * np.cos(np.radians(53.2685))
@@ -274,10 +276,10 @@ def test_rows_from_below_and_wmts_names() -> None:
 )
 def test_a_provider_that_misbehaves(provider: Misbehaving, mood: str, error: type[Exception], says: str) -> None:
     provider.mood = mood
-    known = tiles(provider, max_bytes=2**20, seconds=1.5, tries=2)
+    tile_provider = tiles(provider, max_bytes=2**20, seconds=1.5, tries=2)
     begun = time.monotonic()
     with pytest.raises(error, match=says) as caught:
-        fetched(known)
+        fetched(tile_provider)
     assert time.monotonic() - begun < 8.0
     assert SECRET not in str(caught.value)
     assert SECRET not in repr(caught.value.__cause__)
@@ -295,9 +297,9 @@ def test_a_busy_provider_is_asked_again(provider: Misbehaving) -> None:
     check(picture)
     provider.mood, provider.asked[:] = "busy", []
     waits: list[float] = []
-    known = tiles(provider, tries=4)
-    asked = sheet(known, BOX, 0.5)
-    Fetcher(known, sleep=waits.append).fetch(asked.blocks)
+    tile_provider = tiles(provider, tries=4)
+    mosaic = sheet(tile_provider, BOX, 0.5)
+    Fetcher(tile_provider, sleep=waits.append).fetch(mosaic.blocks)
     assert waits
     assert max(waits) <= online.LONGEST_WAIT
 
@@ -317,11 +319,11 @@ def test_parts_that_are_missing_are_transparent(provider: Misbehaving) -> None:
 
 
 def test_what_was_fetched_is_kept_for_a_while(provider: Misbehaving, tmp_path: Path) -> None:
-    known = tiles(provider, cache_dir=tmp_path / "c", cache_bytes=10**6)
-    first, _ = fetched(known)
+    tile_provider = tiles(provider, cache_dir=tmp_path / "c", cache_bytes=10**6)
+    first, _ = fetched(tile_provider)
     count = len(provider.asked)
     provider.mood = "broken"
-    again, _ = fetched(known)
+    again, _ = fetched(tile_provider)
     assert len(provider.asked) == count
     assert np.array_equal(first.pixels, again.pixels)
     files = list((tmp_path / "c").iterdir())
@@ -380,27 +382,27 @@ def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
         listed = {d["id"] for d in api.get("derivations").json()}
         assert "location_to_imagery" in listed
         api.post("environments", {"name": "farm", "datum": {"latitude": 53.2682, "longitude": -0.5251}})
-        wish = {"method": "location_to_imagery", "parameters": {"resolution": 0.5}}
+        request = {"method": "location_to_imagery", "parameters": {"resolution": 0.5}}
         path = "environments/farm/derivations"
-        no_fence = api.problem("POST", path, 422, json=wish)
+        no_fence = api.problem("POST", path, 422, json=request)
         assert "radius" in no_fence["detail"]
         api.upload("farm", {"fence.kml": FENCE.encode()}, layer="location")
-        made = api.post(path, wish).json()
-        assert made["information"]["imagery"] == "derived"
-        assert made["stale"] == []
-        told = api.get(
+        version = api.post(path, request).json()
+        assert version["information"]["imagery"] == "derived"
+        assert version["stale"] == []
+        image = api.get(
             "environments/farm/versions/latest/layers/imagery", headers={"Accept": "application/json"}
         ).json()
-        assert told["crs"] == "EPSG:3857"
-        assert told["attribution"] == ["© Somebody", "© Else"]
+        assert image["crs"] == "EPSG:3857"
+        assert image["attribution"] == ["© Somebody", "© Else"]
         report = api.get("environments/farm/versions/latest/reports/satellite").json()
         assert report["attribution"] == ["© Somebody", "© Else"]
         (line,) = [line for line in report["layers"] if line["layer"] == "imagery"]
         assert line["steps"][0]["step"] == "location_to_imagery"
         assert line["steps"][0]["parameters"]["provider"] == provider.url.removeprefix("http://")
-        assert SECRET not in str(report) + str(made) + str(told)
+        assert SECRET not in str(report) + str(version) + str(image)
         assert api.get("/maps/farm/satellite").content[:4] in (b"II*\0", b"MM\0*")
-        assert api.post(path, wish, expect=200).json()["version"] == made["version"], "the same picture"
+        assert api.post(path, request, expect=200).json()["version"] == version["version"], "the same picture"
         # Another storey has nothing to do with it.
         put = {"op": "put", "layer": "objects", "level": "1", "feature": FEATURE}
         assert api.post("environments/farm/edits", {"changes": [put]}).json()["stale"] == []
@@ -413,13 +415,13 @@ def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
         assert api.get("/maps/farm/satellite").status_code == 200
         report = api.get("environments/farm/versions/latest/reports/satellite").json()
         assert any("derive it anew" in w["problem"] for w in report["warnings"])
-        assert api.post(path, wish).json()["stale"] == []
+        assert api.post(path, request).json()["stale"] == []
         # So does the datum; what comes is the same, and no longer stale.
         place = {"latitude": 53.2682, "longitude": -0.5251, "altitude": 20.0}
         api("PATCH", "environments/farm", 200, json={"datum": place})
         later = api.get("environments/farm/versions/latest").json()
         assert [s["changed"] for s in later["stale"]] == [["datum"]]
-        again = api.post(path, wish).json()
+        again = api.post(path, request).json()
         assert (again["version"], again["root"], again["stale"]) == (later["version"] + 1, later["root"], [])
         # What a provider does wrong makes no version.
         for mood, status in (
@@ -427,22 +429,22 @@ def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
             *(("html", 422), ("forbidden", 422), ("bomb", 422), ("huge", 422), ("endless", 422)),
         ):
             provider.mood = mood
-            problem = api.problem("POST", path, status, json=wish)
+            problem = api.problem("POST", path, status, json=request)
             assert SECRET not in str(problem)
             assert len(problem["detail"]) > 20
         before = api.get("environments/farm/versions/latest").json()["version"]
         provider.mood = "fine"
-        api.problem("POST", path, 422, json={**wish, "parameters": {"zoom": 3}})
+        api.problem("POST", path, 422, json={**request, "parameters": {"zoom": 3}})
         viewer = api.token_for("viewer")
-        viewer.problem("POST", path, 403, json=wish)
+        viewer.problem("POST", path, 403, json=request)
         assert api.get("environments/farm/versions/latest").json()["version"] == before
 
 
 def test_a_picture_around_the_datum_is_stale_when_there_is_a_fence(provider: Misbehaving, tmp_path: Path) -> None:
     with serving(tmp_path, provider) as api:
         api.post("environments", {"name": "farm", "datum": {"latitude": 53.2682, "longitude": -0.5251}})
-        wish = {"method": "location_to_imagery", "parameters": {"resolution": 0.5, "radius": 20}}
-        assert api.post("environments/farm/derivations", wish).json()["stale"] == []
+        request = {"method": "location_to_imagery", "parameters": {"resolution": 0.5, "radius": 20}}
+        assert api.post("environments/farm/derivations", request).json()["stale"] == []
         later = api.upload("farm", {"fence.kml": FENCE.encode()}, layer="location").json()
         assert [s["changed"] for s in later["stale"]] == [["location ground/site"]]
 
@@ -450,7 +452,7 @@ def test_a_picture_around_the_datum_is_stale_when_there_is_a_fence(provider: Mis
 def test_without_a_provider_nobody_is_asked(api: Api, fresh: Callable[[], str]) -> None:
     name = fresh()
     api.post("environments", {"name": name, "datum": {"latitude": 53.2682, "longitude": -0.5251}})
-    wish = {"method": "location_to_imagery", "parameters": {"radius": 50}}
-    problem = api.problem("POST", f"environments/{name}/derivations", 422, json=wish)
+    request = {"method": "location_to_imagery", "parameters": {"radius": 50}}
+    problem = api.problem("POST", f"environments/{name}/derivations", 422, json=request)
     assert "FLEETMAP_IMAGERY_URL" in problem["detail"]
     assert "location_to_imagery" not in {d["id"] for d in api.get("derivations").json()}

@@ -27,8 +27,8 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
     with running(settings_for(tmp_path_factory.mktemp("examples"), job_seconds=60)) as api:
         with Client(api.url, ADMIN) as client:
             demo.install(client)
-        said = {"environment": "orchard", "channel": "latest", "version": 1, "root": "0" * 64, "state": "ready"}
-        api("PUT", "robots/mower-3/status", 200, json=said)
+        status = {"environment": "orchard", "channel": "latest", "version": 1, "root": "0" * 64, "state": "ready"}
+        api("PUT", "robots/mower-3/status", 200, json=status)
         yield api
 
 
@@ -78,14 +78,17 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
 def test_every_call_is_described(schema: dict[str, Any]) -> None:
     seen = set()
     for path, method, op in operations(schema):
-        where = f"{method} {path}"
-        assert op.get("summary"), where
-        assert op.get("description"), where
-        assert op["operationId"] not in seen, where
+        operation = f"{method} {path}"
+        assert op.get("summary"), operation
+        assert op.get("description"), operation
+        assert op["operationId"] not in seen, operation
         seen.add(op["operationId"])
         for parameter in op.get("parameters", ()):
-            assert parameter.get("description") or parameter["schema"].get("description"), (where, parameter["name"])
-        assert ("security" in op) == (path not in ("/healthz", "/readyz")), where
+            assert parameter.get("description") or parameter["schema"].get("description"), (
+                operation,
+                parameter["name"],
+            )
+        assert ("security" in op) == (path not in ("/healthz", "/readyz")), operation
 
 
 def test_every_problem_is_documented_in_its_shape(schema: dict[str, Any]) -> None:
@@ -103,10 +106,10 @@ def test_every_problem_is_documented_in_its_shape(schema: dict[str, Any]) -> Non
 
 
 def test_references_resolve(schema: dict[str, Any]) -> None:
-    known = set(schema["components"]["schemas"])
+    schemas = set(schema["components"]["schemas"])
     used = set(re.findall(r"#/components/schemas/([A-Za-z_0-9]+)", str(schema)))
-    assert used <= known
-    assert "HTTPValidationError" not in known
+    assert used <= schemas
+    assert "HTTPValidationError" not in schemas
 
 
 def test_parameters_of_formats_are_listed(api: Api, schema: dict[str, Any]) -> None:
@@ -119,9 +122,9 @@ def test_parameters_of_formats_are_listed(api: Api, schema: dict[str, Any]) -> N
 
 def test_each_format_has_its_own_parameters(schema: dict[str, Any]) -> None:
     op = schema["paths"]["/maps/{env}/octomap"]["get"]
-    own = {o["name"] for o in describe(get_format("octomap").write_options)}
-    assert own
-    assert {p["name"] for p in op["parameters"] if p["in"] == "query"} == own | {"derive", "closures"}
+    option_names = {o["name"] for o in describe(get_format("octomap").write_options)}
+    assert option_names
+    assert {p["name"] for p in op["parameters"] if p["in"] == "query"} == option_names | {"derive", "closures"}
 
 
 def test_the_page_needs_no_network(api: Api) -> None:
@@ -146,8 +149,8 @@ def example_of(parameter: dict[str, Any]) -> Any:
         return parameter["example"]
     for place in (parameter, parameter.get("schema", {})):
         if place.get("examples"):
-            found = place["examples"]
-            return found[0] if isinstance(found, list) else next(iter(found.values()))["value"]
+            examples = place["examples"]
+            return examples[0] if isinstance(examples, list) else next(iter(examples.values()))["value"]
     return None
 
 
@@ -159,9 +162,9 @@ def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]
     """Ways to send the examples of a call, as arguments for the client."""
     content = op.get("requestBody", {}).get("content", {})
     out: list[dict[str, Any]] = []
-    for media, told in content.items():
-        examples = [e["value"] for e in told.get("examples", {}).values()]
-        reference = told["schema"].get("$ref", "").rpartition("/")[2]
+    for media, media_object in content.items():
+        examples = [e["value"] for e in media_object.get("examples", {}).values()]
+        reference = media_object["schema"].get("$ref", "").rpartition("/")[2]
         examples += schema["components"]["schemas"].get(reference, {}).get("examples", [])
         assert examples, f"{op['operationId']} has no example for {media}"
         for value in examples:
@@ -175,15 +178,15 @@ def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]
 
 
 def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -> None:
-    known: dict[str, str] = {}
+    resource_ids: dict[str, str] = {}
     job = api.app.state.services.store.create_job(owner="", detail="an example")
-    known["/api/v1/jobs/{id}"] = job.id
-    known["/api/v1/stored/{kind}/{sha256}"] = api.app.state.services.store.blobs.put(b"an example")
-    found = operations(schema)
-    found.sort(key=lambda o: (LAST.index(_name(o)) if _name(o) in LAST else -1, ORDER.index(o[1])))
+    resource_ids["/api/v1/jobs/{id}"] = job.id
+    resource_ids["/api/v1/stored/{kind}/{sha256}"] = api.app.state.services.store.blobs.put(b"an example")
+    calls = operations(schema)
+    calls.sort(key=lambda o: (LAST.index(_name(o)) if _name(o) in LAST else -1, ORDER.index(o[1])))
     ran = 0
-    for path, method, op in found:
-        where = f"{method} {path}"
+    for path, method, op in calls:
+        operation = f"{method} {path}"
         if path == "/api/v1/environments/{env}/channels/{channel}/planned":
             body = {"version": 1, "activate_at": "2099-01-01T00:00:00Z"}
             api("PUT", "environments/orchard/channels/production", 200, json=body)
@@ -192,7 +195,7 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
             blocked = {"kind": "blocked", "crs": "local", "polygon": {"type": "Polygon", "coordinates": [ring]}}
             if path.endswith(("/end", "/keep")):
                 blocked["state"] = "accepted"
-            known[path] = api("POST", "environments/orchard/overlays", None, json=blocked).json()["id"]
+            resource_ids[path] = api("POST", "environments/orchard/overlays", None, json=blocked).json()["id"]
         if path.endswith("/sources/{name}"):
             api.upload("orchard", UPLOADED)
         if path == "/api/v1/environments/{env}/derivations":
@@ -204,8 +207,8 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
         for parameter in op.get("parameters", ()):
             value = example_of(parameter)
             if parameter["in"] == "path":
-                value = value if value is not None else known.get(path)
-                assert value is not None, (where, parameter["name"])
+                value = value if value is not None else resource_ids.get(path)
+                assert value is not None, (operation, parameter["name"])
                 target = target.replace("{" + parameter["name"] + "}", str(value))
             elif parameter["in"] == "query" and value is not None:
                 query[parameter["name"]] = value
@@ -216,12 +219,12 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
             missing = (
                 op["tags"] == ["maps by format"] and answer.status_code == 422
             )  # what that format needs is not there
-            assert answer.status_code < 400 or missing, (where, answer.status_code, answer.text[:1000])
-            assert str(answer.status_code) in op["responses"], (where, answer.status_code)
+            assert answer.status_code < 400 or missing, (operation, answer.status_code, answer.text[:1000])
+            assert str(answer.status_code) in op["responses"], (operation, answer.status_code)
             if path == "/api/v1/tokens" and method == "post":
-                known["/api/v1/tokens/{id}"] = answer.json()["id"]
+                resource_ids["/api/v1/tokens/{id}"] = answer.json()["id"]
             ran += 1
-    assert ran >= len(found)
+    assert ran >= len(calls)
 
 
 def _name(operation: tuple[str, str, dict[str, Any]]) -> str:

@@ -19,15 +19,15 @@ SQUARE = {"type": "Polygon", "coordinates": [[[1, 1], [4, 1], [4, 3], [1, 3], [1
 
 def edge(api: Api, env: str, name: str, version: str = "latest") -> dict[str, Any]:
     features = api.get(f"environments/{env}/versions/{version}/layers/topology?crs=local").json()["features"]
-    found: dict[str, Any] = next(f for f in features if f["id"] == name)
-    return found
+    feature: dict[str, Any] = next(f for f in features if f["id"] == name)
+    return feature
 
 
 def zones(api: Api, env: str) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = api.get(f"environments/{env}/versions/latest/layers/zones?crs=local").json()[
+    features: list[dict[str, Any]] = api.get(f"environments/{env}/versions/latest/layers/zones?crs=local").json()[
         "features"
     ]
-    return found
+    return features
 
 
 def told_of(api: Api, env: str) -> list[dict[str, Any]]:
@@ -40,10 +40,10 @@ def told_of(api: Api, env: str) -> list[dict[str, Any]]:
 
 def until(condition: Any) -> Any:
     deadline = time.monotonic() + 20
-    while not (found := condition()):
+    while not (value := condition()):
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    return found
+    return value
 
 
 def test_accepted_overlay_is_in_force_until_its_end_and_changes_no_version(api: Api, farm: str) -> None:
@@ -84,20 +84,20 @@ def test_editor_creates_an_overlay_in_force(api: Api, farm: str) -> None:
     body = {"kind": "blocked", "edge": "gate_barn", "state": "accepted"}
     robot = api.token_for("robot", robot="mower-7")
     assert "only editors" in robot.problem("POST", url, 403, json=body)["detail"]
-    made = api.token_for("editor").post(url, body).json()
-    assert (made["state"], made["decided_by"]) == ("accepted", made["reporter"])
+    overlay = api.token_for("editor").post(url, body).json()
+    assert (overlay["state"], overlay["decided_by"]) == ("accepted", overlay["reporter"])
     assert [e["type"] for e in told_of(api, farm)] == ["overlay.accepted"]
-    api.post(f"{url}/{made['id']}/end", expect=200)
+    api.post(f"{url}/{overlay['id']}/end", expect=200)
     assert [e["type"] for e in told_of(api, farm)] == ["overlay.accepted", "overlay.ended"]
-    api.problem("POST", f"{url}/{made['id']}/end", 409)
-    robot.problem("POST", f"{url}/{made['id']}/end", 403)
+    api.problem("POST", f"{url}/{overlay['id']}/end", 409)
+    robot.problem("POST", f"{url}/{overlay['id']}/end", 403)
 
 
 def test_end_is_given_as_a_time_or_as_seconds(api: Api, farm: str) -> None:
     url = f"environments/{farm}/overlays"
     soon = datetime.now(UTC) + timedelta(hours=2)
-    made = api.post(url, {"kind": "blocked", "edge": "gate_barn", "expires": rfc3339(soon)}).json()
-    assert made["expires"] == rfc3339(soon)
+    overlay = api.post(url, {"kind": "blocked", "edge": "gate_barn", "expires": rfc3339(soon)}).json()
+    assert overlay["expires"] == rfc3339(soon)
     for expires, more, text in (
         (rfc3339(datetime.now(UTC) - timedelta(seconds=1)), {}, "in the past"),
         (rfc3339(soon + timedelta(days=400)), {}, "days ahead"),
@@ -112,16 +112,16 @@ def test_edge_that_only_a_channel_has_can_be_closed(api: Api, farm: str) -> None
     """The robot drives on production, and the newest version has another network."""
     url = f"environments/{farm}/overlays"
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 3}).raise_for_status()
-    gone = {"op": "delete", "layer": "topology", "id": "gate_barn"}
-    api.post(f"environments/{farm}/edits", {"changes": [gone]})
-    made = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
+    deletion = {"op": "delete", "layer": "topology", "id": "gate_barn"}
+    api.post(f"environments/{farm}/edits", {"changes": [deletion]})
+    overlay = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 4}).raise_for_status()
-    problem = api.problem("POST", f"{url}/{made['id']}/accept", 422)
+    problem = api.problem("POST", f"{url}/{overlay['id']}/accept", 422)
     assert "no edge 'gate_barn' in version 4" in problem["detail"]
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 3}).raise_for_status()
-    api.post(f"{url}/{made['id']}/accept", expect=200)
+    api.post(f"{url}/{overlay['id']}/accept", expect=200)
     assert "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
-    problem = api.problem("POST", f"{url}/{made['id']}/keep", 422)
+    problem = api.problem("POST", f"{url}/{overlay['id']}/keep", 422)
     assert "version 4" in problem["detail"]
 
 
@@ -135,10 +135,10 @@ def test_piece_of_a_bent_edge_closes_the_edge(api: Api, farm: str) -> None:
     put = {"op": "put", "layer": "topology", "feature": feature}
     api.post(f"environments/{farm}/edits", {"changes": [put]})
     assert "gate_barn~2" in api.get(f"/maps/{farm}/tmap2").text
-    made = api.post(url, {"kind": "blocked", "edge": "gate_barn~2", "state": "accepted"}).json()
-    assert made["edge"] == "gate_barn"
+    overlay = api.post(url, {"kind": "blocked", "edge": "gate_barn~2", "state": "accepted"}).json()
+    assert overlay["edge"] == "gate_barn"
     assert "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
-    api.post(f"{url}/{made['id']}/end", expect=200)
+    api.post(f"{url}/{overlay['id']}/end", expect=200)
     for name in ("gate_barn~3", "barn_gate~1", "gate~1"):
         problem = api.problem("POST", url, 422, json={"kind": "blocked", "edge": name})
         assert f"no edge '{name}'" in problem["detail"]
@@ -148,13 +148,13 @@ def test_piece_of_a_bent_edge_closes_the_edge(api: Api, farm: str) -> None:
 def test_kept_overlay_is_a_version_and_stays_in_force(api: Api, farm: str, what: dict[str, Any]) -> None:
     url = f"environments/{farm}/overlays"
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 3}).raise_for_status()
-    made = api.post(url, {"kind": "blocked", "detail": "a wall", **what}).json()
-    api.problem("POST", f"{url}/{made['id']}/keep", 409)
-    api.post(f"{url}/{made['id']}/accept", expect=200)
-    kept = api.post(f"{url}/{made['id']}/keep", expect=200).json()
-    assert (kept["state"], kept["version"]) == ("accepted", 4)
-    assert api.post(f"{url}/{made['id']}/keep", expect=200).json() == kept
-    assert [o["id"] for o in api.get(f"{url}?state=accepted").json()] == [made["id"]], "production is not there yet"
+    overlay = api.post(url, {"kind": "blocked", "detail": "a wall", **what}).json()
+    api.problem("POST", f"{url}/{overlay['id']}/keep", 409)
+    api.post(f"{url}/{overlay['id']}/accept", expect=200)
+    result = api.post(f"{url}/{overlay['id']}/keep", expect=200).json()
+    assert (result["state"], result["version"]) == ("accepted", 4)
+    assert api.post(f"{url}/{overlay['id']}/keep", expect=200).json() == result
+    assert [o["id"] for o in api.get(f"{url}?state=accepted").json()] == [overlay["id"]], "production is not there yet"
     if "edge" in what:
         assert edge(api, farm, "gate_barn")["properties"]["blocked"] is True
         assert "gate_barn" not in api.get(f"environments/{farm}/versions/4/maps/tmap2").text
@@ -162,17 +162,17 @@ def test_kept_overlay_is_a_version_and_stays_in_force(api: Api, farm: str, what:
     else:
         (zone,) = zones(api, farm)
         assert zone["properties"] == {
-            "kind": "keepout", "overlay": {"id": made["id"], "reporter": "administrator", "detail": "a wall"},
+            "kind": "keepout", "overlay": {"id": overlay["id"], "reporter": "administrator", "detail": "a wall"},
         }  # fmt: skip
         # It is closed now, and it is a keepout for good.
-        assert f"overlay-{made['id']}" in api.get(f"environments/{farm}/versions/4/maps/geojson").text
-    api.post(f"{url}/{made['id']}/end", expect=200)
+        assert f"overlay-{overlay['id']}" in api.get(f"environments/{farm}/versions/4/maps/geojson").text
+    api.post(f"{url}/{overlay['id']}/end", expect=200)
     assert "gate_barn" in api.get(f"/maps/{farm}/tmap2").text, "production was never moved"
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 4}).raise_for_status()
     if "edge" in what:
         assert "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
     else:
-        assert f"overlay-{made['id']}" in api.get(f"/maps/{farm}/geojson").text
+        assert f"overlay-{overlay['id']}" in api.get(f"/maps/{farm}/geojson").text
 
 
 @pytest.mark.parametrize("what", [{"edge": "gate_barn"}, {"polygon": SQUARE, "crs": "local"}])
@@ -180,14 +180,14 @@ def test_overlay_of_an_earlier_release_goes_on_as_a_closure(api: Api, farm: str,
     """It stands in version 4, which was promoted: it ends there as well."""
     url = f"environments/{farm}/overlays"
     end = rfc3339(datetime.now(UTC) + timedelta(hours=1))
-    made = api.post(url, {"kind": "blocked", "expires": end, "state": "accepted", **what}).json()
+    overlay = api.post(url, {"kind": "blocked", "expires": end, "state": "accepted", **what}).json()
     if "edge" in what:
         layer, feature = "topology", edge(api, farm, "gate_barn")
         feature["properties"] |= {"blocked": True, "blocked_until": end}
         feature["properties"].pop("level", None)
     else:
-        layer, properties = "zones", {"kind": "keepout", "expires": end, "overlay": {"id": made["id"]}}
-        feature = {"type": "Feature", "id": f"overlay-{made['id']}", "properties": properties, "geometry": SQUARE}
+        layer, properties = "zones", {"kind": "keepout", "expires": end, "overlay": {"id": overlay["id"]}}
+        feature = {"type": "Feature", "id": f"overlay-{overlay['id']}", "properties": properties, "geometry": SQUARE}
     put = {"op": "put", "layer": layer, "level": "ground", "crs": "local", "feature": feature}
     api.post(f"environments/{farm}/edits", {"changes": [put]})
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 4}).raise_for_status()
@@ -195,12 +195,12 @@ def test_overlay_of_an_earlier_release_goes_on_as_a_closure(api: Api, farm: str,
     def blocked() -> bool:
         if "edge" in what:
             return "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
-        return f"overlay-{made['id']}" in api.get(f"/maps/{farm}/geojson").text
+        return f"overlay-{overlay['id']}" in api.get(f"/maps/{farm}/geojson").text
 
     assert blocked()
-    assert api.get(f"/maps/{farm}/geojson").text.count(f'"overlay-{made["id"]}"') <= 1
+    assert api.get(f"/maps/{farm}/geojson").text.count(f'"overlay-{overlay["id"]}"') <= 1
     api.app.state.services.store.end_due_overlays(datetime.now(UTC) + timedelta(hours=2))
-    assert api.get(f"{url}?state=ended").json()[0]["id"] == made["id"]
+    assert api.get(f"{url}?state=ended").json()[0]["id"] == overlay["id"]
     assert not blocked(), "production still stands on version 4"
     assert "blocked_until" not in api.get(f"/maps/{farm}/geojson").text
 
@@ -225,16 +225,17 @@ def test_area_without_a_place_is_refused(api: Api, farm: str, ring: Any, crs: st
 
 def test_a_polygon_is_kept_without_what_came_along(api: Api, farm: str, bare: str) -> None:
     url = f"environments/{farm}/overlays"
-    said = {"kind": "blocked", "crs": "local", "polygon": {**SQUARE, "properties": {"x": "y" * 5000}, "crs": {}}}
-    assert api.post(url, said).json()["polygon"] == SQUARE
-    assert api.post(url, {**said, "polygon": SQUARE}, 200).json()["polygon"] == SQUARE
+    report = {"kind": "blocked", "crs": "local", "polygon": {**SQUARE, "properties": {"x": "y" * 5000}, "crs": {}}}
+    assert api.post(url, report).json()["polygon"] == SQUARE
+    assert api.post(url, {**report, "polygon": SQUARE}, 200).json()["polygon"] == SQUARE
     round_ = [[math.cos(k / 500 * math.pi), math.sin(k / 500 * math.pi)] for k in range(1000)]
-    told = api.problem("POST", url, 422, json={**said, "polygon": {"type": "Polygon", "coordinates": [round_]}})
-    assert "1001 points" in told["detail"]
-    told = api.problem("POST", url, 422, json={**said, "level": "attic"})
-    assert "it has ground" in told["detail"]
+    problem = api.problem("POST", url, 422, json={**report, "polygon": {"type": "Polygon", "coordinates": [round_]}})
+    assert "1001 points" in problem["detail"]
+    problem = api.problem("POST", url, 422, json={**report, "level": "attic"})
+    assert "it has ground" in problem["detail"]
     assert (
-        "no datum" in api.problem("POST", f"environments/{bare}/overlays", 422, json={**said, "crs": "wgs84"})["detail"]
+        "no datum"
+        in api.problem("POST", f"environments/{bare}/overlays", 422, json={**report, "crs": "wgs84"})["detail"]
     )
 
 
@@ -253,9 +254,9 @@ def test_one_that_goes_wild_leaves_room(api: Api, farm: str, monkeypatch: pytest
 
 def test_undecided_overlays_expire(api: Api, farm: str) -> None:
     url = f"environments/{farm}/overlays"
-    told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 1}).json()
+    overlay = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 1}).json()
     until(lambda: api.get(f"{url}?state=expired").json())
-    api.problem("POST", f"{url}/{told['id']}/accept", 409)
+    api.problem("POST", f"{url}/{overlay['id']}/accept", 409)
     assert api.get(f"environments/{farm}").json()["version"] == 3
     other = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
     assert api.post(f"{url}/{other['id']}/reject", expect=200).json()["state"] == "rejected"
@@ -263,7 +264,7 @@ def test_undecided_overlays_expire(api: Api, farm: str) -> None:
     assert [o["state"] for o in api.get(url).json()] == ["expired", "rejected"]
     kinds = [(e["type"], e["overlay"]["id"]) for e in told_of(api, farm)]
     assert kinds == [
-        ("overlay.created", told["id"]), ("overlay.expired", told["id"]),
+        ("overlay.created", overlay["id"]), ("overlay.expired", overlay["id"]),
         ("overlay.created", other["id"]), ("overlay.rejected", other["id"]),
     ]  # fmt: skip
     assert Event.from_json(json.dumps(told_of(api, farm)[1])).type == "overlay.expired"

@@ -61,8 +61,8 @@ def test_the_whole_way(api: Api) -> None:
     assert api.get("environments?bbox=10,10,11,11").json() == []
     api("PUT", "environments/farm/channels/production", 200, json={"version": 1})
     assert api.get("/maps/farm/tmap2").headers["etag"] == first.headers["etag"]
-    said = {"set": "outdoor", "formats": {"tmap2": {"values": {"pointset": "rows"}}}}
-    assert api("PUT", "environments/farm/templates", 201, json=said).json()["version"] == 3
+    templates = {"set": "outdoor", "formats": {"tmap2": {"values": {"pointset": "rows"}}}}
+    assert api("PUT", "environments/farm/templates", 201, json=templates).json()["version"] == 3
     assert b"pointset: rows" in api.get("environments/farm/versions/latest/maps/tmap2").content
     assert api.get("environments/farm/versions/2/maps/tmap2").headers["etag"] == second.headers["etag"]
     api.post("environments/farm/versions", {"revert_to": 1})

@@ -16,15 +16,15 @@ def test_files_lead_to_layers_and_layers_to_maps(api: Api, fresh: object) -> Non
     api.upload("traced", lanes())
     api.post("environments/traced/derivations", {"method": "objects_to_topology"})
     address = "environments/traced/versions/{}/provenance"
-    told = api.get(address.format("latest"), headers={"accept": "application/json"}).json()
-    links = {(link["from"], link["to"]) for link in told["links"]}
+    provenance = api.get(address.format("latest"), headers={"accept": "application/json"}).json()
+    links = {(link["from"], link["to"]) for link in provenance["links"]}
     assert ("source:lanes.kml", "part:objects/ground/kml") in links
     assert ("part:objects/ground/kml", "part:topology/ground/network") in links
     assert ("part:topology/ground/network", "map:tmap2") in links
-    assert not any(part["stale"] for part in told["parts"])
+    assert not any(part["stale"] for part in provenance["parts"])
     api.upload("traced", lanes("0.002,0.002"))
-    told = api.get(address.format("latest"), headers={"accept": "application/json"}).json()
-    stale = {part["id"]: part["stale"] for part in told["parts"]}
+    provenance = api.get(address.format("latest"), headers={"accept": "application/json"}).json()
+    stale = {part["id"]: part["stale"] for part in provenance["parts"]}
     assert stale["part:topology/ground/network"] == ["objects ground/kml"]
     picture = api.get(address.format("latest"))
     assert picture.headers["content-type"] == "image/svg+xml"
@@ -46,6 +46,6 @@ def test_the_command_line_writes_it(api: Api, tmp_path: Path) -> None:
     api.post("environments", {"name": "drawn", "datum": DATUM})
     api.upload("drawn", lanes())
     target = tmp_path / "p.svg"
-    said = ["coverage", "drawn", "--picture", str(target), "--server", api.url, "--token", api.token]
-    assert run(said) == 0
+    arguments = ["coverage", "drawn", "--picture", str(target), "--server", api.url, "--token", api.token]
+    assert run(arguments) == 0
     assert etree.fromstring(target.read_bytes()).tag.endswith("svg")

@@ -25,18 +25,18 @@ def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
     api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
     robot = api.token_for("robot", robot="mower-1", environments=farm)
     root = root_of(api, farm, 2)
-    said = status(farm, root, detail="fine", sequence=5, time="2031-01-01T00:00:00+01:00")
-    told = robot("PUT", "robots/mower-1/status", 200, json=said).json()
-    assert {k: told[k] for k in ("robot", "environment", "channel", "version", "root", "state", "detail")} == {
+    report = status(farm, root, detail="fine", sequence=5, time="2031-01-01T00:00:00+01:00")
+    body = robot("PUT", "robots/mower-1/status", 200, json=report).json()
+    assert {k: body[k] for k in ("robot", "environment", "channel", "version", "root", "state", "detail")} == {
         "robot": "mower-1", "environment": farm, "channel": "production", "version": 2, "root": root,
         "state": "active", "detail": "fine",
     }  # fmt: skip
-    assert told["time"] == "2030-12-31T23:00:00.000000Z"
-    assert told["online"] is True
-    assert told["vouched"] is True
-    assert told["lag"] == {"events": 0, "differs": False, "since": None}
-    assert told["holds"] == {"version": 2, "root": root, "since": told["received"]}
-    assert robot.get(f"robots?environment={farm}").json() == [told]
+    assert body["time"] == "2030-12-31T23:00:00.000000Z"
+    assert body["online"] is True
+    assert body["vouched"] is True
+    assert body["lag"] == {"events": 0, "differs": False, "since": None}
+    assert body["holds"] == {"version": 2, "root": root, "since": body["received"]}
+    assert robot.get(f"robots?environment={farm}").json() == [body]
     moved = api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 3}).json()
     (now,) = api.get(f"robots?environment={farm}&channel=production").json()
     assert now["lag"] == {"events": 1, "differs": True, "since": moved["time"]}
@@ -114,12 +114,12 @@ def test_the_list_comes_in_pages(api: Api, farm: str, bare: str) -> None:
             path = answer.links["next"]["url"] if "next" in answer.links else ""
         return out
 
-    whole = [(r["environment"], r["robot"]) for r in api.get("robots?limit=1000").json()]
-    assert walk(api, "robots?limit=2") == whole
-    assert {r for e, r in whole if e == farm} == {"a", "B", "c", "d.1", "e"}
-    own = [pair for pair in whole if pair[0] == farm]
-    assert walk(api, f"robots?environment={farm}&limit=2") == own
-    assert walk(api, f"robots?environment={farm}&limit=2&channel=production") == [p for p in own if p[1] != "c"]
+    all_pairs = [(r["environment"], r["robot"]) for r in api.get("robots?limit=1000").json()]
+    assert walk(api, "robots?limit=2") == all_pairs
+    assert {r for e, r in all_pairs if e == farm} == {"a", "B", "c", "d.1", "e"}
+    farm_pairs = [pair for pair in all_pairs if pair[0] == farm]
+    assert walk(api, f"robots?environment={farm}&limit=2") == farm_pairs
+    assert walk(api, f"robots?environment={farm}&limit=2&channel=production") == [p for p in farm_pairs if p[1] != "c"]
     limited = api.token_for("viewer", environments=bare)
     assert walk(limited, "robots?limit=1") == [(bare, "a"), (bare, "z")]
     api.problem("GET", "robots?cursor=x", 422)
@@ -135,12 +135,12 @@ def test_an_environment_that_goes_meanwhile_takes_its_robots_along(
     store = type(api.app.state.services.store)
     quick = store.channels
 
-    def gone(self: Any, environment: str) -> Any:
+    def delete_first(self: Any, environment: str) -> Any:
         if environment == farm and self.environment(farm, deleted=True).deleted is None:
             self.delete_environment(farm)
         return quick(self, environment)
 
-    monkeypatch.setattr(store, "channels", gone)
+    monkeypatch.setattr(store, "channels", delete_first)
     assert farm not in {r["environment"] for r in api.get("robots?limit=1000").json()}
     for method, path in (("GET", f"robots/goer?environment={farm}"), ("PUT", "robots/goer/status")):
         api("POST", f"environments/{farm}/restore", 200)
@@ -151,10 +151,10 @@ def test_an_environment_that_goes_meanwhile_takes_its_robots_along(
 def test_history_of_a_robot(api: Api, farm: str) -> None:
     for state in ("downloading", "downloading", "ready", "active"):
         api("PUT", "robots/digger/status", 200, json=status(farm, "a" * 64, state))
-    told = api.get("robots/digger").json()
-    assert [h["state"] for h in told["history"]] == ["active", "ready", "downloading"]
-    assert told["environments"] == [farm]
-    assert told["lag"] is None, "the channel stands nowhere"
+    body = api.get("robots/digger").json()
+    assert [h["state"] for h in body["history"]] == ["active", "ready", "downloading"]
+    assert body["environments"] == [farm]
+    assert body["lag"] is None, "the channel stands nowhere"
     assert len(api.get("robots/digger?limit=1").json()["history"]) == 1
     api("DELETE", f"robots/digger?environment={farm}", 204)
     api.problem("GET", "robots/digger", 404)
@@ -162,15 +162,15 @@ def test_history_of_a_robot(api: Api, farm: str) -> None:
 
 
 def test_who_may_tell(api: Api, farm: str, bare: str) -> None:
-    said = status(farm, "a" * 64)
-    mine = api.token_for("robot", robot="r-1", environments=farm)
-    for caller in (mine, api.token_for("editor"), api):
-        caller("PUT", "robots/r-1/status", 200, json=said)
-    assert "names the robot r-1" in mine.problem("PUT", "robots/r-2/status", 403, json=said)["detail"]
-    mine.problem("PUT", "robots/r-1/status", 403, json=status(bare, "a" * 64))
-    assert "the robot a-robot" in api.token_for("robot").problem("PUT", "robots/r-1/status", 403, json=said)["detail"]
-    api.token_for("viewer").problem("PUT", "robots/r-1/status", 403, json=said)
-    mine.problem("DELETE", f"robots/r-1?environment={farm}", 403)
+    report = status(farm, "a" * 64)
+    robot_client = api.token_for("robot", robot="r-1", environments=farm)
+    for caller in (robot_client, api.token_for("editor"), api):
+        caller("PUT", "robots/r-1/status", 200, json=report)
+    assert "names the robot r-1" in robot_client.problem("PUT", "robots/r-2/status", 403, json=report)["detail"]
+    robot_client.problem("PUT", "robots/r-1/status", 403, json=status(bare, "a" * 64))
+    assert "the robot a-robot" in api.token_for("robot").problem("PUT", "robots/r-1/status", 403, json=report)["detail"]
+    api.token_for("viewer").problem("PUT", "robots/r-1/status", 403, json=report)
+    robot_client.problem("DELETE", f"robots/r-1?environment={farm}", 403)
     other = api.token_for("viewer", environments=bare)
     assert other.get("robots").json() == []
     other.problem("GET", f"robots?environment={farm}", 403)
@@ -219,15 +219,15 @@ def test_channel_counts_what_robots_hold(api: Api, farm: str) -> None:
         return robots["holding"], robots["lagging"], robots["failed"]
 
     roots = {v: root_of(api, farm, v) for v in (1, 2, 3)}
-    held = {v: {"version": v, "root": roots[v]} for v in roots}
+    active_maps = {v: {"version": v, "root": roots[v]} for v in roots}
     api("PUT", f"{url}/production", 200, json={"version": 2})
     api("PUT", "robots/k/status", 200, json={**status(farm, roots[1]), "version": 1})
     assert stand() == (0, 1, 0)
-    failed = {**status(farm, roots[3], "failed", holds=held[2]), "version": 3}
-    told = api("PUT", "robots/k/status", 200, json=failed).json()
-    assert (told["version"], told["state"], told["holds"]["version"]) == (3, "failed", 2)
+    failed = {**status(farm, roots[3], "failed", holds=active_maps[2]), "version": 3}
+    body = api("PUT", "robots/k/status", 200, json=failed).json()
+    assert (body["version"], body["state"], body["holds"]["version"]) == (3, "failed", 2)
     assert stand() == (1, 0, 0), "it holds what the channel points to, and refused what comes next"
-    api("PUT", "robots/k/status", 200, json={**failed, "holds": held[1]})
+    api("PUT", "robots/k/status", 200, json={**failed, "holds": active_maps[1]})
     assert stand() == (0, 0, 1)
     api("PUT", "robots/k/status", 200, json={**failed, "holds": {"version": 0, "root": "0" * 64}})
     assert api.get(f"robots/k?environment={farm}").json()["holds"] is None

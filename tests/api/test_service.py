@@ -66,9 +66,9 @@ def test_planned_moves(api: Api, farm: str) -> None:
 
 
 def test_formats(api: Api) -> None:
-    known = {f["id"]: f for f in api.get("formats").json()}
-    assert {"datum", "osm", "kml", "kmz", "occupancy_grid", "tmap2", "geojson"} <= set(known)
-    grid = known["occupancy_grid"]
+    formats = {f["id"]: f for f in api.get("formats").json()}
+    assert {"datum", "osm", "kml", "kmz", "occupancy_grid", "tmap2", "geojson"} <= set(formats)
+    grid = formats["occupancy_grid"]
     assert set(grid) == {"id", "title", "files", "media_types", "read", "write", "options", "information"}
     assert set(grid["information"]) == {
         "location", "objects", "topology", "occupancy", "voxels", "imagery", "zones",
@@ -76,8 +76,8 @@ def test_formats(api: Api) -> None:
     assert grid["information"]["occupancy"] == "raw"
     assert grid["information"]["voxels"] == "derived"
     assert grid["information"]["location"] == "-"
-    assert known["kml"]["information"]["occupancy"] == "derived", "a KML says where a grid lies, not what is in it"
-    assert known["kml"]["information"]["topology"] in ("raw", "derived")
+    assert formats["kml"]["information"]["occupancy"] == "derived", "a KML says where a grid lies, not what is in it"
+    assert formats["kml"]["information"]["topology"] in ("raw", "derived")
     option = next(o for o in grid["options"] if o["name"] == "file_type")
     assert option["schema"]["enum"] == ["pgm", "png"]
     assert "default" in option
@@ -242,18 +242,18 @@ def test_tokens(guarded: dict[str, Api]) -> None:
     expires = (datetime.now(UTC) + timedelta(days=1)).isoformat()
     body = {"name": "mower", "role": "robot", "environments": "farm*", "robot": "mower-3", "expires": expires}
     answer = api.post("tokens", body)
-    made = answer.json()
+    token = answer.json()
     assert answer.headers["cache-control"] == "no-store"
-    assert len(made["token"]) >= 22
-    assert (made["role"], made["robot"], made["environments"]) == ("robot", "mower-3", "farm*")
+    assert len(token["token"]) >= 22
+    assert (token["role"], token["robot"], token["environments"]) == ("robot", "mower-3", "farm*")
     listed = {t["id"]: t for t in api.get("tokens").json()}
-    assert "token" not in listed[made["id"]]
-    assert made["token"] not in api.get("tokens").text
-    mine = api.as_(made["token"])
-    mine.get(E)
-    api("DELETE", f"tokens/{made['id']}", 204)
-    mine.problem("GET", E, 401)
-    api.problem("DELETE", f"tokens/{made['id']}", 404)
+    assert "token" not in listed[token["id"]]
+    assert token["token"] not in api.get("tokens").text
+    client = api.as_(token["token"])
+    client.get(E)
+    api("DELETE", f"tokens/{token['id']}", 204)
+    client.problem("GET", E, 401)
+    api.problem("DELETE", f"tokens/{token['id']}", 404)
     for bad in (
         {"name": "x"},
         {"name": "", "role": "viewer"},
@@ -267,15 +267,15 @@ def test_tokens(guarded: dict[str, Api]) -> None:
 def test_robot_token_names_its_robot(guarded: dict[str, Api]) -> None:
     api = guarded["first"]
     assert api.post("tokens", {"name": "mower-3", "role": "robot"}).json()["robot"] == "mower-3"
-    made = api.post("tokens", {"name": "the red one", "role": "robot", "robot": "Mower.4"}).json()
-    assert (made["name"], made["robot"]) == ("the red one", "Mower.4")
+    token = api.post("tokens", {"name": "the red one", "role": "robot", "robot": "Mower.4"}).json()
+    assert (token["name"], token["robot"]) == ("the red one", "Mower.4")
     assert api.post("tokens", {"name": "the red one", "role": "viewer"}).json()["robot"] is None
-    for bad, where in (
+    for bad, location in (
         ({"name": "the red one"}, "name"), ({"name": "r/1"}, "name"), ({"name": "r" * 129}, "name"),
         ({"name": "r", "robot": "a b"}, "robot"), ({"name": "r", "robot": "-r"}, "robot"),
     ):  # fmt: skip
         body = api.problem("POST", "tokens", 422, json={"role": "robot", **bad})
-        assert [e["where"] for e in body["errors"]] == [where]
+        assert [e["where"] for e in body["errors"]] == [location]
         assert "A-Z, a-z, 0-9" in body["detail"]
 
 
@@ -479,8 +479,8 @@ def test_stops_cleanly(tmp_path: Path) -> None:
     with running(settings_for(tmp_path)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
-        here = api.app.state.services
-        workers = [w.process for w in here.pool._workers.values()]
+        services = api.app.state.services
+        workers = [w.process for w in services.pool._workers.values()]
         assert workers
         listening = api.as_(api.token).http.stream("GET", f"{API}/events?since=0", timeout=60)
         lines = listening.__enter__().iter_lines()

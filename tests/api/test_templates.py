@@ -28,8 +28,8 @@ def env(api: Api, request: pytest.FixtureRequest) -> str:
     return name
 
 
-def put(api: Api, env: str, what: str = "", expect: int = 201, headers: Any = None, **body: Any) -> Any:
-    place = f"environments/{env}/templates{what}"
+def put(api: Api, env: str, suffix: str = "", expect: int = 201, headers: Any = None, **body: Any) -> Any:
+    place = f"environments/{env}/templates{suffix}"
     return api("PUT", place, expect, json=body, headers=headers or {}).json()
 
 
@@ -51,19 +51,21 @@ def etag(api: Api, env: str, format: str = "tmap2", version: Any = "latest", que
 
 def files(api: Api, env: str, version: Any = "latest") -> dict[str, str]:
     """The hashes of a signed manifest, by format."""
-    told = api.get(f"environments/{env}/versions/{version}/manifest?formats=tmap2,kml").json()
-    return {file["format"]: file["sha256"] for file in told["files"]}
+    manifest = api.get(f"environments/{env}/versions/{version}/manifest?formats=tmap2,kml").json()
+    return {file["format"]: file["sha256"] for file in manifest["files"]}
 
 
 def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, env: str) -> None:
     assert filled(api, env)["xy_goal_tolerance"] == (0.3, "default")
     before, kml = etag(api, env), etag(api, env, "kml")
     listed = files(api, env)
-    made = put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.4, "action": "NavigateToPose"}, message="for ROS 2")
-    assert (made["version"], made["parent"], made["message"]) == (3, 2, "for ROS 2")
+    version = put(
+        api, env, "/tmap2", values={"xy_goal_tolerance": 0.4, "action": "NavigateToPose"}, message="for ROS 2"
+    )
+    assert (version["version"], version["parent"], version["message"]) == (3, 2, "for ROS 2")
     old = api.get(f"environments/{env}/versions/2").json()
-    assert made["root"] != old["root"], "what robots get has changed, so has the root that they hold"
-    assert made["changes"] == {
+    assert version["root"] != old["root"], "what robots get has changed, so has the root that they hold"
+    assert version["changes"] == {
         "templates": {
             "tmap2": {
                 "action": {"from": None, "to": "NavigateToPose"},
@@ -71,7 +73,7 @@ def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, en
             }
         }
     }
-    assert api.get(f"environments/{env}/diff?from=2&to=3").json()["layers"] == made["changes"]
+    assert api.get(f"environments/{env}/diff?from=2&to=3").json()["layers"] == version["changes"]
     assert tolerance(api, env) == 0.4
     assert api.get(f"/maps/{env}/tmap2").content.count(b"action: NavigateToPose") == 4
     assert etag(api, env) != before
@@ -81,10 +83,10 @@ def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, en
     assert after["tmap2"] != listed["tmap2"], "what robots verify is what they get"
     assert files(api, env, 2) == listed
     assert (tolerance(api, env, 2), etag(api, env, version=2)) == (0.3, before), "old versions, too"
-    said = filled(api, env)
-    assert said["xy_goal_tolerance"] == (0.4, "environment")
-    assert said["action"] == ("NavigateToPose", "environment")
-    assert said["verts_radius"][1] == "default"
+    values = filled(api, env)
+    assert values["xy_goal_tolerance"] == (0.4, "environment")
+    assert values["action"] == ("NavigateToPose", "environment")
+    assert values["verts_radius"][1] == "default"
     event = api.get(f"events?environment={env}&since=0&follow=false").text
     assert '"message":"for ROS 2"' in event.replace('": ', '":')
 
@@ -106,10 +108,10 @@ def test_a_request_goes_before_the_environment_before_the_set_before_the_default
 
 
 def test_equal_values_have_equal_bytes_and_hashes(api: Api, env: str) -> None:
-    asked = etag(api, env, query="?xy_goal_tolerance=0.4")
+    query_etag = etag(api, env, query="?xy_goal_tolerance=0.4")
     before = etag(api, env)
     put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.4})
-    assert etag(api, env) == asked
+    assert etag(api, env) == query_etag
     put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.3})
     assert etag(api, env) == before, "it is the format's own default, and said all the same"
     assert filled(api, env)["xy_goal_tolerance"] == (0.3, "environment")
@@ -118,18 +120,18 @@ def test_equal_values_have_equal_bytes_and_hashes(api: Api, env: str) -> None:
 def test_what_holds_can_be_read(api: Api, env: str) -> None:
     put(api, env, set="warehouse", formats={"tmap2": {"values": {"yaw_goal_tolerance": 0.2}}})
     answer = api.get(f"environments/{env}/templates")
-    told = answer.json()
+    templates = answer.json()
     assert answer.headers["etag"] == '"3"'
-    assert (told["version"], told["set"]) == (3, "warehouse")
-    assert {"default", "outdoor", "indoor", "warehouse"} <= set(told["sets"])
-    lines = {line["format"]: line for line in told["formats"]}
-    mine = lines["tmap2"]
-    assert mine["values"] == {"yaw_goal_tolerance": 0.2}
-    assert mine["effective"]["yaw_goal_tolerance"] == {"value": 0.2, "from": "environment"}
-    assert mine["effective"]["xy_goal_tolerance"] == {"value": 0.1, "from": "set warehouse"}
-    assert mine["effective"]["action"] == {"value": "move_base", "from": "default"}
+    assert (templates["version"], templates["set"]) == (3, "warehouse")
+    assert {"default", "outdoor", "indoor", "warehouse"} <= set(templates["sets"])
+    lines = {line["format"]: line for line in templates["formats"]}
+    tmap2 = lines["tmap2"]
+    assert tmap2["values"] == {"yaw_goal_tolerance": 0.2}
+    assert tmap2["effective"]["yaw_goal_tolerance"] == {"value": 0.2, "from": "environment"}
+    assert tmap2["effective"]["xy_goal_tolerance"] == {"value": 0.1, "from": "set warehouse"}
+    assert tmap2["effective"]["action"] == {"value": "move_base", "from": "default"}
     one = api.get(f"environments/{env}/templates/tmap2").json()
-    assert one == {"environment": env, "version": 3, **mine}
+    assert one == {"environment": env, "version": 3, **tmap2}
     assert api.get(f"environments/{env}/templates/tmap2?version=2").json()["values"] == {}
     sets = {line["name"]: line for line in api.get("templates").json()}
     assert sets["default"]["formats"] == {}
@@ -142,7 +144,7 @@ def test_what_holds_can_be_read(api: Api, env: str) -> None:
 
 def test_they_are_taken_back_and_reverted_and_go_along(api: Api, env: str) -> None:
     first = api.get(f"environments/{env}/versions/2").json()
-    made = put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.4})
+    version = put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.4})
     moved = LANE.replace(b"53.2687", b"53.2688")
     later = api.upload(env, {"lanes.kml": moved}, layer="topology").json()
     assert "templates" not in later["changes"]
@@ -153,15 +155,15 @@ def test_they_are_taken_back_and_reverted_and_go_along(api: Api, env: str) -> No
     assert back["root"] == first["root"]
     assert back["changes"]["templates"] == {"tmap2": {"xy_goal_tolerance": {"from": 0.4, "to": None}}}
     assert tolerance(api, env) == 0.3
-    again = api.post(f"environments/{env}/versions", {"revert_to": made["version"]}).json()
-    assert again["root"] == made["root"]
+    again = api.post(f"environments/{env}/versions", {"revert_to": version["version"]}).json()
+    assert again["root"] == version["root"]
     copied = api.post("environments", {"name": f"{env}-b", "clone": {"environment": env}}).json()
-    assert copied["root"] == made["root"]
+    assert copied["root"] == version["root"]
     assert tolerance(api, f"{env}-b") == 0.4
     put(api, env, set="indoor")
-    gone = api("DELETE", f"environments/{env}/templates/tmap2?message=no+more", 201).json()
-    assert (gone["message"], filled(api, env)["xy_goal_tolerance"]) == ("no more", (0.2, "set indoor"))
-    assert api("DELETE", f"environments/{env}/templates/tmap2", 200).json()["version"] == gone["version"]
+    deletion = api("DELETE", f"environments/{env}/templates/tmap2?message=no+more", 201).json()
+    assert (deletion["message"], filled(api, env)["xy_goal_tolerance"]) == ("no more", (0.2, "set indoor"))
+    assert api("DELETE", f"environments/{env}/templates/tmap2", 200).json()["version"] == deletion["version"]
     bare = api("DELETE", f"environments/{env}/templates", 201).json()
     assert bare["root"] == first["root"], "an environment that says nothing has the root that it always had"
 
@@ -173,14 +175,14 @@ def test_conditions_keys_and_dry_runs(api: Api, env: str) -> None:
     assert dry["changes"]["templates"]["tmap2"] == {"xy_goal_tolerance": {"from": None, "to": 0.4}}
     assert api.get(f"environments/{env}").json()["version"] == 2
     put(api, env, "/tmap2", 412, {"if-match": '"1"'}, values=values)
-    made = put(api, env, "/tmap2", 201, {"if-match": '"2"', "idempotency-key": "k"}, values=values)
-    assert made["root"] == dry["root"]
-    assert put(api, env, "/tmap2", 201, {"idempotency-key": "k"}, values=values) == made
+    version = put(api, env, "/tmap2", 201, {"if-match": '"2"', "idempotency-key": "k"}, values=values)
+    assert version["root"] == dry["root"]
+    assert put(api, env, "/tmap2", 201, {"idempotency-key": "k"}, values=values) == version
     put(api, env, "/tmap2", 409, {"idempotency-key": "k"}, values={})
-    assert put(api, env, "/tmap2", 200, values=values)["version"] == made["version"], "nothing new"
+    assert put(api, env, "/tmap2", 200, values=values)["version"] == version["version"], "nothing new"
     dry = api("DELETE", f"environments/{env}/templates?dry_run=true", 200).json()
     assert dry["changes"]["templates"]["tmap2"] == {"xy_goal_tolerance": {"from": 0.4, "to": None}}
-    assert put(api, env, "", 200)["version"] == made["version"]
+    assert put(api, env, "", 200)["version"] == version["version"]
 
 
 @pytest.mark.parametrize(
@@ -202,9 +204,9 @@ def test_conditions_keys_and_dry_runs(api: Api, env: str) -> None:
     ],
 )
 def test_what_is_wrong_is_named(api: Api, env: str, what: str, body: Any, status: int, where: str | None) -> None:
-    told = api.problem("PUT", f"environments/{env}/templates{what}", status, json=body)
+    problem = api.problem("PUT", f"environments/{env}/templates{what}", status, json=body)
     if where is not None:
-        assert [e["where"] for e in told["errors"]] == [where]
+        assert [e["where"] for e in problem["errors"]] == [where]
     assert api.get(f"environments/{env}").json()["version"] == 2
 
 
@@ -218,17 +220,17 @@ def test_a_package_holds_maps_by_the_environments_templates(api: Api, env: str) 
     text = data.read("config/topological/network.tmap2.yaml")
     assert {n["node"]["properties"]["xy_goal_tolerance"] for n in yaml.safe_load(text)["nodes"]} == {0.4}
     assert text == api.get(f"/maps/{env}/tmap2").content
-    said = filled(api, env, format="environment")
-    assert said["xy_goal_tolerance"] == (0.4, "environment")
-    assert said["action"] == ("move_base", "default")
+    values = filled(api, env, format="environment")
+    assert values["xy_goal_tolerance"] == (0.4, "environment")
+    assert values["action"] == ("move_base", "default")
 
 
 def test_what_this_release_does_not_know_is_told_and_no_robot_stands_without_a_map(api: Api, env: str) -> None:
     from app.store.changes import Changes
 
     store = api.app.state.services.store
-    kept = Templates("of-tomorrow", {"tmap2": Own(None, {"colour": "red", "xy_goal_tolerance": 0.4})})
-    store.commit(env, store.prepare(store.version(env), Changes(templates=kept)), author="", message="")
+    templates = Templates("of-tomorrow", {"tmap2": Own(None, {"colour": "red", "xy_goal_tolerance": 0.4})})
+    store.commit(env, store.prepare(store.version(env), Changes(templates=templates)), author="", message="")
     assert tolerance(api, env) == 0.4
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
     problems = [w["problem"] for w in report["warnings"]]

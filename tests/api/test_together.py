@@ -58,11 +58,11 @@ def test_one_call_for_all() -> None:
             gate()
             return number
 
-        asked = [asyncio.create_task(together.run("a", look, k)) for k in range(5)]
+        tasks = [asyncio.create_task(together.run("a", look, k)) for k in range(5)]
         other = asyncio.create_task(together.run("b", look, 7))
         await asyncio.sleep(0.05)
         gate.open.set()
-        assert await asyncio.gather(*asked) == [0] * 5
+        assert await asyncio.gather(*tasks) == [0] * 5
         assert await other == 7
         assert gate.calls == 2
         assert await together.run("a", look, 9) == 9, "what is over is not shared"
@@ -102,13 +102,13 @@ def test_an_error_is_everybodys_and_is_not_kept(caplog: pytest.LogCaptureFixture
             gate()
             raise NotFound("it is not here")
 
-        asked = [asyncio.create_task(together.run("a", fail)) for _ in range(3)]
+        tasks = [asyncio.create_task(together.run("a", fail)) for _ in range(3)]
         alone = asyncio.create_task(together.run("b", fail))
         await asyncio.sleep(0.05)
         alone.cancel()  # nobody is left to hear of its error
         gate.open.set()
-        told = await asyncio.gather(*asked, return_exceptions=True)
-        assert [type(error) for error in told] == [NotFound] * 3
+        errors = await asyncio.gather(*tasks, return_exceptions=True)
+        assert [type(error) for error in errors] == [NotFound] * 3
         assert await together.run("a", lambda: 5) == 5
         await asyncio.sleep(0.05)
 
@@ -126,17 +126,17 @@ def test_no_map_is_older_than_a_commit_that_was_told(api: Api, bare: str, monkey
     api.get(path)
     api.upload(bare, network("mid"))  # the answer in memory is not this one's; its map is made
     api.get(f"environments/{bare}/versions/2/maps/tmap2/network.tmap2.yaml")
-    here = api.app.state.services
+    services = api.app.state.services
     gate, began = Gate(), threading.Event()
-    find, ready = maps._resolve, here.maps.ready
+    find, ready = maps._resolve, services.maps.ready
 
     def resolve(*args: Any) -> Any:
-        found = find(*args)
+        result = find(*args)
         if not began.is_set():
             began.set()
             api.upload(bare, network("new"))  # a commit between this look and the next
             time.sleep(0.3)
-        return found
+        return result
 
     def slow(recipe: Any) -> Any:
         if recipe.version.number == 2:
@@ -144,7 +144,7 @@ def test_no_map_is_older_than_a_commit_that_was_told(api: Api, bare: str, monkey
         return ready(recipe)
 
     monkeypatch.setattr(maps, "_resolve", resolve)
-    monkeypatch.setattr(here.maps, "ready", slow)
+    monkeypatch.setattr(services.maps, "ready", slow)
     with at_once(2) as ask:
         first = ask(api.get, path)
         assert gate.reached.wait(20)
@@ -164,10 +164,10 @@ def test_what_robots_say_is_in_the_next_answer(api: Api, farm: str, monkeypatch:
     first_only = iter([True])
 
     def slow(*args: Any) -> Any:
-        found = quick(*args)
+        result = quick(*args)
         if next(first_only, False):
             gate()
-        return found
+        return result
 
     monkeypatch.setattr(channels, "_listed", slow)
     with at_once(2) as ask:
@@ -197,13 +197,13 @@ def test_one_look_for_a_fleet_but_none_for_strangers(api: Api, farm: str, monkey
     stranger = api.token_for("viewer", environments="other-*")
     monkeypatch.setattr(Store, "standing", slow)
     with at_once(8) as ask:
-        asked = [ask(robot.get, path) for robot in robots]
+        futures = [ask(robot.get, path) for robot in robots]
         assert gate.reached.wait(20)
         assert ask(stranger.get, path, None).result(20).status_code == 403
         assert ask(api.as_("none").get, path, None).result(20).status_code == 401
         time.sleep(0.2)
         gate.open.set()
-        answers = [one.result(20) for one in asked]
+        answers = [one.result(20) for one in futures]
     assert {a.json()["version"] for a in answers} == {4}
     assert len({a.content for a in answers}) == 1
     assert gate.calls < 4, "at most one before and one after it was made"
@@ -222,11 +222,11 @@ def test_an_environment_that_is_not_there_is_told_to_each(
     path = f"environments/{fresh()}/channels?robots=false"
     clients = [api.as_(api.token) for _ in range(3)]
     with at_once(3) as ask:
-        asked = [ask(client.problem, "GET", path, 404) for client in clients]
+        futures = [ask(client.problem, "GET", path, 404) for client in clients]
         assert gate.reached.wait(20)
         time.sleep(0.2)
         gate.open.set()
-        assert [one.result(20)["status"] for one in asked] == [404] * 3
+        assert [one.result(20)["status"] for one in futures] == [404] * 3
 
 
 # --- tokens ---
@@ -247,10 +247,10 @@ def test_a_token_is_looked_up_once_and_each_its_own(api: Api, farm: str, monkeyp
     monkeypatch.setattr(access, "_find", lambda text: slow(api.app.state.services.store, text))
     clients = [api.as_(token) for token in tokens for _ in range(3)]
     with at_once(len(clients)) as ask:
-        asked = [ask(client.get, f"environments/{farm}", None) for client in clients]
+        futures = [ask(client.get, f"environments/{farm}", None) for client in clients]
         time.sleep(0.4)
         gate.open.set()
-        statuses = [one.result(20).status_code for one in asked]
+        statuses = [one.result(20).status_code for one in futures]
     assert statuses == [200] * 3 + [403] * 3 + [401] * 3
     assert sorted(asked_for) == sorted(tokens), "one look for each token"
 
@@ -263,9 +263,9 @@ def test_a_token_revoked_while_it_is_looked_up_is_not_believed_again() -> None:
         id, name, role, environments, robot, expires = "1", "n", "viewer", None, None, None
 
     def find(text: str) -> Any:
-        found = Found() if text in store else None
+        entry = Found() if text in store else None
         gate()
-        return found
+        return entry
 
     access = Access(find, failures=10)
     with at_once(1) as ask:
@@ -283,8 +283,8 @@ def test_a_token_revoked_while_it_is_looked_up_is_not_believed_again() -> None:
 
 def test_writers_take_turns(tmp_path: Any) -> None:
     """One that takes long lets others wait, not fail; one that fails gives its turn back; readers never wait."""
-    told: list[int] = []
-    database = Database(f"sqlite:///{tmp_path}/turns.sqlite3", readonly=False, written=lambda: told.append(1))
+    notifications: list[int] = []
+    database = Database(f"sqlite:///{tmp_path}/turns.sqlite3", readonly=False, written=lambda: notifications.append(1))
     with database.write() as connection:
         connection.exec_driver_sql("CREATE TABLE t (n INTEGER)")
     gate = Gate()
@@ -315,7 +315,7 @@ def test_writers_take_turns(tmp_path: Any) -> None:
         with pytest.raises(RuntimeError):
             bad.result(20)
     assert read() == 9
-    assert len(told) == 10, "what failed is not told"
+    assert len(notifications) == 10, "what failed is not told"
     database.close()
 
 

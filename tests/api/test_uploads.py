@@ -256,8 +256,8 @@ def test_damaged_files(api: Api, bare: str, name: str, data: bytes) -> None:
 
 @pytest.mark.parametrize("name", ["a/b", "../../x", "..", ".hidden", "C:\\x", "C:x", "a\nb", "x" * 101])
 def test_a_grid_is_called_as_a_file_can_be(api: Api, bare: str, name: str) -> None:
-    found = problem(api.upload(bare, samples.grid(), expect=422, grid=name))
-    assert found["errors"][0]["where"] == "grid"
+    body = problem(api.upload(bare, samples.grid(), expect=422, grid=name))
+    assert body["errors"][0]["where"] == "grid"
     files = [("files", (n, data)) for n, data in samples.grid().items()]
     api.problem("POST", "convert", 422, files=files, data={"to": "occupancy_grid", "grid": name})
 
@@ -283,8 +283,8 @@ FAR_KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><n
 def test_what_lies_far_from_the_datum_is_doubted(api: Api, lon: float, lat: float, far: bool) -> None:
     env = f"far-{abs(int(lon * 10))}"
     api.post("environments", {"name": env, "datum": {"latitude": 53.2, "longitude": -0.5}})
-    made = api.upload(env, {"a.kml": FAR_KML.format(lon, lat).encode()}).json()
-    told = [w["problem"] for w in made["warnings"] if "km from the datum" in w["problem"]]
-    assert bool(told) == far
+    version = api.upload(env, {"a.kml": FAR_KML.format(lon, lat).encode()}).json()
+    warnings = [w["problem"] for w in version["warnings"] if "km from the datum" in w["problem"]]
+    assert bool(warnings) == far
     if far:
-        assert "7746 km" in told[0], "by the spherical law of cosines, worked out apart"
+        assert "7746 km" in warnings[0], "by the spherical law of cosines, worked out apart"

@@ -31,9 +31,9 @@ def maps(env: str, *versions: tuple[Any, str], **more: Any) -> dict[str, Any]:
 
 
 def test_actions_name_the_very_bytes(api: Api, farm: str) -> None:
-    told = api.get(f"environments/{farm}/versions/latest/vda5050/actions?mapId=hall&grid=map&file_type=png").json()
-    assert (told["mapId"], told["mapVersion"], told["version"]) == ("hall", "3", 3)
-    actions = [told[k] for k in ("downloadMap", "enableMap", "deleteMap")]
+    body = api.get(f"environments/{farm}/versions/latest/vda5050/actions?mapId=hall&grid=map&file_type=png").json()
+    assert (body["mapId"], body["mapVersion"], body["version"]) == ("hall", "3", 3)
+    actions = [body[k] for k in ("downloadMap", "enableMap", "deleteMap")]
     assert [a["actionType"] for a in actions] == ["downloadMap", "enableMap", "deleteMap"]
     assert [a["blockingType"] for a in actions] == ["NONE"] * 3, "3.0 allows no other for instant actions"
     assert all(parameters(a)["mapId"] == "hall" and parameters(a)["mapVersion"] == "3" for a in actions)
@@ -42,11 +42,11 @@ def test_actions_name_the_very_bytes(api: Api, farm: str) -> None:
     link = urlsplit(given["mapDownloadLink"])
     assert f"{link.scheme}://{link.netloc}" == api.url
     bundle = api.as_(None).get(f"{link.path}?{link.query}").content
-    assert (hashlib.sha256(bundle).hexdigest(), len(bundle)) == (given["mapHash"], told["size"])
+    assert (hashlib.sha256(bundle).hexdigest(), len(bundle)) == (given["mapHash"], body["size"])
     assert sorted(zipfile.ZipFile(io.BytesIO(bundle)).namelist()) == ["map.png", "map.yaml"]
     again = api.get(f"environments/{farm}/versions/3/vda5050/actions?format=geojson").json()
     assert again["mapId"] == farm
-    assert again["downloadMap"]["actionId"] != told["downloadMap"]["actionId"]
+    assert again["downloadMap"]["actionId"] != body["downloadMap"]["actionId"]
     url = f"environments/{farm}/versions/3/vda5050/actions"
     api.problem("GET", f"{url}?format=nothing", 404)
     api.problem("GET", f"{url}?nonsense=1", 422)
@@ -87,21 +87,21 @@ def test_actions_come_for_each_level(api: Api, tower: str) -> None:
     assert [m["mapId"] for m in named["maps"]][:2] == ["hall", "hall/L2"]
     assert "ground, L2, roof" in api.problem("GET", f"{url}?level=L9", 404)["detail"]
     assert "no level has this map" in api.problem("GET", f"{url}?level=*&grid=other&derive=false", 422)["detail"]
-    told = api.problem("GET", f"{url}?level=*&format=nav2_route", 422)
-    assert "holds all levels" in told["detail"]
-    assert "occupancy_grid" in told["detail"]
+    problem = api.problem("GET", f"{url}?level=*&format=nav2_route", 422)
+    assert "holds all levels" in problem["detail"]
+    assert "occupancy_grid" in problem["detail"]
 
 
 def test_lif_is_not_offered_to_vehicles(api: Api, farm: str) -> None:
-    told = api.problem("GET", f"environments/{farm}/versions/3/vda5050/actions?format=lif", 422)
-    assert "for the fleet manager, never for vehicles" in told["detail"]
+    problem = api.problem("GET", f"environments/{farm}/versions/3/vda5050/actions?format=lif", 422)
+    assert "for the fleet manager, never for vehicles" in problem["detail"]
     api.get(f"environments/{farm}/versions/3/maps/lif")
 
 
 def test_links_of_actions_are_signed_unless_asked_otherwise(api: Api, farm: str) -> None:
     url = f"environments/{farm}/versions/3/vda5050/actions?format=geojson"
-    made = api.get(f"{url}&seconds=60").json()
-    left = datetime.fromisoformat(made["expires"]) - datetime.now(UTC)
+    body = api.get(f"{url}&seconds=60").json()
+    left = datetime.fromisoformat(body["expires"]) - datetime.now(UTC)
     assert timedelta(seconds=30) < left <= timedelta(seconds=60)
     plain = api.get(f"{url}&signed=false&derive=false").json()
     link = parameters(plain["downloadMap"])["mapDownloadLink"]
@@ -120,9 +120,9 @@ def test_floors_count_together(api: Api, tower: str) -> None:
     def floors(ground: list[tuple[str, str]], upper: list[tuple[str, str]]) -> tuple[str, int, int | None]:
         body = maps(tower, *ground)
         body["maps"] += maps(f"{tower}/L2", *upper)["maps"]
-        (told,) = vehicle.post("robots/agv-9/vda5050/state", body, 200).json()["robots"]
-        assert told["environment"] == tower
-        return told["state"], told["version"], told["holds"] and told["holds"]["version"]
+        (robot,) = vehicle.post("robots/agv-9/vda5050/state", body, 200).json()["robots"]
+        assert robot["environment"] == tower
+        return robot["state"], robot["version"], robot["holds"] and robot["holds"]["version"]
 
     on, off = "ENABLED", "DISABLED"
     assert floors([("4", on)], [("4", on)]) == ("active", 4, 4)
@@ -134,8 +134,8 @@ def test_floors_count_together(api: Api, tower: str) -> None:
     body = maps(f"{tower}/L2", ("5", on))
     body["maps"] += maps("other/L2", ("5", on))["maps"]
     vehicle.problem("POST", f"robots/agv-9/vda5050/state?environment={tower}", 422, json=body)
-    told = vehicle.post("robots/agv-9/vda5050/state", body, 200).json()
-    assert [i["mapId"] for i in told["ignored"]] == ["other/L2"]
+    result = vehicle.post("robots/agv-9/vda5050/state", body, 200).json()
+    assert [i["mapId"] for i in result["ignored"]] == ["other/L2"]
 
 
 def test_whole_site_of_floors() -> None:
@@ -153,19 +153,19 @@ def test_a_state_is_a_status(api: Api, farm: str) -> None:
     def say(body: dict[str, Any], query: str = "") -> Any:
         return vehicle.post(url + query, body, 200).json()
 
-    (told,) = say(maps(farm, ("2", "ENABLED"), ("1", "DISABLED")))["robots"]
-    assert (told["channel"], told["version"], told["state"]) == ("production", 2, "active")
-    assert told["lag"]["differs"] is False
+    (robot,) = say(maps(farm, ("2", "ENABLED"), ("1", "DISABLED")))["robots"]
+    assert (robot["channel"], robot["version"], robot["state"]) == ("production", 2, "active")
+    assert robot["lag"]["differs"] is False
     plan = {"version": 3, "rollout": {"ready": 1}}
     planned = api("PUT", f"environments/{farm}/channels/production", 200, json=plan).json()
     assert planned["robots"]["ready"] == 0
     failing = [{"actionId": f"downloadMap:{farm}:3:ab", "actionStatus": "FAILED", "resultDescription": "disk full"}]
-    (told,) = say(maps(farm, ("2", "ENABLED"), actionStates=failing))["robots"]
-    assert (told["state"], told["version"], told["detail"]) == ("failed", 3, "disk full")
+    (robot,) = say(maps(farm, ("2", "ENABLED"), actionStates=failing))["robots"]
+    assert (robot["state"], robot["version"], robot["detail"]) == ("failed", 3, "disk full")
     both = maps(farm, ("3", "DISABLED"), ("2", "ENABLED"))
     for _ in range(3):
-        (told,) = say(both)["robots"]
-        assert (told["state"], told["version"], told["holds"]["version"]) == ("ready", 3, 2)
+        (robot,) = say(both)["robots"]
+        assert (robot["state"], robot["version"], robot["holds"]["version"]) == ("ready", 3, 2)
     states = [(h["state"], h["version"]) for h in api.get("robots/agv-1").json()["history"]]
     assert states == [("ready", 3), ("failed", 3), ("active", 2)]
     other = maps("hall", ("2", "ENABLED"))
@@ -176,11 +176,11 @@ def test_what_is_not_known_is_told(api: Api, farm: str, bare: str) -> None:
     editor = api.token_for("editor", environments=farm)
     body = maps(farm, ("99", "ENABLED"))
     body["maps"] += maps("nowhere", ("1", "ENABLED"))["maps"] + maps(bare, ("0", "ENABLED"))["maps"]
-    told = editor.post("robots/agv-2/vda5050/state", body, 200).json()
-    assert told["robots"] == []
-    assert [i["mapId"] for i in told["ignored"]] == sorted([farm, "nowhere", bare])
-    told = editor.post("robots/agv-2/vda5050/state", maps(farm, ("a-b", "ENABLED")), 200).json()
-    assert "no version's number" in told["ignored"][0]["why"]
+    result = editor.post("robots/agv-2/vda5050/state", body, 200).json()
+    assert result["robots"] == []
+    assert [i["mapId"] for i in result["ignored"]] == sorted([farm, "nowhere", bare])
+    result = editor.post("robots/agv-2/vda5050/state", maps(farm, ("a-b", "ENABLED")), 200).json()
+    assert "no version's number" in result["ignored"][0]["why"]
     editor.problem("POST", f"robots/agv-2/vda5050/state?environment={farm}", 422, json=body)
     api.token_for("robot", robot="agv-1").problem("POST", "robots/agv-2/vda5050/state", 403, json=body)
     api.token_for("viewer").problem("POST", "robots/agv-2/vda5050/state", 403, json=body)

@@ -109,8 +109,8 @@ def test_a_dry_run_stores_nothing(api: Api, bare: str) -> None:
     assert body["changes"]["topology"]["added"] == 6
     assert len(body["root"]) == 64
     assert api.get(f"environments/{bare}").json()["version"] == 0
-    made = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}).json()
-    assert made["root"] == body["root"]
+    version = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}).json()
+    assert version["root"] == body["root"]
 
 
 @pytest.mark.parametrize("tag", ['"0"', '"7", "0"', "*"])
@@ -155,11 +155,11 @@ def test_a_request_that_changed_nothing_undoes_nothing_when_sent_again(api: Api,
 def test_a_revert_is_a_version(api: Api, farm: str) -> None:
     body = {"revert_to": 1, "message": "the gate was open"}
     answer = api.post(f"environments/{farm}/versions", body, headers={"If-Match": '"3"', "Idempotency-Key": "r"})
-    made = answer.json()
-    assert (made["version"], made["parent"], made["message"]) == (4, 3, "the gate was open")
-    assert made["root"] == api.get(f"environments/{farm}/versions/1").json()["root"]
+    version = answer.json()
+    assert (version["version"], version["parent"], version["message"]) == (4, 3, "the gate was open")
+    assert version["root"] == api.get(f"environments/{farm}/versions/1").json()["root"]
     again = api.post(f"environments/{farm}/versions", body, headers={"If-Match": '"3"', "Idempotency-Key": "r"})
-    assert again.json() == made
+    assert again.json() == version
     api.post(f"environments/{farm}/versions", {"revert_to": 4}, expect=200)
     api.problem("POST", f"environments/{farm}/versions", 404, json={"revert_to": 99})
     api.problem("POST", f"environments/{farm}/versions", 412, json=body, headers={"If-Match": '"3"'})

@@ -39,8 +39,8 @@ class Nothing:
 @pytest.fixture
 def blank(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two more ways to a grid, of which the cheaper one never works."""
-    known = dict(derive.all_derivations())
-    monkeypatch.setattr(derive, "_registry", {k: d for k, d in known.items() if d.gives != "occupancy"})
+    derivations = dict(derive.all_derivations())
+    monkeypatch.setattr(derive, "_registry", {k: d for k, d in derivations.items() if d.gives != "occupancy"})
 
     @derives(gives="occupancy", needs={"objects"}, parameters=Blank, cost=5.0)
     def blank_grid(layers: Layers, parameters: Blank, notes: Notes) -> Layers:
@@ -58,14 +58,14 @@ def blank(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_next_way_is_taken_and_notes_are_told(blank: None) -> None:
-    made = offline({"a.geojson": SQUARE}, "occupancy_grid", options={"side": "7"})
-    assert b"7 7" in made.files["map.pgm"][:20]
-    line = next(line for line in made.report["layers"] if line["layer"] == "occupancy")
+    converted = offline({"a.geojson": SQUARE}, "occupancy_grid", options={"side": "7"})
+    assert b"7 7" in converted.files["map.pgm"][:20]
+    line = next(line for line in converted.report["layers"] if line["layer"] == "occupancy")
     assert line["information"] == "derived"
     assert line["sources"] == ["a.geojson"]
     assert line["steps"] == [{"step": "blank_grid", "from": ["objects"], "to": "occupancy", "parameters": {"side": 7}}]
-    assert {"problem": "it is blank"} in made.report["warnings"]
-    assert {"what": "objects", "count": 1, "why": "a blank grid shows none"} in made.report["dropped"]
+    assert {"problem": "it is blank"} in converted.report["warnings"]
+    assert {"what": "objects", "count": 1, "why": "a blank grid shows none"} in converted.report["dropped"]
 
 
 def test_when_nothing_is_left_every_reason_is_told(blank: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,10 +79,12 @@ def test_a_parameter_makes_a_stored_layer_anew(blank: None) -> None:
     yaml = b"image: map.pgm\nresolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     files = {"map.yaml": yaml, "map.pgm": b"P5 2 1 255\n\0\xfe", "a.geojson": SQUARE}
     stored = offline(files, "occupancy_grid")
-    assert [told["information"] for told in stored.report["layers"] if told["layer"] == "occupancy"] == ["raw"]
-    made = offline(files, "occupancy_grid", options={"side": "3"})
-    assert b"3 3" in made.files["map.pgm"][:20]
-    assert [told["information"] for told in made.report["layers"] if told["layer"] == "occupancy"] == ["derived"]
+    assert [entry["information"] for entry in stored.report["layers"] if entry["layer"] == "occupancy"] == ["raw"]
+    converted = offline(files, "occupancy_grid", options={"side": "3"})
+    assert b"3 3" in converted.files["map.pgm"][:20]
+    assert [entry["information"] for entry in converted.report["layers"] if entry["layer"] == "occupancy"] == [
+        "derived"
+    ]
     with pytest.raises(Invalid, match="side"):
         offline(files, "occupancy_grid", options={"side": "3"}, derived=False)
 
@@ -137,9 +139,9 @@ def test_of_several_grids_one_has_to_be_named(api: Api) -> None:
     api.post("environments", {"name": "two-grids"})
     for name in ("coarse", "fine"):
         size = b"0.2" if name == "coarse" else b"0.1"
-        said = b"image: %s.pgm\nresolution: %s\norigin: [0, 0, 0]\nnegate: 0\n" % (name.encode(), size)
+        map_yaml = b"image: %s.pgm\nresolution: %s\norigin: [0, 0, 0]\nnegate: 0\n" % (name.encode(), size)
         more = b"occupied_thresh: 0.65\nfree_thresh: 0.196\n"
-        api.upload("two-grids", {f"{name}.yaml": said + more, f"{name}.pgm": ROOM}, grid=name)
+        api.upload("two-grids", {f"{name}.yaml": map_yaml + more, f"{name}.pgm": ROOM}, grid=name)
     rows = {row["format"]: row for row in api.get("environments/two-grids/versions/latest/maps").json()}
     assert rows["tmap2"]["state"] == "derivable"
     assert rows["tmap2"]["chain"][0]["step"] == "occupancy_to_topology"

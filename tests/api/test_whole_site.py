@@ -25,9 +25,9 @@ ODD_LEVELS = ("map.yaml", "a/b", "..", "Étage 2", "L2 ", "50%", "a%2Fb", "x?y#z
 
 def zone(name: str, kind: str, value: Any = None, *, x: float = 0.0) -> dict[str, Any]:
     ring = [[x, -1.0], [x + 1.0, -1.0], [x + 1.0, 0.0], [x, 0.0], [x, -1.0]]
-    said = {"kind": kind} | ({} if value is None else {"value": value})
+    properties = {"kind": kind} | ({} if value is None else {"value": value})
     geometry = {"type": "Polygon", "coordinates": [ring]}
-    return {"type": "Feature", "id": name, "properties": said, "geometry": geometry}
+    return {"type": "Feature", "id": name, "properties": properties, "geometry": geometry}
 
 
 def draw(api: Api, env: str, *features: dict[str, Any], level: str = "ground") -> None:
@@ -52,10 +52,10 @@ def names_of(body: dict[str, Any], fmt: str = "occupancy_grid") -> list[str]:
     return [f["name"] for f in body["files"] if f["format"] == fmt]
 
 
-def check_files(api: Api, env: str, body: dict[str, Any], own: str = "") -> None:
+def check_files(api: Api, env: str, body: dict[str, Any], query: str = "") -> None:
     """Each file of a manifest is had by its name, with these bytes."""
     for file in body["files"]:
-        path = f"environments/{env}/versions/{body['version']}/maps/{file['format']}/{quote(file['name'])}{own}"
+        path = f"environments/{env}/versions/{body['version']}/maps/{file['format']}/{quote(file['name'])}{query}"
         got = api.get(path).content
         assert hashlib.sha256(got).hexdigest() == file["sha256"], file
         assert len(got) == file["size"]
@@ -118,14 +118,14 @@ def test_an_environment_uploaded_again_as_its_package_has_the_same_root(
         package = api.get(f"environments/{name}/versions/latest/maps/environment").content
         copy = fresh()
         api.post("environments", {"name": copy})
-        made = api.upload(copy, {"environment.zip": package}).json()
+        version = api.upload(copy, {"environment.zip": package}).json()
         before = api.get(f"environments/{name}/versions/latest").json()
-        assert made["root"] == before["root"]
-        assert made["warnings"] == []
+        assert version["root"] == before["root"]
+        assert version["warnings"] == []
         for env in (name, copy):
             network = yaml.safe_load(api.get(f"/maps/{env}/tmap2/network.tmap2.yaml").content)
-            said = {network[key] for key in ("name", "metric_map", "pointset")}
-            assert said == {env} if name != real else "riseholme" in network["name"], "an uploaded one keeps its own"
+            names = {network[key] for key in ("name", "metric_map", "pointset")}
+            assert names == {env} if name != real else "riseholme" in network["name"], "an uploaded one keeps its own"
 
 
 def test_manifest_lists_drawn_masks_of_polytunnels(api: Api, polytunnels: str) -> None:
@@ -142,16 +142,16 @@ def test_manifest_lists_drawn_masks_of_polytunnels(api: Api, polytunnels: str) -
 def test_zip_of_all_has_the_files_of_the_manifest(api: Api, office: str) -> None:
     files = unzipped(api.get(f"/maps/{office}/occupancy_grid?level=*&grid=*").content)
     body = listed(api, office, "occupancy_grid")
-    told = {f["name"]: f["sha256"] for f in body["files"]}
-    assert told == {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
+    hashes = {f["name"]: f["sha256"] for f in body["files"]}
+    assert hashes == {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     for name, data in files.items():
         if name.endswith("map.yaml"):
             assert yaml.safe_load(data)["image"] == "map.pgm", "beside its YAML"
-    whole = api.get(f"/maps/{office}/occupancy_grid?level=*&grid=*")
+    response = api.get(f"/maps/{office}/occupancy_grid?level=*&grid=*")
     again = api.get(
-        f"/maps/{office}/occupancy_grid?level=*&grid=*", expect=304, headers={"if-none-match": whole.headers["etag"]}
+        f"/maps/{office}/occupancy_grid?level=*&grid=*", expect=304, headers={"if-none-match": response.headers["etag"]}
     )
-    assert again.headers["fleetmap-root"] == whole.headers["fleetmap-root"]
+    assert again.headers["fleetmap-root"] == response.headers["fleetmap-root"]
 
 
 @pytest.mark.parametrize(
@@ -223,9 +223,9 @@ def test_zones_of_other_kinds_draw_no_mask(api: Api, house: str) -> None:
 def test_mask_that_cannot_be_drawn_fails_the_whole_format(api: Api, house: str) -> None:
     draw(api, house, zone("a", "speed", 0.5), zone("b", "speed", "50%", x=1.0), zone("c", "keepout", x=2.0))
     path = f"environments/{house}/versions/latest/manifest?formats=occupancy_grid"
-    told = api.problem("GET", path, 422)["detail"]
-    assert "max_speed" in told
-    assert told.startswith("occupancy_grid: ")
+    detail = api.problem("GET", path, 422)["detail"]
+    assert "max_speed" in detail
+    assert detail.startswith("occupancy_grid: ")
     assert "keepout.pgm" in names_of(listed(api, house, "occupancy_grid?max_speed=2"))
     check_files(api, house, listed(api, house, "occupancy_grid?max_speed=2"), "?max_speed=2")
     api.get(f"/maps/{house}/occupancy_grid/map.yaml")
@@ -334,8 +334,8 @@ def test_optional_formats_that_cannot_be_given_are_listed(api: Api, house: str) 
     assert {line["format"] for line in body["missing"]} == {"kml", "datum"}
     assert all("upload" in line["detail"] for line in body["missing"])
     assert {"map.yaml", "L2/map.yaml"} <= set(names_of(body))
-    told = api.problem("GET", f"environments/{house}/versions/latest/manifest?formats=occupancy_grid,kml", 422)
-    assert "kml" in told["detail"]
+    problem = api.problem("GET", f"environments/{house}/versions/latest/manifest?formats=occupancy_grid,kml", 422)
+    assert "kml" in problem["detail"]
 
 
 def test_optional_format_whose_making_fails_is_not_tried_again_at_once(

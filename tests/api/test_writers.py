@@ -53,9 +53,9 @@ def races(api: Api, env: str) -> None:
     listed = api.get(f"environments/{env}/versions?limit=100").json()
     assert [v["version"] for v in listed] == list(range(last, -1, -1))
     assert [v["parent"] for v in listed] == [*range(last - 1, -1, -1), None]
-    told = {v["version"]: v["message"] for v in listed}
+    messages = {v["version"]: v["message"] for v in listed}
     for k, (status, body) in enumerate(answers):
-        assert status == 200 or told[body["version"]] == f"by writer {k}"
+        assert status == 200 or messages[body["version"]] == f"by writer {k}"
     zones = api.get(f"environments/{env}/versions/latest/layers/zones?crs=local").json()["features"]
     assert {z["id"] for z in zones} == {f"z{k}" for k in range(WRITERS)}, "nobody has overwritten another"
     lines = api.get(f"events?environment={env}&since=0&follow=false").text.splitlines()

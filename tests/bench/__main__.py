@@ -89,13 +89,13 @@ def conversions(tries: int) -> list[dict[str, Any]]:
         )
     )
     rows = []
-    for what, name, files, to, more, floor in cases:
+    for label, name, files, to, more, floor in cases:
         low = best(floor, tries)
         ours = best(lambda: offline(files, to, **more), tries)  # noqa: B023
         bound = 2 * low + ALLOWED_MS
         rows.append(
             {
-                "conversion": what,
+                "conversion": label,
                 "input": name,
                 "floor_ms": low,
                 "ours_ms": ours,
@@ -130,7 +130,7 @@ def _first_gets(client: httpx.Client, tries: int) -> list[dict[str, Any]]:
         ("first GET, osm → tmap2", "map.osm", osm, "tmap2", {}),
     )
     rows = []
-    for what, name, data, to, more in cases:
+    for label, name, data, to, more in cases:
         bare = best(lambda: offline({name: data}, to, **more), tries)  # noqa: B023
         times = []
         for k in range(tries + 1):
@@ -153,7 +153,7 @@ def _first_gets(client: httpx.Client, tries: int) -> list[dict[str, Any]]:
         first = min(times[1:])
         rows.append(
             {
-                "what": what,
+                "what": label,
                 "peer": bare,
                 "ours": first,
                 "unit": "ms",
@@ -179,7 +179,7 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
     one, large = "/maps/bench/datum", "/maps/bench/occupancy_grid/big.pgm"
     tag = client.get(one).headers["etag"]
     rows = []
-    for what, ours_path, peer_path, more, peer_more, bound in (
+    for label, ours_path, peer_path, more, peer_more, bound in (
         ("repeated GET, 1 kB", one, "/1k", {}, {}, 0.6),
         ("repeated GET, 100 kB", large, "/100k", {}, {}, 0.9),
         ("repeated GET, 304", one, "/1k", {"If-None-Match": tag}, {"If-None-Match": '"tag"'}, 0.6),
@@ -188,16 +188,16 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
         for _ in range(3):  # in turns, so that a noisy machine is noisy to both
             theirs.append(http.rate(peer, peer_path, peer_more))
             ours.append(http.rate(port, ours_path, {**auth, **more}))
-        mine, bare = max(ours), max(theirs)
+        ours_best, bare = max(ours), max(theirs)
         rows.append(
             {
-                "what": what,
+                "what": label,
                 "peer": bare,
-                "ours": mine,
+                "ours": ours_best,
                 "unit": "1/s",
-                "ratio": mine / bare,
+                "ratio": ours_best / bare,
                 "bound": f"≥ {bound}",
-                "holds": mine >= bound * bare,
+                "holds": ours_best >= bound * bare,
             }
         )
     return rows
@@ -206,8 +206,8 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
 def farm_grid() -> OccupancyGrid:
     """The real map of 4000 × 4000 cells."""
     files = {name: (DATA / FARM / "metric/map" / name).read_bytes() for name in ("map.yaml", "map.png")}
-    told = bundle.read(files, Hints(), bundle.Known(None, None, None, True, False), Limits())
-    (grid,) = told.layers(None).grids().values()
+    upload_bundle = bundle.read(files, Hints(), bundle.Known(None, None, None, True, False), Limits())
+    (grid,) = upload_bundle.layers(None).grids().values()
     return grid
 
 
@@ -238,13 +238,13 @@ def main() -> int:
     served = serving(arguments.tries) if arguments.only in (None, "serving") else []
     paths = networks.rows(farm_grid(), arguments.tries) if arguments.only in (None, "networks") else []
     big = memory() if arguments.only in (None, "large") else []
-    told = events.rows() if arguments.only in (None, "events") else []
+    event_rows = events.rows() if arguments.only in (None, "events") else []
     closed = closures.rows() if arguments.only in (None, "closures") else []
-    made = generate.rows() if arguments.only in (None, "generate") else []
+    generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
     if arguments.json:
-        tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": told}
-        tables |= {"closures": closed, "generate": made, "derived": huge}
+        tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": event_rows}
+        tables |= {"closures": closed, "generate": generation_rows, "derived": huge}
         print(json.dumps(tables, indent=2))
     else:
         console = Console(width=110)
@@ -262,7 +262,13 @@ def main() -> int:
                     "yes" if r["holds"] else "NO",
                 )
             console.print(table)
-        ratios = {"served": served, "grid → network": paths, "events": told, "closures": closed, "generated": made}
+        ratios = {
+            "served": served,
+            "grid → network": paths,
+            "events": event_rows,
+            "closures": closed,
+            "generated": generation_rows,
+        }
         for title, rows in ratios.items():
             if not rows:
                 continue
@@ -294,10 +300,14 @@ def main() -> int:
         if huge:
             table = Table("20 000 × 14 000 cells", "s", "peak GB, of the whole process", "bound", "holds")
             for r in huge:
-                spent, most = f"{r['ms'] / 1e3:.0f}", f"≤ {derived.MOST / 1e9:.0f}"
-                table.add_row(r["map"], spent, f"{r['peak'] / 1e9:.2f}", most, "yes" if r["holds"] else "NO")
+                spent, bound = f"{r['ms'] / 1e3:.0f}", f"≤ {derived.MOST / 1e9:.0f}"
+                table.add_row(r["map"], spent, f"{r['peak'] / 1e9:.2f}", bound, "yes" if r["holds"] else "NO")
             console.print(table)
-    return 0 if all(r["holds"] for r in [*converted, *served, *paths, *big, *told, *closed, *made, *huge]) else 1
+    return (
+        0
+        if all(r["holds"] for r in [*converted, *served, *paths, *big, *event_rows, *closed, *generation_rows, *huge])
+        else 1
+    )
 
 
 if __name__ == "__main__":

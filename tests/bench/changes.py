@@ -23,8 +23,8 @@ Upload = Callable[[str, dict[str, bytes]], Any]
 def moved_node(shared: Path, upload: Upload, server: str, token: str) -> int:
     """One node of the strawberry polytunnels' network is moved by 25 cm: bytes."""
     network = (shared / FARM / "topological/network.tmap2.yaml").read_bytes()
-    found = list(re.finditer(rb"\n      position:\n        x: (\S+)", network))
-    x = found[len(found) // 2]
+    matches = list(re.finditer(rb"\n      position:\n        x: (\S+)", network))
+    x = matches[len(matches) // 2]
     moved = network[: x.start(1)] + f"{float(x[1]) + 0.25:.6f}".encode() + network[x.end(1) :]
     before, after = {"network.tmap2.yaml": network}, {"network.tmap2.yaml": moved}
     return _cost("moved-node", "tmap2", before, after, upload, server, token)
@@ -48,23 +48,23 @@ def changed_block(shared: Path, upload: Upload, server: str, token: str) -> tupl
 def _cost(
     env: str, kind: str, before: dict[str, bytes], after: dict[str, bytes], upload: Upload, server: str, token: str
 ) -> int:
-    said: list[tuple[str, dict[str, Any]]] = []
+    events: list[tuple[str, dict[str, Any]]] = []
     with tempfile.TemporaryDirectory() as folder:
         options = Options(server=server, environment=env, formats=(kind,), into=Path(folder) / "robot", token=token)
         upload(env, before)
-        agent = Agent(options, lambda what, **more: said.append((what, more)))
+        agent = Agent(options, lambda event, **more: events.append((event, more)))
         agent.open()
         try:
-            _sync(agent, said)
+            _sync(agent, events)
             upload(env, after)
-            return _sync(agent, said)
+            return _sync(agent, events)
         finally:
             agent.close()
 
 
-def _sync(agent: Agent, said: list[tuple[str, dict[str, Any]]]) -> int:
+def _sync(agent: Agent, events: list[tuple[str, dict[str, Any]]]) -> int:
     received = agent._web.received
-    said.clear()
-    if not agent.once() or not any(what == "switched" for what, _ in said):
-        raise RuntimeError(f"the agent has not switched: {said}")
+    events.clear()
+    if not agent.once() or not any(event == "switched" for event, _ in events):
+        raise RuntimeError(f"the agent has not switched: {events}")
     return agent._web.received - received

@@ -110,11 +110,11 @@ class _Fleet:
         deadline = time.monotonic() + seconds
         while True:
             with self._lock:
-                found = dict(self._switched.get(digest, {}))
-            if len(found) == ROBOTS:
-                return list(found.values())
+                reports = dict(self._switched.get(digest, {}))
+            if len(reports) == ROBOTS:
+                return list(reports.values())
             if time.monotonic() > deadline:
-                raise RuntimeError(f"{len(found)} of {ROBOTS} agents hold files with the closures {digest[:8]}")
+                raise RuntimeError(f"{len(reports)} of {ROBOTS} agents hold files with the closures {digest[:8]}")
             time.sleep(0.01)
 
     def forget(self) -> None:
@@ -134,8 +134,8 @@ def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> 
     lock = threading.Lock()
 
     def report_as(robot: str, current: Path) -> Any:
-        def report(what: str, **_: Any) -> None:
-            if what == "active":
+        def report(event: str, **_: Any) -> None:
+            if event == "active":
                 body = json.loads((current / "closures.json").read_text())
                 with lock:
                     line = {"robot": robot, "digest": body["digest"], "at": time.monotonic()}

@@ -98,8 +98,8 @@ def aisles(scale: float) -> Layers:
             for k, m in ((i + 1, j), (i, j + 1)):
                 if k < len(xs) and m < len(ys):
                     line = shapely.LineString([(x, y), (xs[k], ys[m])])
-                    said = {"kind": "edge", "source": f"{i}/{j}", "target": f"{k}/{m}", "width": 2.0}
-                    rows.append((f"{i}/{j}-{k}/{m}", line, said))
+                    properties = {"kind": "edge", "source": f"{i}/{j}", "target": f"{k}/{m}", "width": 2.0}
+                    rows.append((f"{i}/{j}-{k}/{m}", line, properties))
     return Layers({PartKey("topology", "ground", NETWORK): features(rows, "local")})
 
 
@@ -127,26 +127,26 @@ def measure(name: str) -> dict[str, Any]:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{name}: {done.stderr[-2000:]}")
-    told: dict[str, Any] = json.loads(done.stdout)
-    return {"map": name, **told, "holds": told["peak"] <= MOST}
+    figures: dict[str, Any] = json.loads(done.stdout)
+    return {"map": name, **figures, "holds": figures["peak"] <= MOST}
 
 
 def run(case: Case, scale: float) -> Layers:
     """Derive it once."""
-    known = derive.all_derivations()[case.step]
-    return known.function(case.make(scale), known.parameters(**case.parameters), Notes())
+    derivation = derive.all_derivations()[case.step]
+    return derivation.function(case.make(scale), derivation.parameters(**case.parameters), Notes())
 
 
 def _child(name: str) -> None:
     case = CASES[name]
     run(case, SMALL)
-    known = derive.all_derivations()[case.step]
-    layers, options = case.make(1.0), known.parameters(**case.parameters)
+    derivation = derive.all_derivations()[case.step]
+    layers, options = case.make(1.0), derivation.parameters(**case.parameters)
     reset()
     start = time.perf_counter()
-    made = known.function(layers, options, Notes())
+    derived_layers = derivation.function(layers, options, Notes())
     spent = time.perf_counter() - start
-    (part,) = made.parts.values()
+    (part,) = derived_layers.parts.values()
     size = part.cells.size if isinstance(part, OccupancyGrid) else len(part)  # type: ignore[arg-type]
     print(json.dumps({"ms": spent * 1e3, "peak": peak(), "result": size}))
 

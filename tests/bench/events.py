@@ -137,9 +137,9 @@ def latency() -> list[dict[str, Any]]:
         def take_bare(sample: zenoh.Sample) -> None:
             bare.append((time.time(), bytes(sample.payload)))
 
-        held: list[Any] = []
+        declarations: list[Any] = []
         for session in sessions:
-            held.append(
+            declarations.append(
                 ext.declare_advanced_subscriber(
                     session,
                     messages.events_key(messages.PREFIX, ENVIRONMENT),
@@ -148,7 +148,7 @@ def latency() -> list[dict[str, Any]]:
                     recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
                 )
             )
-            held.append(session.declare_subscriber("bare/events", take_bare))
+            declarations.append(session.declare_subscriber("bare/events", take_bare))
         time.sleep(3.0)
         arrived.clear()
         generation, ours = Generation(Path(folder) / "blobs"), []
@@ -174,18 +174,18 @@ def latency() -> list[dict[str, Any]]:
         floor = [(at - json.loads(body)["time"]) * 1e3 for at, body in bare]
         for session in sessions:
             session.close()  # type: ignore[no-untyped-call]
-    mine, peer = statistics.median(ours), statistics.median(floor)
+    our_median, peer = statistics.median(ours), statistics.median(floor)
     complete = len(arrived) == SESSIONS * COMMITS
     bound = 2 * peer + ALLOWED_MS
     return [
         {
             "what": f"commit → event at {SESSIONS} sessions, p50 (peer: a bare put)",
             "peer": peer,
-            "ours": mine,
+            "ours": our_median,
             "unit": "ms",
-            "ratio": mine / peer,
+            "ratio": our_median / peer,
             "bound": f"≤ {bound:.1f} ms",
-            "holds": complete and mine <= bound,
+            "holds": complete and our_median <= bound,
         }
     ]
 
@@ -224,10 +224,10 @@ def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> 
     lock = threading.Lock()
 
     def tell_as(robot: str) -> Any:
-        def tell(what: str, **members: Any) -> None:
-            if what in ("active", "connected", "failed", "refused"):
-                line = {"robot": robot, "event": what, "at": time.monotonic(), "version": members.get("version")}
-                if what in ("failed", "refused"):
+        def tell(event: str, **members: Any) -> None:
+            if event in ("active", "connected", "failed", "refused"):
+                line = {"robot": robot, "event": event, "at": time.monotonic(), "version": members.get("version")}
+                if event in ("failed", "refused"):
                     line["detail"] = members.get("detail")
                 with lock:
                     print(json.dumps(line), flush=True)
@@ -313,23 +313,23 @@ class _Robots:
 def convergence() -> list[dict[str, Any]]:
     """The router is killed, a change is committed, the router comes back: until all 500 agents drive on the change."""
     port, zenoh_port = http.free_port(), http.free_port()
-    where = f"tcp/127.0.0.1:{zenoh_port}"
-    options = router_configuration(BusOptions(listen=where))
+    endpoint = f"tcp/127.0.0.1:{zenoh_port}"
+    options = router_configuration(BusOptions(listen=endpoint))
     router = Router(options)
     # 500 robots have 500 disks: here their folders are in memory, where that is to be had.
     shared = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     disk = Path(tempfile.mkdtemp(dir=shared))
-    more = {"FLEETMAP_ZENOH_MODE": "client", "FLEETMAP_ZENOH_CONNECT": where, "FLEETMAP_ZENOH_ADVERTISE": where}
+    more = {"FLEETMAP_ZENOH_MODE": "client", "FLEETMAP_ZENOH_CONNECT": endpoint, "FLEETMAP_ZENOH_ADVERTISE": endpoint}
     try:
         with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port, **more) as client:
             robots = _Robots(f"http://127.0.0.1:{port}", zenoh_port, disk)
             _until(lambda: len(robots.times("active", 1)) == ROBOTS and len(robots.times("connected")) == ROBOTS, 300)
             # All hear of a change at once: one conversion.
-            made, at = conversions(client), time.monotonic()
+            count_before, at = conversions(client), time.monotonic()
             second = commit(client, 1.0)
             _until(lambda: len(robots.times("active", second)) == ROBOTS, 120)
             heard = max(robots.times("active", second).values()) - at
-            one = conversions(client) - made
+            one = conversions(client) - count_before
             # And after the router's restart.
             router._process.kill()
             router.close()
@@ -341,7 +341,7 @@ def convergence() -> list[dict[str, Any]]:
                 raise RuntimeError(router.problem)
             _until(lambda: len(robots.times("active", third)) == ROBOTS, 120)
             seconds = max(robots.times("active", third).values()) - back
-            another = conversions(client) - made - one
+            another = conversions(client) - count_before - one
             time.sleep(2.0)
             manifest = client.get(f"/api/v1/environments/{ENVIRONMENT}/versions/latest/manifest?formats=tmap2")
             last = int(manifest.json()["sequence"])
@@ -352,7 +352,7 @@ def convergence() -> list[dict[str, Any]]:
     finally:
         router.close()
         shutil.rmtree(disk, ignore_errors=True)
-    lost = sum(not set(range(2, last + 1)) <= set(found) for found in sequences.values())
+    lost = sum(not set(range(2, last + 1)) <= set(numbers) for numbers in sequences.values())
     print(f"all {ROBOTS} robots drove on a change {heard:.1f} s after it was sent", file=sys.stderr)
     row = {"peer": None, "ratio": None}
     return [
@@ -378,8 +378,8 @@ def convergence() -> list[dict[str, Any]]:
 
 def conversions(client: httpx.Client) -> int:
     """Maps that the server has made."""
-    found = re.search(r'fleetmap_conversions_total\{format="tmap2",result="made"\} (\S+)', client.get("/metrics").text)
-    return int(float(found[1])) if found else 0
+    match = re.search(r'fleetmap_conversions_total\{format="tmap2",result="made"\} (\S+)', client.get("/metrics").text)
+    return int(float(match[1])) if match else 0
 
 
 # --- what a change costs a robot --------------------------------------------------------------------------------------

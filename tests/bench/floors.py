@@ -70,13 +70,13 @@ def kml_to_tmap2(data: bytes) -> str:
     names: list[str] = []
     places: list[str] = []
     links: dict[str, list[str]] = defaultdict(list)
-    known: dict[str, str] = {}
+    node_names: dict[str, str] = {}
     for k, coordinates in enumerate(root.iter("{*}coordinates")):
         last = None
         for j, point in enumerate((coordinates.text or "").split()):
-            name = known.get(point)
+            name = node_names.get(point)
             if name is None:
-                name = known[point] = f"n{k}_{j}"
+                name = node_names[point] = f"n{k}_{j}"
                 names.append(name)
                 places.append(point)
             if last is not None:
@@ -101,15 +101,15 @@ def tmap2_to_kml(data: bytes) -> str:
     for n in nodes:
         node = n["node"]
         edges = node.pop("edges")
-        own = "".join(more % (k, orjson.dumps(v).decode()) for k, v in node.items())
+        extended_data = "".join(more % (k, orjson.dumps(v).decode()) for k, v in node.items())
         out.append(
-            f"<Placemark><name>{node['name']}</name><ExtendedData>{own}</ExtendedData>"
+            f"<Placemark><name>{node['name']}</name><ExtendedData>{extended_data}</ExtendedData>"
             f"<Point><coordinates>{place[node['name']]}</coordinates></Point></Placemark>\n"
         )
         for e in edges:
-            own = "".join(more % (k, orjson.dumps(v).decode()) for k, v in e.items())
+            extended_data = "".join(more % (k, orjson.dumps(v).decode()) for k, v in e.items())
             out.append(
-                f"<Placemark><name>{e['edge_id']}</name><ExtendedData>{own}</ExtendedData><LineString><coordinates>"
+                f"<Placemark><name>{e['edge_id']}</name><ExtendedData>{extended_data}</ExtendedData><LineString><coordinates>"
                 f"{place[node['name']]} {place[e['node']]}</coordinates></LineString></Placemark>\n"
             )
     return "".join(out) + "</Document></kml>"
@@ -117,8 +117,8 @@ def tmap2_to_kml(data: bytes) -> str:
 
 def datum_to_kml(data: bytes) -> str:
     """The fence as a polygon."""
-    known = yaml.load(data, yaml.CSafeLoader)
-    ring = " ".join(f"{lon!r},{lat!r}" for lat, lon in known["gnss_fence"]["gnss_fence_coords"])
+    document = yaml.load(data, yaml.CSafeLoader)
+    ring = " ".join(f"{lon!r},{lat!r}" for lat, lon in document["gnss_fence"]["gnss_fence_coords"])
     return (
         '<?xml version="1.0" encoding="UTF-8"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark>'
         f"<name>fence</name><Polygon><outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing>"
@@ -128,15 +128,15 @@ def datum_to_kml(data: bytes) -> str:
 
 def grid_to_kml(described: bytes, picture: bytes) -> str:
     """The grid as a ground overlay: its corners, not its cells."""
-    known = dict(re.findall(r"(\w+):\s*(.+)", described.decode()))
+    map_yaml = dict(re.findall(r"(\w+):\s*(.+)", described.decode()))
     width, height = Image.open(io.BytesIO(picture)).size
-    x, y, _ = (float(v) for v in known["origin"].strip("[] ").split(","))
-    res = float(known["resolution"])
+    x, y, _ = (float(v) for v in map_yaml["origin"].strip("[] ").split(","))
+    res = float(map_yaml["resolution"])
     back = Proj("+proj=tmerc +lat_0=53.268642038 +lon_0=-0.524509505881 +k=1 +ellps=WGS84")
     lon, lat = back([x, x + width * res], [y, y + height * res], inverse=True)
     return (
         '<?xml version="1.0" encoding="UTF-8"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><GroundOverlay>'
-        f"<name>map</name><Icon><href>{known['image']}</href></Icon><LatLonBox><north>{lat[1]!r}</north>"
+        f"<name>map</name><Icon><href>{map_yaml['image']}</href></Icon><LatLonBox><north>{lat[1]!r}</north>"
         f"<south>{lat[0]!r}</south><east>{lon[1]!r}</east><west>{lon[0]!r}</west></LatLonBox></GroundOverlay>"
         "</Document></kml>"
     )

@@ -67,12 +67,12 @@ def collapse() -> list[dict[str, Any]]:
             out = _wfc.rendered(model, tiles)
             apart.append(float(np.abs(pairs(out) - pairs(sample)).max()))
             share.append(abs(float((out == OCCUPIED).mean() - (sample == OCCUPIED).mean())))
-        what = f"wave-function collapse, {side} × {side} tiles"
+        label = f"wave-function collapse, {side} × {side} tiles"
         row = {"peer": None, "ratio": None}
         rows += [
             {
                 **row,
-                "what": f"{what}: slowest of {seeds}",
+                "what": f"{label}: slowest of {seeds}",
                 "ours": max(times),
                 "unit": "s",
                 "bound": "≤ 5 s" if side == 200 else "–",
@@ -80,7 +80,7 @@ def collapse() -> list[dict[str, Any]]:
             },
             {
                 **row,
-                "what": f"{what}: seeds without contradiction",
+                "what": f"{label}: seeds without contradiction",
                 "ours": 100 * (1 - failed / seeds),
                 "unit": "%",
                 "bound": "≥ 99 %",
@@ -88,7 +88,7 @@ def collapse() -> list[dict[str, Any]]:
             },
             {
                 **row,
-                "what": f"{what}: occupied, largest difference",
+                "what": f"{label}: occupied, largest difference",
                 "ours": 100 * max(share),
                 "unit": "%",
                 "bound": f"≤ {100 * SHARE:g} %",
@@ -96,7 +96,7 @@ def collapse() -> list[dict[str, Any]]:
             },
             {
                 **row,
-                "what": f"{what}: neighbours, largest difference",
+                "what": f"{label}: neighbours, largest difference",
                 "ours": 100 * max(apart),
                 "unit": "%",
                 "bound": f"≤ {100 * SHARE:g} %",
@@ -158,11 +158,11 @@ def perlin(x: Array, y: Array, table: NDArray[np.uint8]) -> Array:
     return np.asarray(math.sqrt(2) * (low + w * (high - low)))
 
 
-def _row(what: str, peer: float, ours: float) -> dict[str, Any]:
+def _row(label: str, peer: float, ours: float) -> dict[str, Any]:
     """One against a pass of NumPy: nanoseconds a cell."""
     peer, ours = (1e9 * t / SIDE**2 for t in (peer, ours))
     return {
-        "what": what,
+        "what": label,
         "peer": peer,
         "ours": ours,
         "unit": "ns",

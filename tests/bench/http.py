@@ -101,8 +101,8 @@ def _answer(s: socket.socket) -> bytes:
     while b"\r\n\r\n" not in data:
         data += s.recv(1 << 20)
     head, _, body = data.partition(b"\r\n\r\n")
-    found = re.search(rb"(?i)content-length: *(\d+)", head)
-    need = int(found[1]) if found and b" 304 " not in head.split(b"\r\n")[0] else 0
+    match = re.search(rb"(?i)content-length: *(\d+)", head)
+    need = int(match[1]) if match and b" 304 " not in head.split(b"\r\n")[0] else 0
     while len(body) < need:
         body += s.recv(1 << 20)
     return head + b"\r\n\r\n" + body

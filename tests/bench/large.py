@@ -63,8 +63,8 @@ def octree(kind: str) -> Callable[[float], dict[str, bytes]]:
         order = np.argsort(code)
         depth = np.full(len(code), 16, np.uint8)
         voxels = VoxelMap(0.05, depth, code[order], odds[order], None, kind == "bt")
-        known = formats.get_format("octomap")
-        return formats.write(known, Layers({PartKey("voxels"): voxels}), formats.WriteContext())
+        fmt = formats.get_format("octomap")
+        return formats.write(fmt, Layers({PartKey("voxels"): voxels}), formats.WriteContext())
 
     return make
 
@@ -212,9 +212,9 @@ def photo(end: str, noise: float) -> Callable[[float], dict[str, bytes]]:
             grain = dice.integers(0, 256, (side, 3)) if noise >= 256 else dice.normal(0, noise, (side, 3))
             pixels[y] = grain if noise >= 256 else np.clip(shade[:, None] + np.array([0, 10, 20]) + grain, 0, 255)
         picture = Picture(pixels, (0.1, 0.0, 665000.0, 0.0, -0.1, 5905000.0), "EPSG:32630")
-        known = formats.get_format("satellite")
-        options = formats.write_options(known, {"file_type": end})
-        return formats.write(known, Layers({PartKey("imagery"): picture}), formats.WriteContext(options=options))
+        fmt = formats.get_format("satellite")
+        options = formats.write_options(fmt, {"file_type": end})
+        return formats.write(fmt, Layers({PartKey("imagery"): picture}), formats.WriteContext(options=options))
 
     return make
 
@@ -302,7 +302,7 @@ def measure(name: str, folder: Path) -> dict[str, Any]:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{name}: {done.stderr[-2000:]}")
-    told = json.loads(done.stdout)
+    figures = json.loads(done.stdout)
     case = CASES[name]
     bound = None
     if case.bounded:
@@ -310,11 +310,11 @@ def measure(name: str, folder: Path) -> dict[str, Any]:
     return {
         "map": name,
         "input_mb": size / 1e6,
-        "ms": told["ms"],
-        "peak_mb": told["peak"] / 1e6,
-        "times": told["peak"] / (case.decoded or size),
+        "ms": figures["ms"],
+        "peak_mb": figures["peak"] / 1e6,
+        "times": figures["peak"] / (case.decoded or size),
         "bound": None if bound is None else RASTER_TIMES if case.decoded else TEXT_TIMES,
-        "holds": bound is None or (told["peak"] <= bound and (case.decoded is not None or size >= TEXT)),
+        "holds": bound is None or (figures["peak"] <= bound and (case.decoded is not None or size >= TEXT)),
     }
 
 

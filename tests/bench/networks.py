@@ -31,10 +31,10 @@ def library_skeleton(mask: Any) -> int:
 
 def our_skeleton(grid: OccupancyGrid) -> int:
     """From the grid's cells to the simplified graph, erosion included; how many pieces that graph has."""
-    found = _skeleton.free_cells(grid, unknown=False)
-    assert found is not None
-    where = _skeleton.space(*found, RADIUS / grid.resolution)
-    graph, _ = _skeleton.skeleton(where, merge=6.0, spur=10.0, tolerance=2.0, island=0.0)
+    free_cells = _skeleton.free_cells(grid, unknown=False)
+    assert free_cells is not None
+    free_space = _skeleton.space(*free_cells, RADIUS / grid.resolution)
+    graph, _ = _skeleton.skeleton(free_space, merge=6.0, spur=10.0, tolerance=2.0, island=0.0)
     return _skeleton.pieces(graph)[0]
 
 
@@ -60,14 +60,14 @@ def plain_roadmap(grid: OccupancyGrid) -> nx.Graph:
 
 def our_roadmap(grid: OccupancyGrid) -> tuple[Any, Any]:
     """The same from the grid's cells on: the graph and the clearance of its edges, joined where free space is."""
-    found = _skeleton.free_cells(grid, unknown=False)
-    assert found is not None
-    where = _skeleton.space(*found, RADIUS / grid.resolution)
-    middle, _ = _skeleton.skeleton(where, merge=6.0, spur=10.0, tolerance=2.0, island=0.0)
+    free_cells = _skeleton.free_cells(grid, unknown=False)
+    assert free_cells is not None
+    free_space = _skeleton.space(*free_cells, RADIUS / grid.resolution)
+    middle, _ = _skeleton.skeleton(free_space, merge=6.0, spur=10.0, tolerance=2.0, island=0.0)
     far = MAX_EDGE / grid.resolution
-    graph, _ = _roadmap.roadmap(where, middle, samples=SAMPLES, neighbours=NEIGHBOURS, max_edge=far, seed=0)
+    graph, _ = _roadmap.roadmap(free_space, middle, samples=SAMPLES, neighbours=NEIGHBOURS, max_edge=far, seed=0)
     width = np.empty(len(graph.edges))
-    _kernels_space.widths(where.gap, graph.nodes, graph.edges, width)
+    _kernels_space.widths(free_space.gap, graph.nodes, graph.edges, width)
     return graph, width
 
 
@@ -76,20 +76,20 @@ def rows(grid: OccupancyGrid, tries: int) -> list[dict[str, Any]]:
     mask = distance_transform_edt(grid.cells == FREE) * grid.resolution > RADIUS * (1 + 1e-9)
     same = library_skeleton(mask) == our_skeleton(grid)
     out = []
-    for what, theirs, ours, times in (
+    for label, theirs, ours, times in (
         ("skeleton and graph", lambda: library_skeleton(mask), lambda: our_skeleton(grid), 5.0),
         ("roadmap", lambda: plain_roadmap(grid), lambda: our_roadmap(grid), 20.0),
     ):
-        peer, mine = in_turns(theirs, ours, tries)
-        holds = peer >= times * mine and (same or what == "roadmap")
+        peer, our_time = in_turns(theirs, ours, tries)
+        holds = peer >= times * our_time and (same or label == "roadmap")
         out.append(
             {
-                "what": what,
+                "what": label,
                 "peer": peer,
-                "ours": mine,
+                "ours": our_time,
                 "unit": "ms",
-                "ratio": peer / mine,
-                "bound": f"≥ {times:g}, same pieces" if what != "roadmap" else f"≥ {times:g}",
+                "ratio": peer / our_time,
+                "bound": f"≥ {times:g}, same pieces" if label != "roadmap" else f"≥ {times:g}",
                 "holds": holds,
             }
         )
@@ -100,9 +100,9 @@ def in_turns(theirs: Callable[[], Any], ours: Callable[[], Any], tries: int) -> 
     """Milliseconds of the fastest tries of both, each after one that does not count."""
     best = [np.inf, np.inf]
     for k in range(tries + 1):
-        for which, work in enumerate((theirs, ours)):
+        for index, work in enumerate((theirs, ours)):
             start = time.perf_counter()
             work()
             if k:
-                best[which] = min(best[which], (time.perf_counter() - start) * 1e3)
+                best[index] = min(best[index], (time.perf_counter() - start) * 1e3)
     return best[0], best[1]

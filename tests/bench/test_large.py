@@ -16,15 +16,15 @@ def test_a_made_up_map_converts(name: str) -> None:
     case = CASES[name]
     files = case.make(SMALL)
     assert files == case.make(SMALL)
-    made = offline(files, case.to, datum=case.datum, options=case.options)
-    assert made.files
-    assert not [w for w in made.report["warnings"] if "left out" in w["problem"]]
+    converted = offline(files, case.to, datum=case.datum, options=case.options)
+    assert converted.files
+    assert not [w for w in converted.report["warnings"] if "left out" in w["problem"]]
 
 
 @pytest.mark.parametrize("name", sorted(derived.CASES))
 def test_a_made_up_site_derives(name: str) -> None:
-    made = derived.run(derived.CASES[name], derived.SMALL)
-    (part,) = made.parts.values()
+    derived_layers = derived.run(derived.CASES[name], derived.SMALL)
+    (part,) = derived_layers.parts.values()
     if isinstance(part, OccupancyGrid):
         assert part.cells.shape == pytest.approx((derived.HEIGHT * derived.SMALL, derived.WIDTH * derived.SMALL), abs=4)
         assert part.counts()["free"] > 0

@@ -82,11 +82,11 @@ def check(fleet: Fleet) -> None:
     assert [event["sequence"] for event in events] == list(range(1, last + 1)), "the log has a gap"
     created = [event["version"] for event in events if event["type"] == "version.created"]
     assert created == list(range(1, head["version"] + 1)), "an event is missing, or told twice"
-    whole = list(range(1, last + 1))
+    expected = list(range(1, last + 1))
     eventually(lambda: fleet.reader.sequences[-1:] == [last], 30)
-    assert fleet.reader.sequences == whole, "server-sent events: a gap or a repeat"
+    assert fleet.reader.sequences == expected, "server-sent events: a gap or a repeat"
     eventually(lambda: fleet.listener.sequences()[-1:] == [last], 30)
-    assert fleet.listener.sequences() == whole, "Zenoh: a gap"
+    assert fleet.listener.sequences() == expected, "Zenoh: a gap"
     check_robots(fleet, head)
 
 
@@ -100,17 +100,17 @@ def check_versions(fleet: Fleet, head: int) -> None:
         cursor = page[-1]["version"]
     assert [v["version"] for v in versions] == list(range(head, -1, -1)), "a gap, a fork or a number used twice"
     assert [v["parent"] for v in versions] == [*range(head - 1, -1, -1), None]
-    told = {v["version"]: v["message"] for v in versions}
+    messages = {v["version"]: v["message"] for v in versions}
     assert all(writer.made for writer in (*fleet.first, *fleet.writers))
-    assert lost_versions(fleet, told) == []
-    counts = Counter(told.values())
+    assert lost_versions(fleet, messages) == []
+    counts = Counter(messages.values())
     assert all(counts[message] == 1 for writer in fleet.writers for message in writer.made), "a commit was made twice"
 
 
 def lost_versions(fleet: Fleet, messages: dict[int, str]) -> list[int]:
     """The acknowledged versions that are absent or another commit, by the messages that the server lists."""
-    made = [item for writer in (*fleet.first, *fleet.writers) for item in writer.made.items()]
-    return [number for message, number in made if messages.get(number) != message]
+    commits = [item for writer in (*fleet.first, *fleet.writers) for item in writer.made.items()]
+    return [number for message, number in commits if messages.get(number) != message]
 
 
 def _after(versions: list[dict[str, object]]) -> str:

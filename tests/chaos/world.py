@@ -52,8 +52,8 @@ class World:
             "FLEETMAP_ZENOH_LISTEN": f"tcp/127.0.0.1:{self.zenoh}",
         }
         if not own_router:
-            where = f"tcp/127.0.0.1:{self.zenoh}"
-            self.variables |= {"FLEETMAP_ZENOH_CONNECT": where, "FLEETMAP_ZENOH_ADVERTISE": where}
+            endpoint = f"tcp/127.0.0.1:{self.zenoh}"
+            self.variables |= {"FLEETMAP_ZENOH_CONNECT": endpoint, "FLEETMAP_ZENOH_ADVERTISE": endpoint}
         if cluster is not None:
             url = cluster.url(cluster.create_database())
             self.variables["FLEETMAP_DATABASE_URL"] = url
@@ -99,13 +99,13 @@ class World:
             self.router._process.kill()
             return
         assert self.server is not None
-        found = subprocess.run(
+        listing = subprocess.run(
             ["pgrep", "-P", str(self.server.process.pid), "-f", "app.events.router"],
             capture_output=True,
             text=True,
             check=False,
         )
-        for process in found.stdout.split():
+        for process in listing.stdout.split():
             os.kill(int(process), signal.SIGKILL)
 
     def revive_router(self) -> None:
@@ -333,8 +333,8 @@ def look(into: Path) -> int | None:
             manifest = json.loads((version / "manifest.json").read_bytes())
             for file in manifest["files"]:
                 data = (version / file["format"] / file["name"]).read_bytes()
-                told = (file["size"], file["sha256"])
-                assert (len(data), hashlib.sha256(data).hexdigest()) == told, f"{into.name}: half a map: {file}"
+                expected = (file["size"], file["sha256"])
+                assert (len(data), hashlib.sha256(data).hexdigest()) == expected, f"{into.name}: half a map: {file}"
             return int(manifest["sequence"])
         except FileNotFoundError:
             # Three switches have come since: the old version was tidied away. What stands now must be whole.
@@ -407,15 +407,15 @@ class Fleet:
 
     def under_way(self) -> set[str]:
         """The phases that something is in at this moment."""
-        found = set()
+        stages = set()
         if any(writer.busy.is_set() for writer in self.writers):
-            found.add(COMMIT)
+            stages.add(COMMIT)
         heard = {event["version"] for event in list(self.listener.events)}
         if any(version not in heard for writer in self.writers for version in list(writer.made.values())[-3:]):
-            found.add(RELAY)
+            stages.add(RELAY)
         if any(self._fetching(robot) for robot in self.robots):
-            found.add(DOWNLOAD)
-        return found
+            stages.add(DOWNLOAD)
+        return stages
 
     @staticmethod
     def _fetching(robot: Robot, after: int = 0) -> bool:
@@ -439,8 +439,8 @@ class Fleet:
             try:
                 eventually(lambda r=robot: r.standing["root"] == head["root"], seconds)
             except AssertionError:
-                told = "\n".join(map(str, robot.lines[-20:]))
-                raise AssertionError(f"{robot.into.name} does not come to {head['version']}:\n{told}") from None
+                log = "\n".join(map(str, robot.lines[-20:]))
+                raise AssertionError(f"{robot.into.name} does not come to {head['version']}:\n{log}") from None
         return head
 
     def close(self) -> None:

@@ -81,12 +81,12 @@ class ServerProcess:
     def wait_for(self, pattern: str, seconds: float = START_SECONDS) -> re.Match[str]:
         """The first printed line that fits; fails where the server ends or the time is over."""
 
-        def found() -> re.Match[str] | None:
+        def find_match() -> re.Match[str] | None:
             return next((m for line in self.lines if (m := re.search(pattern, line))), None)
 
         with self._news:
-            self._news.wait_for(lambda: found() or not self._reader.is_alive(), seconds)
-        match = found()
+            self._news.wait_for(lambda: find_match() or not self._reader.is_alive(), seconds)
+        match = find_match()
         assert match, f"no line with {pattern!r}; printed:\n" + "\n".join(self.lines)
         return match
 
@@ -158,8 +158,8 @@ def offline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     def call(*arguments: str | Path) -> Result:
         capsys.readouterr()
         status = run([str(a) for a in arguments])
-        told = capsys.readouterr()
-        return Result(status, told.out, told.err)
+        captured = capsys.readouterr()
+        return Result(status, captured.out, captured.err)
 
     return call
 

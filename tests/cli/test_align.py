@@ -23,24 +23,24 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def hall(fleetmap: Fleetmap, maps: Path, name: str) -> None:
     for grid in ("map", "other"):
-        told = fleetmap("import", maps / f"{grid}.yaml", maps / f"{grid}.png", "-e", name, "--grid", grid)
-        assert told.status == 0, told.err
+        result = fleetmap("import", maps / f"{grid}.yaml", maps / f"{grid}.png", "-e", name, "--grid", grid)
+        assert result.status == 0, result.err
 
 
 def test_a_grid_is_laid_onto_another(fleetmap: Fleetmap, maps: Path) -> None:
     hall(fleetmap, maps, "halls")
-    told = fleetmap("align", "halls", "map", "--grid", "other", "--dry-run")
-    assert told.status == 0, told.err
-    assert "halls: ground/other turned by -17." in told.out
-    assert "residual 0.0" in told.out
-    assert "agreement 100.0%" in told.out
-    assert "origin (4.000, -1.000, 17.189°) → (-3.0" in told.out
-    assert "nothing is stored" in told.out
-    found = fleetmap("align", "halls", "map", "--grid", "other", "-m", "by its walls", "--json").json
-    assert found["version"]["message"] == "by its walls"
-    assert found["alignment"]["yaw"] == pytest.approx(-0.3, abs=math.radians(0.2))
-    assert found["alignment"]["residual"] < 0.1
-    assert found["alignment"]["origin"][:2] == pytest.approx([-3.0, 2.0], abs=0.05)
+    result = fleetmap("align", "halls", "map", "--grid", "other", "--dry-run")
+    assert result.status == 0, result.err
+    assert "halls: ground/other turned by -17." in result.out
+    assert "residual 0.0" in result.out
+    assert "agreement 100.0%" in result.out
+    assert "origin (4.000, -1.000, 17.189°) → (-3.0" in result.out
+    assert "nothing is stored" in result.out
+    body = fleetmap("align", "halls", "map", "--grid", "other", "-m", "by its walls", "--json").json
+    assert body["version"]["message"] == "by its walls"
+    assert body["alignment"]["yaw"] == pytest.approx(-0.3, abs=math.radians(0.2))
+    assert body["alignment"]["residual"] < 0.1
+    assert body["alignment"]["origin"][:2] == pytest.approx([-3.0, 2.0], abs=0.05)
     again = fleetmap("align", "halls", "map", "--grid", "other")
     assert again.status == 0
     assert "turned by 0.0" in again.out.replace("-0.0", "0.0"), "it lies there already"
@@ -50,10 +50,10 @@ def test_a_grid_is_laid_onto_another(fleetmap: Fleetmap, maps: Path) -> None:
 def test_by_points(fleetmap: Fleetmap, maps: Path) -> None:
     hall(fleetmap, maps, "points")
     pairs = ("--pair", "4,-1=0,0", "--pair", "5,-1=1,0", "--pair", "4,3=0,4", "--pair", "0,0=9,9")
-    told = fleetmap("align", "points", "--grid", "other", *pairs)
-    assert told.status == 0, told.err
-    assert "moved by -4.000, 1.000 m" in told.out
-    assert "1 pairs disagree" in told.err
+    result = fleetmap("align", "points", "--grid", "other", *pairs)
+    assert result.status == 0, result.err
+    assert "moved by -4.000, 1.000 m" in result.out
+    assert "1 pairs disagree" in result.err
     refused = fleetmap("align", "points", "--grid", "other", *pairs, "--least", "0.9")
     assert refused.status == 1
     assert "do not fit" in refused.err
@@ -78,8 +78,8 @@ def test_onto_a_slice_of_objects_and_what_is_refused(fleetmap: Fleetmap, maps: P
     )
     assert fleetmap("import", tmp_path / "walls.geojson", "-e", "sliced").status == 0
     slice_ = ("objects", "--grid", "other", "-O", "resolution=0.1", "--near", "0.15", "--dry-run")
-    told = fleetmap("align", "sliced", *slice_, "--json")
-    assert told.json["alignment"]["origin"] == pytest.approx([-3.0, 2.0, 0.0], abs=0.1)
+    result = fleetmap("align", "sliced", *slice_, "--json")
+    assert result.json["alignment"]["origin"] == pytest.approx([-3.0, 2.0, 0.0], abs=0.1)
     assert fleetmap("align", "sliced", *slice_, "-O", "colour=1").status == 1
     for wrong, says in (
         ((), "name what the grid is laid onto"),

@@ -23,24 +23,24 @@ def a_map(folder: Path, image: str = "map.pgm", yaw: float = 0.0) -> Path:
 
 def test_a_good_map_passes(offline: Fleetmap, tmp_path: Path) -> None:
     a_map(tmp_path)
-    told = offline("check", tmp_path)
-    assert told.status == 0, told.err
-    assert "map.yaml (occupancy_grid): nothing to complain of" in told.out
+    result = offline("check", tmp_path)
+    assert result.status == 0, result.err
+    assert "map.yaml (occupancy_grid): nothing to complain of" in result.out
 
 
 def test_doubts_are_told_and_pass(offline: Fleetmap, tmp_path: Path) -> None:
     a_map(tmp_path, yaw=0.5)
-    told = offline("check", tmp_path)
-    assert told.status == 0
-    assert "warning: map.yaml: origin: " in told.out
+    result = offline("check", tmp_path)
+    assert result.status == 0
+    assert "warning: map.yaml: origin: " in result.out
 
 
 def test_a_map_that_nav2_would_refuse_fails(offline: Fleetmap, tmp_path: Path) -> None:
     path = a_map(tmp_path, image="other.pgm")
-    told = offline("check", path, tmp_path / "map.pgm")
-    assert told.status == 1
-    assert "map.yaml (occupancy_grid): would be refused" in told.out
-    assert "error: map.yaml: image: " in told.out
+    result = offline("check", path, tmp_path / "map.pgm")
+    assert result.status == 1
+    assert "map.yaml (occupancy_grid): would be refused" in result.out
+    assert "error: map.yaml: image: " in result.out
     answer = offline("check", path, tmp_path / "map.pgm", "--json")
     assert answer.status == 1
     (line,) = answer.json["maps"]
@@ -53,16 +53,19 @@ def test_each_map_of_a_folder_is_checked(offline: Fleetmap, tmp_path: Path) -> N
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         a_map(tmp_path / name, image="map.pgm" if name == "a" else "gone.pgm")
-    told = offline("check", tmp_path, "--json")
-    assert told.status == 1
-    assert {line["file"]: line["result"] for line in told.json["maps"]} == {"a/map.yaml": "fine", "b/map.yaml": "error"}
+    result = offline("check", tmp_path, "--json")
+    assert result.status == 1
+    assert {line["file"]: line["result"] for line in result.json["maps"]} == {
+        "a/map.yaml": "fine",
+        "b/map.yaml": "error",
+    }
 
 
 def test_what_is_no_map_is_said(offline: Fleetmap, tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("nothing here")
-    told = offline("check", tmp_path / "note.txt")
-    assert told.status == 1
-    assert "none of the files is a map" in told.err
+    result = offline("check", tmp_path / "note.txt")
+    assert result.status == 1
+    assert "none of the files is a map" in result.err
     named = offline("check", tmp_path / "note.txt", "--format", "nav2_route")
     assert named.status == 1
     assert "would be refused" in named.out
@@ -73,14 +76,14 @@ def test_the_picture_beside_a_named_file_is_read(offline: Fleetmap, tmp_path: Pa
     folder.mkdir()
     path = a_map(folder, image="/home/somebody/map.pgm")
     (tmp_path / "map.pgm").write_bytes(b"P5 1 1 255\n\0")
-    told = offline("check", path, "--json")
-    assert [(line["file"], line["result"]) for line in told.json["maps"]] == [("map.yaml", "warning")]
+    result = offline("check", path, "--json")
+    assert [(line["file"], line["result"]) for line in result.json["maps"]] == [("map.yaml", "warning")]
     a_map(folder)
-    told = offline("check", path, "--json")
-    assert (told.status, told.json["maps"][0]["result"], told.json["unknown"]) == (0, "fine", [])
+    result = offline("check", path, "--json")
+    assert (result.status, result.json["maps"][0]["result"], result.json["unknown"]) == (0, "fine", [])
     out = tmp_path / "out"
-    told = offline("convert", path, "--to", "occupancy_grid", "-o", f"{out}/")
-    assert told.status == 0, told.err
+    result = offline("convert", path, "--to", "occupancy_grid", "-o", f"{out}/")
+    assert result.status == 0, result.err
     assert (out / "map.pgm").read_bytes().endswith(bytes([0, 254, 205, 254]))
 
 
@@ -90,9 +93,9 @@ def test_files_outside_of_a_maps_folder_are_not_read(offline: Fleetmap, tmp_path
     (tmp_path / "other.pgm").write_bytes(b"P5 2 2 255\n" + bytes(4))
     (folder / "linked.pgm").symlink_to(tmp_path / "other.pgm")
     for image in ("../other.pgm", str(tmp_path / "other.pgm"), "linked.pgm"):
-        told = offline("convert", a_map(folder, image=image), "--to", "occupancy_grid", "-o", "-")
-        assert told.status == 1, image
-        assert "is not in the upload" in told.err
+        result = offline("convert", a_map(folder, image=image), "--to", "occupancy_grid", "-o", "-")
+        assert result.status == 1, image
+        assert "is not in the upload" in result.err
 
 
 WORLD = """<sdf version="1.9"><world name="w"><include><uri>model://crate</uri></include></world></sdf>"""
@@ -119,14 +122,14 @@ def test_companions_are_those_that_each_format_names(shared: Path, tmp_path: Pat
         hotel: {f"hotel_L{n}.png" for n in (1, 2, 3)},
     }
     for path, names in expected.items():
-        found = with_companions([single(path)])
-        assert {f.name for f in found} == {path.name} | names
+        files = with_companions([single(path)])
+        assert {f.name for f in files} == {path.name} | names
     named = with_companions([single(tmp_path / "field.png"), single(tmp_path / "other.pgw", "field.pgw")])
     assert [f.path.name for f in named] == ["field.png", "other.pgw"], "what the user names stays"
 
 
 def test_a_wrong_option_of_a_generator_lists_its_own(offline: Fleetmap, tmp_path: Path) -> None:
-    told = offline("generate", "orchard", "--to", "tmap2", "-o", tmp_path / "n.yaml", "-O", "typo=1")
-    assert told.status == 1
-    assert "typo: no such parameter of orchard; accepted: crown_diameter," in told.err
-    assert "tmap2 accepts action," in told.err
+    result = offline("generate", "orchard", "--to", "tmap2", "-o", tmp_path / "n.yaml", "-O", "typo=1")
+    assert result.status == 1
+    assert "typo: no such parameter of orchard; accepted: crown_diameter," in result.err
+    assert "tmap2 accepts action," in result.err

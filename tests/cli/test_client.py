@@ -37,13 +37,13 @@ def reply(status: int, value: Any, media_type: str = "application/json", **heade
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Script, str]]:
-    told = Script()
+    new_script = Script()
 
     class Handler(BaseHTTPRequestHandler):
         def answer(self) -> None:
             body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
-            told.asked.append((self.command, self.path, dict(self.headers), body))
-            answer = told.answers.pop(0) if len(told.answers) > 1 else told.answers[0]
+            new_script.asked.append((self.command, self.path, dict(self.headers), body))
+            answer = new_script.answers.pop(0) if len(new_script.answers) > 1 else new_script.answers[0]
             if answer is None:
                 self.close_connection = True
                 return
@@ -64,7 +64,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Script, str]]:
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
-    yield told, f"http://127.0.0.1:{server.server_port}"
+    yield new_script, f"http://127.0.0.1:{server.server_port}"
     server.shutdown()
     thread.join()
     server.server_close()
@@ -142,8 +142,8 @@ def test_a_job_is_followed_and_the_map_asked_for_again(talk: Talk) -> None:
         assert got.path.read_bytes() == b"<kml/>"
         assert got.name == "map.kml"
         assert not got.is_zip
-    where = "/api/v1/environments/e/versions/1/maps/kml?grid=map"
-    assert [path for _, path, _, _ in script.asked] == [where, "/api/v1/jobs/7", "/api/v1/jobs/7", where]
+    map_path = "/api/v1/environments/e/versions/1/maps/kml?grid=map"
+    assert [path for _, path, _, _ in script.asked] == [map_path, "/api/v1/jobs/7", "/api/v1/jobs/7", map_path]
     assert not got.path.exists()
 
 

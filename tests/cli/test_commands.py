@@ -66,9 +66,9 @@ def test_versions_diff_promote_and_revert(fleetmap: Fleetmap, network: Path, tmp
     rows = fleetmap("versions", "story", "--json").json
     assert [(row["version"], row["message"]) for row in rows][:2] == [(2, "moved A"), (1, "first")]
 
-    told = fleetmap("diff", "story", "1", "2").out
-    assert "~ topology A: " in told
-    assert "B" not in {line.split()[2] for line in told.splitlines() if line.startswith("~ topology")}
+    output = fleetmap("diff", "story", "1", "2").out
+    assert "~ topology A: " in output
+    assert "B" not in {line.split()[2] for line in output.splitlines() if line.startswith("~ topology")}
 
     assert fleetmap("promote", "story", "1").status == 0
     assert "production" in fleetmap("versions", "story").out
@@ -95,14 +95,14 @@ def test_all_environments_are_listed(fleetmap: Fleetmap, network: Path) -> None:
 
 def test_which_map_am_i_on(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "south-field", "--datum", "-33.9,18.4").status == 0
-    told = fleetmap("where", "-33.9,18.40002")
-    assert told.status == 0, told.err
-    assert "south-field" in told.out
-    assert "mapped floor" in told.out
-    told = fleetmap("where", "-33.9,18.40002", "--json")
-    (found,) = told.json
-    assert (found["name"], found["match"]["by"], told.status) == ("south-field", "floor", 0)
-    assert found["match"]["distance_m"] == pytest.approx(1.8, abs=0.1)
+    result = fleetmap("where", "-33.9,18.40002")
+    assert result.status == 0, result.err
+    assert "south-field" in result.out
+    assert "mapped floor" in result.out
+    result = fleetmap("where", "-33.9,18.40002", "--json")
+    (environment,) = result.json
+    assert (environment["name"], environment["match"]["by"], result.status) == ("south-field", "floor", 0)
+    assert environment["match"]["distance_m"] == pytest.approx(1.8, abs=0.1)
     nowhere = fleetmap("where", "33.9,18.4")
     assert (nowhere.status, nowhere.out) == (1, "")
     assert "no environment contains 33.9,18.4" in nowhere.err
@@ -117,9 +117,9 @@ def test_which_map_am_i_on(fleetmap: Fleetmap, network: Path) -> None:
 
 def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "planned")
-    told = fleetmap("promote", "planned", "2", "--channel", "staging", "--at", "2099-01-31T06:00:00Z", "--json")
-    assert told.status == 0, told.err
-    assert told.json["planned"]["version"] == 2
+    result = fleetmap("promote", "planned", "2", "--channel", "staging", "--at", "2099-01-31T06:00:00Z", "--json")
+    assert result.status == 0, result.err
+    assert result.json["planned"]["version"] == 2
     assert "staging" not in fleetmap("versions", "planned").out
     past = fleetmap("promote", "planned", "2", "--at", "2001-01-31T06:00:00Z")
     assert past.status == 1
@@ -128,8 +128,10 @@ def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
 
 def test_a_promotion_in_two_stages(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "staged")
-    told = fleetmap("promote", "staged", "1", "--ready", "0.9", "--failed", "0.2", "--deadline", "2099-01-31T06:00:00Z")
-    assert told.out.strip() == "staged: production will point to version 1 when 0.9 of its online robots have it"
+    result = fleetmap(
+        "promote", "staged", "1", "--ready", "0.9", "--failed", "0.2", "--deadline", "2099-01-31T06:00:00Z"
+    )
+    assert result.out.strip() == "staged: production will point to version 1 when 0.9 of its online robots have it"
     body = fleetmap("promote", "staged", "1", "--ready", "0.9", "--window", "60", "--json").json
     assert body["version"] is None
     assert (body["rollout"]["state"], body["rollout"]["ready"], body["rollout"]["window"]) == ("waiting", 0.9, 60.0)
@@ -150,8 +152,8 @@ def test_a_grid_gets_its_name_and_a_merge_deletes_nothing(fleetmap: Fleetmap, ne
     )
     (tmp_path / "mask.pgm").write_bytes(b"P5 2 2 255\n" + bytes([0, 254, 205, 254]))
     files = (tmp_path / "mask.yaml", tmp_path / "mask.pgm")
-    told = fleetmap("import", *files, "-e", "merged", "--grid", "keepout", "--mode", "merge")
-    assert told.status == 0, told.err
+    result = fleetmap("import", *files, "-e", "merged", "--grid", "keepout", "--mode", "merge")
+    assert result.status == 0, result.err
     assert fleetmap("export", "merged", "occupancy_grid", "-o", f"{tmp_path}/out/").status == 0
     written = {p.name for p in (tmp_path / "out").iterdir()}
     assert written == {"keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"}
@@ -189,19 +191,19 @@ def test_a_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:
     assert "does not create it" in refused.err
     assert fleetmap("import", network, "-e", "rehearsal").status == 0
     network.write_text(NETWORK.format(x="9.0"))
-    told = fleetmap("import", network, "-e", "rehearsal", "--dry-run")
-    assert told.status == 0, told.err
-    assert "topology: 2 changed" in told.out, "the node and the edge that starts at it"
+    result = fleetmap("import", network, "-e", "rehearsal", "--dry-run")
+    assert result.status == 0, result.err
+    assert "topology: 2 changed" in result.out, "the node and the edge that starts at it"
     assert fleetmap("versions", "rehearsal", "--json").json[0]["version"] == 1
 
 
 def test_a_damaged_file_is_refused_with_its_place(fleetmap: Fleetmap, tmp_path: Path) -> None:
     bad = tmp_path / "bad.tmap2.yaml"
     bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
-    told = fleetmap("import", bad, "-e", "damaged", "-f", "tmap2")
-    assert told.status == 1
-    assert "bad.tmap2.yaml:" in told.err
-    assert "Traceback" not in told.err
+    result = fleetmap("import", bad, "-e", "damaged", "-f", "tmap2")
+    assert result.status == 1
+    assert "bad.tmap2.yaml:" in result.err
+    assert "Traceback" not in result.err
     problem = json.loads(fleetmap("import", bad, "-e", "damaged", "-f", "tmap2", "--json").err)
     assert problem["status"] == 422
     assert problem["errors"][0]["file"] == "bad.tmap2.yaml"
@@ -212,9 +214,9 @@ def test_a_damaged_file_is_refused_with_its_place(fleetmap: Fleetmap, tmp_path: 
 def test_the_same_problem_without_a_server(offline: Fleetmap, tmp_path: Path) -> None:
     bad = tmp_path / "bad.tmap2.yaml"
     bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
-    told = offline("convert", bad, "--format", "tmap2", "--to", "geojson", "-o", tmp_path / "out.geojson")
-    assert told.status == 1
-    assert "bad.tmap2.yaml:" in told.err
+    result = offline("convert", bad, "--format", "tmap2", "--to", "geojson", "-o", tmp_path / "out.geojson")
+    assert result.status == 1
+    assert "bad.tmap2.yaml:" in result.err
     assert not (tmp_path / "out.geojson").exists()
 
 
@@ -223,9 +225,9 @@ def test_a_new_environment_takes_its_datum(fleetmap: Fleetmap, network: Path, tm
     out = tmp_path / "datum.yaml"
     assert fleetmap("export", "placed", "datum", "-o", out).status == 0
     assert "52.5" in out.read_text()
-    told = fleetmap("import", network, "-e", "placed", "--datum", "91,0")
-    assert told.status == 1
-    assert "latitude" in told.err
+    result = fleetmap("import", network, "-e", "placed", "--datum", "91,0")
+    assert result.status == 1
+    assert "latitude" in result.err
 
 
 def test_coverage_and_formats(fleetmap: Fleetmap, network: Path) -> None:
@@ -234,17 +236,17 @@ def test_coverage_and_formats(fleetmap: Fleetmap, network: Path) -> None:
     assert rows["tmap2"] == "direct"
     assert rows["occupancy_grid"] == "derivable"
     assert rows["datum"] == "missing"
-    told = fleetmap("coverage", "covered").out
-    assert "tmap2" in told
-    known = {f["id"]: f for f in fleetmap("formats", "--json").json}
-    assert {"datum", "geojson", "kml", "kmz", "occupancy_grid", "osm", "tmap2"} <= set(known)
-    assert "resolution" in {o["name"] for o in known["occupancy_grid"]["options"]}
+    output = fleetmap("coverage", "covered").out
+    assert "tmap2" in output
+    formats = {f["id"]: f for f in fleetmap("formats", "--json").json}
+    assert {"datum", "geojson", "kml", "kmz", "occupancy_grid", "osm", "tmap2"} <= set(formats)
+    assert "resolution" in {o["name"] for o in formats["occupancy_grid"]["options"]}
 
 
 def test_parameters_of_generators_have_types_units_defaults_and_bounds(offline: Fleetmap) -> None:
-    told = offline("generate", "orchard", "--parameters")
-    assert told.status == 0
-    lines = {line.split()[0]: " ".join(line.split()) for line in told.out.splitlines() if line}
+    result = offline("generate", "orchard", "--parameters")
+    assert result.status == 0
+    lines = {line.split()[0]: " ".join(line.split()) for line in result.out.splitlines() if line}
     assert lines["row_spacing"] == "row_spacing number, 1 to 30 m 3.6 from row to row"
     assert lines["docks"] == "docks whole number, 1 to 20 2 charging docks in the yard"
     described = {p["name"]: p for p in offline("generate", "orchard", "--parameters", "--json").json["parameters"]}
@@ -255,28 +257,28 @@ def test_parameters_of_generators_have_types_units_defaults_and_bounds(offline: 
 
 def test_tokens(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "guarded").status == 0
-    made = fleetmap("token", "create", "field robot", "--role", "viewer", "--environments", "guard*", "--json").json
-    assert fleetmap("versions", "guarded", "--token", made["token"]).status == 0
-    denied = fleetmap("revert", "guarded", "1", "--token", made["token"])
+    token = fleetmap("token", "create", "field robot", "--role", "viewer", "--environments", "guard*", "--json").json
+    assert fleetmap("versions", "guarded", "--token", token["token"]).status == 0
+    denied = fleetmap("revert", "guarded", "1", "--token", token["token"])
     assert denied.status == 1
     assert "error:" in denied.err
     listed = fleetmap("token", "list", "--json")
-    assert made["id"] in {row["id"] for row in listed.json}
-    assert made["token"] not in listed.out
+    assert token["id"] in {row["id"] for row in listed.json}
+    assert token["token"] not in listed.out
     assert "ended" in fleetmap("token", "list").out.splitlines()[0].split()
-    assert fleetmap("token", "delete", made["id"]).status == 0
-    gone = fleetmap("versions", "guarded", "--token", made["token"])
-    assert gone.status == 1
-    assert "--token" in gone.err
+    assert fleetmap("token", "delete", token["id"]).status == 0
+    result = fleetmap("versions", "guarded", "--token", token["token"])
+    assert result.status == 1
+    assert "--token" in result.err
 
 
 def test_link_gives_a_map_without_a_token(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "linked")
     assert fleetmap("promote", "linked", "1").status == 0
-    made = fleetmap("link", "linked", "tmap2", "network.tmap2.yaml", "--seconds", "600")
-    assert made.status == 0
-    assert "network.tmap2.yaml of version 1, without a token until" in made.err
-    with urllib.request.urlopen(made.out.strip()) as answer:
+    result = fleetmap("link", "linked", "tmap2", "network.tmap2.yaml", "--seconds", "600")
+    assert result.status == 0
+    assert "network.tmap2.yaml of version 1, without a token until" in result.err
+    with urllib.request.urlopen(result.out.strip()) as answer:
         assert b"edge_id" in answer.read()
     newest = fleetmap("link", "linked", "tmap2", "-V", "latest", "--json").json
     assert (newest["version"], newest["name"]) == (2, "network.tmap2.yaml")
@@ -290,8 +292,8 @@ def test_link_gives_a_map_without_a_token(fleetmap: Fleetmap, network: Path) -> 
 
 def test_robot_token_names_its_robot(fleetmap: Fleetmap) -> None:
     assert fleetmap("token", "create", "mower-9", "--role", "robot", "--json").json["robot"] == "mower-9"
-    made = fleetmap("token", "create", "the red one", "--role", "robot", "--robot", "mower-9")
-    assert (made.status, "sets the status of the robot mower-9" in made.err) == (0, True)
+    result = fleetmap("token", "create", "the red one", "--role", "robot", "--robot", "mower-9")
+    assert (result.status, "sets the status of the robot mower-9" in result.err) == (0, True)
     for wrong in (("the red one", "--role", "robot"), ("x", "--role", "robot", "--robot", "a b")):
         refused = fleetmap("token", "create", *wrong)
         assert (refused.status, refused.out) == (1, "")
@@ -314,13 +316,13 @@ def test_usage_errors_have_their_own_status(fleetmap: Fleetmap, network: Path, t
 
 def test_an_option_that_nobody_knows_is_refused(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     assert fleetmap("import", network, "-e", "opted").status == 0
-    for told in (
+    for result in (
         fleetmap("export", "opted", "tmap2", "-o", tmp_path / "x", "-O", "colour=red"),
         fleetmap("convert", network, "--to", "tmap2", "-o", tmp_path / "x", "-O", "colour=red"),
         fleetmap("import", network, "-e", "opted", "-O", "colour=red"),
     ):
-        assert told.status == 1
-        assert "colour" in told.err
+        assert result.status == 1
+        assert "colour" in result.err
     assert not (tmp_path / "x").exists()
 
 
@@ -332,8 +334,8 @@ def test_the_demo_comes_once_and_its_commands_work(fleetmap: Fleetmap, server: s
     assert fleetmap("demo", "--json").json == {**first, "created": False}
     version = fleetmap("versions", demo.NAME, "--json").json[0]
     assert version["warnings"] == []
-    held = {layer for layer, kind in version["information"].items() if kind != "missing"}
-    assert held == {"location", "objects", "topology", "occupancy", "zones", "imagery"}
+    layers = {layer for layer, kind in version["information"].items() if kind != "missing"}
+    assert layers == {"location", "objects", "topology", "occupancy", "zones", "imagery"}
     assert len(demo.curl_lines(server, TOKEN)) == 3
     for line in demo.curl_lines(server, TOKEN):
         done = subprocess.run(

@@ -63,8 +63,8 @@ def read(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def originals(folder: Path, wanted: Wanted) -> dict[str, bytes]:
-    return {Path(name).name: (folder / "config" / name).read_bytes() for name in wanted.files}
+def originals(folder: Path, expected: Wanted) -> dict[str, bytes]:
+    return {Path(name).name: (folder / "config" / name).read_bytes() for name in expected.files}
 
 
 @pytest.mark.parametrize("name", FOLDERS)
@@ -72,21 +72,21 @@ def test_a_folder_imports_with_one_command_and_its_maps_come_back(
     name: str, shared: Path, fleetmap: Fleetmap, same: Same, tmp_path: Path
 ) -> None:
     folder = template(shared, name)
-    told = fleetmap("import", folder, "--json")
-    assert told.status == 0, told.err
-    version = told.json
+    result = fleetmap("import", folder, "--json")
+    assert result.status == 0, result.err
+    version = result.json
     assert version["environment"] == name
     assert version["version"] == 1
     sources = {source["name"] for source in version["sources"]}
     assert sources == set(read(folder)), "every file is kept as a source"
     used = {source["name"] for source in version["sources"] if source["used"]}
-    for wanted in FOLDERS[name]:
-        assert {f"config/{file}" for file in wanted.files} <= used
-        out = tmp_path / f"{wanted.format}-{wanted.option}"
-        options = ["--option", wanted.option] if wanted.option else []
-        got = fleetmap("export", name, wanted.format, "-o", f"{out}/", *options)
+    for expected in FOLDERS[name]:
+        assert {f"config/{file}" for file in expected.files} <= used
+        out = tmp_path / f"{expected.format}-{expected.option}"
+        options = ["--option", expected.option] if expected.option else []
+        got = fleetmap("export", name, expected.format, "-o", f"{out}/", *options)
         assert got.status == 0, got.err
-        assert same(wanted.format, originals(folder, wanted), read(out)) == []
+        assert same(expected.format, originals(folder, expected), read(out)) == []
     again = fleetmap("import", folder)
     assert again.status == 0, again.err
     assert f"{name}: nothing changed, version 1 stays" in again.out
@@ -97,12 +97,12 @@ def test_a_folder_converts_without_a_server(
     name: str, shared: Path, offline: Fleetmap, same: Same, tmp_path: Path
 ) -> None:
     folder = template(shared, name)
-    for wanted in FOLDERS[name]:
-        out = tmp_path / f"{wanted.format}-{wanted.option}"
-        options = ["--option", wanted.option] if wanted.option else []
-        told = offline("convert", folder, "--to", wanted.format, "-o", f"{out}/", *options)
-        assert told.status == 0, told.err
-        assert same(wanted.format, originals(folder, wanted), read(out)) == []
+    for expected in FOLDERS[name]:
+        out = tmp_path / f"{expected.format}-{expected.option}"
+        options = ["--option", expected.option] if expected.option else []
+        result = offline("convert", folder, "--to", expected.format, "-o", f"{out}/", *options)
+        assert result.status == 0, result.err
+        assert same(expected.format, originals(folder, expected), read(out)) == []
 
 
 def test_a_network_becomes_another_format_and_comes_back_offline(
@@ -112,10 +112,10 @@ def test_a_network_becomes_another_format_and_comes_back_offline(
     datum = template(shared, "riseholme_park_farm_vineyard") / "config/location/datum_autogen.yaml"
     for middle in ("kml", "geojson"):
         drawn, back = tmp_path / f"map.{middle}", tmp_path / f"{middle}.tmap2.yaml"
-        told = offline("convert", original, datum, "--to", middle, "-o", drawn)
-        assert told.status == 0, told.err
-        told = offline("convert", drawn, datum, "--to", "tmap2", "-o", back)
-        assert told.status == 0, told.err
+        result = offline("convert", original, datum, "--to", middle, "-o", drawn)
+        assert result.status == 0, result.err
+        result = offline("convert", drawn, datum, "--to", "tmap2", "-o", back)
+        assert result.status == 0, result.err
         assert (
             same("tmap2", {"network.tmap2.yaml": original.read_bytes()}, {"network.tmap2.yaml": back.read_bytes()})
             == []

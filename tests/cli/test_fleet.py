@@ -34,8 +34,8 @@ def post_status(server: str, robot: str, body: dict[str, Any]) -> None:
 
 
 def test_environment_life(fleetmap: Fleetmap) -> None:
-    made = fleetmap("environment", "create", "life", "--datum", "53.25,-0.5", "--title", "A life", "--tag", "x")
-    assert (made.status, made.out) == (0, "life: created, version 1\n"), made.err
+    result = fleetmap("environment", "create", "life", "--datum", "53.25,-0.5", "--title", "A life", "--tag", "x")
+    assert (result.status, result.out) == (0, "life: created, version 1\n"), result.err
     assert fleetmap("environment", "create", "life").status == 1
     listed = {row["name"]: row for row in fleetmap("environment", "list", "--json").json}
     assert listed["life"]["title"] == "A life"
@@ -51,9 +51,9 @@ def test_environment_life(fleetmap: Fleetmap) -> None:
         fleetmap("environment", "create", "life-3", "--clone", "life-2@1", "--json").json["datum"]["latitude"] == 53.25
     )
     assert fleetmap("environment", "delete", "life-2").status == 0
-    gone = fleetmap("environment", "show", "life-2")
-    assert gone.status == 1
-    assert "environment restore" in gone.err
+    refusal = fleetmap("environment", "show", "life-2")
+    assert refusal.status == 1
+    assert "environment restore" in refusal.err
     assert "life-2" in fleetmap("environment", "list", "--deleted").out
     assert fleetmap("environment", "restore", "life-2", "--json").json["version"] == 2
     assert fleetmap("environment", "purge", "life-2", "--yes").status == 1, "only what is deleted"
@@ -68,8 +68,8 @@ def test_channels_and_robots(fleetmap: Fleetmap, server: str, network: Path) -> 
     row = fleetmap("channels", "show", "manned", "production", "--json").json
     status = {"environment": "manned", "channel": "production", "version": 1, "root": row["root"], "state": "active"}
     post_status(server, "mower-3", status)
-    told = fleetmap("channels", "manned")
-    assert "1 of 1" in told.out, "a group without a command lists"
+    result = fleetmap("channels", "manned")
+    assert "1 of 1" in result.out, "a group without a command lists"
     assert {row["channel"] for row in fleetmap("channels", "list", "manned", "--json").json} == {"latest", "production"}
     assert "version" in fleetmap("channels", "show", "manned", "production").out
     assert fleetmap("promote", "manned", "1", "--at", "2099-01-31T06:00:00Z", "-c", "staging").status == 0
@@ -86,20 +86,24 @@ def test_channels_and_robots(fleetmap: Fleetmap, server: str, network: Path) -> 
 
 def test_overlays(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     assert fleetmap("import", network, "-e", "blocked").status == 0
-    made = fleetmap("overlays", "create", "blocked", "--edge", "A_B", "--detail", "fallen tree", "--json").json
-    assert (made["state"], made["edge"]) == ("pending", "A_B")
+    overlay = fleetmap("overlays", "create", "blocked", "--edge", "A_B", "--detail", "fallen tree", "--json").json
+    assert (overlay["state"], overlay["edge"]) == ("pending", "A_B")
     assert "fallen tree" in fleetmap("overlays", "list", "blocked").out
-    assert fleetmap("overlays", "show", "blocked", made["id"], "--json").json == made
-    assert "edge A_B" in fleetmap("overlays", "show", "blocked", made["id"]).out
-    assert "is in force until" in fleetmap("overlays", "accept", "blocked", made["id"]).out
-    assert [row["id"] for row in fleetmap("overlays", "blocked", "--state", "accepted", "--json").json] == [made["id"]]
-    assert fleetmap("overlays", "keep", "blocked", made["id"], "--json").json["version"] == 2
-    assert "has ended" in fleetmap("overlays", "end", "blocked", made["id"]).out
+    assert fleetmap("overlays", "show", "blocked", overlay["id"], "--json").json == overlay
+    assert "edge A_B" in fleetmap("overlays", "show", "blocked", overlay["id"]).out
+    assert "is in force until" in fleetmap("overlays", "accept", "blocked", overlay["id"]).out
+    assert [row["id"] for row in fleetmap("overlays", "blocked", "--state", "accepted", "--json").json] == [
+        overlay["id"]
+    ]
+    assert fleetmap("overlays", "keep", "blocked", overlay["id"], "--json").json["version"] == 2
+    assert "has ended" in fleetmap("overlays", "end", "blocked", overlay["id"]).out
     area = tmp_path / "area.geojson"
     ring = [[0, 0], [1, 0], [1, 1], [0, 0]]
     area.write_text(json.dumps({"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [ring]}}))
-    told = fleetmap("overlays", "create", "blocked", "--polygon", area, "--crs", "local", "--accept", "--seconds", "60")
-    assert "(area) is in force until" in told.out, told.err
+    result = fleetmap(
+        "overlays", "create", "blocked", "--polygon", area, "--crs", "local", "--accept", "--seconds", "60"
+    )
+    assert "(area) is in force until" in result.out, result.err
     pending = fleetmap("overlays", "create", "blocked", "--polygon", area, "--crs", "local", "--json").json
     if pending["state"] == "pending":
         assert "is rejected" in fleetmap("overlays", "reject", "blocked", pending["id"]).out
@@ -117,9 +121,9 @@ def test_jobs_and_keys(fleetmap: Fleetmap) -> None:
     assert fleetmap("jobs", "cancel", "nonsense").status == 1
     before = fleetmap("keys", "--json").json
     assert fleetmap("keys", "show").out.strip() == before[0]["public_key"]
-    made = fleetmap("keys", "rotate", "--yes", "--json").json
+    key = fleetmap("keys", "rotate", "--yes", "--json").json
     after = fleetmap("keys", "list", "--json").json
-    assert after[0]["id"] == made["id"] != before[0]["id"]
+    assert after[0]["id"] == key["id"] != before[0]["id"]
     assert fleetmap("keys", "show", before[0]["id"], "--json").json["public_key"] == before[0]["public_key"]
     assert fleetmap("keys", "show", "nonsense").status == 1
 
@@ -142,8 +146,8 @@ def test_json_stands_before_or_after_the_command(fleetmap: Fleetmap, network: Pa
 
 def test_events_are_listed_and_followed(fleetmap: Fleetmap, server: str, network: Path) -> None:
     assert fleetmap("import", network, "-e", "eventful").status == 0
-    told = fleetmap("events", "-e", "eventful")
-    assert "eventful" in told.out, told.err
+    result = fleetmap("events", "-e", "eventful")
+    assert "eventful" in result.out, result.err
     lines = [json.loads(line) for line in fleetmap("events", "-e", "eventful", "--json").out.splitlines()]
     assert [event["id"] for event in lines] == sorted(event["id"] for event in lines)
     assert fleetmap("events", "-e", "eventful", "--since", str(lines[-1]["id"])).out == ""
@@ -175,17 +179,17 @@ def test_diff_starts_with_a_summary(fleetmap: Fleetmap, network: Path) -> None:
 def test_export_prints_paths_and_reports_on_request(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     assert fleetmap("import", network, "-e", "quiet").status == 0
     path = tmp_path / "out.tmap2.yaml"
-    told = fleetmap("export", "quiet", "tmap2", "-o", path)
-    assert (told.status, told.out, told.err) == (0, f"{path}\n", "")
-    told = fleetmap("export", "quiet", "tmap2", "-o", path, "-v")
-    assert told.out == f"{path}\n"
-    assert "topology" in told.err
+    result = fleetmap("export", "quiet", "tmap2", "-o", path)
+    assert (result.status, result.out, result.err) == (0, f"{path}\n", "")
+    result = fleetmap("export", "quiet", "tmap2", "-o", path, "-v")
+    assert result.out == f"{path}\n"
+    assert "topology" in result.err
 
 
 def test_one_format_is_described(offline: Fleetmap, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    told = offline("formats", "occupancy_grid").out
-    assert "map.yaml, map.pgm" in told
+    output = offline("formats", "occupancy_grid").out
+    assert "map.yaml, map.pgm" in output
     for line in ("resolution  number, 0.001 to 1000  m", "file_type   pgm, png", "free_thresh      number, 0 to 1"):
-        assert line in told
+        assert line in output
     assert offline("formats", "tmap2", "--json").json["id"] == "tmap2"

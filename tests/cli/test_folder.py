@@ -17,8 +17,8 @@ def put(root: Path, *names: str) -> None:
         path.write_text(name)
 
 
-def names(found: folder.Folder) -> list[str]:
-    return [f.name for f in found.files]
+def names(content: folder.Folder) -> list[str]:
+    return [f.name for f in content.files]
 
 
 @pytest.fixture
@@ -30,9 +30,9 @@ def template(tmp_path: Path) -> Path:
 
 
 def test_a_template_gives_its_config_and_scripts_alone(template: Path) -> None:
-    found = folder.collect(template)
-    assert found.is_template
-    assert names(found) == [
+    content = folder.collect(template)
+    assert content.is_template
+    assert names(content) == [
         "config/location/datum.yaml",
         "config/metric/map/map.yaml",
         "config/properties.sh",
@@ -47,9 +47,9 @@ def test_the_config_folder_itself_gives_the_same_names(template: Path) -> None:
 
 def test_any_other_folder_gives_all_its_files_but_no_version_control(tmp_path: Path) -> None:
     put(tmp_path, "building.yaml", "plans/office.png", ".git/HEAD", "config/robot.yaml")
-    found = folder.collect(tmp_path)
-    assert not found.is_template
-    assert names(found) == ["building.yaml", "config/robot.yaml", "plans/office.png"]
+    content = folder.collect(tmp_path)
+    assert not content.is_template
+    assert names(content) == ["building.yaml", "config/robot.yaml", "plans/office.png"]
 
 
 def test_links_out_of_the_folder_are_left_out_and_told(template: Path, tmp_path: Path) -> None:
@@ -59,13 +59,13 @@ def test_links_out_of_the_folder_are_left_out_and_told(template: Path, tmp_path:
     (template / "config/world/inner.yaml").symlink_to(template / "config/location/datum.yaml")
     (template / "config/world/loop").symlink_to(template / "config")
     (template / "config/world/dangling").symlink_to(template / "nothing")
-    found = folder.collect(template)
-    assert "config/world/inner.yaml" in names(found)
-    assert "config/world/linked.kml" not in names(found)
-    told = " ".join(found.notes)
-    assert "linked.kml" in told
-    assert "loop" in told
-    assert "dangling" in told
+    content = folder.collect(template)
+    assert "config/world/inner.yaml" in names(content)
+    assert "config/world/linked.kml" not in names(content)
+    notes = " ".join(content.notes)
+    assert "linked.kml" in notes
+    assert "loop" in notes
+    assert "dangling" in notes
 
 
 def test_nothing_to_upload_is_said(tmp_path: Path) -> None:

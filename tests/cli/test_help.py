@@ -58,12 +58,12 @@ def test_help_is_as_wide_as_the_terminal(
     columns: str, expected: int, offline: Fleetmap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", columns)
-    told = offline("--help").out
-    assert max(map(len, told.splitlines())) == expected
+    output = offline("--help").out
+    assert max(map(len, output.splitlines())) == expected
     for panel in PANELS:
-        assert panel[:50] in told
-    told = offline("promote", "--help").out
-    assert "[default: production]" in " ".join(told.replace("│", " ").split()), "brackets are no markup"
+        assert panel[:50] in output
+    output = offline("promote", "--help").out
+    assert "[default: production]" in " ".join(output.replace("│", " ").split()), "brackets are no markup"
 
 
 def test_only_the_command_that_runs_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,16 +112,16 @@ def test_unknown_variables_are_warned_of(offline: Fleetmap, monkeypatch: pytest.
     monkeypatch.setenv("FLEETMAP_TOKEN", "a client's")
     monkeypatch.setenv("FLEETMAP_NAV2_GRID", "a hook's")
     (tmp_path / ".env").write_text("# FLEETMAP_COMMENT=1\nexport FLEETMAP_WORKRS=2\nOTHER=1\nFLEETMAP_PORT=8000\n")
-    told = offline("migrate", "--data-dir", tmp_path / "data")
-    assert told.status == 0
-    assert told.err.splitlines() == [
+    result = offline("migrate", "--data-dir", tmp_path / "data")
+    assert result.status == 0
+    assert result.err.splitlines() == [
         "warning: unknown setting FLEETMAP_MAX_UPLOAD_BYTE (did you mean FLEETMAP_MAX_UPLOAD_BYTES?); it has no effect",
         "warning: unknown setting FLEETMAP_WORKRS (did you mean FLEETMAP_WORKERS?); it has no effect",
     ]
     monkeypatch.setenv("FLEETMAP_TOKN", "x")
-    told = offline("robots", "--server", "http://127.0.0.1:9")
-    assert "did you mean FLEETMAP_TOKEN?" in told.err
-    assert "FLEETMAP_MAX_UPLOAD_BYTE" not in told.err, "a client does not know the server's settings"
+    result = offline("robots", "--server", "http://127.0.0.1:9")
+    assert "did you mean FLEETMAP_TOKEN?" in result.err
+    assert "FLEETMAP_MAX_UPLOAD_BYTE" not in result.err, "a client does not know the server's settings"
 
 
 def test_known_variables_are_those_of_settings_and_options(everything: Any) -> None:
@@ -133,20 +133,20 @@ def test_names_are_completed_from_the_server(server: str, fleetmap: Fleetmap, mo
     assert fleetmap("generate", "office", "-e", "completed", "--create").status == 0
     assert fleetmap("promote", "completed", "1").status == 0
 
-    def complete(typed: str, where: str = server) -> set[str]:
+    def complete(typed: str, address: str = server) -> set[str]:
         clean = {name: value for name, value in os.environ.items() if not name.startswith("FLEETMAP_")}
-        known = {"FLEETMAP_SERVER": where, "FLEETMAP_TOKEN": TOKEN, "_FLEETMAP_COMPLETE": "complete_bash"}
+        variables = {"FLEETMAP_SERVER": address, "FLEETMAP_TOKEN": TOKEN, "_FLEETMAP_COMPLETE": "complete_bash"}
         words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split(" ")) - 1)}
-        told = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", "app.cli"],
-            env={**clean, **known, **words},
+            env={**clean, **variables, **words},
             capture_output=True,
             text=True,
             timeout=60,
             check=False,
         )
-        assert told.stderr == ""
-        return set(told.stdout.split())
+        assert process.stderr == ""
+        return set(process.stdout.split())
 
     assert complete("fleetmap export comp") == {"completed"}
     assert {"tmap2", "tmap"} <= complete("fleetmap export completed tm")

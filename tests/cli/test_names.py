@@ -66,9 +66,9 @@ def test_unknown_names_get_a_proposal(fleetmap: Fleetmap, network: Path) -> None
         (("convert", network, "--to", "kmll", "-o", "-"), "did you mean kml?"),
         (("formats", "tmpa2"), "did you mean tmap2?"),
     ):
-        told = fleetmap(*arguments)
-        assert told.status == 1, arguments
-        assert proposal in told.err, (arguments, told.err)
+        result = fleetmap(*arguments)
+        assert result.status == 1, arguments
+        assert proposal in result.err, (arguments, result.err)
     for arguments, proposal in (
         (("frmats",), "there is no command frmats (did you mean formats?)"),
         (("convrt",), "there is no command convrt (did you mean convert?)"),
@@ -82,9 +82,9 @@ def test_unknown_names_get_a_proposal(fleetmap: Fleetmap, network: Path) -> None
         (("jobs", "list", "--state", "rnning"), "did you mean running?"),
         (("token", "create", "x", "--role", "edtor"), "did you mean editor?"),
     ):
-        told = fleetmap(*arguments)
-        assert told.status == 2, arguments
-        assert proposal in " ".join(told.err.split()), (arguments, told.err)
+        result = fleetmap(*arguments)
+        assert result.status == 2, arguments
+        assert proposal in " ".join(result.err.split()), (arguments, result.err)
 
 
 def test_environment_that_looks_like_a_slip_needs_create(fleetmap: Fleetmap, network: Path) -> None:

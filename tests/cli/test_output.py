@@ -28,18 +28,18 @@ def test_texts_of_files_cannot_steer_the_terminal(capsys: pytest.CaptureFixture[
     output.show(hostile)
     output.show_table(["name"], [[hostile]])
     output.show_problem({"detail": hostile, "errors": [{"file": hostile, "problem": hostile}]})
-    told = capsys.readouterr()
-    for text in (told.out, told.err):
+    captured = capsys.readouterr()
+    for text in (captured.out, captured.err):
         assert "[red]node[/red]" in text
         assert not {"\x1b", "\u202e", "\r"} & set(text)
 
 
 def test_many_problems_are_cut_short(capsys: pytest.CaptureFixture[str]) -> None:
     output.show_problem({"detail": "bad", "errors": [{"problem": f"p{k}"} for k in range(70)]}, limit=50)
-    told = capsys.readouterr().err
-    assert "p49" in told
-    assert "p50" not in told
-    assert "20 more" in told
+    stderr = capsys.readouterr().err
+    assert "p49" in stderr
+    assert "p50" not in stderr
+    assert "20 more" in stderr
 
 
 def test_bars_are_for_terminals_alone(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,9 +67,9 @@ def test_sizes_and_counts_in_words() -> None:
     assert counts({"added": 2, "changed": 0, "document": True}) == "2 added, file header"
     assert counts({"map": {"freed": 3, "bbox": [0, 0, 1, 1]}}) == "map (3 freed)"
     assert counts({"added": 0}) == "unchanged"
-    here, turned = {"latitude": 53.25, "longitude": -0.5}, {"latitude": 53.25, "longitude": -0.5, "heading": 12.5}
-    assert change_line("datum", {"from": None, "to": here}) == "datum: none → 53.25, -0.5"
-    assert change_line("datum", {"from": here, "to": turned}) == "datum: 53.25, -0.5 → 53.25, -0.5, heading 12.5°"
+    origin, turned = {"latitude": 53.25, "longitude": -0.5}, {"latitude": 53.25, "longitude": -0.5, "heading": 12.5}
+    assert change_line("datum", {"from": None, "to": origin}) == "datum: none → 53.25, -0.5"
+    assert change_line("datum", {"from": origin, "to": turned}) == "datum: 53.25, -0.5 → 53.25, -0.5, heading 12.5°"
 
 
 def test_files_with_the_same_warning_share_a_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,10 +80,10 @@ def test_files_with_the_same_warning_share_a_line(capsys: pytest.CaptureFixture[
         "warning: a.yaml:3: is odd",
     ]
     output.show_warnings([{"problem": f"p{k}"} for k in range(30)], limit=20)
-    told = capsys.readouterr().err
-    assert "p19" in told
-    assert "p20" not in told
-    assert "10 more warnings" in told
+    stderr = capsys.readouterr().err
+    assert "p19" in stderr
+    assert "p20" not in stderr
+    assert "10 more warnings" in stderr
 
 
 def test_a_table_keeps_names_whole_and_wraps_long_texts(
@@ -94,13 +94,13 @@ def test_a_table_keeps_names_whole_and_wraps_long_texts(
     for columns in (12, 30, 60, 79, 80, 81, 160):
         monkeypatch.setenv("COLUMNS", str(columns))
         output.show_table(("environment", "version", "time (UTC)", "reason"), [row])
-        told = capsys.readouterr().out
-        assert max(map(len, told.splitlines())) <= columns
+        stdout = capsys.readouterr().out
+        assert max(map(len, stdout.splitlines())) <= columns
         if columns >= 80:
-            assert name in told
-            assert "2026-05-01 08:30" in told
+            assert name in stdout
+            assert "2026-05-01 08:30" in stdout
         if columns >= 60:
-            assert all(word in told for word in reason.split() if len(word) <= output.WORD)
-        assert sorted("".join(told.split())) == sorted(
+            assert all(word in stdout for word in reason.split() if len(word) <= output.WORD)
+        assert sorted("".join(stdout.split())) == sorted(
             "".join(("environment", "version", "time(UTC)", "reason", *row)).replace(" ", "")
         ), "nothing is cut off"

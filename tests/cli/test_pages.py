@@ -42,8 +42,8 @@ def read(page: str) -> str:
 def pages_with_commands() -> list[str]:
     """Pages of docs with ``sh`` blocks, apart from the tutorials."""
     docs = ROOT / "docs"
-    found = (str(path.relative_to(docs)) for path in sorted(docs.rglob("*.md")) if blocks(path.read_text()))
-    return [page for page in found if page not in TUTORIALS]
+    names = (str(path.relative_to(docs)) for path in sorted(docs.rglob("*.md")) if blocks(path.read_text()))
+    return [page for page in names if page not in TUTORIALS]
 
 
 class Place:
@@ -124,8 +124,8 @@ def test_readme_works_as_pasted(place: Place) -> None:
     readme = (ROOT / "README.md").read_text()
     pasted = ""
     for heading in README_SECTIONS:
-        _, found, after = readme.partition(f"\n## {heading}\n")
-        assert found, f"README.md has no section {heading!r}: name the sections to run in README_SECTIONS"
+        _, separator, after = readme.partition(f"\n## {heading}\n")
+        assert separator, f"README.md has no section {heading!r}: name the sections to run in README_SECTIONS"
         pasted += "\n".join(blocks(after.split("\n## ")[0]))
     assert ADDRESS in pasted
     output = place.run(pasted.replace("my-farm", "readme-farm"))

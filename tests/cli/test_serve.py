@@ -48,9 +48,9 @@ def test_a_given_token_is_used_and_never_printed(tmp_path: Path, offline: Fleetm
     process = start(tmp_path, FLEETMAP_ADMIN_TOKEN="given-by-the-operator")
     try:
         process.ready()
-        told = offline("token", "list", "--server", process.address, "--token", "given-by-the-operator")
-        assert told.status == 0
-        assert "given-by-the-operator" not in told.out
+        result = offline("token", "list", "--server", process.address, "--token", "given-by-the-operator")
+        assert result.status == 0
+        assert "given-by-the-operator" not in result.out
     finally:
         process.stop()
     assert not any("given-by-the-operator" in line for line in process.lines)
@@ -86,10 +86,10 @@ def test_the_demo_prints_commands_that_work_at_every_start(tmp_path: Path) -> No
 def test_a_taken_port_is_said_in_one_line(tmp_path: Path, offline: Fleetmap) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        told = offline("serve", "--port", str(port), "--data-dir", tmp_path / "data")
-    assert told.status == 1
-    assert f"cannot listen on 127.0.0.1 port {port}" in told.err
-    assert "--port" in told.err
+        result = offline("serve", "--port", str(port), "--data-dir", tmp_path / "data")
+    assert result.status == 1
+    assert f"cannot listen on 127.0.0.1 port {port}" in result.err
+    assert "--port" in result.err
 
 
 @pytest.mark.parametrize(
@@ -104,9 +104,9 @@ def test_a_taken_port_is_said_in_one_line(tmp_path: Path, offline: Fleetmap) -> 
 def test_unusable_settings_are_usage_errors(
     arguments: list[str], named: str, offline: Fleetmap, tmp_path: Path
 ) -> None:
-    told = offline("serve", "--data-dir", tmp_path / "data", *arguments)
-    assert told.status == 2
-    assert named in " ".join(told.err.split())
+    result = offline("serve", "--data-dir", tmp_path / "data", *arguments)
+    assert result.status == 2
+    assert named in " ".join(result.err.split())
 
 
 def test_https_by_two_flags(tmp_path: Path) -> None:
@@ -139,24 +139,24 @@ def test_files_that_cannot_be_used_end_the_start(tmp_path: Path, offline: Fleetm
     data = ("--data-dir", tmp_path / "data", "--port", "0")
     certificate, key = Authority(tmp_path).sign("server")
     other = Authority(tmp_path / "other").sign("server")[1]
-    told = offline("serve", *data, "--tls-certificate", certificate, "--tls-key", other)
-    assert told.status == 2
-    assert "--tls-certificate and --tls-key cannot be used" in " ".join(told.err.split())
-    told = offline("serve", "--demo", *data, "--tls-certificate", certificate, "--tls-key", key)
-    assert told.status == 2
+    result = offline("serve", *data, "--tls-certificate", certificate, "--tls-key", other)
+    assert result.status == 2
+    assert "--tls-certificate and --tls-key cannot be used" in " ".join(result.err.split())
+    result = offline("serve", "--demo", *data, "--tls-certificate", certificate, "--tls-key", key)
+    assert result.status == 2
     (tmp_path / "users").write_text("r1\n")
-    told = offline("serve", *data, "--zenoh-users", tmp_path / "users")
-    assert told.status == 1
-    assert "line 1: not NAME:PASSWORD" in " ".join(told.err.split())
+    result = offline("serve", *data, "--zenoh-users", tmp_path / "users")
+    assert result.status == 1
+    assert "line 1: not NAME:PASSWORD" in " ".join(result.err.split())
 
 
 def test_every_setting_is_a_flag_but_secrets(offline: Fleetmap, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.config import Settings
 
     monkeypatch.setenv("COLUMNS", "200")
-    told = offline("serve", "--help").out
+    output = offline("serve", "--help").out
     for name in Settings.model_fields:
-        assert (f"--{name.replace('_', '-')} " in told) == (name not in ("admin_token", "zenoh_password")), name
+        assert (f"--{name.replace('_', '-')} " in output) == (name not in ("admin_token", "zenoh_password")), name
 
 
 def test_workers_end_with_the_process_that_started_them(tmp_path: Path) -> None:
@@ -174,14 +174,14 @@ def test_workers_end_with_the_process_that_started_them(tmp_path: Path) -> None:
 
 
 def test_migrate_brings_a_database_up_and_hides_its_password(offline: Fleetmap, tmp_path: Path) -> None:
-    told = offline("migrate", "--data-dir", tmp_path / "data", "--json")
-    assert told.status == 0, told.err
-    assert told.json["migrated"] is True
+    result = offline("migrate", "--data-dir", tmp_path / "data", "--json")
+    assert result.status == 0, result.err
+    assert result.json["migrated"] is True
     assert (tmp_path / "data" / "fleetmap.sqlite3").is_file()
     assert offline("migrate", "--data-dir", tmp_path / "data").status == 0
-    told = offline("migrate", "--database-url", "postgresql+psycopg://me:hidden-word@127.0.0.1:1/none")
-    assert told.status == 1
-    assert "hidden-word" not in told.err + told.out
+    result = offline("migrate", "--database-url", "postgresql+psycopg://me:hidden-word@127.0.0.1:1/none")
+    assert result.status == 1
+    assert "hidden-word" not in result.err + result.out
 
 
 def test_a_database_of_a_newer_release_is_left_alone(offline: Fleetmap, tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_a_database_of_a_newer_release_is_left_alone(offline: Fleetmap, tmp_path
         database.execute("UPDATE alembic_version SET version_num = 'of-tomorrow'")
         database.commit()
     for command in ("serve", "migrate"):
-        told = offline(command, "--data-dir", tmp_path / "data", *(["--port", "0"] if command == "serve" else []))
-        assert told.status == 1
-        assert "newer release" in told.err
-        assert "Traceback" not in told.err
+        result = offline(command, "--data-dir", tmp_path / "data", *(["--port", "0"] if command == "serve" else []))
+        assert result.status == 1
+        assert "newer release" in result.err
+        assert "Traceback" not in result.err

@@ -16,8 +16,8 @@ LANE = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>lanes</nam
 def farm(fleetmap: Fleetmap, tmp_path: Path, request: pytest.FixtureRequest) -> str:
     name = f"tf-{abs(hash(request.node.name)) % 10**9}"
     (tmp_path / "lanes.kml").write_text(LANE)
-    told = fleetmap("import", tmp_path / "lanes.kml", "-e", name, "--layer", "topology", "--datum", "53.2686,-0.5245")
-    assert told.status == 0, told.err
+    result = fleetmap("import", tmp_path / "lanes.kml", "-e", name, "--layer", "topology", "--datum", "53.2686,-0.5245")
+    assert result.status == 0, result.err
     return name
 
 
@@ -33,15 +33,15 @@ def test_the_sets_need_no_server(offline: Fleetmap) -> None:
 
 def test_a_set_and_values_of_an_environment(fleetmap: Fleetmap, farm: str, tmp_path: Path) -> None:
     first = version(fleetmap, farm)
-    told = fleetmap("template", farm, "--set", "outdoor", "-m", "it is a field")
-    assert (told.status, told.out.splitlines()) == (
+    result = fleetmap("template", farm, "--set", "outdoor", "-m", "it is a field")
+    assert (result.status, result.out.splitlines()) == (
         0,
         [f"{farm}: version {first + 1}", "  templates: set: default → outdoor"],
     )
     assert "nothing changed" in fleetmap("template", farm, "--set", "outdoor").out
-    told = fleetmap("template", farm, "tmap2", "-O", "action=NavigateToPose", "--option", "xy_goal_tolerance=0.4")
-    assert told.status == 0, told.err
-    assert "tmap2 action: none → NavigateToPose, tmap2 xy_goal_tolerance: none → 0.4" in told.out
+    result = fleetmap("template", farm, "tmap2", "-O", "action=NavigateToPose", "--option", "xy_goal_tolerance=0.4")
+    assert result.status == 0, result.err
+    assert "tmap2 action: none → NavigateToPose, tmap2 xy_goal_tolerance: none → 0.4" in result.out
     more = fleetmap("template", farm, "tmap2", "-O", "xy_goal_tolerance=0.6", "--json")
     assert more.json["changes"]["templates"] == {"tmap2": {"xy_goal_tolerance": {"from": 0.4, "to": 0.6}}}
     shown = fleetmap("template", farm)
@@ -66,9 +66,9 @@ def test_taking_back(fleetmap: Fleetmap, farm: str) -> None:
     dry = fleetmap("template", farm, "tmap2", "--unset", "-O", "action", "--dry-run")
     assert dry.out.splitlines() == [f"{farm}: this would make a version", "  templates: tmap2 action: a → none"]
     fleetmap("template", farm, "tmap2", "--unset", "-O", "action")
-    said = fleetmap("template", farm, "tmap2", "--json").json
-    assert (said["values"], said["set"]) == ({"osm": True}, "ros2")
-    assert said["effective"]["action"] == {"value": "NavigateToPose", "from": "set ros2"}
+    template = fleetmap("template", farm, "tmap2", "--json").json
+    assert (template["values"], template["set"]) == ({"osm": True}, "ros2")
+    assert template["effective"]["action"] == {"value": "NavigateToPose", "from": "set ros2"}
     assert fleetmap("template", farm, "tmap2", "--unset").status == 0
     fleetmap("template", farm, "--set", "indoor")
     assert fleetmap("template", farm, "--unset", "-m", "as it was").status == 0

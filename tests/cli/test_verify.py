@@ -88,24 +88,24 @@ def test_verify_says_what_is_damaged_and_changes_nothing(
 ) -> None:
     api, folder = server
     good = answers(api)
-    status, told = verify(folder, capfd)
-    assert (status, told["ok"], told["findings"]) == (0, True, [])
-    assert told["checked"]["version"] == 4
-    assert told["checked"]["cache"] > 0
+    status, report = verify(folder, capfd)
+    assert (status, report["ok"], report["findings"]) == (0, True, [])
+    assert report["checked"]["version"] == 4
+    assert report["checked"]["cache"] > 0
     damage_chunks(api, folder)
     for _ in range(2):
-        status, told = verify(folder, capfd)
-        assert (status, told["ok"]) == (1, False)
-        assert {f["problem"] for f in told["findings"]} == {"lost", "damaged"}
-        assert {v["version"] for f in told["findings"] for v in f["versions"]} == {1, 2, 3}
+        status, report = verify(folder, capfd)
+        assert (status, report["ok"]) == (1, False)
+        assert {f["problem"] for f in report["findings"]} == {"lost", "damaged"}
+        assert {v["version"] for f in report["findings"] for v in f["versions"]} == {1, 2, 3}
     assert run(["verify", "--data-dir", str(folder)]) == 1
     text = capfd.readouterr().out
     assert "farm 1" in text
     assert "fleetmap verify --repair" in text
     # The uploads are read again, by the reader that made the chunks.
-    status, told = verify(folder, capfd, "--repair")
-    assert status == 0, told
-    assert {f["repaired_from"].rpartition(" ")[0] for f in told["findings"]} == {"the uploads of farm"}
+    status, report = verify(folder, capfd, "--repair")
+    assert status == 0, report
+    assert {f["repaired_from"].rpartition(" ")[0] for f in report["findings"]} == {"the uploads of farm"}
     for path in (folder / "cache").glob("??/*/map.json"):
         path.unlink()
     api.app.state.services.hot._entries.clear()
@@ -119,15 +119,15 @@ def test_files_are_healed_from_originals_and_archives(
     api, folder = server
     good = answers(api)
     damage_blobs(folder)
-    status, told = verify(folder, capfd, "--repair")
+    status, report = verify(folder, capfd, "--repair")
     assert status == 1
-    assert not any(f["repaired_from"] for f in told["findings"])
+    assert not any(f["repaired_from"] for f in report["findings"])
     originals = tmp_path / "anywhere" / "deep"
     originals.mkdir(parents=True)
     (originals / "of-another-name").write_bytes(ARCHIVE["site.zip"])
-    status, told = verify(folder, capfd, "--repair", "--from", str(tmp_path))
+    status, report = verify(folder, capfd, "--repair", "--from", str(tmp_path))
     assert status == 1
-    healed = [f["repaired_from"] for f in told["findings"] if f["repaired_from"]]
+    healed = [f["repaired_from"] for f in report["findings"] if f["repaired_from"]]
     assert sorted(healed) == [str(tmp_path), "the uploads of farm 3", "the uploads of farm 3"], "and its members"
     for number, files in enumerate((NETWORK, MOVED)):
         (originals / str(number)).write_bytes(next(iter(files.values())))
@@ -145,9 +145,9 @@ def test_a_replica_heals_everything(
     damage_blobs(folder)
     damage_chunks(api, folder)
     place = str(other[1]) if how == "folder" else other[0].url
-    status, told = verify(folder, capfd, "--repair", "--from", place, "--token", ADMIN)
-    assert status == 0, told
-    assert {f["repaired_from"] for f in told["findings"]} == {place}
+    status, report = verify(folder, capfd, "--repair", "--from", place, "--token", ADMIN)
+    assert status == 0, report
+    assert {f["repaired_from"] for f in report["findings"]} == {place}
     api.app.state.services.hot._entries.clear()
     assert answers(api) == good
 

@@ -30,21 +30,21 @@ def product(data: bytes = b"hello", archive: bytes | None = None) -> Product:
 def test_a_made_map_comes_back_with_its_bytes_hash_and_report(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
     assert cache.get(key("a")) is None
-    made = cache.get_or_make(key("a"), product)
-    file = made.whole()
+    cached_map = cache.get_or_make(key("a"), product)
+    file = cached_map.whole()
     assert (file.name, file.size, file.media_type) == ("map.kml", 5, "text/xml")
     assert file.path.read_bytes() == b"hello"
     assert file.sha256 == hashlib.sha256(b"hello").hexdigest()
-    assert made.report == {"format": "kml"}
+    assert cached_map.report == {"format": "kml"}
     again = Cache(tmp_path, 10**6).get(key("a"))
-    assert again == made
+    assert again == cached_map
 
 
 def test_several_files_come_with_an_archive(tmp_path: Path) -> None:
-    made = Cache(tmp_path, 10**6).get_or_make(key("a"), lambda: product(archive=b"PK.."))
-    assert made.whole().name == "kml.zip"
-    assert made.file("map.kml") is not None
-    assert made.file("other") is None
+    cached_map = Cache(tmp_path, 10**6).get_or_make(key("a"), lambda: product(archive=b"PK.."))
+    assert cached_map.whole().name == "kml.zip"
+    assert cached_map.file("map.kml") is not None
+    assert cached_map.file("other") is None
 
 
 def test_one_of_many_askers_makes_it(tmp_path: Path) -> None:
@@ -57,9 +57,9 @@ def test_one_of_many_askers_makes_it(tmp_path: Path) -> None:
         return product()
 
     with ThreadPoolExecutor(20) as many:
-        made = list(many.map(lambda _: cache.get_or_make(key("a"), slow), range(20)))
+        cached_maps = list(many.map(lambda _: cache.get_or_make(key("a"), slow), range(20)))
     assert len(count) == 1
-    assert len({m.whole().sha256 for m in made}) == 1
+    assert len({m.whole().sha256 for m in cached_maps}) == 1
     assert (cache.misses, cache.hits) == (1, 19)
 
 
@@ -121,21 +121,21 @@ def test_a_damaged_entry_is_made_again_after_a_start(tmp_path: Path, file: str, 
     cache = Cache(tmp_path, 10**6)
     assert cache.get(key("a")) is None
     assert cache.damaged == (0 if harm is Path.unlink and file == "map.json" else 1)
-    made = cache.get_or_make(key("a"), lambda: product(b"y" * 5000, archive=b"PK" * 50))
-    assert made.files[0].read() == b"y" * 5000
-    assert Cache(tmp_path, 10**6).get(key("a")) == made
+    cached_map = cache.get_or_make(key("a"), lambda: product(b"y" * 5000, archive=b"PK" * 50))
+    assert cached_map.files[0].read() == b"y" * 5000
+    assert Cache(tmp_path, 10**6).get(key("a")) == cached_map
 
 
 def test_an_entry_that_changes_while_the_server_runs_is_never_served(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
-    made = cache.get_or_make(key("a"), product)
-    flip(made.files[0].path, quietly=True)
+    cached_map = cache.get_or_make(key("a"), product)
+    flip(cached_map.files[0].path, quietly=True)
     with pytest.raises(LostMap):
-        made.files[0].read()
+        cached_map.files[0].read()
     assert cache.damaged == 1
     assert cache.get(key("a")) is None, "what was found damaged is gone"
-    made = cache.get_or_make(key("a"), product)
-    flip(made.files[0].path)
+    cached_map = cache.get_or_make(key("a"), product)
+    flip(cached_map.files[0].path)
     assert cache.get(key("a")) is None, "a file that was written to is hashed again"
     assert cache.damaged == 2
 
@@ -207,12 +207,16 @@ def test_a_full_disk_does_not_stop_maps(
 
     monkeypatch.setattr(Path, "mkdir", mkdir)
     for _ in range(2):
-        made = cache.get_or_make(key("a"), lambda: product(archive=b"PK"))
-        assert (made.files[0].read(), made.whole().read(), made.files[0].path) == (b"hello", b"PK", None)
+        cached_map = cache.get_or_make(key("a"), lambda: product(archive=b"PK"))
+        assert (cached_map.files[0].read(), cached_map.whole().read(), cached_map.files[0].path) == (
+            b"hello",
+            b"PK",
+            None,
+        )
     assert cache.misses == 2, "it was made once"
     assert cache.get(key("before")) == stored
     with cache.holding() as hold:
-        assert [f.read() for f in (*hold(made).files, *hold(stored).files)] == [b"hello", b"before"]
+        assert [f.read() for f in (*hold(cached_map).files, *hold(stored).files)] == [b"hello", b"before"]
     assert cache.problem == "No space left on device"
     assert [r.levelname for r in caplog.records] == ["ERROR"], "it is logged once"
     monkeypatch.undo()
@@ -265,8 +269,8 @@ def test_an_entry_that_is_removed_at_once_is_no_problem_of_the_disk(
 ) -> None:
     cache = Cache(tmp_path, 10**6)
     refusing(monkeypatch, "map.json", errno.ENOENT)
-    made = cache.get_or_make(key("a"), product)
-    assert (made.files[0].read(), cache.problem) == (b"hello", None)
+    cached_map = cache.get_or_make(key("a"), product)
+    assert (cached_map.files[0].read(), cache.problem) == (b"hello", None)
 
 
 @pytest.mark.parametrize("error", [shutil.Error("/srv/data/cache/0"), OSError("/srv/data is odd"), PermissionError(13)])

@@ -72,11 +72,11 @@ def test_map_of_real_network_loses_the_closed_edge_alone(shared: Path, name: str
     assert readable, f"no network of {name} in the real maps"
     layers = readable[0]
     level, edge = sorted(edges(layers))[len(edges(layers)) // 2]
-    known = formats.get_format(name)
+    fmt = formats.get_format(name)
     closures = Closures((Closure("c", "blocked", level, "2030-01-01T00:00:00Z", edge=edge),))
-    closed = make.from_layers(known, layers, {}, derived=False, closures=closures)
-    whole = make.from_layers(known, layers, {}, derived=False, closures=Closures())
-    before, after = edges_in(name, whole.files), edges_in(name, closed.files)
+    closed = make.from_layers(fmt, layers, {}, derived=False, closures=closures)
+    complete = make.from_layers(fmt, layers, {}, derived=False, closures=Closures())
+    before, after = edges_in(name, complete.files), edges_in(name, closed.files)
     assert before - after == Counter([edges(layers)[level, edge]])
     assert not after - before
     assert closed.report["closures"] == [

@@ -58,13 +58,13 @@ def crossing(report: Mapping[str, Any]) -> list[str]:
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
 def test_straight_edges_through_a_wall_are_reported_and_bent_ones_go_around(yaw: float) -> None:
     for name in ("tmap2", "geojson"):
-        known = formats.get_format(name)
-        through = make.from_layers(known, site(False, yaw, occupancy=hall(yaw)), {}, derived=False)
+        fmt = formats.get_format(name)
+        through = make.from_layers(fmt, site(False, yaw, occupancy=hall(yaw)), {}, derived=False)
         assert crossing(through.report) == [
             "2 edges cross occupied cells of the occupancy grid 'map': a_b, b_a; a robot that follows the network "
             "meets an obstacle there"
         ]
-        assert crossing(make.from_layers(known, site(True, yaw, occupancy=hall(yaw)), {}, derived=False).report) == []
+        assert crossing(make.from_layers(fmt, site(True, yaw, occupancy=hall(yaw)), {}, derived=False).report) == []
 
 
 def test_buildings_count_where_there_is_no_grid() -> None:
@@ -75,36 +75,38 @@ def test_buildings_count_where_there_is_no_grid() -> None:
         ("park", shapely.box(0, 0, 9, 9), {"kind": "region"}),
     ]
     objects = features(rows, "local")
-    known = formats.get_format("tmap2")
-    (told,) = crossing(make.from_layers(known, site(False, objects=objects), {}, derived=False).report)
-    assert told.startswith("2 edges cross buildings or walls: a_b, b_a;") or told.startswith("2 edges cross")
-    assert crossing(make.from_layers(known, site(True, objects=objects), {}, derived=False).report) == []
+    fmt = formats.get_format("tmap2")
+    (warning,) = crossing(make.from_layers(fmt, site(False, objects=objects), {}, derived=False).report)
+    assert warning.startswith("2 edges cross buildings or walls: a_b, b_a;") or warning.startswith("2 edges cross")
+    assert crossing(make.from_layers(fmt, site(True, objects=objects), {}, derived=False).report) == []
 
 
 def test_nav2_drives_straight_along_its_own_bent_edges() -> None:
     layers = site(True, occupancy=hall())
     part = layers.vector("topology")[TOPOLOGY]
     owned = tuple({**p, "nav2_route": {"id": k}} for k, p in enumerate(part.properties))
-    mine = Layers({**layers.parts, TOPOLOGY: features(zip(part.ids, part.geometry, owned, strict=True), "local")})
-    known = formats.get_format("nav2_route")
-    (told,) = crossing(make.from_layers(known, mine, {}, derived=False).report)
-    assert told.startswith("2 edges cross occupied cells")
-    assert crossing(make.from_layers(known, layers, {}, derived=False).report) == []
+    nav2_layers = Layers(
+        {**layers.parts, TOPOLOGY: features(zip(part.ids, part.geometry, owned, strict=True), "local")}
+    )
+    fmt = formats.get_format("nav2_route")
+    (warning,) = crossing(make.from_layers(fmt, nav2_layers, {}, derived=False).report)
+    assert warning.startswith("2 edges cross occupied cells")
+    assert crossing(make.from_layers(fmt, layers, {}, derived=False).report) == []
 
 
 def test_closures_by_id_and_area_close_all_pieces_of_a_bent_edge() -> None:
-    known = formats.get_format("tmap2")
+    fmt = formats.get_format("tmap2")
     until = "2030-01-01T00:00:00Z"
     area = {"type": "Polygon", "coordinates": [[[4, 8], [6, 8], [6, 9], [4, 9], [4, 8]]]}
     by_id = Closures((Closure("c", "blocked", GROUND, until, edge="a_b"),))
     by_area = Closures((Closure("c", "blocked", GROUND, until, polygon=area, crs="local"),))
-    for closures, gone in ((by_id, {"a_b"}), (by_area, {"a_b", "b_a"})):
-        made = make.from_layers(known, site(True), {}, derived=False, closures=closures)
-        nodes = yaml.safe_load(made.files["network.tmap2.yaml"])["nodes"]
+    for closures, closed_ids in ((by_id, {"a_b"}), (by_area, {"a_b", "b_a"})):
+        written_map = make.from_layers(fmt, site(True), {}, derived=False, closures=closures)
+        nodes = yaml.safe_load(written_map.files["network.tmap2.yaml"])["nodes"]
         left = {e["edge_id"].partition("~")[0] for n in nodes for e in n["node"]["edges"]}
-        assert left == {"a_b", "b_a", "a_c"} - gone
-        (line,) = made.report["closures"]
-        assert set(line["edges"]) == gone, "the report names the edges of the version"
+        assert left == {"a_b", "b_a", "a_c"} - closed_ids
+        (line,) = written_map.report["closures"]
+        assert set(line["edges"]) == closed_ids, "the report names the edges of the version"
 
 
 def test_reports_of_stored_maps_name_edges_through_obstacles(api: Api, fresh: Any) -> None:
@@ -138,35 +140,35 @@ def detour(*between: tuple[float, float], inside: bool = False, **parts: Part) -
 
 @pytest.mark.parametrize("name", ["tmap2", "geojson", "nav2_route"])
 def test_bends_inside_a_building_do_not_hide_that_an_edge_leads_through_it(name: str) -> None:
-    known = formats.get_format(name)
+    fmt = formats.get_format(name)
     crossed = {
         "straight": detour(),
         "bend inside": detour((5, 1)),
         "in, out and in": detour((5, 1), (5, 6), (4.5, 6), (4.5, 2), (2, 2), inside=True),
     }
     for called, layers in crossed.items():
-        (told,) = crossing(make.from_layers(known, layers, {}, derived=False).report)
-        assert told.startswith("1 edge crosses buildings or walls: e;"), called
+        (warning,) = crossing(make.from_layers(fmt, layers, {}, derived=False).report)
+        assert warning.startswith("1 edge crosses buildings or walls: e;"), called
     clear = [detour(inside=True), detour((4.5, 1), inside=True), detour((3, 6), (8, 6))]
-    assert all(crossing(make.from_layers(known, layers, {}, derived=False).report) == [] for layers in clear)
+    assert all(crossing(make.from_layers(fmt, layers, {}, derived=False).report) == [] for layers in clear)
 
 
 def test_buildings_count_where_a_grid_knows_nothing() -> None:
-    known = formats.get_format("tmap2")
+    fmt = formats.get_format("tmap2")
     free = OccupancyGrid(np.full((20, 40), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     unknown = OccupancyGrid(np.full((20, 40), UNKNOWN, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     beyond = OccupancyGrid(np.full((20, 20), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     grey = replace(free, free_thresh=0.25, properties={UNKNOWN_GREY: packed_cells(np.ones((20, 40), bool))})
     for grid, count in ((free, 0), (unknown, 1), (beyond, 1), (grey, 1)):
-        told = crossing(make.from_layers(known, detour((5, 1), occupancy=grid), {}, derived=False).report)
-        assert len(told) == count
+        warnings = crossing(make.from_layers(fmt, detour((5, 1), occupancy=grid), {}, derived=False).report)
+        assert len(warnings) == count
 
 
 def test_an_environment_package_warns_of_edges_through_obstacles() -> None:
-    known = formats.get_format("environment")
-    told = crossing(make.from_layers(known, detour((5, 1)), {}, derived=False).report)
-    assert len(told) == 1
-    assert "1 edge crosses buildings or walls: e;" in told[0]
+    fmt = formats.get_format("environment")
+    warnings = crossing(make.from_layers(fmt, detour((5, 1)), {}, derived=False).report)
+    assert len(warnings) == 1
+    assert "1 edge crosses buildings or walls: e;" in warnings[0]
 
 
 @pytest.mark.parametrize("name", ["nav2_route", "navgraph"])
@@ -175,6 +177,6 @@ def test_files_of_a_network_and_a_grid_are_checked_without_a_server(name: str) -
     files: dict[str, bytes] = {}
     for source in ("nav2_route", "occupancy_grid"):
         files |= make.from_layers(formats.get_format(source), layers, {}, derived=False).files
-    told = crossing(offline(files, name, datum=Datum(48.0, 9.0)).report)
-    assert len(told) == 1
-    assert "occupied cells of the occupancy grid" in told[0]
+    warnings = crossing(offline(files, name, datum=Datum(48.0, 9.0)).report)
+    assert len(warnings) == 1
+    assert "occupied cells of the occupancy grid" in warnings[0]

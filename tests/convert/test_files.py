@@ -40,7 +40,7 @@ def test_offline_conversion_equals_the_map_of_all_layers(shared: Path, wanted: s
     world = (root / "worlds/no_roof_small_warehouse.world").read_bytes()
     files["worlds/a.world"] = world.replace(b"</world>", CRATE + b"</world>")
     options = {"resolution": "0.25"}
-    told = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(), Limits())
-    known = formats.get_format(wanted)
-    complete = make.from_layers(known, told.layers(None), options, derived=True, origin=told.origin)
+    upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(), Limits())
+    fmt = formats.get_format(wanted)
+    complete = make.from_layers(fmt, upload_bundle.layers(None), options, derived=True, origin=upload_bundle.origin)
     assert direct.offline(files, wanted, options=options).files == complete.files

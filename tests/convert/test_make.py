@@ -18,17 +18,21 @@ from app.model.layers import NETWORK, Layers, PartKey
 PLANNED = ("tmap2", "nav2_route", "rmf_nav_graph", "openrmf", "lif", "navgraph", "osm", "lanelet2")
 
 
-def network(**said: object) -> Layers:
+def network(**edge_properties: object) -> Layers:
     rows = [
         ("a", shapely.Point(0, 0), {"kind": "node", "name": "a"}),
         ("b", shapely.Point(5, 0), {"kind": "node", "name": "b"}),
-        ("a_b", shapely.LineString([(0, 0), (5, 0)]), {"kind": "edge", "source": "a", "target": "b", **said}),
+        (
+            "a_b",
+            shapely.LineString([(0, 0), (5, 0)]),
+            {"kind": "edge", "source": "a", "target": "b", **edge_properties},
+        ),
         ("b_a", shapely.LineString([(5, 0), (0, 0)]), {"kind": "edge", "source": "b", "target": "a"}),
     ]
     return Layers({PartKey("topology", "ground", NETWORK): features(rows, "local")}, Datum(53.2, -0.5))
 
 
-def made(name: str, layers: Layers, mode: ClosureMode = "apply") -> make.Written:
+def write_map(name: str, layers: Layers, mode: ClosureMode = "apply") -> make.Written:
     closures = Closures(mode=mode)
     return make.from_layers(formats.get_format(name), layers, {}, derived=False, closures=closures)
 
@@ -48,18 +52,18 @@ def edges_in(name: str, files: Mapping[str, bytes]) -> set[tuple[str, str]]:
 
 @pytest.mark.parametrize("name", PLANNED)
 def test_blocked_edge_is_left_out_and_reported(name: str) -> None:
-    written = made(name, network(blocked=True))
+    written = write_map(name, network(blocked=True))
     assert edges_in(name, written.files) == {("b", "a")}
     assert [d["count"] for d in written.report["dropped"] if d["what"] == "blocked edges"] == [1]
     for free in (network(), network(blocked=False)):
-        written = made(name, free)
+        written = write_map(name, free)
         assert edges_in(name, written.files) == {("a", "b"), ("b", "a")}
         assert not [d for d in written.report["dropped"] if d["what"] == "blocked edges"]
 
 
 @pytest.mark.parametrize("name", PLANNED)
 def test_blocked_edge_stays_with_a_warning_when_marked(name: str) -> None:
-    written = made(name, network(blocked=True), "mark")
+    written = write_map(name, network(blocked=True), "mark")
     assert edges_in(name, written.files) == {("a", "b"), ("b", "a")}
     (warning,) = [w["problem"] for w in written.report["warnings"] if "blocked" in w["problem"]]
     assert warning.startswith("1 blocked edge stays")
@@ -67,6 +71,6 @@ def test_blocked_edge_stays_with_a_warning_when_marked(name: str) -> None:
 
 
 def test_formats_that_nobody_plans_on_mark_blocked_edges() -> None:
-    written = made("geojson", network(blocked=True))
+    written = write_map("geojson", network(blocked=True))
     assert not written.report["warnings"]
     assert b'"blocked":true' in b"".join(written.files.values())

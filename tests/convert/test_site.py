@@ -26,8 +26,8 @@ EMPTY = make.empty_report(formats.get_format("satellite"))
 
 def recipe(key: str, **more: Any) -> Recipe:
     version: Any = None
-    known = formats.get_format("satellite")
-    return Recipe(version, known, known.write_options(), Chain((), ()), key, **more)
+    fmt = formats.get_format("satellite")
+    return Recipe(version, fmt, fmt.write_options(), Chain((), ()), key, **more)
 
 
 def product(name: str, **more: Any) -> Product:
@@ -37,8 +37,8 @@ def product(name: str, **more: Any) -> Product:
 def test_files_of_one_name_are_reported(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     members = tuple(Member(recipe(str(n)), "L2/", ("L2", name)) for n, name in enumerate(("a_b", "a/b")))
-    held = [cache.get_or_make(f"{n:064}", lambda: product("a_b.tif")) for n in range(2)]
-    out = joined(recipe("all", members=members), held)
+    cached_maps = [cache.get_or_make(f"{n:064}", lambda: product("a_b.tif")) for n in range(2)]
+    out = joined(recipe("all", members=members), cached_maps)
     assert list(out.files) == ["L2/a_b.tif"]
     assert out.places == {"L2/a_b.tif": ("L2", "a_b")}
     (line,) = out.report["dropped"]
@@ -50,57 +50,62 @@ def test_reports_are_joined_with_the_folders_of_their_files() -> None:
     lost = {"what": "zones", "count": 1, "why": "no place"}
     warned = {"problem": "turned", "file": "map.yaml"}
     reports = [(folder, {**EMPTY, "dropped": [lost], "warnings": [warned]}) for folder in ("", "L2/")]
-    told = site.merged_report(reports)
-    assert told["dropped"] == [lost]
-    assert [w["file"] for w in told["warnings"]] == ["map.yaml", "L2/map.yaml"]
+    report = site.merged_report(reports)
+    assert report["dropped"] == [lost]
+    assert [w["file"] for w in report["warnings"]] == ["map.yaml", "L2/map.yaml"]
 
 
 def test_held_files_outlive_the_cache(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 1)
     first = cache.get_or_make("0" * 64, lambda: product("a.tif"))
     with cache.holding() as hold:
-        held = hold(first)
+        open_map = hold(first)
         cache.get_or_make("1" * 64, lambda: product("b.tif"))
         assert cache.get("0" * 64) is None
-        assert held.files[0].path.read_bytes() == b"a.tif"
+        assert open_map.files[0].path.read_bytes() == b"a.tif"
         with pytest.raises(LostMap):
             hold(first)
-    assert not held.files[0].path.exists()
+    assert not open_map.files[0].path.exists()
 
 
 def test_linked_files_are_stored_as_they_are(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     (file,) = cache.get_or_make("0" * 64, lambda: product("a.tif")).files
     linked = Product({"L2/a.tif": (file, file.media_type)}, None, EMPTY, {"L2/a.tif": ("L2", "a")})
-    (made,) = cache.get_or_make("1" * 64, lambda: linked).files
-    assert (made.size, made.sha256, made.place) == (file.size, file.sha256, ("L2", "a"))
-    assert made.path.read_bytes() == b"a.tif"
+    (cached_file,) = cache.get_or_make("1" * 64, lambda: linked).files
+    assert (cached_file.size, cached_file.sha256, cached_file.place) == (file.size, file.sha256, ("L2", "a"))
+    assert cached_file.path.read_bytes() == b"a.tif"
     (again,) = cache.get("1" * 64).files  # type: ignore[union-attr]
-    assert again == made
+    assert again == cached_file
 
 
 def test_default_part_of_each_level_is_selected(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     files: dict[str, Any] = dict.fromkeys(("satellite.tif", "plan.tif", "L2/plan.tif"), (b"x", "image/tiff"))
     places = {"satellite.tif": ("ground", "satellite"), "plan.tif": ("ground", "plan"), "L2/plan.tif": ("L2", "plan")}
-    made = cache.get_or_make("0" * 64, lambda: Product(files, None, EMPTY, places)).files
+    cached_files = cache.get_or_make("0" * 64, lambda: Product(files, None, EMPTY, places)).files
     spread = recipe("0", spread=Spread("ground"))
-    assert [f.name for f in site.select(made, Member(spread, only_default=True))] == ["satellite.tif", "L2/plan.tif"]
-    assert [f.name for f in site.select(made, Member(spread, levels=frozenset({"L2"})))] == ["L2/plan.tif"]
-    assert [f.name for f in site.select(made, Member(spread, names=frozenset({"satellite"})))] == ["satellite.tif"]
+    assert [f.name for f in site.select(cached_files, Member(spread, only_default=True))] == [
+        "satellite.tif",
+        "L2/plan.tif",
+    ]
+    assert [f.name for f in site.select(cached_files, Member(spread, levels=frozenset({"L2"})))] == ["L2/plan.tif"]
+    assert [f.name for f in site.select(cached_files, Member(spread, names=frozenset({"satellite"})))] == [
+        "satellite.tif"
+    ]
 
 
 def test_file_of_a_map_of_several_parts_is_found_on_its_only_level(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     files: dict[str, Any] = dict.fromkeys(("L2/a.tif", "L2/b.tif", "b.tif"), (b"x", "image/tiff"))
-    made = cache.get_or_make("0" * 64, lambda: Product(files, None, EMPTY))
+    cached_map = cache.get_or_make("0" * 64, lambda: Product(files, None, EMPTY))
     spread = recipe("0", spread=Spread("ground"))
-    assert file_of(spread, made, "a.tif").name == "L2/a.tif"
-    assert file_of(spread, made, "b.tif").name == "b.tif"
+    assert file_of(spread, cached_map, "a.tif").name == "L2/a.tif"
+    assert file_of(spread, cached_map, "b.tif").name == "b.tif"
     with pytest.raises(NotFound, match="its files are"):
-        file_of(spread, made, "c.tif")
+        file_of(spread, cached_map, "c.tif")
     with pytest.raises(NotFound):
-        file_of(replace(spread, spread=None), made, "a.tif")
+        file_of(replace(spread, spread=None), cached_map, "a.tif")
 
 
 def tower(*kinds: str) -> Layers:
@@ -125,36 +130,38 @@ def tower(*kinds: str) -> Layers:
     ],
 )
 def test_layers_in_memory_give_the_whole_site(asked: dict[str, str], derived: bool, expected: set[str]) -> None:
-    made = make.from_layers(formats.get_format("occupancy_grid"), tower("keepout", "priority"), asked, derived=derived)
-    assert {name.removesuffix(".pgm") for name in made.files if name.endswith(".pgm")} == expected
-    drawn = [line for line in made.report["layers"] if line["information"] == "derived"]
+    written_map = make.from_layers(
+        formats.get_format("occupancy_grid"), tower("keepout", "priority"), asked, derived=derived
+    )
+    assert {name.removesuffix(".pgm") for name in written_map.files if name.endswith(".pgm")} == expected
+    drawn = [line for line in written_map.report["layers"] if line["information"] == "derived"]
     assert [(line["level"], line["name"]) for line in drawn] == [("L2", "keepout")] * ("L2/keepout" in expected)
 
 
 def test_masks_need_no_map() -> None:
-    known, layers = formats.get_format("occupancy_grid"), tower("keepout")
+    fmt, layers = formats.get_format("occupancy_grid"), tower("keepout")
     zones = Layers({k: p for k, p in layers.parts.items() if k.layer == "zones"}, None, layers.levels)
-    made = make.from_layers(known, zones, {"level": "*", "grid": "keepout"}, derived=True)
-    assert "keepout.pgm" in made.files, "the lowest level with zones is at the top"
+    written_map = make.from_layers(fmt, zones, {"level": "*", "grid": "keepout"}, derived=True)
+    assert "keepout.pgm" in written_map.files, "the lowest level with zones is at the top"
     with pytest.raises(MissingLayer):
-        make.from_layers(known, zones, {"level": "*", "grid": "*"}, derived=True)
+        make.from_layers(fmt, zones, {"level": "*", "grid": "*"}, derived=True)
 
 
 def test_whole_site_without_a_part_that_fits_is_not_found() -> None:
-    known = formats.get_format("occupancy_grid")
-    for asked in ({"level": "*", "grid": "keepout"}, {"level": "L9", "grid": "*"}):
+    fmt = formats.get_format("occupancy_grid")
+    for options in ({"level": "*", "grid": "keepout"}, {"level": "L9", "grid": "*"}):
         with pytest.raises(NotFound):
-            make.from_layers(known, tower(), asked, derived=True)
+            make.from_layers(fmt, tower(), options, derived=True)
     with pytest.raises(NotFound, match="none of them can be derived"):
-        make.from_layers(known, tower("speed"), {"level": "*", "grid": "keepout"}, derived=True)
+        make.from_layers(fmt, tower("speed"), {"level": "*", "grid": "keepout"}, derived=True)
 
 
 def test_formats_with_parts_declare_their_own_options() -> None:
-    for known in formats.all_formats().values():
-        if known.parts is not None:
-            options = known.write_options()
-            assert getattr(options, known.parts.name) is None, known.name
-            assert getattr(options, known.parts.level) is None, known.name
-            assert known.parts.layer in known.carries
-            assert site.everything(known) == {known.parts.level: "*", known.parts.name: "*"}
+    for fmt in formats.all_formats().values():
+        if fmt.parts is not None:
+            options = fmt.write_options()
+            assert getattr(options, fmt.parts.name) is None, fmt.name
+            assert getattr(options, fmt.parts.level) is None, fmt.name
+            assert fmt.parts.layer in fmt.carries
+            assert site.everything(fmt) == {fmt.parts.level: "*", fmt.parts.name: "*"}
     assert site.everything(formats.get_format("tmap2")) == {}

@@ -72,9 +72,9 @@ def test_fields_of_another_release_are_passed_over(tmp_path: Path) -> None:
 def test_memory_and_file_stay_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials, "MOST", 5)
     path = tmp_path / "trials"
-    known = Trials(path)
+    trial_record = Trials(path)
     for number in range(100):
-        known.add(str(number), None, lasting=True)
+        trial_record.add(str(number), None, lasting=True)
         assert len(path.read_bytes().splitlines()) <= 10
     again = Trials(path)
     assert again["99"] is None
@@ -85,9 +85,9 @@ def test_memory_and_file_stay_small(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_disk_that_refuses_leaves_the_memory(tmp_path: Path) -> None:
     (tmp_path / "trials").mkdir()
-    known = Trials(tmp_path / "trials")
-    known.add("works", None, lasting=True)
-    assert known["works"] is None
+    trial_record = Trials(tmp_path / "trials")
+    trial_record.add("works", None, lasting=True)
+    assert trial_record["works"] is None
 
 
 class Runs:

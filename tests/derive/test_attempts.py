@@ -61,11 +61,11 @@ def test_trial_fails_as_the_derivation_does(name: str, stock: str, monkeypatch: 
 def test_samples_have_both_outcomes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(occupancy_to_voxels, "MOST", 10_000)
     steps = (derive.all_derivations()["occupancy_to_voxels"].step(),)
-    found = {
+    outcomes = {
         name: outcome(derive.attempt, steps, Layers({PartKey("occupancy", *k): g for k, g in grids.items()}))
         for name, (grids, _) in STOCKS.items()
     }
-    assert {name for name, failed in found.items() if failed} == {
+    assert {name for name, failed in outcomes.items() if failed} == {
         "nothing known",
         "masks alone",
         "far away",

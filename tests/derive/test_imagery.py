@@ -36,20 +36,20 @@ DATUM = Datum(53.0, -0.5)
 
 
 def layers(picture: Picture, *, name: str = "satellite", datum: Datum | None = None, **more: Picture) -> Layers:
-    known = {PartKey("imagery", "ground", n): p for n, p in {name: picture, **more}.items()}
-    return Layers(dict(known), datum)
+    images = {PartKey("imagery", "ground", n): p for n, p in {name: picture, **more}.items()}
+    return Layers(dict(images), datum)
 
 
 def objects(content: Layers, notes: Notes | None = None, **options: Any) -> Features:
-    made = imagery_to_objects(content, ObjectParameters(**options), notes if notes is not None else Notes())
-    (part,) = made.parts.values()
+    derived_layers = imagery_to_objects(content, ObjectParameters(**options), notes if notes is not None else Notes())
+    (part,) = derived_layers.parts.values()
     assert isinstance(part, Features)
     return part
 
 
 def grid(content: Layers, notes: Notes | None = None, level: str = "ground", **options: Any) -> OccupancyGrid:
-    made = imagery_to_occupancy(content, Parameters(**options), notes if notes is not None else Notes())
-    part = made.parts[PartKey("occupancy", level, MAP)]
+    derived_layers = imagery_to_occupancy(content, Parameters(**options), notes if notes is not None else Notes())
+    part = derived_layers.parts[PartKey("occupancy", level, MAP)]
     assert isinstance(part, OccupancyGrid)
     return part
 
@@ -78,16 +78,16 @@ def test_a_farm_is_told_apart() -> None:
         assert max(overlap(tree, crown) for tree in trees) > 0.85
     (house,) = of(part, "building")
     assert overlap(house, shapely.box(*BUILDING)) > 0.93
-    ways = [shapely.LineString(line).buffer(PATH_WIDTH / 2, cap_style="flat") for line in (PATH, BRANCH)]
+    paths = [shapely.LineString(line).buffer(PATH_WIDTH / 2, cap_style="flat") for line in (PATH, BRANCH)]
     paved = [g for g in of(part, "path") if g.geom_type != "LineString"]
-    assert overlap(shapely.union_all(paved), shapely.union_all(ways)) > 0.9
+    assert overlap(shapely.union_all(paved), shapely.union_all(paths)) > 0.9
     fields = shapely.union_all(of(part, "field"))
-    grass = shapely.box(0, 0, 60, 40).difference(shapely.union_all([*ways, house, *trees]))
+    grass = shapely.box(0, 0, 60, 40).difference(shapely.union_all([*paths, house, *trees]))
     assert overlap(fields, grass) > 0.93
     assert not of(part, "vegetation")
-    told = [f.properties["confidence"] for f in part if "confidence" in f.properties]
-    assert all(0.5 < c <= 1 for c in told)
-    assert len(told) == Counter(f.geometry.geom_type for f in part)["Polygon"]
+    confidences = [f.properties["confidence"] for f in part if "confidence" in f.properties]
+    assert all(0.5 < c <= 1 for c in confidences)
+    assert len(confidences) == Counter(f.geometry.geom_type for f in part)["Polygon"]
     assert any("guessed" in w.problem for w in notes.warnings)
 
 
@@ -100,11 +100,11 @@ def test_middle_lines_become_a_network() -> None:
     assert sum(line.length for line in lines) == pytest.approx(true.length, rel=0.06)
     widths = [f.properties["width"] for f in part if f.properties.get("middle_line")]
     assert all(1.5 <= w <= 2.3 for w in widths)
-    way = derive.plan(frozenset({"imagery"}), frozenset({"topology"}))
-    assert way is not None
-    assert [step.name for step in way.steps] == ["imagery_to_objects", "objects_to_topology"]
-    made = run(way.steps, layers(local(farm())))
-    (network,) = made.vector("topology").values()
+    plan = derive.plan(frozenset({"imagery"}), frozenset({"topology"}))
+    assert plan is not None
+    assert [step.name for step in plan.steps] == ["imagery_to_objects", "objects_to_topology"]
+    derived_layers = run(plan.steps, layers(local(farm())))
+    (network,) = derived_layers.vector("topology").values()
     ends = {p["source"] for p in network.properties if p["kind"] == "edge"}
     assert len(ends) >= 4
     nodes = shapely.get_coordinates(
@@ -128,8 +128,8 @@ def test_a_farm_as_a_grid() -> None:
     # The same through objects.
     notes = Notes()
     both = Layers({**content.parts, **imagery_to_objects(content, ObjectParameters(), notes).parts})
-    made = objects_to_occupancy(both, Rasterised(resolution=0.1, padding=0.0), notes)
-    (rasterised,) = made.grids().values()
+    derived_layers = objects_to_occupancy(both, Rasterised(resolution=0.1, padding=0.0), notes)
+    (rasterised,) = derived_layers.grids().values()
     assert (rasterised.cells == OCCUPIED).sum() * 0.01 == pytest.approx(true, rel=0.1)
 
 
@@ -140,13 +140,13 @@ def test_the_same_picture_gives_the_same_cells_and_a_seed_is_used() -> None:
     patches = np.random.default_rng(3).integers(0, 255, (12, 12, 3), np.uint8)
     noisy = layers(local(np.kron(patches, np.ones((40, 40, 1), np.uint8))))
 
-    def found(**options: Any) -> list[Any]:
+    def ids_of(**options: Any) -> list[Any]:
         return [(f.id, f.geometry.wkt) for f in objects(noisy, minimum_area=0.1, **options)]
 
-    first_ids = found(clusters=12)
-    assert first_ids == found(clusters=12)
-    assert any(first_ids != found(clusters=12, cluster_seed=seed) for seed in (1, 2, 3))
-    assert first_ids != found(clusters=3)
+    first_ids = ids_of(clusters=12)
+    assert first_ids == ids_of(clusters=12)
+    assert any(first_ids != ids_of(clusters=12, cluster_seed=seed) for seed in (1, 2, 3))
+    assert first_ids != ids_of(clusters=3)
 
 
 def test_small_things_are_left_out() -> None:
@@ -194,9 +194,9 @@ def test_a_near_infrared_band_gives_the_ndvi() -> None:
     nir[:, 300:] = 60
     pixels = np.concatenate([rgb, nir[..., None]], axis=2)
     bands = [{"colour": c} for c in ("red", "green", "blue")]
-    said = local(pixels, bands=[*bands, {"colour": "undefined", "description": "NIR"}])
+    labelled = local(pixels, bands=[*bands, {"colour": "undefined", "description": "NIR"}])
     unsaid = local(pixels, bands=[*bands, {"colour": "undefined"}])
-    for content, options in ((layers(said), {}), (layers(unsaid), {"near_infrared": 4})):
+    for content, options in ((layers(labelled), {}), (layers(unsaid), {"near_infrared": 4})):
         notes = Notes()
         part = objects(content, notes, segmentation="index", **options)
         assert "NDVI" in notes.template[0]["why"]
@@ -238,11 +238,17 @@ def test_a_turned_plan_lies_where_its_transform_says() -> None:
     turned = Picture(plan()[..., None], (c, s, 100.0, s, -c, 50.0))
     g = grid(layers(turned))
 
-    def there(x: float, y: float) -> int:
+    def cell_at(x: float, y: float) -> int:
         u, v = x / 0.02, (12 - y) / 0.02
         return at(g, c * u + s * v + 100.0, s * u - c * v + 50.0)
 
-    assert (there(2.1, 6), there(7.05, 3), there(4, 6), there(7.05, 5.5), there(1, 6)) == (100, 100, 0, 0, 255)
+    assert (cell_at(2.1, 6), cell_at(7.05, 3), cell_at(4, 6), cell_at(7.05, 5.5), cell_at(1, 6)) == (
+        100,
+        100,
+        0,
+        0,
+        255,
+    )
     assert g.origin[2] == 0.0
     for k in (0, 1):
         assert g.origin[k] / 0.05 == pytest.approx(round(g.origin[k] / 0.05), abs=1e-6)
@@ -291,12 +297,12 @@ def test_which_picture_and_parameters_of_another_method() -> None:
 def test_pictures_come_last() -> None:
     """Whatever else is stored goes before a picture; a picture before a blank grid."""
     for better in ("objects", "voxels"):
-        way = derive.plan(frozenset({"imagery", better}), frozenset({"occupancy"}))
-        assert way is not None
-        assert [step.needs for step in way.steps] == [(better,)]
-    way = derive.plan(frozenset({"imagery", "location"}), frozenset({"occupancy"}))
-    assert way is not None
-    assert [step.name for step in way.steps] == ["imagery_to_occupancy"]
+        plan = derive.plan(frozenset({"imagery", better}), frozenset({"occupancy"}))
+        assert plan is not None
+        assert [step.needs for step in plan.steps] == [(better,)]
+    plan = derive.plan(frozenset({"imagery", "location"}), frozenset({"occupancy"}))
+    assert plan is not None
+    assert [step.name for step in plan.steps] == ["imagery_to_occupancy"]
 
 
 # --- a building's drawings ------------------------------------------------------------------------------------------
@@ -319,8 +325,8 @@ def png(pixels: Any) -> bytes:
 
 def test_a_buildings_drawing_is_a_picture() -> None:
     notes = Notes()
-    made = resources_to_imagery(building({"plan.png": png(plan())}), Drawings(), notes)
-    g = grid(made, level="L1")
+    derived_layers = resources_to_imagery(building({"plan.png": png(plan())}), Drawings(), notes)
+    g = grid(derived_layers, level="L1")
     assert (at(g, 2.1, 6), at(g, 4, 6), at(g, 1, 6)) == (OCCUPIED, FREE, UNKNOWN)
     assert not notes.warnings
 
@@ -357,10 +363,10 @@ def test_plans_of_real_buildings_have_their_walls(folder: str, levels: int) -> N
     if not (DATA / "openrmf_building" / folder).is_dir():
         pytest.skip("the real maps are not here")
     content = real(folder)
-    made = resources_to_imagery(content, Drawings(), Notes())
-    assert len(made.parts) == levels
-    for key in made.parts:
-        g = grid(Layers({key: made.parts[key]}), level=key.level)
+    derived_layers = resources_to_imagery(content, Drawings(), Notes())
+    assert len(derived_layers.parts) == levels
+    for key in derived_layers.parts:
+        g = grid(Layers({key: derived_layers.parts[key]}), level=key.level)
         (part,) = content.vector("objects", key.level).values()
         walls = of(part, "wall")
         assert covered(walls, g) >= 0.9
@@ -385,8 +391,8 @@ def test_a_plan_that_a_robot_made_agrees_with_its_map() -> None:
     if not folder.is_dir():
         pytest.skip("the real maps are not here")
     files = {p.name: p.read_bytes() for p in (folder / "ros_map").iterdir()}
-    known = bundle.read(files, Hints(format="occupancy_grid"), Known(), Limits()).layers(None)
-    (true,) = known.grids().values()
+    map_layers = bundle.read(files, Hints(format="occupancy_grid"), Known(), Limits()).layers(None)
+    (true,) = map_layers.grids().values()
     pixels = cv2.imread(str(folder / "small_sim_map.png"), cv2.IMREAD_GRAYSCALE)
     assert pixels is not None
     assert pixels.shape == true.cells.shape
@@ -394,16 +400,22 @@ def test_a_plan_that_a_robot_made_agrees_with_its_map() -> None:
     size = true.resolution
     lain = Picture(pixels[..., None], (size, 0.0, x, 0.0, -size, y + len(pixels) * size))
     notes = Notes()
-    made = grid(layers(lain), notes, minimum_area=0.0)
+    derived_grid = grid(layers(lain), notes, minimum_area=0.0)
     assert any("205" in w.problem for w in notes.warnings)
-    near = cv2.distanceTransform((made.cells != OCCUPIED).astype(np.uint8), cv2.DIST_L2, 5) * made.resolution <= 0.1
+    near = (
+        cv2.distanceTransform((derived_grid.cells != OCCUPIED).astype(np.uint8), cv2.DIST_L2, 5)
+        * derived_grid.resolution
+        <= 0.1
+    )
     rows, columns = np.nonzero(true.cells == OCCUPIED)
     at_x, at_y = (columns + 0.5) * size + x, (rows + 0.5) * size + y
-    j, i = ((v - o) / made.resolution for v, o in zip((at_x, at_y), made.origin, strict=False))
+    j, i = ((v - o) / derived_grid.resolution for v, o in zip((at_x, at_y), derived_grid.origin, strict=False))
     assert near[i.astype(int), j.astype(int)].mean() >= 0.98
-    free = true.cells[(made.cells == FREE)[: len(true.cells), : true.cells.shape[1]]]
+    free = true.cells[(derived_grid.cells == FREE)[: len(true.cells), : true.cells.shape[1]]]
     assert (free == OCCUPIED).mean() < 0.02
-    assert (made.cells == FREE).sum() == pytest.approx((pixels > 230).sum(), rel=0.02)  # its grey is not free here
+    assert (derived_grid.cells == FREE).sum() == pytest.approx(
+        (pixels > 230).sum(), rel=0.02
+    )  # its grey is not free here
 
 
 def test_the_strawberry_farm_from_above() -> None:
@@ -412,8 +424,8 @@ def test_the_strawberry_farm_from_above() -> None:
     if not file.is_file():
         pytest.skip("the real maps are not here")
     hints = Hints(format="satellite", options={"corners": "53.2694,-0.5262,53.2682,-0.5224", "picture": "satellite"})
-    told = bundle.read({"satellite-auto.png": file.read_bytes()}, hints, Known(), Limits())
-    content = told.layers(Datum(53.268642038, -0.524509505881))
+    upload_bundle = bundle.read({"satellite-auto.png": file.read_bytes()}, hints, Known(), Limits())
+    content = upload_bundle.layers(Datum(53.268642038, -0.524509505881))
     part = objects(content)
     assert not part.local.any()
     frame = local_frame(Datum(53.268642038, -0.524509505881))

@@ -63,10 +63,10 @@ def model(rows: Any, prototypes: Any = None, *, side: int | None = SIDE, names: 
     size: Any = side if side else "side"
     inputs = [make.make_tensor_value_info("images", dtype, [1, 3, size, size])]
     graph = make.make_graph(nodes, "tiny", inputs, outputs, constants)
-    made = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
+    onnx_model = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
     if names:
-        made.metadata_props.add(key="names", value=names)
-    return bytes(made.SerializeToString())
+        onnx_model.metadata_props.add(key="names", value=names)
+    return bytes(onnx_model.SerializeToString())
 
 
 @pytest.fixture
@@ -90,10 +90,10 @@ def content(width: int = SIDE, height: int = SIDE, red: Any = None) -> Layers:
     return Layers({PartKey("imagery", "ground", "satellite"): local(pixels, 1.0)})
 
 
-def found(where: Layers, notes: Notes | None = None, **more: Any) -> dict[str, Any]:
+def detect(layers: Layers, notes: Notes | None = None, **more: Any) -> dict[str, Any]:
     options = Parameters(segmentation="model", model="tiny", resolution=1.0, **more)
-    made = imagery_to_objects(where, options, notes if notes is not None else Notes())
-    (part,) = made.parts.values()
+    derived_layers = imagery_to_objects(layers, options, notes if notes is not None else Notes())
+    (part,) = derived_layers.parts.values()
     assert isinstance(part, Features)
     return {f.properties["kind"]: (f.geometry, f.properties["confidence"]) for f in part}
 
@@ -110,7 +110,7 @@ ROWS = np.array([HOUSE, TWICE, TREE, CAR, UNSURE]).T
 def test_boxes_become_objects_and_cells(folder: Path) -> None:
     put(folder, model(ROWS))
     notes = Notes()
-    things = found(content(), notes)
+    things = detect(content(), notes)
     assert set(things) == {"building", "tree"}
     assert things["building"][0].equals(shapely.box(10, 64 - 25, 30, 64 - 15)), "y points upward"
     assert things["building"][1] == 0.9
@@ -120,8 +120,10 @@ def test_boxes_become_objects_and_cells(folder: Path) -> None:
     with pytest.raises(CannotConvert, match="nothing that is free"):
         imagery_to_occupancy(content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), Notes())
     put(folder, model(ROWS), ("building", "field", None))
-    made = imagery_to_occupancy(content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), Notes())
-    (grid,) = made.parts.values()
+    derived_layers = imagery_to_occupancy(
+        content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), Notes()
+    )
+    (grid,) = derived_layers.parts.values()
     assert isinstance(grid, OccupancyGrid)
     assert ((grid.cells == OCCUPIED).sum(), (grid.cells == FREE).sum()) == (200, 100)
 
@@ -130,7 +132,7 @@ def test_masks_cut_a_thing_out_of_its_box(folder: Path) -> None:
     left = np.where(np.arange(16) < 5, 8.0, -8.0)[None, :].repeat(16, axis=0)  # the left 20 of 64 pixels
     rows = np.concatenate([ROWS, [[1.0] * 5, [0.0] * 5]])
     put(folder, model(rows, np.stack([left, np.zeros((16, 16))])))
-    things = found(content())
+    things = detect(content())
     assert set(things) == {"building"}, "nothing of the tree is in the mask"
     assert things["building"][0].area == pytest.approx(100, abs=10)
     assert shapely.bounds(things["building"][0])[2] == pytest.approx(20, abs=1)
@@ -139,50 +141,50 @@ def test_masks_cut_a_thing_out_of_its_box(folder: Path) -> None:
 def test_the_older_layout_with_objectness(folder: Path) -> None:
     older = np.array([[*r[:4], 1.0, *r[4:]] for r in (HOUSE, TWICE, TREE, CAR, UNSURE)])
     put(folder, model(older))  # [n, 5 + classes]
-    things = found(content(), confidence=0.5)
+    things = detect(content(), confidence=0.5)
     assert things["building"][0].equals(shapely.box(10, 39, 30, 49))
 
 
 def test_large_pictures_are_cut_and_seams_do_not_show(folder: Path) -> None:
     """The model answers for a tile with any red in it: that of the far corner only, here."""
     put(folder, model(np.array([TREE]).T))
-    where = content(200, 100, red=(slice(90, 100), slice(190, 200), 0))
-    (tree,) = found(where).values()
+    layers = content(200, 100, red=(slice(90, 100), slice(190, 200), 0))
+    (tree,) = detect(layers).values()
     assert tree[0].equals(shapely.box(136 + 43, 11, 136 + 53, 21))
-    everywhere = found(content(200, 100))
+    everywhere = detect(content(200, 100))
     assert "tree" in everywhere
-    small = found(content(55, 55))
+    small = detect(content(55, 55))
     assert shapely.bounds(small["tree"][0]).tolist() == [43, 2, 53, 12], "a tile of the lower right, padded"
 
 
 def test_names_in_the_model_itself(folder: Path) -> None:
     put(folder, model(ROWS, names="{0: 'building', 1: 'tree', 2: 'car'}"), None)
-    assert set(found(content())) == {"building", "tree"}
+    assert set(detect(content())) == {"building", "tree"}
     put(folder, model(ROWS), None)
     with pytest.raises(CannotConvert, match=r"put tiny\.json beside it"):
-        found(content())
+        detect(content())
 
 
 def test_the_same_model_gives_the_same(folder: Path) -> None:
     put(folder, model(ROWS))
-    assert str(found(content(150, 90))) == str(found(content(150, 90)))
+    assert str(detect(content(150, 90))) == str(detect(content(150, 90)))
 
 
 def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(NotFound, match="there are: none"):
-        found(content())
+        detect(content())
     put(folder, model(ROWS), ("building", "tree", None, None, None))
     with pytest.raises(CannotConvert, match="other than 5 classes"):
-        found(content())
+        detect(content())
     put(folder, model(ROWS), ("building", "castle", None))
     with pytest.raises(CannotConvert, match="must be null or one of"):
-        found(content())
+        detect(content())
     put(folder, b"no model")
     with pytest.raises(CannotConvert, match="cannot be loaded"):
-        found(content())
+        detect(content())
     put(folder, model(ROWS))
     with pytest.raises(CannotConvert, match="finds nothing"):
-        found(content(), confidence=0.95)
+        detect(content(), confidence=0.95)
     for name in ("../tiny", "other", "tiny.onnx"):
         with pytest.raises(NotFound, match="there are: tiny"):
             _onnx.supplied(name)
@@ -199,10 +201,10 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(_onnx.importlib, "import_module", absent)
     with pytest.raises(CannotConvert, match=r'pip install "fleet-map-server\[models\]"'):
-        found(content())
+        detect(content())
     monkeypatch.delenv(_onnx.FOLDER)
     with pytest.raises(CannotConvert, match="FLEETMAP_MODELS_DIR"):
-        found(content())
+        detect(content())
 
 
 def test_through_the_server(folder: Path, tmp_path: Path) -> None:
@@ -213,10 +215,12 @@ def test_through_the_server(folder: Path, tmp_path: Path) -> None:
     with running(settings_for(tmp_path / "data", models_dir=folder)) as api:
         api.post("environments", {"name": "yard"})
         api.upload("yard", {"yard.png": png.tobytes()}, format="satellite", metres_per_pixel="1")
-        wish = {"segmentation": "model", "model": "tiny", "resolution": 1.0}
+        parameters = {"segmentation": "model", "model": "tiny", "resolution": 1.0}
         path = "environments/yard/derivations"
-        made = api.post(path, {"method": "imagery_to_objects", "parameters": wish}).json()
-        assert made["information"]["objects"] == "derived"
+        version = api.post(path, {"method": "imagery_to_objects", "parameters": parameters}).json()
+        assert version["information"]["objects"] == "derived"
         things = api.get("environments/yard/versions/latest/layers/objects?crs=local").json()["features"]
         assert {f["properties"]["kind"] for f in things} == {"building", "tree"}
-        api.problem("POST", path, 404, json={"method": "imagery_to_objects", "parameters": {**wish, "model": "x"}})
+        api.problem(
+            "POST", path, 404, json={"method": "imagery_to_objects", "parameters": {**parameters, "model": "x"}}
+        )

@@ -61,12 +61,12 @@ def content(image: np.ndarray[Any, np.dtype[np.uint8]]) -> Layers:
     return Layers({PartKey("imagery", "ground", "satellite"): local(image, 0.5)})
 
 
-def found(where: Layers, notes: Notes | None = None, **more: Any) -> dict[str, list[tuple[Any, dict[str, Any]]]]:
+def detect(layers: Layers, notes: Notes | None = None, **more: Any) -> dict[str, list[tuple[Any, dict[str, Any]]]]:
     # Squares of the embedding that hold two colours are things, too: small ones.
     usual = {"segmentation": "model", "model": "sam", "resolution": 0.5, "minimum_area": 5.0}
     options = Parameters(**{**usual, **more})
-    made = imagery_to_objects(where, options, notes if notes is not None else Notes())
-    (part,) = made.parts.values()
+    derived_layers = imagery_to_objects(layers, options, notes if notes is not None else Notes())
+    (part,) = derived_layers.parts.values()
     assert isinstance(part, Features)
     out: dict[str, list[tuple[Any, dict[str, Any]]]] = {}
     for f in part:
@@ -109,12 +109,12 @@ def check(things: dict[str, list[tuple[Any, dict[str, Any]]]], height: int = 64)
 def test_things_are_cut_out_and_told_by_colour(folder: Path, how: dict[str, dict[str, Any]]) -> None:
     put(folder, tiny_sam.encoder(SIDE, **how.get("encoder", {})), tiny_sam.decoder(SIDE, **how.get("decoder", {})))
     notes = Notes()
-    things = found(content(yard()), notes, stability=0.7)
+    things = detect(content(yard()), notes, stability=0.7)
     check(things)
-    said = things["building"][0][1]
-    assert said["model"] == "sam"
-    assert 0.3 < said["confidence"] <= 0.95
-    assert said["stability"] > 0.9
+    properties = things["building"][0][1]
+    assert properties["model"] == "sam"
+    assert 0.3 < properties["confidence"] <= 0.95
+    assert properties["stability"] > 0.9
     assert any("3 are told by colour and shape, 1 cannot be and are of kind area" in w.problem for w in notes.warnings)
 
 
@@ -135,76 +135,76 @@ def test_large_pictures_are_cut_into_tiles_and_seen_as_a_whole(folder: Path) -> 
     for x0, y0, x1, y1 in houses:
         image[y0:y1, x0:x1] = ROOF if x0 < 100 else (210, 200, 205)  # one thing, for this model, is of one colour
     image[48:56, 24:296] = (185, 175, 160)  # through all tiles: only the whole picture shows all of it
-    things = found(content(image))
-    assert all("middle_line" in said for _, said in things.pop("path"))
+    things = detect(content(image))
+    assert all("middle_line" in properties for _, properties in things.pop("path"))
     assert {kind: len(of) for kind, of in things.items()} == {"building": 2, "field": 1, "road": 1}
     seen = sorted((t[0] for t in things["building"]), key=lambda g: float(g.centroid.x))
     assert [alike(g, box(house)) > 0.85 for g, house in zip(seen, houses, strict=True)] == [True, True]
-    (way,) = things["road"]
-    assert alike(way[0], box((24, 48, 296, 56))) > 0.9
-    assert way[1]["width"] == pytest.approx(4, abs=0.3)
+    (road,) = things["road"]
+    assert alike(road[0], box((24, 48, 296, 56))) > 0.9
+    assert road[1]["width"] == pytest.approx(4, abs=0.3)
 
 
 def test_what_the_model_is_not_sure_of_is_left_out(folder: Path) -> None:
     put(folder, decoder=tiny_sam.decoder(SIDE, iou=0.6))
     with pytest.raises(CannotConvert, match=r"confidence of 0\.88 and a stability of 0\.95"):
-        found(content(yard()))
-    assert found(content(yard()), confidence=0.55)["tree"][0][1]["confidence"] <= 0.6
+        detect(content(yard()))
+    assert detect(content(yard()), confidence=0.55)["tree"][0][1]["confidence"] <= 0.6
     put(folder, decoder=tiny_sam.decoder(SIDE, steep=0.5))  # its logits are all near the threshold
     with pytest.raises(CannotConvert, match=r"a stability of 0\.95"):
-        found(content(yard()))
-    assert found(content(yard()), stability=0.0)
+        detect(content(yard()))
+    assert detect(content(yard()), stability=0.0)
 
 
 def test_one_point_finds_one_thing(folder: Path) -> None:
     put(folder)
-    assert set(found(content(yard()), points=1)) == {"field"}
+    assert set(detect(content(yard()), points=1)) == {"field"}
 
 
 def test_grey_pictures_have_no_kinds(folder: Path) -> None:
     put(folder)
     notes = Notes()
     grey = cv2.cvtColor(yard(), cv2.COLOR_RGB2GRAY)
-    assert set(found(content(grey), notes)) == {"area"}
+    assert set(detect(content(grey), notes)) == {"area"}
     assert any("0 are told" in w.problem for w in notes.warnings)
 
 
 def test_the_same_model_gives_the_same(folder: Path) -> None:
     put(folder)
-    assert str(found(content(yard(150, 90)))) == str(found(content(yard(150, 90))))
+    assert str(detect(content(yard(150, 90)))) == str(detect(content(yard(150, 90))))
 
 
 def test_what_a_wrong_model_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = r"image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size"
     put(folder, decoder=tiny_sam.encoder(SIDE))
     with pytest.raises(CannotConvert, match=expected + r".*sam\.decoder\.onnx\) is \(x \[batch, 3, 128, 128\]\)"):
-        found(content(yard()))
+        detect(content(yard()))
     put(folder, encoder=tiny_sam.decoder(SIDE))
     with pytest.raises(CannotConvert, match=expected + r".*sam\.encoder\.onnx\) is"):
-        found(content(yard()))
+        detect(content(yard()))
     put(folder, decoder=tiny_sam.decoder(SIDE, second=True))
     with pytest.raises(CannotConvert, match="high_res_feats"):
-        found(content(yard()))
+        detect(content(yard()))
     put(folder, decoder=tiny_sam.decoder(SIDE, without="has_mask_input"))
     with pytest.raises(CannotConvert, match=expected):
-        found(content(yard()))
+        detect(content(yard()))
     put(folder, encoder=b"no model")
     with pytest.raises(CannotConvert, match=r"cannot be loaded: sam\.encoder\.onnx"):
-        found(content(yard()))
+        detect(content(yard()))
     put(folder, encoder=tiny_sam.encoder(64))  # an embedding that the decoder does not take
     with pytest.raises(CannotConvert, match=r"the model sam \(sam\.decoder\.onnx\) fails"):
-        found(content(yard()))
+        detect(content(yard()))
     put(folder)
     monkeypatch.setenv(_onnx.LARGEST, "1000")
     with pytest.raises(TooLarge, match="larger than 1000 bytes: the operator may set FLEETMAP_MODELS_MAX_BYTES"):
-        found(content(yard()))
+        detect(content(yard()))
     monkeypatch.delenv(_onnx.LARGEST)
     big = Layers({PartKey("imagery", "ground", "satellite"): local(np.zeros((3000, 3000, 3), np.uint8), 0.5)})
     with pytest.raises(CannotConvert, match="give a coarser resolution than"):
-        found(big)
+        detect(big)
     (folder / "sam.decoder.onnx").unlink()
     with pytest.raises(NotFound, match=r"there are: sam\.encoder$"):
-        found(content(yard()))
+        detect(content(yard()))
 
 
 def test_names_of_the_two_files(folder: Path) -> None:
@@ -236,58 +236,58 @@ def pixels(side: int | None = 64, count: int = 3, coarse: int = 2) -> bytes:
         [make.make_tensor_value_info("logits", dtype, [1, count, "h", "w"])],
         constants,
     )
-    made = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
-    return bytes(made.SerializeToString())
+    onnx_model = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
+    return bytes(onnx_model.SerializeToString())
 
 
 PLAIN = {"classes": ["building", "field", None], "mean": [0, 0, 0], "std": [1, 1, 1]}
 
 
-def told(folder: Path, data: bytes, said: Any) -> None:
+def write_model(folder: Path, data: bytes, metadata: Any) -> None:
     (folder / "pixels.onnx").write_bytes(data)
-    (folder / "pixels.json").write_text(json.dumps(said))
+    (folder / "pixels.json").write_text(json.dumps(metadata))
 
 
 def test_each_pixel_is_told_across_tiles(folder: Path) -> None:
     """Red is a building, green a field, blue nothing; a red band runs through three tiles without a seam."""
-    told(folder, pixels(), PLAIN)
+    write_model(folder, pixels(), PLAIN)
     image = np.full((80, 150, 3), (0, 255, 0), np.uint8)
     image[20:40, 10:140] = (255, 0, 0)
     image[60:70, 60:80] = (0, 0, 255)
     notes = Notes()
-    things = found(content(image), notes, model="pixels", minimum_area=None)
+    things = detect(content(image), notes, model="pixels", minimum_area=None)
     assert {kind: len(of) for kind, of in things.items()} == {"building": 1, "field": 1}
     assert alike(things["building"][0][0], box((10, 20, 140, 40), 80)) > 0.98
     assert things["field"][0][0].area == pytest.approx((80 * 150 - 20 * 130 - 200) / 4, rel=0.02)
     assert things["building"][0][1]["confidence"] > 0.9
     assert [d["what"] for d in notes.dropped] == ["m² of ground"]
     with pytest.raises(CannotConvert, match="finds nothing"):
-        found(content(np.full((80, 80, 3), 128, np.uint8)), model="pixels")  # a third each
+        detect(content(np.full((80, 80, 3), 128, np.uint8)), model="pixels")  # a third each
 
 
 def test_classes_that_are_ways_have_a_width(folder: Path) -> None:
-    told(folder, pixels(), {**PLAIN, "classes": ["path", "field", None]})
+    write_model(folder, pixels(), {**PLAIN, "classes": ["path", "field", None]})
     image = np.full((64, 64, 3), (0, 255, 0), np.uint8)
     image[30:36] = (255, 0, 0)
-    things = found(content(image), model="pixels")
+    things = detect(content(image), model="pixels")
     assert things["path"][0][1]["width"] == pytest.approx(3, abs=0.5)
 
 
 def test_usual_mean_and_wrong_words(folder: Path) -> None:
-    told(folder, pixels(None), ["building", "field", None])
+    write_model(folder, pixels(None), ["building", "field", None])
     image = np.full((64, 64, 3), (124, 116, 104), np.uint8)  # ImageNet's mean: nothing is more likely than the rest
     image[10:30, 10:30] = (255, 0, 0)
-    assert set(found(content(image), model="pixels")) == {"building"}
-    told(folder, pixels(), {**PLAIN, "classes": ["building", "field"]})
+    assert set(detect(content(image), model="pixels")) == {"building"}
+    write_model(folder, pixels(), {**PLAIN, "classes": ["building", "field"]})
     with pytest.raises(CannotConvert, match=r"other than 2 classes: it gives \(1, 3, 32, 32\)"):
-        found(content(image), model="pixels")
+        detect(content(image), model="pixels")
     for wrong in ({"std": [1, 0, 1]}, {"mean": [1, 2]}, {"mean": "abc"}, {"std": None}):
-        told(folder, pixels(), {**PLAIN, **wrong})
+        write_model(folder, pixels(), {**PLAIN, **wrong})
         with pytest.raises(CannotConvert, match=r"pixels\.json: (std|mean) must be"):
-            found(content(image), model="pixels")
-    told(folder, pixels(), PLAIN)
+            detect(content(image), model="pixels")
+    write_model(folder, pixels(), PLAIN)
     with pytest.raises(Invalid, match="points: belongs to models of the Segment-Anything family, and pixels is none"):
-        found(content(image), model="pixels", points=8)
+        detect(content(image), model="pixels", points=8)
     with pytest.raises(Invalid, match="stability: belongs to segmentation=model"):
         imagery_to_objects(content(image), Parameters(stability=0.5, segmentation="colour"), Notes())
 
@@ -301,19 +301,19 @@ def test_through_the_server(folder: Path, tmp_path: Path) -> None:
     with running(settings) as api:
         api.post("environments", {"name": "yard"})
         api.upload("yard", {"yard.png": png.tobytes()}, format="satellite", metres_per_pixel="0.5")
-        wish = {"segmentation": "model", "model": "sam", "resolution": 0.5, "minimum_area": 5}
+        parameters = {"segmentation": "model", "model": "sam", "resolution": 0.5, "minimum_area": 5}
         path = "environments/yard/derivations"
-        made = api.post(path, {"method": "imagery_to_objects", "parameters": wish}).json()
-        assert made["information"]["objects"] == "derived"
-        assert any("kind area" in w["problem"] for w in made["warnings"])
+        version = api.post(path, {"method": "imagery_to_objects", "parameters": parameters}).json()
+        assert version["information"]["objects"] == "derived"
+        assert any("kind area" in w["problem"] for w in version["warnings"])
         things = api.get("environments/yard/versions/latest/layers/objects?crs=local").json()["features"]
         assert sorted(f["properties"]["kind"] for f in things) == ["area", "building", "field", "tree"]
         wrong = api.problem(
-            "POST", path, 422, json={"method": "imagery_to_objects", "parameters": {**wish, "points": 99}}
+            "POST", path, 422, json={"method": "imagery_to_objects", "parameters": {**parameters, "points": 99}}
         )
         assert "at most 64" in wrong["detail"]
         (folder / "sam.decoder.onnx").write_bytes(tiny_sam.encoder(SIDE))
         wrong = api.problem(
-            "POST", path, 422, json={"method": "imagery_to_objects", "parameters": {**wish, "points": 9}}
+            "POST", path, 422, json={"method": "imagery_to_objects", "parameters": {**parameters, "points": 9}}
         )
         assert "expected are an encoder" in wrong["detail"]

@@ -21,10 +21,10 @@ DATUM = Datum(52.0, 10.0)
 
 def blank(fence: Any, anchor: Any = "local", notes: Notes | None = None, **options: Any) -> OccupancyGrid:
     part = features([("fence", fence, {"kind": "fence"})], anchor)
-    made = location_to_occupancy(
+    derived_layers = location_to_occupancy(
         Layers({PartKey("location", "ground", SITE): part}, DATUM), Parameters(**options), notes or Notes()
     )
-    grid = made.parts[PartKey("occupancy", "ground", MAP)]
+    grid = derived_layers.parts[PartKey("occupancy", "ground", MAP)]
     assert isinstance(grid, OccupancyGrid)
     return grid
 

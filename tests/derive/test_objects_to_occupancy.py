@@ -37,7 +37,7 @@ DATUM = Datum(52.0, 10.0)
 
 
 def objects(*rows: tuple[Any, dict[str, Any]], anchor: Any = "local") -> Features:
-    return features([(f"o{k}", geometry, said) for k, (geometry, said) in enumerate(rows)], anchor)
+    return features([(f"o{k}", geometry, properties) for k, (geometry, properties) in enumerate(rows)], anchor)
 
 
 def layers(part: Features, *, level: str = "ground", **more: Any) -> Layers:
@@ -54,13 +54,13 @@ def grid(
     content: Layers, notes: Notes | None = None, level: str = "ground", *, outside_free: bool = True, **options: Any
 ) -> OccupancyGrid:
     chosen = Parameters(outside_free=outside_free, **options)
-    made = objects_to_occupancy(content, chosen, notes if notes is not None else Notes())
-    part = made.parts[PartKey("occupancy", level, MAP)]
+    derived_layers = objects_to_occupancy(content, chosen, notes if notes is not None else Notes())
+    part = derived_layers.parts[PartKey("occupancy", level, MAP)]
     assert isinstance(part, OccupancyGrid)
     assert part.origin[2] == 0
     for k in (0, 1):
-        whole = part.origin[k] / part.resolution
-        assert whole == pytest.approx(round(whole), abs=1e-6)
+        cell_count = part.origin[k] / part.resolution
+        assert cell_count == pytest.approx(round(cell_count), abs=1e-6)
     return part
 
 
@@ -215,14 +215,14 @@ def test_places_on_earth_need_a_datum() -> None:
     ],
 )
 def test_the_tags_of_openstreetmap(tags: dict[str, str], expected: bool) -> None:
-    said = {"kind": next(iter(tags)), "osm": {"tags": tags}}
-    content = layers(objects((shapely.box(0, 0, 2, 2), said), (shapely.box(9, 9, 9.1, 9.1), {"kind": "post"})))
+    properties = {"kind": next(iter(tags)), "osm": {"tags": tags}}
+    content = layers(objects((shapely.box(0, 0, 2, 2), properties), (shapely.box(9, 9, 9.1, 9.1), {"kind": "post"})))
     assert (at(grid(content), 1, 1) == 100) is expected
 
 
 def test_widths_and_discs_of_lines_and_points() -> None:
-    def square_metres(geometry: Any, **said: Any) -> float:
-        return occupied(grid(layers(objects((geometry, said))), resolution=0.01))
+    def square_metres(geometry: Any, **properties: Any) -> float:
+        return occupied(grid(layers(objects((geometry, properties))), resolution=0.01))
 
     line = shapely.LineString([(0.003, 0.003), (10.003, 0.003)])
     assert square_metres(line, kind="barrier", osm={"tags": {"barrier": "hedge", "width": "2"}}) == pytest.approx(
@@ -397,8 +397,8 @@ def test_solids_that_cannot_be_read_refuse_a_grid_of_guesses() -> None:
 
 def test_no_grid_is_made_of_the_voxels_of_objects() -> None:
     """The way round by voxels would give what the slice refuses: nothing but obstacles."""
-    found = derive.plan(frozenset({"objects"}), frozenset({"occupancy"}), frozenset({"objects_to_occupancy"}))
-    assert found is None or "objects_to_voxels" not in [step.name for step in found.steps]
+    plan = derive.plan(frozenset({"objects"}), frozenset({"occupancy"}), frozenset({"objects_to_occupancy"}))
+    assert plan is None or "objects_to_voxels" not in [step.name for step in plan.steps]
 
 
 def test_what_cannot_be_read_is_left_out_and_told() -> None:
@@ -450,11 +450,11 @@ def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None
         (shapely.Point(-10, -5), {"kind": "table"}),
         (shapely.Point(-10, 0), {"kind": "table", "width": 0.2}),
     ]
-    where = np.array([g for g, _ in (*ground, WALL)], object)
+    geometries = np.array([g for g, _ in (*ground, WALL)], object)
     frame = LocalFrame(DATUM)
     part = objects(
         *zip(
-            where if anchor == "local" else frame.geometries_to_wgs84(where),
+            geometries if anchor == "local" else frame.geometries_to_wgs84(geometries),
             [p for _, p in (*ground, WALL)],
             strict=True,
         ),
@@ -593,12 +593,12 @@ def test_whatever_objects_say_is_a_grid_or_a_clear_problem(rows: list[Any]) -> N
     """What is wrong with one object is told, and the others are there all the same."""
     content = layers(objects(*rows, (shapely.box(0, 0, 1, 1), {"kind": "building"})), files={"a.stl": stl()})
     try:
-        made = grid(content, resolution=0.5, doors="closed")
+        derived_grid = grid(content, resolution=0.5, doors="closed")
     except CannotConvert as error:
         expected = ("resolution of at least", "no free ground of the level ground is known, since solids")
         assert any(text in error.detail for text in expected), "what lies far away makes it large"
     else:
-        assert at(made, 0.5, 0.5) == 100
+        assert at(derived_grid, 0.5, 0.5) == 100
     try:
         objects_to_voxels(content, VoxelParameters(resolution=0.5), Notes())
     except CannotConvert as error:
@@ -630,8 +630,8 @@ def test_it_is_planned_with_what_it_may_also_read() -> None:
 
 def read(*paths: Path) -> Layers:
     files = {p.name: p.read_bytes() for p in paths}
-    told = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
-    return told.layers(None)
+    upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
+    return upload_bundle.layers(None)
 
 
 def xy_of(listed: list[dict[str, Any]], scale: float) -> Any:
@@ -655,13 +655,13 @@ def test_a_real_building_is_its_walls_and_floors(
     import yaml
 
     path = shared / "data/openrmf_building" / name
-    said = yaml.safe_load(path.read_text())["levels"]
+    levels = yaml.safe_load(path.read_text())["levels"]
     content = read(path)
     g = grid(content, level=level)
     if walls is None:
         assert g.counts()["free"] > 100_000
         return
-    one = said[level]
+    one = levels[level]
     assert (len(one["walls"]), len(one["floors"])) == (walls, floor)
     xy = np.array([[v[0], -v[1]] for v in one["vertices"]])
     scale = np.mean([m[2]["distance"][1] / np.hypot(*(xy[m[0]] - xy[m[1]])) for m in one["measurements"]])
@@ -697,18 +697,18 @@ def test_the_walls_of_robast_sim_are_on_its_ros_map(shared: Path) -> None:
     derived = grid(read(folder / "tiplu.building.yaml"), level="Tiplu")
     real = read(*(p for p in (folder / "ros_map").iterdir() if p.suffix in (".yaml", ".pgm")))
     (measured,) = real.grids().values()
-    said = yaml.safe_load((folder / "tiplu.building.yaml").read_text())["levels"]["Tiplu"]
-    (a, b, more) = said["measurements"][0][:3]
-    ends = np.array([said["vertices"][k][:2] for k in (a, b)])
+    level = yaml.safe_load((folder / "tiplu.building.yaml").read_text())["levels"]["Tiplu"]
+    (a, b, more) = level["measurements"][0][:3]
+    ends = np.array([level["vertices"][k][:2] for k in (a, b)])
     scale = more["distance"][1] / np.hypot(*(ends[0] - ends[1]))
     assert scale == pytest.approx(measured.resolution, rel=0.03)
     rows, columns = np.nonzero(derived.cells == 100)
     x = (derived.origin[0] + (columns + 0.5) * derived.resolution) / scale
     y = measured.height + (derived.origin[1] + (rows + 0.5) * derived.resolution) / scale
     away = ndimage.distance_transform_edt(measured.cells != 100) * measured.resolution
-    here = away[np.clip(y.astype(int), 0, measured.height - 1), np.clip(x.astype(int), 0, measured.width - 1)]
-    assert (here <= 0.2).mean() > 0.8
-    assert (here <= 0.5).mean() > 0.95
+    distances = away[np.clip(y.astype(int), 0, measured.height - 1), np.clip(x.astype(int), 0, measured.width - 1)]
+    assert (distances <= 0.2).mean() > 0.8
+    assert (distances <= 0.5).mean() > 0.95
 
 
 @pytest.mark.parametrize("door", ["left", ["x", "y"], 7, None])

@@ -22,10 +22,10 @@ def objects(geometry: Any, kind: str = "path", name: str = "a") -> Features:
 
 
 def network(layers: Layers, **options: Any) -> dict[str, Features]:
-    made = objects_to_topology(layers, Parameters(**options), derive.Notes())
-    assert {k.layer for k in made.parts} == {"topology"}
-    assert {k.name for k in made.parts} == {NETWORK}
-    return {k.level: p for k, p in made.parts.items() if isinstance(p, Features)}
+    derived_layers = objects_to_topology(layers, Parameters(**options), derive.Notes())
+    assert {k.layer for k in derived_layers.parts} == {"topology"}
+    assert {k.name for k in derived_layers.parts} == {NETWORK}
+    return {k.level: p for k, p in derived_layers.parts.items() if isinstance(p, Features)}
 
 
 def test_one_network_for_each_level() -> None:
@@ -34,10 +34,10 @@ def test_one_network_for_each_level() -> None:
         PartKey("objects", "ground", "geojson"): objects(shapely.LineString([(5, 0.05), (9, 9)])),
         PartKey("objects", "L2", "kml"): objects(PATH),
     }
-    made = network(Layers(parts, levels=(Level(), Level("L2", 4.0))))
-    assert set(made) == {"ground", "L2"}
-    assert len(made["ground"]) == 3 + 4, "two drawings meet at a node"
-    assert {p["drawn_from"] for p in made["ground"].properties} == {"a"}, "ids as the drawings have them"
+    networks = network(Layers(parts, levels=(Level(), Level("L2", 4.0))))
+    assert set(networks) == {"ground", "L2"}
+    assert len(networks["ground"]) == 3 + 4, "two drawings meet at a node"
+    assert {p["drawn_from"] for p in networks["ground"].properties} == {"a"}, "ids as the drawings have them"
 
 
 def test_only_drawings_and_paths_count() -> None:
@@ -57,7 +57,7 @@ def test_it_is_planned_and_its_parameters_are_checked() -> None:
     plan = derive.plan(frozenset({"objects"}), frozenset({"topology"}))
     assert plan is not None
     assert [s.name for s in plan.steps] == ["objects_to_topology"]
-    made = derive.run(plan.steps, Layers({PartKey("objects", "ground", "kml"): objects(PATH)}))
-    assert made.layers == {"objects", "topology"}
+    derived_layers = derive.run(plan.steps, Layers({PartKey("objects", "ground", "kml"): objects(PATH)}))
+    assert derived_layers.layers == {"objects", "topology"}
     with pytest.raises(Invalid, match="at most 100"):
         parameters.parse(Parameters, {"join": "1e9"})

@@ -20,8 +20,8 @@ from tests.derive.test_objects_to_occupancy import BOX, layers, objects
 
 
 def voxels(content: Layers, notes: Notes | None = None, **options: Any) -> VoxelMap:
-    made = objects_to_voxels(content, Parameters(**options), notes or Notes())
-    part = made.parts[PartKey("voxels", "ground", MAP)]
+    derived_layers = objects_to_voxels(content, Parameters(**options), notes or Notes())
+    part = derived_layers.parts[PartKey("voxels", "ground", MAP)]
     assert isinstance(part, VoxelMap)
     assert part.occupied.all()
     return part

@@ -36,8 +36,8 @@ def room(width: int = 40, height: int = 20) -> Any:
 
 
 def drawn(layers: Layers, notes: Notes | None = None, **values: Any) -> Picture:
-    made = plan.occupancy_to_imagery(layers, plan.Parameters(**values), notes or Notes())
-    (picture,) = made.parts.values()
+    derived_layers = plan.occupancy_to_imagery(layers, plan.Parameters(**values), notes or Notes())
+    (picture,) = derived_layers.parts.values()
     assert isinstance(picture, Picture)
     return picture
 
@@ -124,8 +124,8 @@ def test_several_grids_want_a_name() -> None:
 def test_nothing_is_derived_from_a_drawn_plan() -> None:
     have: frozenset[Layer] = frozenset({"occupancy"})
     assert derive.plan(have, frozenset({"imagery"})) is not None
-    way = derive.plan(have, frozenset({"objects"}), without=frozenset({"occupancy_to_objects"}))
-    assert way is None or all(step.name != "occupancy_to_imagery" for step in way.steps)
+    derivation_plan = derive.plan(have, frozenset({"objects"}), without=frozenset({"occupancy_to_objects"}))
+    assert derivation_plan is None or all(step.name != "occupancy_to_imagery" for step in derivation_plan.steps)
 
 
 def test_a_stored_plan_is_no_evidence_either() -> None:
@@ -149,7 +149,7 @@ def test_a_stored_plan_is_no_evidence_either() -> None:
 
 def test_a_derivation_that_finds_nothing_is_missing_and_says_what_to_supply() -> None:
     empty = OccupancyGrid(np.full((4, 4), 255, np.uint8), 0.5)
-    told = Layers({PartKey("occupancy"): empty})
+    layers = Layers({PartKey("occupancy"): empty})
     for fmt in ("octomap", "geojson", "tmap2"):
         with pytest.raises(CannotConvert, match="supply"):
-            from_layers(get_format(fmt), told, {}, derived=True)
+            from_layers(get_format(fmt), layers, {}, derived=True)

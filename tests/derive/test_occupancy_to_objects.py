@@ -39,11 +39,11 @@ def grid(
     return OccupancyGrid(np.array(cells, np.uint8), resolution, origin, **more)
 
 
-def found(g: OccupancyGrid, notes: Notes | None = None, **values: Any) -> Features:
-    told = notes if notes is not None else Notes()
-    made = occupancy_to_objects(Layers({PartKey("occupancy"): g}), Parameters(**values), told)
-    assert set(made.parts) == {PartKey("objects", "ground", NAME)}
-    part = made.parts[PartKey("objects", "ground", NAME)]
+def find_objects(g: OccupancyGrid, notes: Notes | None = None, **values: Any) -> Features:
+    used_notes = notes if notes is not None else Notes()
+    derived_layers = occupancy_to_objects(Layers({PartKey("occupancy"): g}), Parameters(**values), used_notes)
+    assert set(derived_layers.parts) == {PartKey("objects", "ground", NAME)}
+    part = derived_layers.parts[PartKey("objects", "ground", NAME)]
     assert isinstance(part, Features)
     assert part.local.all()
     return part
@@ -99,22 +99,22 @@ def apart(a: float, b: float, period: float) -> float:
 @pytest.mark.parametrize("hollow", [False, True])
 @pytest.mark.parametrize("context", CONTEXTS)
 def test_what_is_there_is_found_where_it_is(context: str, *, hollow: bool) -> None:
-    f = found(scene(hollow=hollow), context=context)
-    said = CONTEXTS[context]
-    assert kinds(f) == {said.post: len(DISCS), "wall": len(WALLS), said.furniture: len(BOXES)}
+    f = find_objects(scene(hollow=hollow), context=context)
+    setting = CONTEXTS[context]
+    assert kinds(f) == {setting.post: len(DISCS), "wall": len(WALLS), setting.furniture: len(BOXES)}
     for item in f:
         p = item.properties
-        assert p["height"] == said.heights[p["kind"]]
+        assert p["height"] == setting.heights[p["kind"]]
         assert p["size"][2] == p["height"]
-    posts = [p for p in f.properties if p["kind"] == said.post]
+    posts = [p for p in f.properties if p["kind"] == setting.post]
     for cx, cy, radius in DISCS:
         near = min(posts, key=lambda p: math.dist(p["pose"][:2], (cx, cy)))
         assert math.dist(near["pose"][:2], (cx, cy)) < CELL
         assert abs(near["radius"] - radius) < CELL
-    for kind, shapes in ((said.furniture, BOXES), ("wall", WALLS)):
-        there = [p for p in f.properties if p["kind"] == kind]
+    for kind, shapes in ((setting.furniture, BOXES), ("wall", WALLS)):
+        candidates = [p for p in f.properties if p["kind"] == kind]
         for at, length, width, yaw in shapes:
-            near = min(there, key=lambda p: math.dist(p["pose"][:2], at))
+            near = min(candidates, key=lambda p: math.dist(p["pose"][:2], at))
             assert math.dist(near["pose"][:2], at) < CELL
             assert abs(near["size"][0] - length) < 2 * CELL
             assert abs(near["size"][1] - width) < 2 * CELL
@@ -123,15 +123,15 @@ def test_what_is_there_is_found_where_it_is(context: str, *, hollow: bool) -> No
 
 @pytest.mark.parametrize("origin", [(-6.0, 3.5, 0.0), (100.0, -20.0, 0.7), (0.05, 0.05, -2.5)])
 def test_any_origin_and_yaw_moves_the_objects_as_a_whole(origin: tuple[float, float, float]) -> None:
-    plain, g = found(scene()), scene()
-    moved = found(grid(g.cells, origin))
+    plain, g = find_objects(scene()), scene()
+    moved = find_objects(grid(g.cells, origin))
     assert plain.ids == moved.ids
     x, y, yaw = origin
     c, s = math.cos(yaw), math.sin(yaw)
-    there = shapely.transform(
+    expected = shapely.transform(
         plain.geometry, lambda a: np.stack([x + c * a[:, 0] - s * a[:, 1], y + s * a[:, 0] + c * a[:, 1]], axis=1)
     )
-    assert shapely.equals_exact(there, moved.geometry, 1e-6).all()
+    assert shapely.equals_exact(expected, moved.geometry, 1e-6).all()
     for a, b in zip(plain.properties, moved.properties, strict=True):
         assert apart(a["pose"][5] + yaw * (a.get("radius") is None), b["pose"][5], math.tau) < 1e-6
         assert a["size"] == b["size"]
@@ -139,10 +139,10 @@ def test_any_origin_and_yaw_moves_the_objects_as_a_whole(origin: tuple[float, fl
 
 def test_solids_stand_where_the_outlines_are() -> None:
     """A cylinder or box by its pose covers what the footprint covers, and is as high."""
-    f = found(scene(), height=2.0)
-    known = solids.Solids({})
+    f = find_objects(scene(), height=2.0)
+    reader = solids.Solids({})
     for item in f:
-        corners = known.triangles(item.properties).reshape(-1, 3)
+        corners = reader.triangles(item.properties).reshape(-1, 3)
         assert corners[:, 2].min() == pytest.approx(0.0)
         assert corners[:, 2].max() == pytest.approx(2.0)
         width = item.properties.get("width")
@@ -161,10 +161,10 @@ def room() -> NDArray[np.uint8]:
 
 
 def test_a_room_is_its_walls() -> None:
-    f = found(grid(room()))
+    f = find_objects(grid(room()))
     assert kinds(f) == {"wall": 5}
-    wanted = [((3.1, 0.175), 6.0), ((3.1, 4.025), 6.0), ((0.175, 2.1), 4.0), ((6.025, 2.1), 4.0), ((3.075, 2.1), 4.0)]
-    for at, length in wanted:
+    walls = [((3.1, 0.175), 6.0), ((3.1, 4.025), 6.0), ((0.175, 2.1), 4.0), ((6.025, 2.1), 4.0), ((3.075, 2.1), 4.0)]
+    for at, length in walls:
         near = min(f.properties, key=lambda p: math.dist(p["pose"][:2], at))
         assert math.dist(near["pose"][:2], at) < CELL
         assert abs(near["size"][0] - length) < 6 * CELL
@@ -175,16 +175,16 @@ def test_a_room_is_its_walls() -> None:
 def test_what_is_thick_in_a_wall_is_no_wall() -> None:
     cells = room()
     cells[20:50, 5:30] = OCCUPIED  # 1.25 × 1.5 m at the wall on the left
-    assert kinds(found(grid(cells)))["furniture"] == 1
+    assert kinds(find_objects(grid(cells)))["furniture"] == 1
     cells[50:70, 5:12] = OCCUPIED  # and no rectangle any more
-    f = found(grid(cells))
+    f = find_objects(grid(cells))
     assert kinds(f)["obstacle"] == 1
     (area,) = f.of_kind("obstacle").geometry
     assert area.area == pytest.approx(1.25 * 1.5 + 0.35 * 1.0 + 0.15 * 2.5, rel=0.15)
     assert f.of_kind("obstacle").properties[0]["height"] == 2.5
     large = np.full((300, 300), OCCUPIED, np.uint8)
     large[100:200, 100:200] = FREE
-    (around,) = found(grid(large)).geometry
+    (around,) = find_objects(grid(large)).geometry
     assert around.area == pytest.approx(15.0**2 - 5.0**2, rel=0.01)
     assert len(around.interiors) == 1
 
@@ -193,7 +193,7 @@ def test_a_rim_around_free_cells_is_a_room() -> None:
     g = scene(hollow=True)
     cells = g.cells.copy()
     cells[cells == UNKNOWN] = FREE
-    f = found(grid(cells))
+    f = find_objects(grid(cells))
     assert "furniture" not in kinds(f)
     assert kinds(f)["wall"] >= len(WALLS) + 4 * len(BOXES)
 
@@ -202,12 +202,12 @@ def test_specks_are_left_out_and_said() -> None:
     cells = scene().cells.copy()
     cells[100, 5], cells[120, 5], cells[140, 5] = OCCUPIED, OCCUPIED, OCCUPIED
     notes = Notes()
-    f = found(grid(cells), notes)
-    assert f.ids == found(scene()).ids
+    f = find_objects(grid(cells), notes)
+    assert f.ids == find_objects(scene()).ids
     assert [(d["what"], d["count"]) for d in notes.dropped] == [("specks", 3)]
-    assert len(found(grid(cells), minimum_size=0.0)) == len(f) + 3
+    assert len(find_objects(grid(cells), minimum_size=0.0)) == len(f) + 3
     notes = Notes()
-    few = found(grid(cells), notes, minimum_size=1.0)
+    few = find_objects(grid(cells), notes, minimum_size=1.0)
     # Of the discs none is a metre across, of the others all are.
     assert kinds(few) == {"furniture": len(BOXES), "wall": len(WALLS)}
     assert notes.dropped[0]["count"] == 3 + len(DISCS)
@@ -215,7 +215,7 @@ def test_specks_are_left_out_and_said() -> None:
 
 def test_what_is_made_up_is_said() -> None:
     notes = Notes()
-    found(scene(), notes, context="orchard")
+    find_objects(scene(), notes, context="orchard")
     assert {(t["what"], t["value"]) for t in notes.template} == {
         ("height of tree", 3.0),
         ("height of crate", 1.0),
@@ -224,7 +224,7 @@ def test_what_is_made_up_is_said() -> None:
     assert len(notes.warnings) == 1
     assert "orchard" in notes.warnings[0].problem
     notes = Notes()
-    f = found(scene(), notes, height=1.75)
+    f = find_objects(scene(), notes, height=1.75)
     assert [(t["what"], t["value"]) for t in notes.template] == [("height", 1.75)]
     assert {p["height"] for p in f.properties} == {1.75}
 
@@ -232,35 +232,35 @@ def test_what_is_made_up_is_said() -> None:
 def test_a_trunk_of_any_shape_is_a_tree_among_trees() -> None:
     cells = np.full((60, 60), FREE, np.uint8)
     cells[20:24, 20:32], cells[24:30, 20:24] = OCCUPIED, OCCUPIED  # an angle, half a metre long
-    assert kinds(found(grid(cells), context="forest")) == {"tree": 1}
-    assert "post" not in kinds(found(grid(cells)))
+    assert kinds(find_objects(grid(cells), context="forest")) == {"tree": 1}
+    assert "post" not in kinds(find_objects(grid(cells)))
 
 
 def test_tolerance_and_wall_width() -> None:
     x, y = middles(120, 200)
     cells = np.full(x.shape, FREE, np.uint8)
     cells[abs(y - 3.0 - 0.6 * np.sin(x)) < 0.12] = OCCUPIED
-    coarse, fine = found(grid(cells), tolerance=0.4), found(grid(cells), tolerance=0.05)
+    coarse, fine = find_objects(grid(cells), tolerance=0.4), find_objects(grid(cells), tolerance=0.05)
     assert 1 < kinds(coarse)["wall"] < kinds(fine)["wall"]
     middle = np.column_stack([np.linspace(0.5, 9.5, 50), 3.0 + 0.6 * np.sin(np.linspace(0.5, 9.5, 50))])
     lines = shapely.union_all(fine.geometry)
     assert max(lines.distance(shapely.Point(p)) for p in middle.tolist()) < 0.05 + 2 * CELL
-    assert kinds(found(grid(cells), wall_width=0.15)).get("obstacle") == 1
+    assert kinds(find_objects(grid(cells), wall_width=0.15)).get("obstacle") == 1
 
 
 def test_thresholds_and_unknown() -> None:
     cells = scene().cells.copy()
     cells[cells == OCCUPIED] = 70
-    assert found(grid(cells)).ids == found(scene()).ids
+    assert find_objects(grid(cells)).ids == find_objects(scene()).ids
     with pytest.raises(CannotConvert, match="no occupied cell"):
-        found(grid(cells, occupied_thresh=0.8))
+        find_objects(grid(cells, occupied_thresh=0.8))
     cells[cells == FREE] = UNKNOWN
-    assert found(grid(cells)).ids == found(scene()).ids
+    assert find_objects(grid(cells)).ids == find_objects(scene()).ids
 
 
 def bad(cells: Any, **values: Any) -> str:
     with pytest.raises(CannotConvert) as caught:
-        found(grid(cells), **values)
+        find_objects(grid(cells), **values)
     return caught.value.detail
 
 
@@ -276,13 +276,13 @@ def test_grids_without_objects_say_what_to_do() -> None:
     assert "1 specks less than 0.1 m" in bad(one)
     assert "minimum_size" in bad(one)
     assert "'map' of level 'ground'" in bad(one)
-    assert kinds(found(grid(one), minimum_size=0.05)) == {"post": 1}
+    assert kinds(find_objects(grid(one), minimum_size=0.05)) == {"post": 1}
 
 
 def test_noise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(0)
     cells = np.where(random.random((200, 200)) < 0.3, OCCUPIED, FREE)
-    labels = found(grid(cells), minimum_size=0.0)
+    labels = find_objects(grid(cells), minimum_size=0.0)
     assert len(labels) > 100
     monkeypatch.setattr(known_figures, "PIECES", 100)
     assert "noise" in bad(cells)
@@ -306,9 +306,9 @@ def test_which_grid_and_levels() -> None:
     parts = {PartKey("occupancy", "ground", n): g for n in ("keepout", MAP)}
     parts[PartKey("occupancy", "L2", "only")] = g
     layers = Layers(dict(parts), levels=(Level(), Level("L2", 4.0)))
-    made = occupancy_to_objects(layers, Parameters(), Notes()).parts
-    assert {k.level for k in made} == {"ground", "L2"}
-    upper = made[PartKey("objects", "L2", NAME)]
+    derived_parts = occupancy_to_objects(layers, Parameters(), Notes()).parts
+    assert {k.level for k in derived_parts} == {"ground", "L2"}
+    upper = derived_parts[PartKey("objects", "L2", NAME)]
     assert isinstance(upper, Features)
     assert {p["pose"][2] for p in upper.properties} == {4.0}
     assert {k.level for k in occupancy_to_objects(layers, Parameters(grid="only"), Notes()).parts} == {"L2"}
@@ -330,18 +330,18 @@ def test_parameters_are_checked_and_the_planner_prefers_all_other_ways() -> None
         ({"occupancy", "imagery"}, "imagery_to_objects"),
         ({"voxels", "imagery"}, "imagery_to_objects"),
     ):
-        way = derive.plan(frozenset(stored), frozenset({"objects"}))  # type: ignore[arg-type]
-        assert way is not None
-        assert way.steps[0].name == first
-    way = derive.plan(frozenset({"occupancy"}), frozenset({"topology"}))
-    assert way is not None
-    assert [s.name for s in way.steps] == ["occupancy_to_topology"]
+        plan = derive.plan(frozenset(stored), frozenset({"objects"}))  # type: ignore[arg-type]
+        assert plan is not None
+        assert plan.steps[0].name == first
+    plan = derive.plan(frozenset({"occupancy"}), frozenset({"topology"}))
+    assert plan is not None
+    assert [s.name for s in plan.steps] == ["occupancy_to_topology"]
 
 
 def load(folder: Path) -> Layers:
     files = {p.name: p.read_bytes() for p in sorted(folder.iterdir()) if p.is_file()}
-    told = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
-    return told.layers(None)
+    upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
+    return upload_bundle.layers(None)
 
 
 def test_the_nine_pillars_of_turtlebot3_world(shared: Path) -> None:
@@ -353,13 +353,13 @@ def test_the_nine_pillars_of_turtlebot3_world(shared: Path) -> None:
         if collision.find(".//cylinder") is not None:
             pillars.append([float(v) for v in str(collision.findtext("pose")).split()[:2]])
     assert len(pillars) == 9
-    f = found(next(iter(load(root / "maps").grids().values())))
+    f = find_objects(next(iter(load(root / "maps").grids().values())))
     posts = f.of_kind("post")
     assert len(posts) == 9
     at = np.array([p["pose"][:2] for p in posts.properties])
-    away, which = cKDTree(at).query(pillars)
+    away, indices = cKDTree(at).query(pillars)
     assert away.max() < 0.1
-    assert sorted(which.tolist()) == list(range(9))
+    assert sorted(indices.tolist()) == list(range(9))
     assert all(abs(p["radius"] - 0.15) < 0.05 for p in posts.properties)
 
 
@@ -374,8 +374,8 @@ def test_the_nine_pillars_of_turtlebot3_world(shared: Path) -> None:
 def test_the_objects_of_real_maps_stand_where_the_map_is_occupied(shared: Path, folder: str) -> None:
     layers = load(shared / "data" / folder)
     (g,) = layers.grids().values()
-    made = occupancy_to_objects(layers, Parameters(), Notes())
-    back = objects_to_occupancy(made, GridParameters(resolution=g.resolution), Notes())
+    derived_layers = occupancy_to_objects(layers, Parameters(), Notes())
+    back = objects_to_occupancy(derived_layers, GridParameters(resolution=g.resolution), Notes())
     (again,) = back.grids().values()
 
     def occupied(one: OccupancyGrid) -> Array:
@@ -399,9 +399,9 @@ def test_the_same_grid_gives_the_same_objects(shared: Path) -> None:
 
 
 def test_a_gazebo_world_of_the_objects_has_their_cylinders_and_boxes() -> None:
-    made = occupancy_to_objects(Layers({PartKey("occupancy"): scene()}), Parameters(), Notes())
+    derived_layers = occupancy_to_objects(Layers({PartKey("occupancy"): scene()}), Parameters(), Notes())
     gazebo = formats.get_format("gazebo")
-    files = gazebo.write(made, formats.WriteContext(title="scene", options=gazebo.write_options()))
+    files = gazebo.write(derived_layers, formats.WriteContext(title="scene", options=gazebo.write_options()))
     world = etree.fromstring(files["world.sdf"])
     assert len(world.findall(".//collision/geometry/cylinder")) == len(DISCS)
     assert len(world.findall(".//collision/geometry/box")) == len(BOXES) + len(WALLS)
@@ -410,8 +410,8 @@ def test_a_gazebo_world_of_the_objects_has_their_cylinders_and_boxes() -> None:
 def test_a_grid_alone_still_is_a_gazebo_world_of_its_cells() -> None:
     gazebo = formats.get_format("gazebo")
     key = PartKey("occupancy")
-    way = recipe.chain(gazebo, recipe.Stock(frozenset({key}), datum=False), gazebo.write_options())
-    assert way == recipe.Chain((), (key,))
+    chain = recipe.chain(gazebo, recipe.Stock(frozenset({key}), datum=False), gazebo.write_options())
+    assert chain == recipe.Chain((), (key,))
     # Objects that were made of it stand for it, unless it is named.
     both = [PartKey("objects", "ground", NAME), key]
     assert gazebo.choose(both, gazebo.write_options()) == both[:1]

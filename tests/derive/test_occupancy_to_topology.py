@@ -68,9 +68,9 @@ def rooms(seed: int = 0, size: int = 120) -> NDArray[np.uint8]:
 
 
 def derived(g: OccupancyGrid, **values: Any) -> Features:
-    made = occupancy_to_topology(Layers({PartKey("occupancy"): g}), Parameters(**values), Notes())
-    assert set(made.parts) == {PartKey("topology", "ground", NETWORK)}
-    part = made.parts[PartKey("topology", "ground", NETWORK)]
+    derived_layers = occupancy_to_topology(Layers({PartKey("occupancy"): g}), Parameters(**values), Notes())
+    assert set(derived_layers.parts) == {PartKey("topology", "ground", NETWORK)}
+    part = derived_layers.parts[PartKey("topology", "ground", NETWORK)]
     assert isinstance(part, Features)
     return part
 
@@ -144,8 +144,8 @@ def test_every_edge_is_free_and_what_is_connected_stays_connected(method: str, r
     g = grid(rooms(seed))
     network = check(g, derived(g, method=method, robot_radius=radius, island=0.0), radius)
     assert nx.number_weakly_connected_components(network) >= 2 or method == "roadmap", "the sealed room has ways too"
-    ways = nx.Graph(network)
-    assert ways.number_of_edges() >= ways.number_of_nodes() - 2
+    graph = nx.Graph(network)
+    assert graph.number_of_edges() >= graph.number_of_nodes() - 2
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -198,8 +198,8 @@ def test_unknown_is_an_obstacle_unless_said() -> None:
     cells[5:35, 5:12], cells[5:35, 28:35], cells[0, 0] = FREE, FREE, OCCUPIED
     apart = graph_of(derived(grid(cells), island=0.0))
     assert nx.number_weakly_connected_components(apart) == 2
-    whole = graph_of(derived(grid(cells), island=0.0, unknown=True))
-    assert nx.number_weakly_connected_components(whole) == 1
+    graph = graph_of(derived(grid(cells), island=0.0, unknown=True))
+    assert nx.number_weakly_connected_components(graph) == 1
 
 
 def test_islands_go_but_never_all() -> None:
@@ -234,13 +234,13 @@ def test_the_open_is_covered_without_detours() -> None:
     free = np.argwhere(distances(g) > 0.8)
     away, _ = cKDTree(at).query((free[:, ::-1] + 0.5) * 0.1)
     assert away.max() <= 1.0
-    ways = dict(nx.all_pairs_dijkstra_path_length(network, weight="length"))
+    lengths = dict(nx.all_pairs_dijkstra_path_length(network, weight="length"))
     random = np.random.default_rng(0)
     worst = 1.0
     for a, b in random.integers(0, len(at), (400, 2)):
         line = shapely.LineString([at[a], at[b]])
         if line.length > 2.0 and not line.intersects(shapely.box(5.6, 8.6, 14.4, 11.4)):
-            worst = max(worst, ways[names[a]][names[b]] / line.length)
+            worst = max(worst, lengths[names[a]][names[b]] / line.length)
     assert worst < 1.35
     sparse = derived(g, spacing=0.0)
     assert len(sparse) < len(network) / 3
@@ -329,9 +329,9 @@ def mean_clearance(g: OccupancyGrid, f: Features) -> float:
 @pytest.mark.parametrize("seed", range(4))
 def test_voronoi_ways_are_as_far_from_obstacles_as_can_be(seed: int) -> None:
     g = grid(rooms(seed))
-    ways = {m: derived(g, method=m, spacing=0.0, robot_radius=0.2) for m in ("skeleton", "voronoi")}
-    assert mean_clearance(g, ways["voronoi"]) >= mean_clearance(g, ways["skeleton"])
-    assert mean_clearance(g, ways["voronoi"]) > mean_clearance(g, derived(g, robot_radius=0.2))
+    networks = {m: derived(g, method=m, spacing=0.0, robot_radius=0.2) for m in ("skeleton", "voronoi")}
+    assert mean_clearance(g, networks["voronoi"]) >= mean_clearance(g, networks["skeleton"])
+    assert mean_clearance(g, networks["voronoi"]) > mean_clearance(g, derived(g, robot_radius=0.2))
 
 
 def test_a_voronoi_diagram_by_hand() -> None:
@@ -410,9 +410,9 @@ def test_masks_are_no_maps_unless_named() -> None:
         occupancy_to_topology(mask, Parameters(), Notes())
     assert occupancy_to_topology(mask, Parameters(grid="keepout"), Notes()).parts
     both = Layers({**mask.parts, PartKey("occupancy", "ground", "floor"): grid(rooms(1))})
-    (made,) = occupancy_to_topology(both, Parameters(), Notes()).parts.values()
-    assert isinstance(made, Features)
-    assert made.ids == derived(grid(rooms(1))).ids
+    (network,) = occupancy_to_topology(both, Parameters(), Notes()).parts.values()
+    assert isinstance(network, Features)
+    assert network.ids == derived(grid(rooms(1))).ids
 
 
 def test_parameters_are_checked() -> None:
@@ -455,9 +455,9 @@ def strawberry() -> tuple[OccupancyGrid, Features]:
         pytest.skip("the real maps are not beside the checkout")
     files = {n: (DATA / FARM / "metric/map" / n).read_bytes() for n in ("map.yaml", "map.png")}
     files["network.tmap2.yaml"] = (DATA / FARM / "topological/network.tmap2.yaml").read_bytes()
-    told = read(files, Hints(), Known(None, None, None, True, False), Limits()).layers(None)
-    (network,) = told.vector("topology").values()
-    (g,) = told.grids().values()
+    layers = read(files, Hints(), Known(None, None, None, True, False), Limits()).layers(None)
+    (network,) = layers.vector("topology").values()
+    (g,) = layers.grids().values()
     return g, network
 
 
@@ -531,14 +531,14 @@ def test_no_way_leads_where_the_grey_of_unknown_is_called_free() -> None:
     ((key, grid),) = formats.read(formats.group(files)[0][0], ReadContext()).grids().items()
     assert int((grid.cells == FREE).sum()) == 7200 - 154, "what Nav2 makes of the file stays"
     notes = Notes()
-    made = network(grid, Parameters(), notes, "the map")
-    assert shapely.total_bounds(made.geometry)[2] < 5.6
-    (told,) = [w.problem for w in notes.warnings if "grey 205" in w.problem]
-    assert "4546 cells" in told
-    assert "unknown_grey=free takes them as free" in told
+    derived_network = network(grid, Parameters(), notes, "the map")
+    assert shapely.total_bounds(derived_network.geometry)[2] < 5.6
+    (warning,) = [w.problem for w in notes.warnings if "grey 205" in w.problem]
+    assert "4546 cells" in warning
+    assert "unknown_grey=free takes them as free" in warning
     notes = Notes()
-    made = network(grid, Parameters(unknown_grey="free"), notes, "the map")
-    assert shapely.total_bounds(made.geometry)[2] > 8
+    derived_network = network(grid, Parameters(unknown_grey="free"), notes, "the map")
+    assert shapely.total_bounds(derived_network.geometry)[2] > 8
     assert "ways may lead where nobody has been" in notes.warnings[0].problem
 
     written = formats.write(formats.get_format("occupancy_grid"), Layers({key: grid}), WriteContext())
@@ -586,21 +586,21 @@ def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
     assert isinstance(picture, Picture)
     assert ((picture.pixels[::-1, :, 3] == 0) == (grey & (cells != OCCUPIED) | (cells == UNKNOWN))).all()
 
-    ((_, whole),) = (
+    ((_, full_grid),) = (
         complete_grid.complete_grid(layers, complete_grid.Options(confidence=0.0), Source(1, "complete_grid"), notes)
         .grids()
         .items()
     )
-    assert (whole.cells[55:58, 55:58] != UNKNOWN).all()
-    assert (whole.cells[5:15, 5:15] == UNKNOWN).all(), "nothing near it was seen"
-    assert (whole.cells[grey & (cells == FREE)] == FREE).all()
+    assert (full_grid.cells[55:58, 55:58] != UNKNOWN).all()
+    assert (full_grid.cells[5:15, 5:15] == UNKNOWN).all(), "nothing near it was seen"
+    assert (full_grid.cells[grey & (cells == FREE)] == FREE).all()
     assert "nothing is learned from them" in notes.warnings[-1].problem
 
-    known = formats.get_format("occupancy_grid")
+    fmt = formats.get_format("occupancy_grid")
     for values in ({"resolution": 0.1}, {"resolution": 0.025}, {"normalize": True}):
         turned = replace(grid, origin=(0.0, 0.0, 0.3)) if "normalize" in values else grid
-        context = WriteContext(options=formats.write_options(known, values))
-        written = formats.write(known, Layers({key: turned}), context)
+        context = WriteContext(options=formats.write_options(fmt, values))
+        written = formats.write(fmt, Layers({key: turned}), context)
         ((_, again),) = formats.read(formats.group(written)[0][0], ReadContext()).grids().items()
         left = unknown_grey(again)
         assert left is not None

@@ -30,15 +30,15 @@ MAP = PartKey("occupancy")
 
 def extrude(grid: OccupancyGrid, *, elevation: float = 0.0, **more: Any) -> VoxelMap:
     layers = Layers({MAP: grid}, levels=(Level("ground", elevation),))
-    made = occupancy_to_voxels(layers, Parameters(**more), derive.Notes()).parts[PartKey("voxels")]
-    assert isinstance(made, VoxelMap)
-    return made
+    voxels = occupancy_to_voxels(layers, Parameters(**more), derive.Notes()).parts[PartKey("voxels")]
+    assert isinstance(voxels, VoxelMap)
+    return voxels
 
 
-def voxels_of(made: VoxelMap) -> dict[tuple[int, int, int], bool]:
+def voxels_of(voxels: VoxelMap) -> dict[tuple[int, int, int], bool]:
     """Every smallest voxel, and whether it is occupied."""
-    code, rows = expanded(made, np.ones(len(made), bool))
-    small = VoxelMap(made.resolution, np.full(len(code), 16, np.uint8), code, made.log_odds[rows])
+    code, rows = expanded(voxels, np.ones(len(voxels), bool))
+    small = VoxelMap(voxels.resolution, np.full(len(code), 16, np.uint8), code, voxels.log_odds[rows])
     places = zip(*(small.axis(k)[0].tolist() for k in range(3)), strict=True)
     return dict(zip(places, small.occupied.tolist(), strict=True))
 
@@ -65,9 +65,9 @@ def test_columns_by_brute_force(rows: list[list[int]], x: int, y: int, floor: in
         with pytest.raises(MissingLayer, match="occupied and free cells"):
             extrude(grid, height=tall * 0.5, free=free)
         return
-    made = extrude(grid, elevation=floor * 0.5, height=tall * 0.5, free=free)
-    assert voxels_of(made) == want
-    assert len(pruned(made)) == len(made), "no leaf can be merged any further"
+    voxels = extrude(grid, elevation=floor * 0.5, height=tall * 0.5, free=free)
+    assert voxels_of(voxels) == want
+    assert len(pruned(voxels)) == len(voxels), "no leaf can be merged any further"
 
 
 @pytest.mark.parametrize("size", [0.5, 0.25, 0.1, 1.0, 1.3])
@@ -76,7 +76,7 @@ def test_turned_and_shifted_cells_occupy_what_they_reach_into(origin: tuple[floa
     dice = np.random.default_rng(4)
     rows = dice.choice([FREE, FREE, OCCUPIED, UNKNOWN], (7, 8)).tolist()
     grid = grid_of(rows, origin=origin)
-    made = voxels_of(extrude(grid, resolution=size, height=size))
+    voxels = voxels_of(extrude(grid, resolution=size, height=size))
     c, s = math.cos(origin[2]), math.sin(origin[2])
     for j, i in np.argwhere(grid.cells == OCCUPIED).tolist():
         for a in np.linspace(0.01, 0.99, 25):
@@ -88,8 +88,8 @@ def test_turned_and_shifted_cells_occupy_what_they_reach_into(origin: tuple[floa
                         [math.floor(place[0] + d) for d in (-0.25, 0, 0.25)],
                         [math.floor(place[1] + d) for d in (-0.25, 0, 0.25)],
                     )
-                    assert any(made.get((m, n, 0)) for m in near[0] for n in near[1]), "within a quarter of a voxel"
-    for (m, n, _), occupied in made.items():
+                    assert any(voxels.get((m, n, 0)) for m in near[0] for n in near[1]), "within a quarter of a voxel"
+    for (m, n, _), occupied in voxels.items():
         x, y = (m + 0.5) * size - origin[0], (n + 0.5) * size - origin[1]
         i, j = math.floor((x * c + y * s) / 0.5), math.floor((y * c - x * s) / 0.5)
         inside = 0 <= i < 8 and 0 <= j < 7
@@ -105,12 +105,12 @@ def test_real_maps_there_and_back(shared: Path, name: str) -> None:
     layers = formats.read(Group(get_format("occupancy_grid"), main, files), ReadContext(grid="map"))
     grid = layers.parts[MAP]
     assert isinstance(grid, OccupancyGrid)
-    made = extrude(grid, height=1.0)
+    voxels = extrude(grid, height=1.0)
     counts = grid.counts()
     tall = round(1.0 / grid.resolution)
-    assert made.voxel_counts() == {"occupied": counts["occupied"] * tall, "free": counts["free"] * tall}
-    assert len(made) < (counts["occupied"] + counts["free"]) * tall / 3, "large leaves where all is free"
-    back = voxels_to_occupancy(Layers({PartKey("voxels"): made}), Back(), derive.Notes()).parts[MAP]
+    assert voxels.voxel_counts() == {"occupied": counts["occupied"] * tall, "free": counts["free"] * tall}
+    assert len(voxels) < (counts["occupied"] + counts["free"]) * tall / 3, "large leaves where all is free"
+    back = voxels_to_occupancy(Layers({PartKey("voxels"): voxels}), Back(), derive.Notes()).parts[MAP]
     assert isinstance(back, OccupancyGrid)
     rows, columns = np.nonzero(grid.cells != UNKNOWN)
     crop = grid.cells[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
@@ -122,8 +122,8 @@ def test_real_maps_there_and_back(shared: Path, name: str) -> None:
 
 def test_grey_cells_follow_the_thresholds() -> None:
     grid = grid_of([[0, 10, 25, 26, 64, 65, 100, 255]], mode="scale", occupied_thresh=0.65, free_thresh=0.25)
-    made = voxels_of(extrude(grid, height=0.5))
-    assert {k[0]: v for k, v in made.items()} == {0: False, 1: False, 2: False, 5: True, 6: True}
+    voxels = voxels_of(extrude(grid, height=0.5))
+    assert {k[0]: v for k, v in voxels.items()} == {0: False, 1: False, 2: False, 5: True, 6: True}
 
 
 def test_which_grids_are_extruded() -> None:
@@ -132,9 +132,9 @@ def test_which_grids_are_extruded() -> None:
         ("ground", "map"), ("ground", "other"), ("ground", "keepout"), ("L2", "lab"), ("L2", "speed"),
     )}  # fmt: skip
     levels = (Level(), Level("L2", 4.0))
-    made = occupancy_to_voxels(Layers(named, levels=levels), Parameters(height=0.5), derive.Notes())
-    assert {(k.level, k.name) for k in made.parts} == {("ground", "map"), ("L2", "lab")}
-    part = made.parts[PartKey("voxels", "L2", "lab")]
+    derived_layers = occupancy_to_voxels(Layers(named, levels=levels), Parameters(height=0.5), derive.Notes())
+    assert {(k.level, k.name) for k in derived_layers.parts} == {("ground", "map"), ("L2", "lab")}
+    part = derived_layers.parts[PartKey("voxels", "L2", "lab")]
     assert isinstance(part, VoxelMap)
     assert part.bounds() == (0.0, 0.0, 4.0, 0.5, 0.5, 4.5)
 
@@ -166,7 +166,7 @@ def test_a_large_free_grid_is_few_leaves() -> None:
     """4096 × 4096 cells, 2 m high: five thousand leaves and not 670 million voxels."""
     big = np.zeros((4096, 4096), np.uint8)
     start = time.process_time()
-    made = extrude(OccupancyGrid(big, 0.05), height=2.0)
+    voxels = extrude(OccupancyGrid(big, 0.05), height=2.0)
     assert time.process_time() - start < 8.0
-    assert made.voxel_counts() == {"occupied": 0, "free": 4096 * 4096 * 40}
-    assert len(made) == 128 * 128 + 512 * 512
+    assert voxels.voxel_counts() == {"occupied": 0, "free": 4096 * 4096 * 40}
+    assert len(voxels) == 128 * 128 + 512 * 512

@@ -35,23 +35,23 @@ def boxes(frame: Frame = FRAME) -> Any:
     return shapely.box(low_x, low_y, low_x + frame.resolution, low_y + frame.resolution)
 
 
-def shape(**said: Any) -> Any:
-    return solids.triangles({"shapes": [said]}, {})
+def shape(**members: Any) -> Any:
+    return solids.triangles({"shapes": [members]}, {})
 
 
 def clipped(triangle: Any, low: float, high: float) -> Any:
     """A triangle between two heights seen from above, by an independent way: half planes on a finely known polygon."""
     out = [tuple(p) for p in triangle]
     for sign, bound in ((1.0, low - 1e-9), (-1.0, -high - 1e-9)):
-        kept = []
+        corners = []
         for a, b in zip(out, [*out[1:], *out[:1]], strict=True):
             da, db = sign * a[2] - bound, sign * b[2] - bound
             if da >= 0:
-                kept.append(a)
+                corners.append(a)
             if (da >= 0) != (db >= 0):
                 t = da / (da - db)
-                kept.append(tuple(p + (q - p) * t for p, q in zip(a, b, strict=True)))
-        out = kept
+                corners.append(tuple(p + (q - p) * t for p, q in zip(a, b, strict=True)))
+        out = corners
     return shapely.convex_hull(shapely.MultiPoint([p[:2] for p in out])) if out else shapely.Polygon()
 
 
@@ -62,13 +62,13 @@ def test_a_surface_touches_the_cells_that_it_meets(seed: int, slice_: bool) -> N
     triangles = random.uniform([-2, -3, 0], [5, 5, 2], (4, 3, 3))
     low = float(random.uniform(0, 2))
     high = low if slice_ else float(random.uniform(low, 2.2))
-    made = cells(_raster.surfaces(triangles, FRAME, np.array([[low, high]])))[0]
+    mask = cells(_raster.surfaces(triangles, FRAME, np.array([[low, high]])))[0]
     pieces = [clipped(t, low, high) for t in triangles]
     # A micrometre against the normal moves the cut of a nearly level triangle by more: only what is grazed may differ.
     near = np.logical_or.reduce([shapely.distance(boxes(), p) < 1e-3 for p in pieces])
     sure = np.logical_or.reduce([shapely.intersects(shapely.buffer(boxes(), -1e-3), p) for p in pieces])
-    assert not (made & ~near).any()
-    assert not (sure & ~made).any()
+    assert not (mask & ~near).any()
+    assert not (sure & ~mask).any()
 
 
 def test_slabs_are_layers() -> None:
@@ -85,11 +85,11 @@ def test_slabs_are_layers() -> None:
 def test_a_box_covers_its_cells_and_no_more() -> None:
     box = shape(type="box", size=[1.0, 0.5, 1.0], pose=[0.5, 0.25, 0.5, 0, 0, 0])
     for low, high in ((0.2, 0.2), (0.0, 1.0), (-5.0, 5.0), (0.0, 0.0)):
-        made = cells(_raster.surfaces(box, FRAME, np.array([[low, high]])))[0]
-        made |= cells(_raster.insides(box, np.zeros(len(box), int), FRAME, np.array([low])))[0]
-        rows, columns = np.nonzero(made)
+        mask = cells(_raster.surfaces(box, FRAME, np.array([[low, high]])))[0]
+        mask |= cells(_raster.insides(box, np.zeros(len(box), int), FRAME, np.array([low])))[0]
+        rows, columns = np.nonzero(mask)
         assert (rows.min(), rows.max(), columns.min(), columns.max()) == (8, 9, 4, 7)
-        assert made.sum() == 8
+        assert mask.sum() == 8
     for height in (1.0, -0.1):
         slab = np.array([[height, height]])
         assert not cells(_raster.surfaces(box, FRAME, slab)).any(), "the top is where it ends"
@@ -106,13 +106,13 @@ def test_inside_agrees_with_the_distance_to_spheres(seed: int) -> None:
     parts[0] = parts[0][:, ::-1]  # its inside turned out
     owner = np.repeat(np.arange(5), [len(p) for p in parts])
     height = 0.5 + 1e-4
-    made = cells(_raster.insides(np.concatenate(parts), owner, FRAME, np.array([height])))[0]
+    mask = cells(_raster.insides(np.concatenate(parts), owner, FRAME, np.array([height])))[0]
     x, y = np.meshgrid(np.arange(20) * 0.25 - 0.875, np.arange(24) * 0.25 - 1.875)
     away = np.min(
         [np.hypot(np.hypot(x - p[0], y - p[1]), height - p[2]) - r for p, r in zip(at, radii, strict=True)], axis=0
     )
-    assert made[away < -0.01].all()
-    assert not made[away > 1e-6].any()
+    assert mask[away < -0.01].all()
+    assert not mask[away > 1e-6].any()
 
 
 def test_an_open_surface_encloses_nothing() -> None:
@@ -137,20 +137,20 @@ def test_areas_with_holes_agree_with_rasterio() -> None:
         outer = shapely.Point(*random.uniform(0, 2, 2)).buffer(float(random.uniform(0.5, 2)), quad_segs=3)
         hole = shapely.affinity.scale(outer, 0.5, 0.4)
         area = shapely.MultiPolygon([shapely.Polygon(outer.exterior, [hole.exterior]), shapely.box(3.1, 3.1, 3.6, 3.7)])
-        made = cells(_raster.areas([area], FRAME, touched=False))[0]
+        mask = cells(_raster.areas([area], FRAME, touched=False))[0]
         transform = Affine(0.25, 0, -1, 0, -0.25, -2 + 24 * 0.25)
         theirs = rasterize([area], (24, 20), transform=transform)[::-1].astype(bool)
-        assert (made == theirs).all()
+        assert (mask == theirs).all()
         touched = cells(_raster.areas([area], FRAME, touched=True))[0]
         assert (touched == shapely.intersects(boxes(), area)).all()
 
 
 def test_lines_and_points_and_what_lies_outside() -> None:
     line = shapely.LineString([(-0.9, -1.9), (0.9, -1.9), (0.9, 100)])
-    made = cells(_raster.areas([line], FRAME, touched=False))[0]
-    assert np.flatnonzero(made[0]).tolist() == list(range(8))
-    assert np.flatnonzero(made[:, 7]).tolist() == list(range(24))
-    assert made.sum() == 31
+    mask = cells(_raster.areas([line], FRAME, touched=False))[0]
+    assert np.flatnonzero(mask[0]).tolist() == list(range(8))
+    assert np.flatnonzero(mask[:, 7]).tolist() == list(range(24))
+    assert mask.sum() == 31
     assert cells(_raster.areas([shapely.Point(0.1, 0.1)], FRAME, touched=False))[0, 8, 4]
     far = [shapely.Point(50, 50), shapely.box(90, 90, 99, 99), shapely.LineString([(-9, 0), (-8, 0)]), shapely.Point()]
     assert not cells(_raster.areas(far, FRAME, touched=True)).any()
@@ -170,9 +170,9 @@ def test_frames_lie_on_whole_cells() -> None:
     assert (frame.origin, frame.width, frame.height) == ((0.3, -0.4), 6, 10)
     assert Frame.around((1.0, 1.0, 1.0, 1.0), 0.5).cells == 1
     assert _raster.limited(frame, 60, 10) is frame
-    for most, longest in ((59, 100), (1000, 9)):
+    for maximum, longest in ((59, 100), (1000, 9)):
         with pytest.raises(CannotConvert, match="resolution of at least"):
-            _raster.limited(frame, most, longest)
+            _raster.limited(frame, maximum, longest)
 
 
 def test_paint_and_grow() -> None:

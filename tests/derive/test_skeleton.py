@@ -82,9 +82,9 @@ def masks(count: int) -> list[Mask]:
 
 def ridges(mask: Mask) -> Mask:
     """The generalised Voronoi diagram of a mask."""
-    where = _skeleton.space(np.pad(mask.astype(np.uint8), 1), 0, 0, 0.0)
-    padded = where.mask.copy()
-    assert _skeleton.ridges(padded, where.gap) == padded.sum()
+    free_space = _skeleton.space(np.pad(mask.astype(np.uint8), 1), 0, 0, 0.0)
+    padded = free_space.mask.copy()
+    assert _skeleton.ridges(padded, free_space.gap) == padded.sum()
     assert set(np.unique(padded)) <= {0, 1}
     return np.asarray(padded[1:-1, 1:-1] == 1)
 
@@ -114,10 +114,10 @@ def test_distances_to_the_nearest_obstacle_are_exact() -> None:
 
 @pytest.mark.parametrize("band", [1, 50, 700])
 def test_a_diagram_made_in_parts_is_the_same(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    known = masks(60)
-    whole = [ridges(mask) for mask in known]
+    mask_list = masks(60)
+    diagrams = [ridges(mask) for mask in mask_list]
     monkeypatch.setattr(_skeleton, "BAND", band)
-    for mask, diagram in zip(known, whole, strict=True):
+    for mask, diagram in zip(mask_list, diagrams, strict=True):
         assert (ridges(mask) == diagram).all()
 
 
@@ -176,13 +176,13 @@ def test_before_the_last_step_it_is_zhang_and_suen_cell_for_cell() -> None:
 
     for mask in masks(90):
         expected = plain(mask)
-        mine = thinned(mask)
+        skeleton = thinned(mask)
         # Ours goes one step further (redundant cells) and keeps lone 2 × 2 blocks, which the paper's rules delete.
-        extra = mine & ~expected
+        extra = skeleton & ~expected
         blocks = label(mask, connectivity=2)
-        gone = set(np.unique(blocks[mask])) - set(np.unique(blocks[expected]))
-        assert set(np.unique(blocks[extra])) <= gone
-        assert len(np.argwhere(extra)) == len(gone)
+        missing_blocks = set(np.unique(blocks[mask])) - set(np.unique(blocks[expected]))
+        assert set(np.unique(blocks[extra])) <= missing_blocks
+        assert len(np.argwhere(extra)) == len(missing_blocks)
 
 
 def test_the_real_map(strawberry: Any) -> None:  # noqa: F811
@@ -265,15 +265,15 @@ def test_the_graph_is_the_skeleton() -> None:
         assert nx.number_connected_components(g) == label(skeleton, connectivity=2).max()
         assert set(nodes.tolist()) | set(path.tolist()) == set(range(len(cells)))
         for e in range(len(start)):
-            way = cells[path[begin[e] : begin[e + 1]]]
-            assert (np.abs(np.diff(way, axis=0)).max(axis=1) == 1).all(), "each cell is next to the one before"
+            path_cells = cells[path[begin[e] : begin[e + 1]]]
+            assert (np.abs(np.diff(path_cells, axis=0)).max(axis=1) == 1).all(), "each cell is next to the one before"
             assert path[begin[e]] == nodes[start[e]]
             assert path[begin[e + 1] - 1] == nodes[end[e]]
         merged = kernels.contract(graph, np.full(padded.shape, 3, np.uint16) * padded, cells, 1.5)
         assert nx.number_connected_components(network_of(merged)) == nx.number_connected_components(g)
         for e in range(len(merged[1])):
-            way = cells[merged[4][merged[3][e] : merged[3][e + 1]]]
-            assert (np.abs(np.diff(way, axis=0)).max(axis=1) == 1).all()
+            path_cells = cells[merged[4][merged[3][e] : merged[3][e + 1]]]
+            assert (np.abs(np.diff(path_cells, axis=0)).max(axis=1) == 1).all()
 
 
 def test_hostile_shapes_end_quickly() -> None:
@@ -305,8 +305,8 @@ def test_compiled_code_is_read_from_a_folder_that_cannot_be_written(tmp_path: Pa
         "print(sum(k.spanner.stats.cache_hits.values()))\n"
     )
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "native"), "PYTHONDONTWRITEBYTECODE": "1"}
-    told = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
-    assert told.stdout.split() == ["0"]
+    process = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
+    assert process.stdout.split() == ["0"]
     fill = (  # of one module, as of all of them
         "from pathlib import Path\n"
         "from app.derive import _native\n"
@@ -317,8 +317,8 @@ def test_compiled_code_is_read_from_a_folder_that_cannot_be_written(tmp_path: Pa
     subprocess.run([sys.executable, "-c", fill], env=env, check=True)
     before = sorted(p.name for p in (tmp_path / "native").rglob("*"))
     assert any("spanner" in n for n in before)
-    told = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
-    assert told.stdout.split() == ["1"]
+    process = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
+    assert process.stdout.split() == ["1"]
     assert sorted(p.name for p in (tmp_path / "native").rglob("*")) == before
 
 
@@ -328,9 +328,9 @@ def test_a_damaged_folder_is_no_obstacle(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", work], env=env, check=True)
     for file in tmp_path.rglob("*.nb?"):
         file.write_bytes(b"nonsense")
-    told = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
-    assert told.stdout.split() == ["made"]
-    told = subprocess.run(
+    process = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
+    assert process.stdout.split() == ["made"]
+    process = subprocess.run(
         [sys.executable, "-c", work], env={**env, "NUMBA_CACHE_DIR": "/proc/nowhere"}, capture_output=True, text=True
     )
-    assert (told.returncode, told.stdout.split()) == (0, ["made"]), told.stderr
+    assert (process.returncode, process.stdout.split()) == (0, ["made"]), process.stderr

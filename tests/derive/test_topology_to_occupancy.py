@@ -28,10 +28,10 @@ def edge(i: str, line: list[tuple[float, float]], **more: Any) -> tuple[str, Any
 
 
 def grid(layers: Layers, notes: Notes | None = None, **options: Any) -> OccupancyGrid:
-    made = topology_to_occupancy(layers, Parameters(**options), notes or Notes())
-    found = made.parts[PartKey("occupancy", "ground", MAP)]
-    assert isinstance(found, OccupancyGrid)
-    return found
+    derived_layers = topology_to_occupancy(layers, Parameters(**options), notes or Notes())
+    part = derived_layers.parts[PartKey("occupancy", "ground", MAP)]
+    assert isinstance(part, OccupancyGrid)
+    return part
 
 
 def at(g: OccupancyGrid, x: float, y: float) -> int:
@@ -128,10 +128,10 @@ def test_the_planner_takes_it_for_a_bare_network() -> None:
 @pytest.mark.parametrize("name", ["urban-netherlands-subburbs", "urban-usa-fl-miami-subberbs"])
 def test_real_towns_have_free_roads_between_occupied_houses(name: str, shared: Path) -> None:
     data = (shared / "data/osm" / name / "osm.xml").read_bytes()
-    found = read(group({"osm.xml": data})[0][0], ReadContext())
-    network = found.parts[TOPOLOGY]
+    osm_layers = read(group({"osm.xml": data})[0][0], ReadContext())
+    network = osm_layers.parts[TOPOLOGY]
     west, south, _, _ = network.document["bounds"]  # type: ignore[union-attr]
-    town = Layers(found.parts, Datum(south, west))
+    town = Layers(osm_layers.parts, Datum(south, west))
     g = grid(town)
     rows = [
         k
@@ -143,7 +143,7 @@ def test_real_towns_have_free_roads_between_occupied_houses(name: str, shared: P
     values = np.array([at(g, x, y) for x, y in middle])
     assert len(values) > 50
     assert (values == FREE).mean() > 0.995
-    houses = found.parts[PartKey("objects", "ground", "osm")].of_kind("building")  # type: ignore[union-attr]
+    houses = osm_layers.parts[PartKey("objects", "ground", "osm")].of_kind("building")  # type: ignore[union-attr]
     inner = shapely.get_coordinates(shapely.point_on_surface(houses.in_local(town.frame)))
     high = np.array(g.origin[:2]) + np.array([g.width, g.height]) * g.resolution
     inside = [(x, y) for x, y in inner if g.origin[0] <= x < high[0] and g.origin[1] <= y < high[1]]

@@ -50,8 +50,8 @@ def leaves(*rows: tuple[int, int, float], resolution: float = 0.5) -> VoxelMap:
 def project(voxels: VoxelMap, *, elevation: float = 0.0, **more: Any) -> tuple[OccupancyGrid, derive.Notes]:
     notes = derive.Notes()
     layers = Layers({PartKey("voxels"): voxels}, levels=(Level("ground", elevation),))
-    made = voxels_to_occupancy(layers, Parameters(**more), notes)
-    grid = made.parts[PartKey("occupancy")]
+    derived_layers = voxels_to_occupancy(layers, Parameters(**more), notes)
+    grid = derived_layers.parts[PartKey("occupancy")]
     assert isinstance(grid, OccupancyGrid)
     assert grid.origin[2] == 0.0
     return grid, notes
@@ -76,14 +76,14 @@ def by_hand(voxels: VoxelMap, low: float, high: float) -> dict[tuple[int, int], 
 @pytest.mark.parametrize("name", REAL)
 def test_full_height_of_real_trees(shared: Path, facts: ModuleType, facts_json: dict[str, Any], name: str) -> None:
     path = shared / "data" / "octomap" / name
-    said = facts_json[f"octomap/{name}"]["facts"]["projection_xy_full_height"]
+    expected = facts_json[f"octomap/{name}"]["facts"]["projection_xy_full_height"]
     grid, _ = project(tree(path))
     counts = grid.counts()
-    assert (grid.width, grid.height) == (said["width_cells"], said["height_cells"])
+    assert (grid.width, grid.height) == (expected["width_cells"], expected["height_cells"])
     assert (counts["occupied"], counts["free"], counts["unknown"]) == (
-        said["occupied"], said["free"], said["unknown"],
+        expected["occupied"], expected["free"], expected["unknown"],
     )  # fmt: skip
-    assert grid.origin[:2] == tuple(said["origin"])
+    assert grid.origin[:2] == tuple(expected["origin"])
     theirs = facts.projection(facts.octomap(path.read_bytes()))
     assert np.array_equal(np.where(grid.cells == UNKNOWN, -1, grid.cells.astype(int)), theirs["cells"]), "cell by cell"
 
@@ -95,7 +95,7 @@ codes = st.tuples(st.integers(12, 16), st.integers(0, 2**15), st.sampled_from([-
 @given(st.lists(codes, min_size=1, max_size=12), st.integers(-5, 9), st.integers(1, 12))
 def test_bands_of_small_trees_by_brute_force(rows: list[tuple[int, int, float]], start: int, tall: int) -> None:
     middle = sum(7 << 3 * k for k in range(15))  # the octant 0 of the root is all below the origin: shift to its middle
-    kept: list[tuple[int, int, float]] = []
+    leaf_rows: list[tuple[int, int, float]] = []
     taken: list[tuple[int, int]] = []
     for depth, code, odds in rows:
         place = (code << 3 * (16 - depth)) & ((1 << 18) - 1)
@@ -103,8 +103,8 @@ def test_bands_of_small_trees_by_brute_force(rows: list[tuple[int, int, float]],
         span = (place, place + (1 << 3 * (16 - depth)))
         if all(span[1] <= a or b <= span[0] for a, b in taken):
             taken.append(span)
-            kept.append((depth, place >> 3 * (16 - depth), odds))
-    voxels = leaves(*kept)
+            leaf_rows.append((depth, place >> 3 * (16 - depth), odds))
+    voxels = leaves(*leaf_rows)
     z = voxels.axis(2)[0].min()
     low, high = (z + start) * 0.5, (z + start + tall) * 0.5
     want = by_hand(voxels, low, high)
@@ -114,8 +114,8 @@ def test_bands_of_small_trees_by_brute_force(rows: list[tuple[int, int, float]],
         return
     grid, _ = project(voxels, band=(low, high))
     x0, y0 = (round(v / 0.5) for v in grid.origin[:2])
-    mine = {(x + x0, y + y0): int(v) for (y, x), v in np.ndenumerate(grid.cells) if v != UNKNOWN}
-    assert mine == want
+    cells = {(x + x0, y + y0): int(v) for (y, x), v in np.ndenumerate(grid.cells) if v != UNKNOWN}
+    assert cells == want
     assert grid.origin[:2] == (voxels.axis(0)[0].min() * 0.5, voxels.axis(1)[0].min() * 0.5), "whatever the band"
 
 
@@ -124,11 +124,11 @@ def test_a_band_stands_above_the_levels_floor() -> None:
     code = sum(1 << 3 * k + b for b, v in enumerate((HALF, HALF, HALF + 2)) for k in range(16) if v >> k & 1)
     voxels = leaves((16, code, 1.0))
     assert voxels.axis(2)[0].tolist() == [2]
-    for elevation, band, there in (
+    for elevation, band, expected in (
         (0.0, (1.0, 1.5), True), (0.0, (1.4, 9.0), True), (0.0, (0.0, 1.0), False), (0.0, (1.5, 2.0), False),
         (1.0, (0.0, 0.5), True), (1.0, (1.0, 1.5), False), (3.0, (-2.0, -1.9), True),
     ):  # fmt: skip
-        if there:
+        if expected:
             assert project(voxels, elevation=elevation, band=band)[0].counts()["occupied"] == 1
         else:
             with pytest.raises(MissingLayer, match=r"map from 1 to 1\.5 m"):
@@ -215,9 +215,9 @@ def test_large_leaves_cost_no_more_than_small_ones() -> None:
 def test_through_http_with_a_band(api: Api, shared: Path) -> None:  # noqa: F811
     api.post("environments", {"name": "tree"})
     api.upload("tree", {"map.bt": (shared / "data/octomap/geb079/geb079.bt").read_bytes()})
-    told = {t["format"]: t for t in api.get("environments/tree/versions/1/maps").json()}
-    assert told["occupancy_grid"]["state"] == "derivable"
-    assert [s["step"] for s in told["occupancy_grid"]["chain"]] == ["voxels_to_occupancy"]
+    coverage = {t["format"]: t for t in api.get("environments/tree/versions/1/maps").json()}
+    assert coverage["occupancy_grid"]["state"] == "derivable"
+    assert [s["step"] for s in coverage["occupancy_grid"]["chain"]] == ["voxels_to_occupancy"]
     pgm = {
         band: api.get(f"/maps/tree/occupancy_grid/map.pgm{band}").content
         for band in ("", "?band=0.3,1.2", "?band=0.3,1.2&resolution=0.16")
@@ -233,6 +233,6 @@ def test_through_http_with_a_band(api: Api, shared: Path) -> None:  # noqa: F811
 
 def test_a_cloud_as_a_grid(shared: Path) -> None:
     data = (shared / "data/pointcloud/pcl_data/room_scan1.pcd").read_bytes()
-    made = offline({"room.pcd": data}, "occupancy_grid", options={"band": "-0.5,0.5"})
-    assert set(made.files) == {"room.yaml", "room.pgm"} or set(made.files) == {"map.yaml", "map.pgm"}
-    assert any("no free space" in w["problem"] for w in made.report["warnings"])
+    converted = offline({"room.pcd": data}, "occupancy_grid", options={"band": "-0.5,0.5"})
+    assert set(converted.files) == {"room.yaml", "room.pgm"} or set(converted.files) == {"map.yaml", "map.pgm"}
+    assert any("no free space" in w["problem"] for w in converted.report["warnings"])

@@ -43,8 +43,8 @@ PAIRS = {
 
 
 def read(files: dict[str, bytes]) -> Layers:
-    told = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
-    return told.layers(None)
+    upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
+    return upload_bundle.layers(None)
 
 
 def world(data: Path, pair: str) -> Layers:
@@ -56,13 +56,13 @@ def world(data: Path, pair: str) -> Layers:
 
 
 def sliced(content: Layers, **options: Any) -> OccupancyGrid:
-    made = objects_to_occupancy(content, Parameters(**options), Notes())
-    grid = made.parts[PartKey("occupancy", "ground", MAP)]
+    derived_layers = objects_to_occupancy(content, Parameters(**options), Notes())
+    grid = derived_layers.parts[PartKey("occupancy", "ground", MAP)]
     assert isinstance(grid, OccupancyGrid)
     return grid
 
 
-def known(data: Path, pair: str) -> dict[str, Any]:
+def pair_facts(data: Path, pair: str) -> dict[str, Any]:
     facts: dict[str, Any] = json.loads((data / "facts.json").read_text())["_world_map_alignment"]["pairs"][pair]
     return facts
 
@@ -78,13 +78,13 @@ def test_a_slice_covers_the_map_that_a_robot_made_there(shared: Path, pair: str)
     from scipy.spatial import cKDTree
 
     data = shared / "data"
-    folder, _, maps, shift, least = PAIRS[pair]
-    facts = known(data, pair)
+    folder, _, maps, shift, minimum = PAIRS[pair]
+    facts = pair_facts(data, pair)
     grid = sliced(world(data, pair), height=facts["slice_z_m"])
     files = {p.name: p.read_bytes() for p in (data / "gazebo_sdf" / folder / maps).iterdir()}
     (measured,) = read(files).grids().values()
     away, _ = cKDTree(middles(grid)).query(middles(measured) - shift)
-    assert (away <= 0.1 + 1e-9).mean() >= least
+    assert (away <= 0.1 + 1e-9).mean() >= minimum
     (low, high) = facts["slice_bbox"]
     at = middles(grid)
     assert at.min(axis=0) == pytest.approx(low, abs=0.05)
@@ -97,7 +97,7 @@ def test_surfaces_are_where_trimesh_cuts_them(shared: Path, pair: str) -> None:
     """Every cell that trimesh's slice runs through is occupied; its total length is the facts'."""
     trimesh: Any = importlib.import_module("trimesh")
     content = world(shared / "data", pair)
-    facts = known(shared / "data", pair)
+    facts = pair_facts(shared / "data", pair)
     height = facts["slice_z_m"]
     grid = sliced(content, height=height)
     solids = Solids(content.resources())
@@ -114,11 +114,11 @@ def test_surfaces_are_where_trimesh_cuts_them(shared: Path, pair: str) -> None:
             steps = np.linspace(0.01, 0.99, 50)[None, :, None]
             at = (cut[:, None, 0] * (1 - steps) + cut[:, None, 1] * steps).reshape(-1, 2)
             # What runs exactly along the border of two cells may be in either.
-            found = np.zeros(len(at), bool)
+            occupied = np.zeros(len(at), bool)
             for aside in ((1e-5, 1e-5), (-1e-5, 1e-5), (1e-5, -1e-5), (-1e-5, -1e-5)):
                 column, row = np.floor((at + aside - grid.origin[:2]) / grid.resolution).astype(int).T
-                found |= grid.cells[row, column] == 100
-            hit += int(found.sum())
+                occupied |= grid.cells[row, column] == 100
+            hit += int(occupied.sum())
             total += len(at)
     assert hit >= 0.999 * total
     assert length == pytest.approx(facts["slice_total_length_m"], rel=0.01)
@@ -126,20 +126,20 @@ def test_surfaces_are_where_trimesh_cuts_them(shared: Path, pair: str) -> None:
 
 def test_the_warehouse_as_voxels(shared: Path) -> None:
     content = world(shared / "data", "aws_small_warehouse")
-    made = objects_to_voxels(content, VoxelParameters(), Notes()).parts[PartKey("voxels", "ground", MAP)]
-    assert isinstance(made, VoxelMap)
-    assert made.resolution == 0.1
-    box = made.bounds()
+    voxels = objects_to_voxels(content, VoxelParameters(), Notes()).parts[PartKey("voxels", "ground", MAP)]
+    assert isinstance(voxels, VoxelMap)
+    assert voxels.resolution == 0.1
+    box = voxels.bounds()
     assert box is not None
     assert box[:2] == pytest.approx((-7.0, -10.5), abs=0.11)
     assert box[3:5] == pytest.approx((7.0, 10.5), abs=0.11)
     grid = sliced(content, band=(1.0, 1.1), resolution=0.1)
-    (za, zb) = made.axis(2)
-    here = (za <= 10) & (zb > 10)
+    (za, zb) = voxels.axis(2)
+    crossing = (za <= 10) & (zb > 10)
     x0, y0 = (round(v / 0.1) for v in grid.origin[:2])
     flat = np.zeros_like(grid.cells)
-    (xa, xb), (ya, yb) = made.axis(0), made.axis(1)
-    for a, b, c, d in zip(xa[here] - x0, xb[here] - x0, ya[here] - y0, yb[here] - y0, strict=True):
+    (xa, xb), (ya, yb) = voxels.axis(0), voxels.axis(1)
+    for a, b, c, d in zip(xa[crossing] - x0, xb[crossing] - x0, ya[crossing] - y0, yb[crossing] - y0, strict=True):
         flat[c:d, a:b] = 100
     differ = (flat == 100) != (grid.cells == 100)
     assert differ.sum() < 0.01 * (grid.cells == 100).sum(), "a layer of the octree is a band of the world"
@@ -183,15 +183,15 @@ def test_a_robots_map_is_laid_onto_its_world(
 ) -> None:
     """The known shifts (a map's places less the world's) are found again to a cell, and from any turn."""
     data = shared / "data"
-    onto = sliced(world(data, pair), height=known(data, pair)["slice_z_m"])
+    onto = sliced(world(data, pair), height=pair_facts(data, pair)["slice_z_m"])
     grid = of_the_robot(data / maps)
     for out in (Fit(0, 0, 0, 0, 1), Fit(3.0, -2.0, math.radians(-64), 0, 1)):
         moving = out.moved(grid)
         fit = of_grids(moving, onto)[0]
         back = fit.moved(moving)
         middle = middles(onto).mean(axis=0)[None]
-        gone = Fit(0, 0, back.origin[2], 0, 1).of(middle - grid.origin[:2]) + back.origin[:2] - middle
-        assert np.abs(gone + shift).max() < 0.05 + 1e-9
+        offset = Fit(0, 0, back.origin[2], 0, 1).of(middle - grid.origin[:2]) + back.origin[:2] - middle
+        assert np.abs(offset + shift).max() < 0.05 + 1e-9
         assert abs(math.degrees(back.origin[2])) < degrees
         assert fit.agreement > 0.95
         assert fit.residual < 0.05

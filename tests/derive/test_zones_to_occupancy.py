@@ -34,20 +34,20 @@ def zones(*rows: tuple[Any, dict[str, Any]], anchor: Any = "local", **more: Any)
     return Layers({ZONES: part, **more.pop("parts", {})}, **more)
 
 
-def made(layers: Layers, **values: Any) -> tuple[Layers, Notes]:
+def derive_masks(layers: Layers, **values: Any) -> tuple[Layers, Notes]:
     notes = Notes()
     return zones_to_occupancy(layers, Parameters(**values), notes), notes
 
 
 def grid(layers: Layers, key: PartKey) -> OccupancyGrid:
-    found = layers.parts[key]
-    assert isinstance(found, OccupancyGrid)
-    return found
+    part = layers.parts[key]
+    assert isinstance(part, OccupancyGrid)
+    return part
 
 
 def info(mask: OccupancyGrid) -> tuple[int, float, float]:
-    said = mask.properties["costmap_filter"]["params"]["costmap_filter_info_server"]["ros__parameters"]
-    return said["type"], said["base"], said["multiplier"]
+    parameters = mask.properties["costmap_filter"]["params"]["costmap_filter_info_server"]["ros__parameters"]
+    return parameters["type"], parameters["base"], parameters["multiplier"]
 
 
 def speed_at(mask: OccupancyGrid, x: float, y: float) -> float | None:
@@ -66,7 +66,7 @@ def the_map(width: int = 12, height: int = 8, origin: tuple[float, float, float]
 def test_a_keepout_takes_every_cell_that_it_touches_in_the_maps_frame() -> None:
     box, sliver = shapely.box(0.0, 0.0, 1.0, 0.5), shapely.box(3.1, 1.1, 3.2, 1.2)
     layers = zones((box, {"kind": "keepout"}), (sliver, {"kind": "Keepout"}), parts={MAP: the_map()})
-    out, notes = made(layers)
+    out, notes = derive_masks(layers)
     mask = grid(out, KEEPOUT)
     assert list(out.parts) == [KEEPOUT]
     assert (mask.resolution, mask.origin, mask.cells.shape) == (0.5, (-1.0, -1.0, 0.0), (8, 12))
@@ -83,16 +83,18 @@ def test_holes_levels_and_other_cells() -> None:
     ring = shapely.box(0, 0, 3, 3).difference(shapely.box(1, 1, 2, 2))
     layers = zones((ring, {"kind": "keepout"}))
     upper = features([("u", shapely.box(10, 10, 11, 11), {"kind": "keepout"})], "local")
-    out, _ = made(Layers({**layers.parts, PartKey("zones", "L2", "zones"): upper}), resolution=0.5)
+    out, _ = derive_masks(Layers({**layers.parts, PartKey("zones", "L2", "zones"): upper}), resolution=0.5)
     mask = grid(out, KEEPOUT)
     assert mask.origin == (-1.0, -1.0, 0.0)  # the zones and a metre around them
     assert mask.cells.shape == (10, 10)
     assert int((mask.cells == 100).sum()) == 36 - 4
     assert mask.cells[4:6, 4:6].tolist() == [[0, 0], [0, 0]]
     assert grid(out, PartKey("occupancy", "L2", "keepout")).origin == (9.0, 9.0, 0.0)
-    finer, _ = made(zones((ring, {"kind": "keepout"}), parts={MAP: the_map(origin=(-1.25, -1.0, 0.0))}), resolution=0.1)
+    finer, _ = derive_masks(
+        zones((ring, {"kind": "keepout"}), parts={MAP: the_map(origin=(-1.25, -1.0, 0.0))}), resolution=0.1
+    )
     assert grid(finer, KEEPOUT).origin == (-1.3, -1.0, 0.0), "a whole multiple of its own cells"
-    turned, _ = made(zones((ring, {"kind": "keepout"}), parts={MAP: the_map(origin=(0.0, 0.0, 0.3))}))
+    turned, _ = derive_masks(zones((ring, {"kind": "keepout"}), parts={MAP: the_map(origin=(0.0, 0.0, 0.3))}))
     assert grid(turned, KEEPOUT).origin[2] == 0.0
 
 
@@ -103,7 +105,7 @@ def test_speed_in_metres_per_second_lowest_wins_and_is_never_raised() -> None:
         (shapely.box(3, 0, 4, 1), {"kind": "speed", "value": 0}),
         (shapely.box(2, 2, 3, 3), {"kind": "speed"}),
     )
-    out, notes = made(layers)
+    out, notes = derive_masks(layers)
     mask = grid(out, SPEED)
     assert list(out.parts) == [SPEED]
     assert info(mask) == (2, 0.0, 0.02)
@@ -120,7 +122,7 @@ def test_speed_in_percent() -> None:
         (shapely.box(0, 0, 4, 4), {"kind": "speed", "value": "50 %"}),
         (shapely.box(5, 0, 6, 1), {"kind": "speed", "value": "120%"}),
     )
-    mask = grid(made(layers)[0], SPEED)
+    mask = grid(derive_masks(layers)[0], SPEED)
     assert info(mask) == (1, 0.0, 1.0)
     assert (speed_at(mask, 1, 1), speed_at(mask, 5.5, 0.5)) == (50.0, None)
     both = zones(
@@ -128,11 +130,11 @@ def test_speed_in_percent() -> None:
         (shapely.box(5, 0, 6, 1), {"kind": "speed", "value": "0.5 m/s"}),
     )
     with pytest.raises(CannotConvert, match="max_speed"):
-        made(both)
-    mask = grid(made(both, max_speed=2.0)[0], SPEED)
+        derive_masks(both)
+    mask = grid(derive_masks(both, max_speed=2.0)[0], SPEED)
     assert info(mask)[0] == 2
     assert (speed_at(mask, 1, 1), speed_at(mask, 5.5, 0.5)) == (pytest.approx(1.0), pytest.approx(0.5))
-    mask = grid(made(both, max_speed=2.0, speed_in="percent")[0], SPEED)
+    mask = grid(derive_masks(both, max_speed=2.0, speed_in="percent")[0], SPEED)
     assert info(mask) == (1, 0.0, 1.0)
     assert (speed_at(mask, 1, 1), speed_at(mask, 5.5, 0.5)) == (50.0, 25.0)
 
@@ -143,7 +145,7 @@ def test_preferred_lanes_are_free_and_what_lies_beside_them_costs() -> None:
         (shapely.box(1, 0, 2, 1), {"kind": "keepout"}),
         parts={MAP: the_map()},
     )
-    out, notes = made(layers, lane_cost=70)
+    out, notes = derive_masks(layers, lane_cost=70)
     mask = grid(out, KEEPOUT)
     assert mask.cells[2].tolist() == [70, 70, 0, 0, 100, 100, 0, 0, 0, 0, 70, 70]
     assert mask.cells[0].tolist() == [70] * 12
@@ -159,7 +161,7 @@ def test_what_is_left_out_is_told() -> None:
         (shapely.LineString([(0, 0), (1, 1)]), {"kind": "keepout"}),
         parts={MAP: the_map()},
     )
-    _, notes = made(layers)
+    _, notes = derive_masks(layers)
     assert {d["what"]: d["count"] for d in notes.dropped} == {
         "zones of other kinds": 1,
         "zones without an area": 1,
@@ -171,13 +173,13 @@ def test_what_is_left_out_is_told() -> None:
 
 def test_it_says_what_is_missing() -> None:
     with pytest.raises(MissingLayer, match="kind keepout"):
-        made(zones((shapely.box(0, 0, 1, 1), {"kind": "priority"})))
+        derive_masks(zones((shapely.box(0, 0, 1, 1), {"kind": "priority"})))
     with pytest.raises(MissingDatum):
-        made(zones((shapely.box(0, 0, 1e-4, 1e-4), {"kind": "keepout"}), anchor="wgs84"))
+        derive_masks(zones((shapely.box(0, 0, 1e-4, 1e-4), {"kind": "keepout"}), anchor="wgs84"))
     with pytest.raises(CannotConvert, match="coarser"):
-        made(zones((shapely.box(0, 0, 1e5, 1e5), {"kind": "keepout"})))
+        derive_masks(zones((shapely.box(0, 0, 1e5, 1e5), {"kind": "keepout"})))
     earth = zones((shapely.box(0, 0, 1e-4, 1e-4), {"kind": "keepout"}), anchor="wgs84", datum=Datum(0.0, 0.0))
-    width = grid(made(earth)[0], KEEPOUT).width
+    width = grid(derive_masks(earth)[0], KEEPOUT).width
     assert width == pytest.approx((11.13 + 2) / 0.05, abs=3)
 
 
@@ -223,11 +225,11 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
 
 
 def mask_of(files: dict[str, bytes], name: str) -> tuple[dict[str, Any], np.ndarray[Any, Any]]:
-    said = yaml.safe_load(files[f"{name}.yaml"])
+    map_yaml = yaml.safe_load(files[f"{name}.yaml"])
     head, size, _, body = files[f"{name}.pgm"].split(b"\n", 3)
     width, height = map(int, size.split())
     assert head == b"P5"
-    return said, np.frombuffer(body, np.uint8).reshape(height, width)
+    return map_yaml, np.frombuffer(body, np.uint8).reshape(height, width)
 
 
 def test_a_drawn_keepout_is_served_as_a_mask(api: Api, tmp_path: Path) -> None:
@@ -247,8 +249,8 @@ def test_a_drawn_keepout_is_served_as_a_mask(api: Api, tmp_path: Path) -> None:
     with zipfile.ZipFile(io.BytesIO(answer.content)) as z:
         files = {n: z.read(n) for n in z.namelist()}
     assert sorted(files) == ["keepout.pgm", "keepout.yaml", "keepout_filter_info.yaml"]
-    said, pixels = mask_of(files, "keepout")
-    assert (said["resolution"], said["origin"], pixels.shape) == (0.25, [-2.0, -3.0, 0.0], (60, 80))
+    map_yaml, pixels = mask_of(files, "keepout")
+    assert (map_yaml["resolution"], map_yaml["origin"], pixels.shape) == (0.25, [-2.0, -3.0, 0.0], (60, 80))
     black = np.argwhere(pixels == 0)
     assert len(black) == (pixels < 254).sum()
     # 5.56 m (in longitude) × 5.53 m from (0, 0): columns 8…30, and rows 12…34 from below.
@@ -283,15 +285,15 @@ def test_speed_zones_over_http_and_committed(api: Api) -> None:
     changes = [{"op": "put", "layer": "zones", "feature": slow, "crs": "local"}]
     api.post("environments/yard/edits", {"message": "slow down", "changes": changes})
     base = "environments/yard/versions/latest/maps/occupancy_grid"
-    said = yaml.safe_load(api.get(f"{base}/speed_filter_info.yaml").text)
-    told = said["costmap_filter_info_server"]["ros__parameters"]
-    assert (told["type"], told["base"], told["multiplier"]) == (2, 0.0, 0.01)
+    filter_info = yaml.safe_load(api.get(f"{base}/speed_filter_info.yaml").text)
+    parameters = filter_info["costmap_filter_info_server"]["ros__parameters"]
+    assert (parameters["type"], parameters["base"], parameters["multiplier"]) == (2, 0.0, 0.01)
     assert yaml.safe_load(api.get(f"{base}/keepout.yaml").text)["mode"] == "scale"
     before = api.get(f"{base}/speed.pgm").content
-    made = api.post("environments/yard/derivations", {"method": "zones_to_occupancy"}).json()
-    assert made["information"]["occupancy"] == "derived"
+    version = api.post("environments/yard/derivations", {"method": "zones_to_occupancy"}).json()
+    assert version["information"]["occupancy"] == "derived"
     assert api.get(f"{base}/speed.pgm").content == before
-    known = api.get(
+    response = api.get(
         "environments/yard/versions/latest/layers/occupancy?name=speed", headers={"Accept": "application/json"}
     )
-    assert known.json()["counts"]["other"] > 0
+    assert response.json()["counts"]["other"] > 0

@@ -23,9 +23,9 @@ def _constants(**values: Any) -> list[Any]:
 
 def _model(nodes: list[Any], inputs: list[Any], outputs: list[Any], constants: list[Any]) -> bytes:
     graph = MAKE.make_graph(nodes, "tiny", inputs, outputs, constants)
-    made = MAKE.make_model(graph, opset_imports=[MAKE.make_opsetid("", 18)], ir_version=8)
-    onnx.checker.check_model(made, full_check=True)
-    return bytes(made.SerializeToString())
+    onnx_model = MAKE.make_model(graph, opset_imports=[MAKE.make_opsetid("", 18)], ir_version=8)
+    onnx.checker.check_model(onnx_model, full_check=True)
+    return bytes(onnx_model.SerializeToString())
 
 
 def encoder(side: int, *, upright: bool = False, second: bool = False, free: bool = False) -> bytes:

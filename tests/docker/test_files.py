@@ -34,8 +34,8 @@ def compose() -> dict[str, Any]:
 
 @pytest.mark.parametrize("path", [COMPOSE, TOP / "docker" / "robot.compose.yaml"], ids=lambda p: p.name)
 def test_compose_fits_its_schema(path: Path) -> None:
-    told = tool("check-jsonschema", "--builtin-schema", "vendor.compose-spec", path)
-    assert told.returncode == 0, told.stdout + told.stderr
+    process = tool("check-jsonschema", "--builtin-schema", "vendor.compose-spec", path)
+    assert process.returncode == 0, process.stdout + process.stderr
 
 
 def test_the_schema_check_refuses_what_is_wrong(tmp_path: Path) -> None:
@@ -46,8 +46,8 @@ def test_the_schema_check_refuses_what_is_wrong(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", [DOCKERFILE, TOP / "docker" / "agent.Dockerfile"], ids=lambda p: p.name)
 def test_hadolint_has_nothing_to_say(path: Path) -> None:
-    told = tool("hadolint", "--no-color", path)
-    assert told.returncode == 0, told.stdout + told.stderr
+    process = tool("hadolint", "--no-color", path)
+    assert process.returncode == 0, process.stdout + process.stderr
 
 
 def test_the_server_is_confined(compose: dict[str, Any]) -> None:
@@ -67,16 +67,16 @@ def test_every_secret_and_volume_that_is_used_is_declared_and_made(compose: dict
     done = subprocess.run(
         [sys.executable, TOP / "docker" / "make_secrets.py", tmp_path / "s"], capture_output=True, text=True, check=True
     )
-    made = {path.name: path.read_text() for path in (tmp_path / "s").iterdir()}
-    assert set(made) == {Path(secret["file"]).name for secret in compose["secrets"].values()}
+    secrets = {path.name: path.read_text() for path in (tmp_path / "s").iterdir()}
+    assert set(secrets) == {Path(secret["file"]).name for secret in compose["secrets"].values()}
     assert stat.S_IMODE((tmp_path / "s").stat().st_mode) == 0o700
-    assert made["database_password"].strip() in made["fleetmap_database_url"]
-    assert all(secret.strip() not in done.stdout for secret in made.values())
+    assert secrets["database_password"].strip() in secrets["fleetmap_database_url"]
+    assert all(secret.strip() not in done.stdout for secret in secrets.values())
     again = subprocess.run(
         [sys.executable, TOP / "docker" / "make_secrets.py", tmp_path / "s"], capture_output=True, text=True, check=True
     )
     assert again.stdout == ""
-    assert {path.name: path.read_text() for path in (tmp_path / "s").iterdir()} == made
+    assert {path.name: path.read_text() for path in (tmp_path / "s").iterdir()} == secrets
 
 
 def test_the_database_url_names_what_compose_creates(compose: dict[str, Any], tmp_path: Path) -> None:
@@ -107,10 +107,10 @@ def test_the_image_is_built_from_what_dockerignore_lets_in() -> None:
 
 def test_the_lock_file_pins_everything_by_hash_from_the_public_index() -> None:
     lock = tomllib.loads((TOP / "uv.lock").read_text())
-    own = [p for p in lock["package"] if "editable" in p["source"]]
-    assert [p["name"] for p in own] == ["fleet-map-server"]
+    project_packages = [p for p in lock["package"] if "editable" in p["source"]]
+    assert [p["name"] for p in project_packages] == ["fleet-map-server"]
     for package in lock["package"]:
-        if package in own:
+        if package in project_packages:
             continue
         assert package["source"] == {"registry": "https://pypi.org/simple"}, package["name"]
         artifacts = package.get("wheels", []) + ([package["sdist"]] if "sdist" in package else [])
@@ -125,10 +125,10 @@ def test_the_lock_file_knows_every_dependency() -> None:
     lock = tomllib.loads((TOP / "uv.lock").read_text())
     locked = {package["name"] for package in lock["package"]}
     groups = project["dependency-groups"]
-    wanted = project["project"]["dependencies"] + groups["robot"]
-    wanted += [one for one in groups["dev"] if isinstance(one, str)]
-    wanted += project["project"]["optional-dependencies"]["server"]
-    names = {re.split(r"[\[<>=!~; ]", text, maxsplit=1)[0].lower().replace("_", "-") for text in wanted}
+    requirements = project["project"]["dependencies"] + groups["robot"]
+    requirements += [one for one in groups["dev"] if isinstance(one, str)]
+    requirements += project["project"]["optional-dependencies"]["server"]
+    names = {re.split(r"[\[<>=!~; ]", text, maxsplit=1)[0].lower().replace("_", "-") for text in requirements}
     assert not names - locked
 
 

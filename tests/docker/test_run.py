@@ -41,15 +41,15 @@ def instructions() -> list[tuple[str, str]]:
 
 def image() -> dict[str, Any]:
     """What the image says: environment, entry point, command, health check."""
-    said: dict[str, Any] = {"env": {}}
+    configuration: dict[str, Any] = {"env": {}}
     for word, argument in instructions():
         if word == "ENV":
-            said["env"].update(re.findall(r"(\w+)=(\S+)", argument))
+            configuration["env"].update(re.findall(r"(\w+)=(\S+)", argument))
         elif word in ("ENTRYPOINT", "CMD", "WORKDIR"):
-            said[word.lower()] = json.loads(argument) if argument.startswith("[") else argument
+            configuration[word.lower()] = json.loads(argument) if argument.startswith("[") else argument
         elif word == "HEALTHCHECK":
-            said["healthcheck"] = json.loads(argument[argument.index("CMD") + 3 :])
-    return said
+            configuration["healthcheck"] = json.loads(argument[argument.index("CMD") + 3 :])
+    return configuration
 
 
 class Container:
@@ -57,18 +57,18 @@ class Container:
 
     def __init__(self, name: str, folder: Path, database_url: str) -> None:
         compose = yaml.safe_load((TOP / "docker" / "compose.yaml").read_text())
-        service, said = compose["services"][name], image()
+        service, configuration = compose["services"][name], image()
         self.folder = folder
-        environment = {**said["env"], **service.get("environment", {})}
+        environment = {**configuration["env"], **service.get("environment", {})}
         defaulted = {k: re.sub(r"\$\{\w+:-(.*?)\}", r"\1", str(v)) for k, v in environment.items()}
         self.environment = {k: self._mapped(v) for k, v in defaulted.items()}
         self.environment["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         if "PYTHONPYCACHEPREFIX" in os.environ:  # in the image all is compiled when it is built
             self.environment["PYTHONPYCACHEPREFIX"] = os.environ["PYTHONPYCACHEPREFIX"]
             self.environment.pop("PYTHONDONTWRITEBYTECODE", None)
-        self.command = [*said["entrypoint"], *(service.get("command") or said["cmd"])]
-        self.healthcheck = said["healthcheck"]
-        self.workdir = self._mapped(said["workdir"])
+        self.command = [*configuration["entrypoint"], *(service.get("command") or configuration["cmd"])]
+        self.healthcheck = configuration["healthcheck"]
+        self.workdir = self._mapped(configuration["workdir"])
         secrets = folder / "run" / "secrets"
         if not secrets.exists():
             subprocess.run(
@@ -112,9 +112,9 @@ class Container:
             )
 
     def program(self, command: list[str]) -> str:
-        found = shutil.which(command[0], path=self.environment["PATH"])
-        assert found, f"{command[0]} is not in the image's PATH"
-        return found
+        program_path = shutil.which(command[0], path=self.environment["PATH"])
+        assert program_path, f"{command[0]} is not in the image's PATH"
+        return program_path
 
 
 def free_port() -> int:
@@ -158,8 +158,8 @@ def test_the_image_serves_maps_from_postgis(
         assert refused.value.code == 401
 
         access = ["--server", address, "--token", token]
-        made = offline("demo", "--json", *access)
-        assert made.status == 0, made.err
+        result = offline("demo", "--json", *access)
+        assert result.status == 0, result.err
         out = tmp_path / "map.yaml"
         assert offline("export", "orchard", "tmap2", "-o", out, *access).status == 0
         assert "Dock" in out.read_text()
@@ -183,17 +183,17 @@ def test_the_image_serves_maps_from_postgis(
 
 
 def test_the_image_needs_no_shell() -> None:
-    said = image()
+    configuration = image()
     for name in ("entrypoint", "cmd", "healthcheck"):
-        assert isinstance(said[name], list), f"{name} must be in exec form"
-        assert said[name][0] not in ("sh", "bash", "/bin/sh")
+        assert isinstance(configuration[name], list), f"{name} must be in exec form"
+        assert configuration[name][0] not in ("sh", "bash", "/bin/sh")
 
 
 def test_what_the_image_writes_lies_in_its_volume() -> None:
     from app.config import Settings
 
-    said = image()
-    folder = Path(said["env"]["FLEETMAP_DATA_DIR"])
+    configuration = image()
+    folder = Path(configuration["env"]["FLEETMAP_DATA_DIR"])
     settings = Settings(data_dir=folder, _env_file=None)
     volumes = [Path(v) for word, argument in instructions() if word == "VOLUME" for v in json.loads(argument)]
     for path in (settings.blob_dir, settings.cache_dir, settings.spool_dir):

@@ -70,9 +70,9 @@ class Listener:
 def eventually(condition: Callable[[], Any], seconds: float = 20.0) -> Any:
     deadline = time.monotonic() + seconds
     while True:
-        found = condition()
-        if found:
-            return found
+        value = condition()
+        if value:
+            return value
         assert time.monotonic() < deadline, "it did not come about in time"
         time.sleep(0.02)
 
@@ -103,8 +103,8 @@ def api(tmp_path: Path, port: int) -> Iterator[Api]:
 @pytest.fixture
 def session(api: Api, port: int) -> Iterator[zenoh.Session]:
     """A robot's session."""
-    made = zenoh.open(client_config(port))
+    new_session = zenoh.open(client_config(port))
     try:
-        yield made
+        yield new_session
     finally:
-        made.close()  # type: ignore[no-untyped-call]
+        new_session.close()  # type: ignore[no-untyped-call]

@@ -34,8 +34,8 @@ def test_statuses_come_in_order(api: Api, session: zenoh.Session) -> None:
     session.put("fleetmap/nowhere/robots/r1/status", said(1))
     session.put("fleetmap/farm/robots/r2/status", said(7))
     eventually(lambda: robot_of(api, "r2"))
-    told = eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 149 and r)
-    assert told["holds"]["version"] == 148
+    robot = eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 149 and r)
+    assert robot["holds"]["version"] == 148
     history = api.get("robots/r1?limit=200").json()["history"]
     assert [h["sequence"] for h in history] == list(range(149, -1, -1))
     assert [r["robot"] for r in api.get("robots?environment=farm").json()] == ["r1", "r2"]
@@ -176,8 +176,8 @@ def test_nonsense_keeps_nothing_from_being_renewed(
     monkeypatch.setattr("app.fleet.intake.RENEW_SECONDS", 0.2)
     store: Store = api.app.state.services.store
     intake, renewed, stop = Intake(store), [], threading.Event()
-    monkeypatch.setattr(store, "note_presence", lambda there, gone, now: renewed.append(there))
-    intake.alive("calm", there=True)
+    monkeypatch.setattr(store, "note_presence", lambda on_bus, absent, now: renewed.append(on_bus))
+    intake.alive("calm", on_bus=True)
 
     def shout() -> None:
         while not stop.is_set():
@@ -192,7 +192,7 @@ def test_nonsense_keeps_nothing_from_being_renewed(
         stop.set()
         loud.join()
         intake.close()
-    assert all(there == {"calm"} for there in renewed)
+    assert all(on_bus == {"calm"} for on_bus in renewed)
     lines = [r for r in caplog.records if "a status is a JSON object" in r.getMessage()]
     assert "others)" in caplog.text
     assert lines

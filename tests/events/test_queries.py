@@ -27,8 +27,8 @@ def port() -> int:
 
 @pytest.fixture(scope="module")
 def api(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Api]:
-    where = f"tcp/127.0.0.1:{port}"
-    with running(settings_for(tmp_path_factory.mktemp("asked"), zenoh_mode="router", zenoh_listen=where)) as api:
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with running(settings_for(tmp_path_factory.mktemp("asked"), zenoh_mode="router", zenoh_listen=endpoint)) as api:
         eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
         yield api
 
@@ -43,10 +43,10 @@ def test_maps_over_zenoh_are_the_bytes_of_http(api: Api, session: zenoh.Session)
         return reply.ok if reply.ok is not None else reply.err
 
     for version in ("1", "latest"):
-        here = get(f"fleetmap/asked/{version}/maps/tmap2/network.tmap2.yaml")
-        there = api.get(f"environments/asked/versions/{version}/maps/tmap2/network.tmap2.yaml")
-        assert bytes(here.payload) == there.content
-        assert str(here.encoding) in there.headers["content-type"]
+        reply = get(f"fleetmap/asked/{version}/maps/tmap2/network.tmap2.yaml")
+        response = api.get(f"environments/asked/versions/{version}/maps/tmap2/network.tmap2.yaml")
+        assert bytes(reply.payload) == response.content
+        assert str(reply.encoding) in response.headers["content-type"]
     grid = get("fleetmap/asked/latest/maps/occupancy_grid/map.yaml?resolution=0.5")
     assert bytes(grid.payload) == api.get("/maps/asked/occupancy_grid/map.yaml?resolution=0.5").content
     version = json.loads(bytes(get("fleetmap/asked/2/version").payload))
@@ -62,15 +62,15 @@ def test_maps_over_zenoh_are_the_bytes_of_http(api: Api, session: zenoh.Session)
         ("asked/latest/maps/osm", ""),
     ):
         environment, _, rest = path.partition("/")
-        there = api.get(f"environments/{environment}/versions/{rest.removesuffix('/version')}", expect=None, params=[
+        response = api.get(f"environments/{environment}/versions/{rest.removesuffix('/version')}", expect=None, params=[
             tuple(pair.split("=")) for pair in options.split(";") if pair
         ])  # fmt: skip
         refused = get(f"fleetmap/{path}?{options}")
-        assert json.loads(bytes(refused.payload)) == problem_of(there)
+        assert json.loads(bytes(refused.payload)) == problem_of(response)
         assert str(refused.encoding) == "application/problem+json"
     for key in ("fleetmap/*/*/version", "fleetmap/asked/latest/maps/**", "**"):
-        told = json.loads(bytes(get(key).payload))
-        assert (told["status"], "without wildcards" in told["detail"]) == (422, True)
+        problem = json.loads(bytes(get(key).payload))
+        assert (problem["status"], "without wildcards" in problem["detail"]) == (422, True)
 
 
 def test_environments_by_position_are_those_of_http(api: Api, session: zenoh.Session) -> None:
@@ -86,9 +86,9 @@ def test_environments_by_position_are_those_of_http(api: Api, session: zenoh.Ses
         return reply.ok if reply.ok is not None else reply.err
 
     answer = get("?lat=53.2687;lon=-0.5246")
-    found = json.loads(bytes(answer.payload))
-    assert found == api.get("environments", params={"contains": "53.2687,-0.5246"}).json()
-    assert [(e["name"], e["match"]["by"]) for e in found if e["name"] in ("fenced", "bare")] == [
+    environments = json.loads(bytes(answer.payload))
+    assert environments == api.get("environments", params={"contains": "53.2687,-0.5246"}).json()
+    assert [(e["name"], e["match"]["by"]) for e in environments if e["name"] in ("fenced", "bare")] == [
         ("fenced", "fence"),
         ("bare", "datum"),
     ]
@@ -104,9 +104,9 @@ def test_environments_by_position_are_those_of_http(api: Api, session: zenoh.Ses
         "?lat=1,2;lon=3",
     ):
         refused = get(bad)
-        told = json.loads(bytes(refused.payload))
-        assert (told["status"], str(refused.encoding)) == (422, "application/problem+json"), bad
-        assert "lat" in told["detail"]
+        problem = json.loads(bytes(refused.payload))
+        assert (problem["status"], str(refused.encoding)) == (422, "application/problem+json"), bad
+        assert "lat" in problem["detail"]
 
 
 def test_a_map_in_the_making_keeps_nobody_waiting(
@@ -117,9 +117,9 @@ def test_a_map_in_the_making_keeps_nobody_waiting(
     go, maps, late = threading.Event(), api.app.state.services.maps, []
     make = maps.fetch
 
-    def slow(*asked: Any, **more: Any) -> Any:
+    def slow(*args: Any, **more: Any) -> Any:
         assert go.wait(30)
-        return make(*asked, **more)
+        return make(*args, **more)
 
     monkeypatch.setattr(maps, "fetch", slow)
     try:
@@ -165,14 +165,14 @@ def test_what_is_too_large_for_zenoh_is_not_even_read(
     api.get("/maps/large/occupancy_grid/map.pgm")
 
     def huge(recipe: Any) -> Any:
-        made = ready(recipe)
-        return replace(made, files=tuple(replace(f, size=2**40, path=Path("/nowhere")) for f in made.files))
+        cached_map = ready(recipe)
+        return replace(cached_map, files=tuple(replace(f, size=2**40, path=Path("/nowhere")) for f in cached_map.files))
 
     monkeypatch.setattr(api.app.state.services.maps, "ready", huge)
     reply = next(iter(session.get("fleetmap/large/latest/maps/occupancy_grid/map.pgm", timeout=20.0)))
-    told = json.loads(bytes(reply.err.payload))
-    assert (told["status"], told["title"]) == (413, "Too large")
-    assert "1099511627776 bytes, more than is sent over Zenoh (67108864): fetch it over HTTP" in told["detail"]
+    problem = json.loads(bytes(reply.err.payload))
+    assert (problem["status"], problem["title"]) == (413, "Too large")
+    assert "1099511627776 bytes, more than is sent over Zenoh (67108864): fetch it over HTTP" in problem["detail"]
 
 
 def test_damaged_data_is_an_alarm_over_zenoh_too(

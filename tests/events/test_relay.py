@@ -32,14 +32,18 @@ def network(k: int) -> bytes:
 def test_a_commit_is_told(api: Api, session: zenoh.Session) -> None:
     ear = Listener(session, "fleetmap/*/events")
     api.post("environments", {"name": "farm"})
-    made = api.upload("farm", {"datum.yaml": samples.DATUM}, message="measured").json()
+    version = api.upload("farm", {"datum.yaml": samples.DATUM}, message="measured").json()
     ear.wait(lambda e: len(e.sequences()) >= 2)
-    told = next(e for e in ear.events if e["type"] == "version.created")
-    assert (told["environment"], told["version"], told["root"]) == ("farm", 1, made["root"])
-    assert told["message"] == "measured"
-    assert told["layers"][0]["layer"] == "location"
-    event = Event.from_json(json.dumps(told))
-    assert event.sequence == told["sequence"]
+    created_event = next(e for e in ear.events if e["type"] == "version.created")
+    assert (created_event["environment"], created_event["version"], created_event["root"]) == (
+        "farm",
+        1,
+        version["root"],
+    )
+    assert created_event["message"] == "measured"
+    assert created_event["layers"][0]["layer"] == "location"
+    event = Event.from_json(json.dumps(created_event))
+    assert event.sequence == created_event["sequence"]
     api("PUT", "environments/farm/channels/production", 200, json={"version": 1})
     ear.wait(lambda e: any(x["type"] == "channel.moved" for x in e.events))
     assert ear.sequences() == [1, 2, 3]
@@ -69,8 +73,10 @@ def router_of(api: Api) -> int:
     """The router's process."""
     import subprocess
 
-    found = subprocess.run(["pgrep", "-P", str(os.getpid()), "-f", "app.events.router"], capture_output=True, text=True)
-    return int(found.stdout.split()[-1])
+    process = subprocess.run(
+        ["pgrep", "-P", str(os.getpid()), "-f", "app.events.router"], capture_output=True, text=True
+    )
+    return int(process.stdout.split()[-1])
 
 
 def test_a_restarted_server_tells_what_it_had_not_told(tmp_path: Path, port: int) -> None:
@@ -95,10 +101,10 @@ def test_a_taken_port_is_told_and_maps_are_served(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        where = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        with running(settings_for(tmp_path, zenoh_mode="router", zenoh_listen=where)) as api:
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with running(settings_for(tmp_path, zenoh_mode="router", zenoh_listen=endpoint)) as api:
             events = eventually(lambda: (e := api.get("/readyz").json()["events"])["state"] == "down" and e)
-            assert where in events["detail"]
+            assert endpoint in events["detail"]
             assert "/root" not in events["detail"], "nor other places of whoever built Zenoh"
             assert ".rs" not in events["detail"]
             api.post("environments", {"name": "deaf"})
@@ -131,11 +137,11 @@ def test_a_taken_port_is_not_tried_all_the_time(monkeypatch: pytest.MonkeyPatch)
 def test_a_router_of_the_operators(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Mode client: the router is somebody else's, and comes later than the server."""
     port = free_port()
-    where = f"tcp/127.0.0.1:{port}"
-    with running(settings_for(tmp_path, zenoh_mode="client", zenoh_connect=where, log_level="info")) as api:
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with running(settings_for(tmp_path, zenoh_mode="client", zenoh_connect=endpoint, log_level="info")) as api:
         api.post("environments", {"name": "patient"})
         eventually(lambda: api.get("/readyz").json()["events"]["state"] == "down", 30)
-        router = Router(router_configuration(BusOptions(listen=where)))
+        router = Router(router_configuration(BusOptions(listen=endpoint)))
         assert router.problem is None
         try:
             eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected", 30)
@@ -144,11 +150,11 @@ def test_a_router_of_the_operators(tmp_path: Path, caplog: pytest.LogCaptureFixt
                 Listener(session, "fleetmap/patient/events").wait(lambda e: e.sequences() == [1])
             finally:
                 session.close()  # type: ignore[no-untyped-call]
-            assert f"events go out over Zenoh at {where}" in caplog.text
+            assert f"events go out over Zenoh at {endpoint}" in caplog.text
         finally:
             router.close()
-        gone = eventually(lambda: (e := api.get("/readyz").json()["events"])["state"] == "down" and e, 30)
-        assert gone["detail"] == f"the router at {where} is gone: it is looked for"
+        bus_state = eventually(lambda: (e := api.get("/readyz").json()["events"])["state"] == "down" and e, 30)
+        assert bus_state["detail"] == f"the router at {endpoint} is gone: it is looked for"
 
 
 @pytest.mark.parametrize(
@@ -166,9 +172,9 @@ def test_statuses_are_checked(payload: bytes, word: str) -> None:
 
 
 def test_a_status_comes_through() -> None:
-    said = {"channel": "production", "version": 3, "root": "0" * 64, "state": "active", "sequence": 7}
-    assert RobotStatus.from_json(json.dumps(said)).as_dict() == said
-    more = said | {"state": "failed", "detail": "no room", "holds": {"version": 2, "root": "a" * 64}}
+    status = {"channel": "production", "version": 3, "root": "0" * 64, "state": "active", "sequence": 7}
+    assert RobotStatus.from_json(json.dumps(status)).as_dict() == status
+    more = status | {"state": "failed", "detail": "no room", "holds": {"version": 2, "root": "a" * 64}}
     assert RobotStatus.from_json(json.dumps(more)).as_dict() == more
 
 
@@ -198,11 +204,11 @@ def test_a_database_that_is_away_is_told_once(
     store = Store(f"sqlite:///{tmp_path / 'store.sqlite'}", tmp_path / "blobs")
     store.migrate()
     store.create_environment("farm")
-    relayed, asked = store.relayed, []
+    relayed, reads = store.relayed, []
 
     def away() -> int:
-        asked.append(1)
-        if len(asked) < 20:
+        reads.append(1)
+        if len(reads) < 20:
             raise Unavailable("the database is away")
         return relayed()
 
@@ -230,13 +236,13 @@ def test_what_a_router_logs_does_not_stop_it(
         assert router.problem is None
         monkeypatch.delenv("RUST_LOG")
         heard: list[bytes] = []
-        with zenoh.open(client_config(port)) as here, zenoh.open(client_config(port)) as there:
-            held = here.declare_subscriber("some/**", lambda sample: heard.append(bytes(sample.payload)))
-            eventually(lambda: there.put("some/key", b"first") or heard)
+        with zenoh.open(client_config(port)) as receiver, zenoh.open(client_config(port)) as sender:
+            subscriber = receiver.declare_subscriber("some/**", lambda sample: heard.append(bytes(sample.payload)))
+            eventually(lambda: sender.put("some/key", b"first") or heard)
             for _ in range(200):
-                there.put("some/key", b"more", congestion_control=zenoh.CongestionControl.BLOCK)
+                sender.put("some/key", b"more", congestion_control=zenoh.CongestionControl.BLOCK)
             eventually(lambda: heard.count(b"more") == 200)
-            held.undeclare()  # type: ignore[no-untyped-call]
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
     finally:
         router.close()
     assert len(capfd.readouterr().err) > 2**16, "more than a pipe holds"
@@ -263,14 +269,14 @@ def test_a_huge_message_is_dropped_and_nothing_else(monkeypatch: pytest.MonkeyPa
     heard: list[int] = []
     with contextlib.ExitStack() as stack:
         stack.callback(router.close)
-        here, there = (stack.enter_context(zenoh.open(client_config(port))) for _ in range(2))
-        held = here.declare_subscriber("some/**", lambda sample: heard.append(len(sample.payload)))
-        eventually(lambda: there.put("some/key", b"1") or heard)
+        receiver, sender = (stack.enter_context(zenoh.open(client_config(port))) for _ in range(2))
+        subscriber = receiver.declare_subscriber("some/**", lambda sample: heard.append(len(sample.payload)))
+        eventually(lambda: sender.put("some/key", b"1") or heard)
         for size in (2**19, 2**22, 2):
-            there.put("some/key", bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
+            sender.put("some/key", bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
         eventually(lambda: heard[-1] == 2)
         assert [size for size in heard if size != 1] == [2**19, 2]
-        held.undeclare()  # type: ignore[no-untyped-call]
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
 def test_router_that_dies_while_it_starts_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,8 +121,8 @@ def test_a_grid_is_these_bytes() -> None:
 
 
 def test_an_update_and_a_text_are_these_bytes() -> None:
-    made = cdr.occupancy_grid_update(1, 0, 2, 1, bytes([100, 255]), WHEN, "odom")
-    assert made == (
+    message = cdr.occupancy_grid_update(1, 0, 2, 1, bytes([100, 255]), WHEN, "odom")
+    assert message == (
         bytes.fromhex("00010000") + struct.pack("<iI", 1777608000, 250_000_000) + bytes.fromhex("05000000") + b"odom\0"
         + bytes(3) + bytes.fromhex("01000000 00000000 02000000 01000000 02000000 64ff")
     )  # fmt: skip
@@ -134,8 +134,8 @@ def test_rosbags_reads_the_same_and_hashes_the_types_so() -> None:
     store = typesys.get_typestore(typesys.Stores.LATEST)
     text = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data\n"
     store.register(typesys.get_types_from_msg(text, "map_msgs/msg/OccupancyGridUpdate"))
-    for known in (ros_names.GRID, ros_names.GRID_UPDATE, ros_names.STRING):
-        assert store.hash_rihs01(known.name) == known.hash
+    for message_type in (ros_names.GRID, ros_names.GRID_UPDATE, ros_names.STRING):
+        assert store.hash_rihs01(message_type.name) == message_type.hash
     for frame in ("map", "a", "odometry"):
         grid = store.deserialize_cdr(cdr.occupancy_grid(SMALL, WHEN, frame), ros_names.GRID.name)
         assert (grid.header.frame_id, grid.info.width, grid.info.height) == (frame, 3, 2)
@@ -143,8 +143,8 @@ def test_rosbags_reads_the_same_and_hashes_the_types_so() -> None:
         assert grid.info.origin.orientation.w == math.cos(math.pi / 4)
         assert list(grid.data) == [0, 100, -1, 50, 0, 0]
         assert bytes(store.serialize_cdr(grid, ros_names.GRID.name)) == cdr.occupancy_grid(SMALL, WHEN, frame)
-        said = cdr.occupancy_grid_update(1, 0, 2, 1, bytes([100, 255]), WHEN, frame)
-        change = store.deserialize_cdr(said, ros_names.GRID_UPDATE.name)
+        message = cdr.occupancy_grid_update(1, 0, 2, 1, bytes([100, 255]), WHEN, frame)
+        change = store.deserialize_cdr(message, ros_names.GRID_UPDATE.name)
         assert (change.x, change.y, list(change.data)) == (1, 0, [100, -1])
     assert store.deserialize_cdr(cdr.string("grün"), ros_names.STRING.name).data == "grün"
 
@@ -274,9 +274,9 @@ def api(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Api]:
 def test_a_map_its_changes_and_its_network(api: Api, session: zenoh.Session) -> None:
     api.post("environments", {"name": "farm"})
     early = Heard(session, f"5/map/{GRID}")
-    made = api.upload("farm", picture((2, 3))).json()
+    version = api.upload("farm", picture((2, 3))).json()
     grid = grid_of(early.wait())
-    moment = datetime.fromisoformat(made["time"])
+    moment = datetime.fromisoformat(version["time"])
     assert grid["header"] == (int(moment.timestamp()), moment.microsecond * 1000, "map")
     assert grid["load"] == grid["header"][:2]
     assert grid["resolution"] == 0.5
@@ -328,18 +328,18 @@ def test_ros_sees_a_node_and_its_publishers(api: Api, session: zenoh.Session) ->
     api.upload("east-hall", picture())
     for key, count in (("@ros2_lv/5/**", 4), ("@/*/@ros2_lv/**", 2)):
         eventually(lambda key=key, n=count: sum("east_hall" in token for token in tokens(session, key)) == n)
-    found = [token.split("/") for token in tokens(session, "@ros2_lv/5/**")]
-    nodes = [t for t in found if t[5] == "NN"]
+    token_fields = [token.split("/") for token in tokens(session, "@ros2_lv/5/**")]
+    nodes = [t for t in token_fields if t[5] == "NN"]
     assert [t[3:] for t in nodes] == [["0", "0", "NN", "%", "%", "fleet_map_server"]]
-    mine = [t for t in found if t[5] == "MP" and t[9].startswith("%east_hall%")]
-    assert {(t[9], t[10].split("::")[-1], t[11][:12], t[12]) for t in mine} == {
+    publishers = [t for t in token_fields if t[5] == "MP" and t[9].startswith("%east_hall%")]
+    assert {(t[9], t[10].split("::")[-1], t[11][:12], t[12]) for t in publishers} == {
         ("%east_hall%map", "OccupancyGrid_", "RIHS01_8d348", ":1:,1:,:,:,,"),
         ("%east_hall%map", "OccupancyGrid_", "TypeHashNotS", ":1:,1:,:,:,,"),
         ("%east_hall%map_updates", "OccupancyGridUpdate_", "RIHS01_c4095", "::,10:,:,:,,"),
         ("%east_hall%map_updates", "OccupancyGridUpdate_", "TypeHashNotS", "::,10:,:,:,,"),
     }
-    assert {t[2] for t in found} == {nodes[0][2]}, "one session"
-    entities = [t[4] for t in found]
+    assert {t[2] for t in token_fields} == {nodes[0][2]}, "one session"
+    entities = [t[4] for t in token_fields]
     assert len(entities) == len(set(entities))
     bridge = {t.split("/", 3)[3] for t in tokens(session, "@/*/@ros2_lv/**") if "east_hall" in t}
     assert bridge == {
@@ -449,13 +449,13 @@ def test_what_can_be_derived_goes_out_where_wanted(tmp_path: Path) -> None:
 @pytest.fixture
 def router(tmp_path: Path) -> Iterator[tuple[str, int]]:
     port = free_port()
-    where = f"tcp/127.0.0.1:{port}"
-    made = Router(router_configuration(BusOptions(listen=where)))
-    assert made.problem is None
+    endpoint = f"tcp/127.0.0.1:{port}"
+    new_router = Router(router_configuration(BusOptions(listen=endpoint)))
+    assert new_router.problem is None
     try:
-        yield where, port
+        yield endpoint, port
     finally:
-        made.close()
+        new_router.close()
 
 
 def version(name: str, root: str) -> Any:
@@ -467,20 +467,20 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
 ) -> None:
     monkeypatch.setattr("app.events.ros2.RETRY_SECONDS", 0.2)
     monkeypatch.setattr("app.events.ros2.ASK_SECONDS", 0.1)
-    where, port = router
+    endpoint, port = router
     state = {"root": "a", "fails": 0, "calls": 0}
     (tmp_path / "ros2.json").write_text('{"state": "connected", "topics": 99}')  # of a process that was killed
 
-    def fetch(asked: Any) -> Content:
+    def fetch(request: Any) -> Content:
         state["calls"] += 1
         if state["fails"]:
             state["fails"] -= 1
             raise Unavailable("the pool is busy")
-        return Content({None: replace(SMALL, cells=SMALL.cells[:5] + asked.root.encode())}, None)
+        return Content({None: replace(SMALL, cells=SMALL.cells[:5] + request.root.encode())}, None)
 
     publishing = Ros2(
         Ros2Options((Chosen("farm", "/"),), ("ros2dds",)),
-        BusOptions(mode="client", connect=where),
+        BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
         look=lambda: {"farm": version("farm", str(state["root"]))},
@@ -506,16 +506,16 @@ def test_a_mistake_with_one_environment_is_not_the_others(
 ) -> None:
     monkeypatch.setattr("app.events.ros2.RETRY_SECONDS", 0.1)
     monkeypatch.setattr("app.events.ros2.ASK_SECONDS", 0.1)
-    where, port = router
+    endpoint, port = router
 
-    def fetch(asked: Any) -> Content:
-        if asked.environment == "bad":
+    def fetch(request: Any) -> Content:
+        if request.environment == "bad":
             raise KeyError("nobody thought of this")
         return Content({None: SMALL}, None)
 
     publishing = Ros2(
         Ros2Options((Chosen("*", None),), ("ros2dds",)),
-        BusOptions(mode="client", connect=where),
+        BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
         look=lambda: {name: version(name, "r") for name in ("bad", "good")},
@@ -537,10 +537,10 @@ def test_a_mistake_with_one_environment_is_not_the_others(
 def test_without_a_router_it_is_told_and_found_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.events.bus.CONNECT_SECONDS", 0.3)
     port = free_port()
-    where = f"tcp/127.0.0.1:{port}"
+    endpoint = f"tcp/127.0.0.1:{port}"
     publishing = Ros2(
         Ros2Options((Chosen("farm", "/"),), ("ros2dds",)),
-        BusOptions(mode="client", connect=where),
+        BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
         look=lambda: {"farm": version("farm", "r")},
@@ -550,12 +550,12 @@ def test_without_a_router_it_is_told_and_found_later(tmp_path: Path, monkeypatch
     try:
         eventually(lambda: state_of(tmp_path)["state"] == "down")
         assert "no router" in state_of(tmp_path)["detail"]
-        made = Router(router_configuration(BusOptions(listen=where)))
+        new_router = Router(router_configuration(BusOptions(listen=endpoint)))
         try:
             with zenoh.open(client_config(port)) as session:
                 assert grid_of(Heard(session, "map").wait())["resolution"] == 0.5
         finally:
-            made.close()
+            new_router.close()
     finally:
         publishing.close()
 
@@ -563,7 +563,7 @@ def test_without_a_router_it_is_told_and_found_later(tmp_path: Path, monkeypatch
 def test_one_topic_belongs_to_one_level_of_one_environment(
     router: tuple[str, int], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    where, port = router
+    endpoint, port = router
     caplog.set_level(logging.ERROR)
     content = {
         "a-b": Content({None: SMALL, "L 1": SMALL, "L-1": replace(SMALL, resolution=1.0)}, None),
@@ -571,15 +571,15 @@ def test_one_topic_belongs_to_one_level_of_one_environment(
     }
     publishing = Ros2(
         Ros2Options((Chosen("a?b", None),), ("ros2dds",)),
-        BusOptions(mode="client", connect=where),
+        BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
         look=lambda: {name: version(name, "r") for name in content},
-        fetch=lambda asked: content[asked.environment],
+        fetch=lambda request: content[request.environment],
     )
     other = Ros2(
         Ros2Options((Chosen("a?b", None),), ("ros2dds",)),
-        BusOptions(mode="client", connect=where),
+        BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
         look=lambda: {"a-b": version("a-b", "r")},

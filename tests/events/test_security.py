@@ -154,8 +154,8 @@ def test_a_robot_says_nothing_else(api: Api, r1: zenoh.Session, r2: zenoh.Sessio
     forged = [r1.declare_queryable(key, lambda query: query.reply(query.key_expr, b"forged")) for key in answered]
     r1.put("fleetmap/farm/robots/r1/status", said(2))  # what was said before was taken or dropped before
     eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 2)
-    made = api.upload("farm", {"network.tmap2.yaml": samples.tmap2(edges=(("gate", "barn"),))}).json()
-    events.wait(lambda e: e.events[-1]["version"] == made["version"])
+    version = api.upload("farm", {"network.tmap2.yaml": samples.tmap2(edges=(("gate", "barn"),))}).json()
+    events.wait(lambda e: e.events[-1]["version"] == version["version"])
     eventually(lambda: any("topological_map_2" in key for key, _, _ in everything))
     assert [event["sequence"] for event in events.events] == list(range(1, len(events.events) + 1))
     assert len(topics.samples) == 1
@@ -166,16 +166,16 @@ def test_a_robot_says_nothing_else(api: Api, r1: zenoh.Session, r2: zenoh.Sessio
     assert not [payload for _, _, payload in heard if payload in (b'{"sequence": 9999}', said(66))]
     assert robot_of(api, "r2") is None
     for key, expected in (("fleetmap/robots/*", []), ("fleetmap/server", ["fleetmap/server"])):
-        found = r2.liveliness().get(key, timeout=5.0)
-        assert [str(reply.ok.key_expr) for reply in found if reply.ok] == expected
+        replies = r2.liveliness().get(key, timeout=5.0)
+        assert [str(reply.ok.key_expr) for reply in replies if reply.ok] == expected
     answers = [bytes(reply.ok.payload) for reply in r2.get("fleetmap/farm/1/version", timeout=5.0) if reply.ok]
     assert len(answers) == 1
     assert json.loads(answers[0])["version"] == 1
     late = Listener(r2, "fleetmap/farm/events")
     late.wait(lambda e: len(e.events) == len(events.events))
     assert 9999 not in late.sequences()
-    for held in (*shown, *forged, advanced):
-        held.undeclare()  # type: ignore[no-untyped-call]
+    for declaration in (*shown, *forged, advanced):
+        declaration.undeclare()  # type: ignore[no-untyped-call]
 
 
 def test_others_are_not_let_in(api: Api, port: int, authority: Authority, tmp_path: Path) -> None:
@@ -276,23 +276,23 @@ def test_robots_that_must_show_a_certificate(authority: Authority, tmp_path: Pat
 
 def test_the_server_is_a_user_of_somebody_elses_router(authority: Authority, tmp_path: Path) -> None:
     port = free_port()
-    where = f"tls/127.0.0.1:{port}"
+    endpoint = f"tls/127.0.0.1:{port}"
     certificate, key = authority.sign("router")
     (tmp_path / "users").write_text("maps:of all\nr1:one\n")
     theirs = Security(Login(authority.pem, certificate, key), users=tmp_path / "users", folder=tmp_path)
-    config = json.loads(router_configuration(BusOptions(listen=where, security=theirs)))
+    config = json.loads(router_configuration(BusOptions(listen=endpoint, security=theirs)))
     config["access_control"]["enabled"] = False  # their rules know their users
     router = Router(json.dumps(config))
     assert router.problem is None
     try:
-        settings: dict[str, Any] = {"zenoh_mode": "client", "zenoh_connect": where, "zenoh_ca": authority.pem}
+        settings: dict[str, Any] = {"zenoh_mode": "client", "zenoh_connect": endpoint, "zenoh_ca": authority.pem}
         with running(settings_for(tmp_path / "a", **settings, zenoh_user="maps", zenoh_password="of all")) as api:
             eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
             api.post("environments", {"name": "farm"})
             with session_to(port, Login(authority.pem, user="r1", password="one")) as session:
                 Listener(session, "fleetmap/farm/events").wait(lambda e: e.sequences() == [1])
         wrong = BusOptions(
-            mode="client", connect=where, security=Security(Login(authority.pem, user="maps", password="of none"))
+            mode="client", connect=endpoint, security=Security(Login(authority.pem, user="maps", password="of none"))
         )
         quick = json.loads(session_configuration(wrong))
         quick["connect"]["timeout_ms"] = int(REFUSED_SECONDS * 1000)
@@ -311,17 +311,17 @@ def test_why_a_certificate_is_not_trusted_is_told(
 ) -> None:
     monkeypatch.setattr("app.events.bus.CONNECT_SECONDS", REFUSED_SECONDS)
     port = free_port()
-    where = f"tls/127.0.0.1:{port}"
+    endpoint = f"tls/127.0.0.1:{port}"
     certificate, key = (Authority(tmp_path, "others") if foreign else authority).sign("own", days)
-    options = BusOptions(listen=where, security=Security(Login(authority.pem, certificate, key)))
+    options = BusOptions(listen=endpoint, security=Security(Login(authority.pem, certificate, key)))
     bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
     try:
         assert not bus.tend()
-        assert bus.state["detail"] == f"no router at {where}: its certificate is not to be trusted: {told}"
+        assert bus.state["detail"] == f"no router at {endpoint}: its certificate is not to be trusted: {told}"
         refused(port, Login(authority.pem))
         ear = Ear("farm", "r1", heard=nothing, back=nothing, login=Login(authority.pem))
         monkeypatch.setattr("app.agent.ear.CONNECT_MS", int(REFUSED_SECONDS * 1000))
-        ear.aim(where, "fleetmap")
+        ear.aim(endpoint, "fleetmap")
         try:
             eventually(lambda: ear.problem and told in ear.problem)
         finally:
@@ -331,23 +331,28 @@ def test_why_a_certificate_is_not_trusted_is_told(
 
 
 def test_why_a_robot_is_not_let_in_is_told(authority: Authority, tmp_path: Path) -> None:
-    where = f"tls/127.0.0.1:{free_port()}"
+    endpoint = f"tls/127.0.0.1:{free_port()}"
     mutual = Security(Login(authority.pem, *authority.sign("strict")), mutual=True)
-    router = Router(router_configuration(BusOptions(listen=where, security=mutual)))
+    router = Router(router_configuration(BusOptions(listen=endpoint, security=mutual)))
     assert router.problem is None
     error = zenoh.ZError("Unable to connect! at /somewhere/else.rs:1")
     try:
-        for login, told in (
+        for login, reason in (
             (Login(authority.pem), "it refuses: tlsv13 alert certificate required"),
             (Login(authority.pem, *authority.sign("late", -1)), "it refuses: sslv3 alert certificate expired"),
             (Login(authority.pem, *Authority(tmp_path, "x").sign("r")), "it refuses: "),
             (Login(authority.pem, *authority.sign("r1")), "Unable to connect!"),
         ):
-            assert no_router(f"{where}, tcp/x:1", error, login).startswith(f"no router at {where}, tcp/x:1: {told}")
+            assert no_router(f"{endpoint}, tcp/x:1", error, login).startswith(
+                f"no router at {endpoint}, tcp/x:1: {reason}"
+            )
     finally:
         router.close()
-    for gone in (where, "tcp/127.0.0.1:1", "tls/[::1]:1", "what is this"):
-        assert no_router(gone, error, Login(authority.pem)) == f"no router at {gone}: Unable to connect!"
+    for other_endpoint in (endpoint, "tcp/127.0.0.1:1", "tls/[::1]:1", "what is this"):
+        assert (
+            no_router(other_endpoint, error, Login(authority.pem))
+            == f"no router at {other_endpoint}: Unable to connect!"
+        )
 
 
 # --- what an operator writes ----------------------------------------------------------------------------------------
@@ -372,27 +377,27 @@ def test_what_is_no_file_of_users(text: bytes, told: str, tmp_path: Path) -> Non
 
 
 def test_a_missing_file_is_told_before_the_start(tmp_path: Path) -> None:
-    gone = tmp_path / "gone.pem"
-    here = tmp_path / "here.pem"
-    here.touch()
+    missing_file = tmp_path / "gone.pem"
+    existing_file = tmp_path / "here.pem"
+    existing_file.touch()
     for security in (
-        Security(Login(ca=gone)),
-        Security(Login(certificate=gone, key=here)),
-        Security(Login(certificate=here, key=gone)),
-        Security(users=gone, folder=tmp_path),
+        Security(Login(ca=missing_file)),
+        Security(Login(certificate=missing_file, key=existing_file)),
+        Security(Login(certificate=existing_file, key=missing_file)),
+        Security(users=missing_file, folder=tmp_path),
     ):
         with pytest.raises(Invalid, match=r"gone\.pem cannot be read"):
             check_bus(BusOptions(security=security))
-    for login in (Login(certificate=here), Login(key=here), Login(user="a"), Login(password="a")):
+    for login in (Login(certificate=existing_file), Login(key=existing_file), Login(user="a"), Login(password="a")):
         with pytest.raises(Invalid, match="the other way round"):
             check_bus(BusOptions(mode="client", connect="tcp/x:1", security=Security(login)))
     with pytest.raises(Unavailable, match="FLEETMAP_ZENOH_CONFIG"):
-        check_bus(BusOptions(config=gone))
-    here.write_text("no PEM")
+        check_bus(BusOptions(config=missing_file))
+    existing_file.write_text("no PEM")
     with pytest.raises(Invalid, match="holds no certificate of a certification authority"):
-        check_bus(BusOptions(security=Security(Login(ca=here))))
+        check_bus(BusOptions(security=Security(Login(ca=existing_file))))
     one, other = Authority(tmp_path / "ca").sign("one"), Authority(tmp_path / "ca").sign("other")
-    for certificate, key in ((one[0], other[1]), (here, one[1]), (one[0], here)):
+    for certificate, key in ((one[0], other[1]), (existing_file, one[1]), (one[0], existing_file)):
         with pytest.raises(Invalid, match="are no certificate and its unencrypted key"):
             check_bus(BusOptions(security=Security(Login(certificate=certificate, key=key))))
     assert "secret" not in repr(Login(user="a", password="secret"))
@@ -427,27 +432,27 @@ def test_access_control_of_the_operators_wins(tmp_path: Path) -> None:
     config = tmp_path / "zenoh.json5"
     theirs = {**access_control("x", ["r1"]), "default_permission": "allow"}
     config.write_text(json.dumps({"access_control": theirs}))
-    made = json.loads(router_configuration(BusOptions(security=security, config=config)))
-    assert made["access_control"]["default_permission"] == "allow"
-    assert made["transport"]["auth"]["usrpwd"]["dictionary_file"] == str(tmp_path / "zenoh-users")
+    configuration = json.loads(router_configuration(BusOptions(security=security, config=config)))
+    assert configuration["access_control"]["default_permission"] == "allow"
+    assert configuration["transport"]["auth"]["usrpwd"]["dictionary_file"] == str(tmp_path / "zenoh-users")
 
 
 def test_processes_that_start_at_once_have_one_password(tmp_path: Path) -> None:
     users = tmp_path / "users"
     users.write_text("r1:one\n")
     options = BusOptions(security=Security(users=users, folder=tmp_path))
-    found: list[str] = []
+    passwords: list[str] = []
     barrier = threading.Barrier(8)
 
     def start() -> None:
         barrier.wait()
-        found.append(json.loads(session_configuration(options))["transport"]["auth"]["usrpwd"]["password"])
+        passwords.append(json.loads(session_configuration(options))["transport"]["auth"]["usrpwd"]["password"])
 
     threads = [threading.Thread(target=start) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(20)
-    assert len(found) == 8
-    assert len(set(found)) == 1
+    assert len(passwords) == 8
+    assert len(set(passwords)) == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == ["users", "zenoh-password"]

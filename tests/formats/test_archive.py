@@ -51,10 +51,10 @@ def with_mode(mode: int, name: str = "a") -> bytes:
     return zipped((info, b"/etc/passwd"))
 
 
-def patched(data: bytes, mark: bytes, offset: int, new: bytes, which: int = 0) -> bytes:
+def patched(data: bytes, mark: bytes, offset: int, new: bytes, occurrence: int = 0) -> bytes:
     """The archive with other bytes at this offset of the n-th header with this mark."""
     at = -1
-    for _ in range(which + 1):
+    for _ in range(occurrence + 1):
         at = data.index(mark, at + 1)
     return data[: at + offset] + new + data[at + offset + len(new) :]
 
@@ -247,7 +247,7 @@ BINARY = (".zip", ".kmz", ".gz", ".bz2", ".pbf", ".bt", ".ot", ".las", ".laz", "
 
 
 def test_texts_of_all_formats_are_bound_as_texts():
-    endings = {end for known in all_formats().values() for end in known.extensions}
+    endings = {end for fmt in all_formats().values() for end in fmt.extensions}
     texts = sorted(end for end in endings if not end.endswith((*BINARY, *_archive._IMAGES)))
     assert ".site.ron" in texts
     for end in texts:

@@ -43,16 +43,16 @@ navsat_transform_node:
 
 
 def read(data: bytes | str, **context: Any) -> tuple[Layers, ReadContext]:
-    told = ReadContext(main="datum.yaml", **context)
-    said = data.encode() if isinstance(data, str) else data
-    return formats.read(Group(FORMAT, "datum.yaml", {"datum.yaml": said}), told), told
+    read_context = ReadContext(main="datum.yaml", **context)
+    content = data.encode() if isinstance(data, str) else data
+    return formats.read(Group(FORMAT, "datum.yaml", {"datum.yaml": content}), read_context), read_context
 
 
 def write(layers: Layers) -> tuple[bytes, WriteContext]:
-    told = WriteContext()
-    files = formats.write(FORMAT, layers, told)
+    context = WriteContext()
+    files = formats.write(FORMAT, layers, context)
     assert list(files) == ["datum.yaml"]
-    return files["datum.yaml"], told
+    return files["datum.yaml"], context
 
 
 def site(layers: Layers) -> Features:
@@ -71,17 +71,17 @@ def real(shared: Path) -> list[Path]:
 
 
 def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
-    found = real(shared)
-    assert len(found) == 9
-    for path in found:
+    paths = real(shared)
+    assert len(paths) == 9
+    for path in paths:
         data = path.read_bytes()
         assert formats.detect(path.name, data) is FORMAT
         layers, context = read(data)
         crossing = "general_east_pathway" in str(path)
         assert ["crosses itself" in w.problem for w in context.warnings] == [True] * crossing, path
-        served, told = write(layers)
+        served, write_context = write(layers)
         assert same("datum", {"datum.yaml": data}, {"datum.yaml": served}) == [], path
-        assert (told.dropped, told.template, told.warnings) == ([], [], [])
+        assert (write_context.dropped, write_context.template, write_context.warnings) == ([], [], [])
         assert yaml.safe_load(served) == yaml.safe_load(data)
         ryml.parse_in_arena(served)
         assert write(read(served)[0])[0] == served
@@ -108,14 +108,14 @@ def test_the_sample_in_full() -> None:
     fence = site(layers).geometry[0]
     assert len(fence.exterior.coords) - 1 == fact["fence_points"]
     assert list(fence.bounds) == fact["fence_bounds"]
-    served, told = write(layers)
+    served, write_context = write(layers)
     after, before = yaml.safe_load(served), yaml.safe_load(data)
     template = after["navsat_transform_node"]
     assert template | before["navsat_transform_node"] == template
     assert {**after, "navsat_transform_node": 0} == {**before, "navsat_transform_node": 0}
     lacking = {key for key in template if key not in before["navsat_transform_node"]}
-    assert {t["option"] for t in told.template} == lacking
-    assert {t["what"].partition(": ")[0] for t in told.template} == {"navsat_transform_node"}
+    assert {t["option"] for t in write_context.template} == lacking
+    assert {t["what"].partition(": ")[0] for t in write_context.template} == {"navsat_transform_node"}
     assert "frequency" in template
 
 
@@ -136,8 +136,8 @@ def test_a_new_datum_moves_what_stood_at_the_old_one_and_nothing_else() -> None:
     served, _ = write(Layers(layers.parts, Datum(-33.4, 151.25, 12.5, 90.0), layers.levels))
     top = yaml.safe_load(served)
     assert (top["datum_latitude"], top["datum_longitude"], top["datum_altitude"]) == (-33.4, 151.25, 12.5)
-    here, depot = top["mapviz_initialize_origin"]["local_xy_origins"]
-    assert (here["latitude"], here["longitude"], here["altitude"]) == (-33.4, 151.25, 100.0)
+    origin, depot = top["mapviz_initialize_origin"]["local_xy_origins"]
+    assert (origin["latitude"], origin["longitude"], origin["altitude"]) == (-33.4, 151.25, 100.0)
     assert (depot["latitude"], depot["longitude"]) == (-33.5, 151.3)
     assert top["navsat_transform_node"]["datum"] == [-33.4, 151.25, pytest.approx(-math.pi / 2)]
     assert len(top["gnss_fence"]["gnss_fence_coords"]) == 5
@@ -149,37 +149,37 @@ def test_what_no_source_says_is_filled_in_from_the_extent() -> None:
     frame = LocalFrame(Datum(10.0, 20.0))
     corners = frame.to_wgs84(np.array([[-30.2, -10.4], [50.5, -10.4], [50.5, 80.9], [-30.2, 80.9]]))
     fence = features([("f", shapely.Polygon(corners), {"kind": "fence"})], "wgs84")
-    served, told = write(Layers({SITE: fence}, Datum(10.0, 20.0)))
+    served, context = write(Layers({SITE: fence}, Datum(10.0, 20.0)))
     top = yaml.safe_load(served)
     assert top["gmapping"] == {"xmin": -31, "xmax": 51, "ymin": -11, "ymax": 81}
     assert top["mapviz_initialize_origin"]["local_xy_origins"][0]["latitude"] == 10.0
     assert top["navsat_transform_node"]["wait_for_datum"] is True
     assert top["navsat_transform_node"]["datum"] == [10.0, 20.0, 0.0]
-    whats = {t["what"].partition(": ")[0] for t in told.template}
+    whats = {t["what"].partition(": ")[0] for t in context.template}
     assert whats == {"gmapping", "mapviz_initialize_origin", "navsat_transform_node"}
 
 
 def test_what_no_source_says_can_be_said() -> None:
-    told = WriteContext(
+    context = WriteContext(
         options=formats.write_options(FORMAT, {"wait_for_datum": "no", "yaw_offset": "1.57", "half_size": 50})
     )
-    top = yaml.safe_load(formats.write(FORMAT, Layers({}, Datum(10.0, 20.0)), told)["datum.yaml"])
+    top = yaml.safe_load(formats.write(FORMAT, Layers({}, Datum(10.0, 20.0)), context)["datum.yaml"])
     assert top["gmapping"] == {"xmin": -50, "xmax": 50, "ymin": -50, "ymax": 50}
     assert top["navsat_transform_node"]["wait_for_datum"] is False
     assert top["navsat_transform_node"]["yaw_offset"] == 1.57
-    assert {t.get("option") for t in told.template} >= {"wait_for_datum", "yaw_offset", "half_size"}
+    assert {t.get("option") for t in context.template} >= {"wait_for_datum", "yaw_offset", "half_size"}
     data = (SAMPLES / "datum.yaml").read_bytes()
     other = {"use_odometry_yaw": True, "wait_for_datum": False}
-    said = WriteContext(options=formats.write_options(FORMAT, other))
-    served = yaml.safe_load(formats.write(FORMAT, read(data)[0], said)["datum.yaml"])["navsat_transform_node"]
+    other_context = WriteContext(options=formats.write_options(FORMAT, other))
+    served = yaml.safe_load(formats.write(FORMAT, read(data)[0], other_context)["datum.yaml"])["navsat_transform_node"]
     source = yaml.safe_load(data)["navsat_transform_node"]
     assert {key: served[key] for key in other} == {**other, **{k: v for k, v in source.items() if k in other}}
 
 
 def test_a_datum_without_a_fence_is_served_and_read() -> None:
-    served, told = write(Layers({}, Datum(10.0, 20.0)))
+    served, write_context = write(Layers({}, Datum(10.0, 20.0)))
     assert yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"] == []
-    assert "no fence" in told.warnings[0].problem
+    assert "no fence" in write_context.warnings[0].problem
     assert [p.problem for p in formats.check(FORMAT, {"datum.yaml": served}) if p.level == "error"] == []
     layers, context = read(served)
     assert datum(layers) == Datum(10.0, 20.0)
@@ -198,9 +198,9 @@ def test_the_fence_is_chosen_and_the_rest_declared() -> None:
         ("b", big, {"kind": "fence"}),
         ("c", shapely.LineString([(0, 0), (1, 1)]), {"kind": "path"}),
     ]
-    served, told = write(Layers({SITE: features(rows, "wgs84")}, Datum(1.0, 1.0)))
+    served, context = write(Layers({SITE: features(rows, "wgs84")}, Datum(1.0, 1.0)))
     assert yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"] == [[0, 0], [3, 0], [3, 3], [0, 3]]
-    assert {d["what"]: d["count"] for d in told.dropped} == {
+    assert {d["what"]: d["count"] for d in context.dropped} == {
         "location items that are no polygons": 1,
         "further location polygons": 1,
         "holes of the fence": 1,
@@ -224,8 +224,8 @@ def test_degrees_near_zero_are_numbers_for_pyyaml() -> None:
 
 
 def test_doubts_are_told() -> None:
-    said = FILE.replace("datum: [53.25, -0.5, 0.0]", "yaw_offset: 1.57\n  datum: [53.2501, -0.5, 0.0]")
-    layers, context = read(said)
+    text = FILE.replace("datum: [53.25, -0.5, 0.0]", "yaw_offset: 1.57\n  datum: [53.2501, -0.5, 0.0]")
+    layers, context = read(text)
     assert datum(layers).latitude == 53.25
     assert [p.where for p in context.warnings] == ["navsat_transform_node.datum", "navsat_transform_node.yaw_offset"]
 
@@ -278,12 +278,12 @@ def test_truncated_and_mutated_files_are_read_or_refused() -> None:
     data = (SAMPLES / "datum.yaml").read_bytes()
     dice = random.Random(5)
     for k in range(400):
-        said = bytearray(data[: dice.randrange(len(data))] if k % 3 == 0 else data)
+        variant = bytearray(data[: dice.randrange(len(data))] if k % 3 == 0 else data)
         for _ in range(dice.randrange(4)):
-            if said:
-                said[dice.randrange(len(said))] = dice.randrange(256)
+            if variant:
+                variant[dice.randrange(len(variant))] = dice.randrange(256)
         try:
-            layers, _ = read(bytes(said))
+            layers, _ = read(bytes(variant))
         except BadUpload:
             continue
         yaml.safe_load(write(layers)[0])
@@ -304,7 +304,7 @@ def test_any_file_comes_back_the_same(
     size: dict[str, Any], navsat: dict[str, Any], rest: dict[str, Any],
 ) -> None:  # fmt: skip
     coords = [list(p) for p in ring] + ([list(ring[0])] if closed else [])
-    said = {
+    document = {
         **rest,
         "datum_latitude": latitude,
         "datum_longitude": longitude,
@@ -313,11 +313,11 @@ def test_any_file_comes_back_the_same(
         "mapviz_initialize_origin": {"local_xy_origins": [{"latitude": latitude, "longitude": longitude}]},
         "navsat_transform_node": {**navsat, "datum": [latitude, longitude, yaw]},
     }
-    layers, _ = read(yaml.safe_dump(said, allow_unicode=True))
+    layers, _ = read(yaml.safe_dump(document, allow_unicode=True))
     served, _ = write(layers)
     after = yaml.safe_load(served)
-    assert after["navsat_transform_node"] | said["navsat_transform_node"] == after["navsat_transform_node"]
-    assert {**after, "navsat_transform_node": 0} == {**said, "navsat_transform_node": 0}
+    assert after["navsat_transform_node"] | document["navsat_transform_node"] == after["navsat_transform_node"]
+    assert {**after, "navsat_transform_node": 0} == {**document, "navsat_transform_node": 0}
     assert write(read(served)[0])[0] == served
     assert [f.id for f in site(layers)] == ["fence"]
 

@@ -63,13 +63,13 @@ def folder(shared: Path, name: str) -> dict[str, bytes]:
     return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
-def told(files: dict[str, bytes], name: str | None = None) -> Bundle:
+def read_upload(files: dict[str, bytes], name: str | None = None) -> Bundle:
     return bundle.read(bundle.unpack(files, Limits()), Hints(name), Known(), Limits())
 
 
 def written(layers: Layers, **options: Any) -> tuple[dict[str, bytes], dict[str, Any]]:
-    made = making.from_layers(FORMAT, layers, options, derived=True)
-    return unzipped(made.files[MAIN]), made.report
+    written_map = making.from_layers(FORMAT, layers, options, derived=True)
+    return unzipped(written_map.files[MAIN]), written_map.report
 
 
 def grid(level: int = 0) -> OccupancyGrid:
@@ -83,25 +83,25 @@ def variables_of(values: dict[str, str]) -> Features:
 VARIABLES = PartKey("objects", "ground", "environment")
 
 
-def sourced(files: dict[str, bytes], where: Path) -> dict[str, str]:
+def sourced(files: dict[str, bytes], root: Path) -> dict[str, str]:
     """What a robot has after ``source config/environment.sh``: every exported variable, from a clean shell."""
     for name, data in files.items():
-        (where / name).parent.mkdir(parents=True, exist_ok=True)
-        (where / name).write_bytes(data)
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(data)
     script = 'cd / && source "$1" && env -0'
     shell = ["env", "-i", "PATH=/usr/bin:/bin", "bash", "--noprofile", "--norc", "-euo", "pipefail", "-c", script, "-"]
     done = subprocess.run(
-        [*shell, str(where / "config/environment.sh")],
+        [*shell, str(root / "config/environment.sh")],
         capture_output=True,
         check=True,
         timeout=60,
     )
     assert done.stderr == b""
-    said = dict(line.split("=", 1) for line in done.stdout.decode().split("\0") if line)
-    return {k: v for k, v in said.items() if k not in ("PATH", "PWD", "OLDPWD", "SHLVL", "_")}
+    variables = dict(line.split("=", 1) for line in done.stdout.decode().split("\0") if line)
+    return {k: v for k, v in variables.items() if k not in ("PATH", "PWD", "OLDPWD", "SHLVL", "_")}
 
 
-def check_paths(values: dict[str, str], where: Path) -> set[str]:
+def check_paths(values: dict[str, str], root: Path) -> set[str]:
     """Each variable that names a file names one that is there; the names of those."""
     named = set()
     for name, value in values.items():
@@ -109,7 +109,7 @@ def check_paths(values: dict[str, str], where: Path) -> set[str]:
             path = Path(value)
             assert path.is_absolute()
             assert path.is_dir() if name.endswith("_MODELS") else path.is_file(), f"{name}={value}"
-            assert where in path.parents
+            assert root in path.parents
             named.add(name)
     return named
 
@@ -122,16 +122,18 @@ def test_real_environments_come_back_and_their_scripts_work(
     shared: Path, same: Same, tmp_path: Path, name: str
 ) -> None:
     files = folder(shared, name)
-    known = json.loads((shared / "data/facts.json").read_text())["_environment_sh"][name]["literal_assignments"]
+    literals = json.loads((shared / "data/facts.json").read_text())["_environment_sh"][name]["literal_assignments"]
     # The script itself is not among the samples; its literals are in the facts.
-    files["config/environment.sh"] = b"".join(b"export %s='%s'\n" % (k.encode(), v.encode()) for k, v in known.items())
-    made = offline(files, "environment", hints=Hints("environment"))
-    assert same("environment", files, made.files) == []
-    inner = unzipped(made.files[MAIN])
-    where = tmp_path / "a folder 'with' $odd \"names\""[:22]
-    values = sourced(inner, where)
-    assert known.items() <= values.items()
-    named = check_paths(values, where)
+    files["config/environment.sh"] = b"".join(
+        b"export %s='%s'\n" % (k.encode(), v.encode()) for k, v in literals.items()
+    )
+    converted = offline(files, "environment", hints=Hints("environment"))
+    assert same("environment", files, converted.files) == []
+    inner = unzipped(converted.files[MAIN])
+    root = tmp_path / "a folder 'with' $odd \"names\""[:22]
+    values = sourced(inner, root)
+    assert literals.items() <= values.items()
+    named = check_paths(values, root)
     expected = {"PROPERTIES_FILE"}
     expected |= {"DATUM_FILE"} if any("location/datum" in n for n in files) else set()
     expected |= {"TMAP_FILE"} if any(n.endswith("network.tmap2.yaml") for n in inner) else set()
@@ -150,14 +152,14 @@ def test_the_archive_means_what_the_folder_means(shared: Path) -> None:
     name = TEMPLATES[-1]
     files = folder(shared, name)
     archive = _archive.pack({n: d for n, d in files.items() if d})
-    loose = told(files)
+    loose = read_upload(files)
     for upload in ({"a.zip": archive}, {"a.zip": archive, "LICENSE": b"free"}):
-        for said in (None, "environment"):
-            packed = told(upload, said)
+        for format_name in (None, "environment"):
+            packed = read_upload(upload, format_name)
             assert packed.parts.keys() == loose.parts.keys()
             assert packed.datum == loose.datum
             assert {w.problem for w in packed.warnings} == {w.problem for w in loose.warnings}
-    other = told({"site.bin": archive}, "environment")
+    other = read_upload({"site.bin": archive}, "environment")
     assert other.parts.keys() == loose.parts.keys()
     assert other.datum == loose.datum
 
@@ -187,9 +189,9 @@ def test_the_sample_is_detected_read_and_written_whole() -> None:
     assert detect("yard.zip", SAMPLE)
     assert not detect("yard.kmz", SAMPLE)
     assert not detect("a.zip", _archive.pack({"doc.kml": b"<kml/>"}))
-    first = told({"yard.zip": SAMPLE}, "environment")
-    made = offline({"yard.zip": SAMPLE}, "environment", hints=Hints("environment"))
-    second = told(maps_of(unzipped(made.files[MAIN])), "environment")
+    first = read_upload({"yard.zip": SAMPLE}, "environment")
+    converted = offline({"yard.zip": SAMPLE}, "environment", hints=Hints("environment"))
+    second = read_upload(maps_of(unzipped(converted.files[MAIN])), "environment")
     assert second.datum == first.datum
     assert second.parts.keys() == first.parts.keys()
     for key, part in first.parts.items():
@@ -204,14 +206,14 @@ def test_the_sample_is_detected_read_and_written_whole() -> None:
 
 
 def test_variables_come_back_as_they_are_and_never_run(tmp_path: Path) -> None:
-    made = offline({"yard.zip": SAMPLE}, "environment")
-    inner = unzipped(made.files[MAIN])
+    converted = offline({"yard.zip": SAMPLE}, "environment")
+    inner = unzipped(converted.files[MAIN])
     values = sourced(inner, tmp_path)
     assert values["FARM_NAME"] == 'It\'s a "yard"; $(echo no)'
     assert values["FIELD_NAME"] == ""
     assert values["ENVIRONMENT_COMMON_LATEST_RELEASE"] == "v1.0.1"
     assert values["DATUM_FILE"] == f"{tmp_path}/config/location/datum.yaml", "not the path on somebody's machine"
-    assert "variables that name files" in {d["what"] for d in made.report["dropped"]}
+    assert "variables that name files" in {d["what"] for d in converted.report["dropped"]}
     assert check_paths(values, tmp_path) == {
         "PROPERTIES_FILE",
         "DATUM_FILE",
@@ -220,7 +222,7 @@ def test_variables_come_back_as_they_are_and_never_run(tmp_path: Path) -> None:
         "NOGO_COSTMAP_YAML_FILE",
         "POI_FILE",
     }
-    again = told(maps_of(inner)).parts[VARIABLES]
+    again = read_upload(maps_of(inner)).parts[VARIABLES]
     assert isinstance(again, Features)
     assert again.document["environment"]["variables"] == {
         "ENVIRONMENT_COMMON_LATEST_RELEASE": "v1.0.1",
@@ -277,15 +279,15 @@ def test_which_grid_is_the_costmap() -> None:
 
 def test_objects_stand_in_the_format_they_came_from() -> None:
     box = shapely.box(0.0, 0.0, 1.0, 1.0)
-    kept: dict[PartKey, Part] = {
+    parts: dict[PartKey, Part] = {
         PartKey("objects", "ground", "kml"): features([("a", shapely.Point(-0.5, 53.2), {"kind": "poi"})], "wgs84"),
         PartKey("objects", "ground", "made-by-hand"): features([("b", box, {"kind": "shed"})], "local"),
         PartKey("zones", "ground", "zones"): features([("z", box, {"kind": "keepout"})], "local"),
     }
-    inner, _ = written(Layers(kept, DATUM))
+    inner, _ = written(Layers(parts, DATUM))
     assert {"config/world/objects.kml", "config/world/objects.geojson"} <= inner.keys()
-    again = told({f"{k}": v for k, v in inner.items()})
-    for key, part in kept.items():
+    again = read_upload({f"{k}": v for k, v in inner.items()})
+    for key, part in parts.items():
         other = again.parts[key]
         assert isinstance(part, Features)
         assert isinstance(other, Features)
@@ -315,12 +317,12 @@ def test_maps_that_would_have_one_path_get_paths_of_their_own() -> None:
     names = {n.removeprefix("config/") for n in maps_of(inner)}
     assert {"world/objects.geojson", "metric/Hall/map.yaml", "metric/hall_2/map.yaml"} <= names
     assert len({n.casefold() for n in names if "/poi_" in n}) == 3
-    maps = told(maps_of(inner))
+    maps = read_upload(maps_of(inner))
     drawn = {k: p for k, p in parts.items() if k.layer == "zones" or k.name in ("geojson", "made by hand")}
     assert {k: p.ids for k in drawn if isinstance(p := maps.parts[k], Features)} == {
         k: p.ids for k, p in drawn.items() if isinstance(p, Features)
     }
-    assert hashes(told({"a.zip": _archive.pack(inner)}).parts) == hashes(parts)
+    assert hashes(read_upload({"a.zip": _archive.pack(inner)}).parts) == hashes(parts)
 
 
 def test_worlds_of_one_name_get_files_of_their_own() -> None:
@@ -329,7 +331,7 @@ def test_worlds_of_one_name_get_files_of_their_own() -> None:
         link = f"<link name='l'><collision name='c'>{shape}</collision></link>"
         return f"<sdf version='1.6'><world name='{name}'><model name='m'>{link}</model></world></sdf>".encode()
 
-    both = told({"a/yard.world": world("a/yard", 1), "b/yard.world": world("b/yard", 2)})
+    both = read_upload({"a/yard.world": world("a/yard", 1), "b/yard.world": world("b/yard", 2)})
     inner, _ = written(both.layers(DATUM))
     assert {"config/world/yard.world.xml", "config/world/yard_2.world.xml"} <= inner.keys()
 
@@ -338,13 +340,13 @@ def test_pictures_and_clouds_have_their_places() -> None:
     samples = Path(__file__).resolve().parents[1] / "samples"
     paths = [samples / "satellite/orchard.tif", samples / "pcd/shelf.pcd", samples / "octomap/shed.bt"]
     files = {p.name: p.read_bytes() for p in paths}
-    made = offline(files, "environment", datum=DATUM)
-    inner = unzipped(made.files[MAIN])
-    wanted = ("location/orchard.tif", "metric/shelf/cloud.pcd", "metric/shelf/octomap.ot", "metric/shed/map.bt")
-    assert {f"config/{n}" for n in wanted} <= inner.keys()
+    converted = offline(files, "environment", datum=DATUM)
+    inner = unzipped(converted.files[MAIN])
+    expected_files = ("location/orchard.tif", "metric/shelf/cloud.pcd", "metric/shelf/octomap.ot", "metric/shed/map.bt")
+    assert {f"config/{n}" for n in expected_files} <= inner.keys()
     assert inner["config/metric/shelf/cloud.pcd"] == files["shelf.pcd"]
-    assert offline(made.files, "environment", datum=DATUM).files == made.files
-    assert set(told(files).parts) <= told(made.files).parts.keys()
+    assert offline(converted.files, "environment", datum=DATUM).files == converted.files
+    assert set(read_upload(files).parts) <= read_upload(converted.files).parts.keys()
 
 
 def test_a_missing_map_is_told_and_the_others_are_there() -> None:
@@ -371,8 +373,10 @@ def test_complete_derives_what_is_missing_and_says_so() -> None:
     assert {line["information"] for line in report["layers"]} == {"raw"}
     inner, report = written(layers, complete="true")
     assert "config/topological/network.tmap2.yaml" in inner
-    made = [line for line in report["layers"] if line["information"] == "derived" and line["layer"] == "topology"]
-    assert [step["step"] for step in made[0]["steps"]] == ["objects_to_topology"]
+    topology_lines = [
+        line for line in report["layers"] if line["information"] == "derived" and line["layer"] == "topology"
+    ]
+    assert [step["step"] for step in topology_lines[0]["steps"]] == ["objects_to_topology"]
 
 
 def test_nothing_is_no_environment() -> None:
@@ -406,10 +410,10 @@ def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
 
 def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.MonkeyPatch) -> None:
     version: Any = SimpleNamespace(environment="e", datum=None, levels=(), templates=NO_TEMPLATES, closures=None)
-    way = recipe.Chain((), ())
+    chain = recipe.Chain((), ())
 
     def keys() -> list[str]:
-        return [recipe._key(version, get_format(n), None, way, {}, None) for n in ("environment", "datum")]
+        return [recipe._key(version, get_format(n), None, chain, {}, None) for n in ("environment", "datum")]
 
     before = keys()
     assert keys() == before
@@ -426,13 +430,13 @@ def test_bad_packages_are_refused_with_file_and_reason() -> None:
     inside = {"config/location/datum.yaml": b"datum_latitude: north\n"}
     for upload in ({"a.zip": _archive.pack(inside)}, {"a.bin": _archive.pack(inside)}):
         with pytest.raises(BadUpload) as caught:
-            told(upload, "environment")
+            read_upload(upload, "environment")
         assert caught.value.problems
         assert all(p.file and p.problem for p in caught.value.problems)
     with pytest.raises(BadUpload):
-        told({"a.bin": b"no archive"}, "environment")
+        read_upload({"a.bin": b"no archive"}, "environment")
     with pytest.raises(BadUpload):
-        told({"a.zip": _archive.pack({"readme.txt": b"hello"})}, "environment")
+        read_upload({"a.zip": _archive.pack({"readme.txt": b"hello"})}, "environment")
 
 
 def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> None:
@@ -450,17 +454,17 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
     layers = Layers(parts, DATUM, (Level(), Level("2", 3.1)))
     files = written(layers)[0]
     package = _archive.pack(files)
-    again = told({"a.zip": package})
+    again = read_upload({"a.zip": package})
     assert again.warnings == []
     assert (again.datum, again.levels) == (layers.datum, layers.levels)
     assert hashes(again.parts) == hashes(parts)
-    assert hashes(told({"a.bin": package}, "environment").parts) == hashes(parts)
+    assert hashes(read_upload({"a.bin": package}, "environment").parts) == hashes(parts)
 
     content = "config/fleet_map/content.json"
     yaml_name = next(n for n in files if n.endswith("nav_2/map.yaml"))
     key = PartKey("occupancy", "2", "nav")
     credited = making.from_layers(FORMAT, layers, {}, derived=True, credit={key: ("© Somebody",)})
-    assert told(credited.files).credit(key) == ("© Somebody",)
+    assert read_upload(credited.files).credit(key) == ("© Somebody",)
     edited = {**files, yaml_name: files[yaml_name].replace(b"resolution:", b"resolution:  ")}
     for changed, reason in (
         (edited, f"{yaml_name} was edited"),
@@ -468,7 +472,7 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
         ({n: d for n, d in files.items() if n != yaml_name}, f"{yaml_name} was removed"),
         ({**files, content: b'{"version": 9}'}, "its version is not 1"),
     ):
-        other = told(changed)
+        other = read_upload(changed)
         assert [p.problem for p in other.warnings if p.file == content] == [
             f"not used, the maps of the package count: {reason}"
         ]
@@ -500,7 +504,7 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
     numbers = [plain.replace(b"4711", text) for text in (b"NaN", b"1e999", b'"nan"', b"18446744073709551616")]
     for wrong in (b"{", b"[]" * 10**5, *numbers, *map(orjson.dumps, damaged)):
         with pytest.raises(BadUpload) as caught:
-            told({**files, content: wrong})
+            read_upload({**files, content: wrong})
         assert [p.file for p in caught.value.problems] == [content], wrong[:100]
 
 
@@ -519,7 +523,7 @@ def test_files_that_are_no_maps_do_not_make_the_maps_of_a_package_count(root: st
         f"{root}config/notes.txt": b"to do\n",
         f"{root}config/empty.kml": b"",
     }
-    plain, with_more = told(files), told({**files, **added})
+    plain, with_more = read_upload(files), read_upload({**files, **added})
     assert hashes(with_more.parts) == hashes(plain.parts)
     assert [(p.file, p.problem) for p in with_more.warnings] == [
         (f"{root}config/notes.txt", "no format reads this file: it is kept as a source")
@@ -527,7 +531,7 @@ def test_files_that_are_no_maps_do_not_make_the_maps_of_a_package_count(root: st
     used = {name for name, use in with_more.files.items() if use.used}
     assert used == files.keys() | {f"{root}config/fleet_map/.DS_Store"}
     assert "Somebody" in str(with_more.credit(PartKey("occupancy", "ground", "map")))
-    other = told({**files, **added, f"{root}config/location/more.kml": b"<kml/>"})
+    other = read_upload({**files, **added, f"{root}config/location/more.kml": b"<kml/>"})
     assert f"the maps of the package count: {root}config/location/more.kml was added" in [
         p.problem.removeprefix("not used, ") for p in other.warnings if p.file == content
     ]
@@ -537,8 +541,8 @@ def test_what_macos_packs_beside_a_drawing_is_no_drawing(shared: Path) -> None:
     drawing = next(path for path in sorted((shared / "data/kml").rglob("*.kml"))).read_bytes()
     files = {"a.kml": drawing, "__MACOSX/._a.kml": b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        "}
     for name in (None, "kml"):
-        both = told(files, name)
-        assert hashes(both.parts) == hashes(told({"a.kml": drawing}, name).parts)
+        both = read_upload(files, name)
+        assert hashes(both.parts) == hashes(read_upload({"a.kml": drawing}, name).parts)
         assert not both.files["__MACOSX/._a.kml"].used
 
 
@@ -548,17 +552,17 @@ def offline_layers() -> Layers:
 
 def hashes(parts: Mapping[PartKey, Part]) -> dict[PartKey, bytes]:
     """What the store would call these parts."""
-    made = {key: store_parts.compose(Draft(lambda _: {}), part, None, "") for key, part in parts.items()}
-    return {key: part.hash for key, part in made.items() if part is not None}
+    encoded_parts = {key: store_parts.compose(Draft(lambda _: {}), part, None, "") for key, part in parts.items()}
+    return {key: part.hash for key, part in encoded_parts.items() if part is not None}
 
 
 def test_packages_in_packages_are_opened_once() -> None:
     middle = _archive.pack({"config/inner.pkg": SAMPLE, "config/properties.sh": b"export A='1'\n"})
-    once = told({"a.zip": middle})
+    once = read_upload({"a.zip": middle})
     assert PartKey("topology", "ground", "network") in once.parts
     outer = _archive.pack({"config/metric/x/deep.pkg": middle})
     with pytest.raises(BadUpload, match="inside another one"):
-        told({"a.pkg": _archive.pack({"config/metric/x/deep.pkg": outer})}, "environment")
+        read_upload({"a.pkg": _archive.pack({"config/metric/x/deep.pkg": outer})}, "environment")
 
 
 def test_of_files_are_the_variables_that_the_script_sets() -> None:

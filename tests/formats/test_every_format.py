@@ -45,18 +45,18 @@ NAMES = sorted(formats.all_formats())
 
 
 def layers_of(name: str, files: dict[str, bytes], hints: Hints | None = None) -> Layers:
-    told = read(unpack(files, LIMITS), hints or Hints(name), Known(), LIMITS)
-    return told.layers(HERE)
+    bundle = read(unpack(files, LIMITS), hints or Hints(name), Known(), LIMITS)
+    return bundle.layers(HERE)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_format_says_all_that_is_asked_of_it(name: str) -> None:
-    known = formats.get_format(name)
-    assert known.title
-    assert known.carries <= set(LAYERS)
-    assert len(known.media_types) == len(known.files) > 0
-    assert known.read is None or known.extensions, "a reader needs extensions, so that a named format finds its file"
-    assert known.write is None or known.needs.one_of, "a writer says what it needs"
+    fmt = formats.get_format(name)
+    assert fmt.title
+    assert fmt.carries <= set(LAYERS)
+    assert len(fmt.media_types) == len(fmt.files) > 0
+    assert fmt.read is None or fmt.extensions, "a reader needs extensions, so that a named format finds its file"
+    assert fmt.write is None or fmt.needs.one_of, "a writer says what it needs"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -123,11 +123,11 @@ def test_damaged_files_are_refused_with_file_and_reason_or_read(name: str, files
 def test_a_format_is_not_made_from_nothing(name: str) -> None:
     from app.convert.recipe import Stock, chain
 
-    known = formats.get_format(name)
-    if known.write is None:
+    fmt = formats.get_format(name)
+    if fmt.write is None:
         pytest.fail(f"{name} is not served: say so in CHANGELOG.md first")
     with pytest.raises((MissingLayer, CannotConvert)) as caught:
-        chain(known, Stock(frozenset(), False), known.write_options())
+        chain(fmt, Stock(frozenset(), False), fmt.write_options())
     assert "supply" in caught.value.detail or "needs" in caught.value.detail
 
 
@@ -138,8 +138,10 @@ FILE_NAME_IS_CONTENT = {"gazebo": "worlds are chosen by their file", "rmf_nav_gr
 @pytest.mark.parametrize(("name", "files"), [case for case in CASES if case.values[0] not in FILE_NAME_IS_CONTENT])
 def test_equal_files_under_other_names_are_equal_content(name: str, files: dict[str, bytes]) -> None:
     def hashes(named: dict[str, bytes]) -> dict[PartKey, bytes]:
-        made = {k: parts.compose(Draft(lambda _: {}), p, None, "") for k, p in layers_of(name, named).parts.items()}
-        return {key: part.hash for key, part in made.items() if part is not None}
+        encoded_parts = {
+            k: parts.compose(Draft(lambda _: {}), p, None, "") for k, p in layers_of(name, named).parts.items()
+        }
+        return {key: part.hash for key, part in encoded_parts.items() if part is not None}
 
     before = hashes(files)
     assert hashes({f"another folder/{n}": data for n, data in files.items()}) == before
@@ -154,14 +156,14 @@ def test_equal_files_under_other_names_are_equal_content(name: str, files: dict[
 @pytest.mark.parametrize("name", NAMES)
 def test_a_format_that_names_the_environment_says_so(name: str) -> None:
     """Else a map of one environment would be served for another one of equal content."""
-    known = formats.get_format(name)
+    fmt = formats.get_format(name)
     rows: list[Any] = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", shapely.Point(9, 0), {"kind": "node"})]
     rows.append(("e", shapely.LineString([(0, 0), (9, 0)]), {"kind": "edge", "source": "a", "target": "b"}))
     wall = ("wall", shapely.box(3, 3, 4, 4), {"kind": "wall", "height": 2.0})
     layers = Layers({PartKey("topology", name="network"): features(rows, "local"),
                      PartKey("objects", name="generated"): features([wall], "local")}, HERE)  # fmt: skip
     try:
-        one, two = (from_layers(known, layers, {}, derived=True, title=title).files for title in ("one", "two"))
+        one, two = (from_layers(fmt, layers, {}, derived=True, title=title).files for title in ("one", "two"))
     except CannotConvert:
         pytest.skip("it needs other layers, and none of them has a name")
-    assert (one != two) == (known.titled or known.holds)
+    assert (one != two) == (fmt.titled or fmt.holds)

@@ -58,16 +58,16 @@ def test_facts_of_our_sample() -> None:
     fact = json.loads((SAMPLES / "facts.json").read_text())["yard.ffr.yaml"]
     assert formats.detect("network.ffr.yaml", YARD) is FORMAT
     part, context = read(YARD)
-    found = zip(part.ids, part.geometry, part.properties, strict=True)
-    at = {i: [g.x, g.y] for i, g, p in found if p["kind"] == "node"}
+    items = zip(part.ids, part.geometry, part.properties, strict=True)
+    at = {i: [g.x, g.y] for i, g, p in items if p["kind"] == "node"}
     assert at == fact["nodes"]
     ends = [[p["source"], p["target"]] for p in part.properties if p["kind"] == "edge"]
     assert ends == fact["edges"]
     assert part.geometry[1].z == 0.5
     assert [p.get("width") for p in part.properties if p["kind"] == "edge"] == [2.5, 2.5, None, None]
-    said = "\n".join(w.problem for w in context.warnings)
-    assert "no point stands" in said
-    assert "have no lines: well" in said
+    warnings = "\n".join(w.problem for w in context.warnings)
+    assert "no point stands" in warnings
+    assert "have no lines: well" in warnings
 
 
 def test_everything_that_a_file_says_comes_back() -> None:

@@ -46,8 +46,8 @@ def folder(path: Path) -> dict[str, bytes]:
     return {p.relative_to(path).as_posix(): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
 
 
-def told(files: dict[str, bytes], name: str | None = None, known: Known | None = None) -> Bundle:
-    return read_bundle(unpack(files, LIMITS), Hints(name), known or Known(), LIMITS)
+def read_upload(files: dict[str, bytes], name: str | None = None, context: Known | None = None) -> Bundle:
+    return read_bundle(unpack(files, LIMITS), Hints(name), context or Known(), LIMITS)
 
 
 def objects(bundle: Bundle) -> Features:
@@ -68,7 +68,7 @@ def world(inner: str, version: str = "1.7", name: str = "w") -> dict[str, bytes]
 
 def one(inner: str, **more: Any) -> dict[str, Any]:
     """The properties of the first object of a world."""
-    return dict(objects(told(world(inner, **more))).properties[0])
+    return dict(objects(read_upload(world(inner, **more))).properties[0])
 
 
 def write(
@@ -113,15 +113,15 @@ def check(files: dict[str, bytes]) -> list[str]:
 
 
 def tree(files: dict[str, bytes]) -> etree._Element:
-    found = etree.fromstring(files["world.sdf"]).find("world")
-    assert found is not None
-    return found
+    world = etree.fromstring(files["world.sdf"]).find("world")
+    assert world is not None
+    return world
 
 
 # --- our own samples ---------------------------------------------------------------------------------------------
 def test_a_yard_worked_out_by_hand() -> None:
-    found = told(folder(SAMPLES / "yard"))
-    part = objects(found)
+    bundle = read_upload(folder(SAMPLES / "yard"))
+    part = objects(bundle)
     assert {(i, p["kind"]) for i, p in zip(part.ids, part.properties, strict=True)} == {
         ("sun", "light"), ("ground_plane", "model"), ("post", "model"), ("sign", "model"), ("crate", "include"),
         ("spare crate", "include"), ("oak", "include"), ("entrance", "model"),
@@ -151,15 +151,15 @@ def test_a_yard_worked_out_by_hand() -> None:
     assert by["entrance"].geometry.bounds == pytest.approx((-2.1, 8.9, 2.1, 9.1))
     assert by["entrance"].geometry.area == pytest.approx(0.08)
     assert by["ground_plane"].geometry.bounds == (-30.0, -20.0, 30.0, 20.0)
-    assert found.datum == Datum(53.2686, -0.5245, 12.5, heading=-30.0)
-    problems = [w.problem for w in found.warnings]
+    assert bundle.datum == Datum(53.2686, -0.5245, 12.5, heading=-30.0)
+    problems = [w.problem for w in bundle.warnings]
     assert any("moves 1 of 8 objects (post)" in p for p in problems)
     assert any("names 1 that are not there: ghost" in p for p in problems)
     assert any("Oak tree is not fetched: supply" in p for p in problems)
     assert by["post"].properties["gazebo"]["state"] == [1.0, 2.5, 0.5, 0.0, 0.0, 0.0]
     files = folder(SAMPLES / "yard")
-    assert resources(found) == {n: d for n, d in files.items() if n.startswith("models/")}
-    assert all(use.used for use in found.files.values())
+    assert resources(bundle) == {n: d for n, d in files.items() if n.startswith("models/")}
+    assert all(use.used for use in bundle.files.values())
 
 
 def test_a_yard_comes_back(same: Same) -> None:
@@ -176,14 +176,14 @@ def test_a_yard_comes_back(same: Same) -> None:
     if (
         CHECKER
     ):  # both are the upload's own words: an address of another machine, and one that libsdformat does not know
-        gone = ("https://fuel.gazebosim.org/1.0/openrobotics/models/Oak tree", "file://models/crate")
-        assert sorted(check(out)) == sorted(f"Error Code 13: Msg: Unable to find uri[{uri}]" for uri in gone)
+        missing_uris = ("https://fuel.gazebosim.org/1.0/openrobotics/models/Oak tree", "file://models/crate")
+        assert sorted(check(out)) == sorted(f"Error Code 13: Msg: Unable to find uri[{uri}]" for uri in missing_uris)
 
 
 def test_heading_runs_the_other_way_round() -> None:
     """heading_deg 30 in a world: libignition-math puts a point 100 m along the world's x axis 86.603 m east and 50 m
     north of the origin, and one along its y axis 50 m west and 86.603 m north (LOCAL2 to SPHERICAL, version 6.10)."""
-    datum = told(folder(SAMPLES / "yard")).datum
+    datum = read_upload(folder(SAMPLES / "yard")).datum
     assert datum is not None
     frame = Layers({}, datum).frame
     assert frame is not None
@@ -200,7 +200,7 @@ def test_a_place_as_libignition_math_finds_it() -> None:
         "<spherical_coordinates><latitude_deg>53.27</latitude_deg><longitude_deg>-0.52</longitude_deg>"
         "<elevation>0</elevation><heading_deg>30</heading_deg></spherical_coordinates>"
     )
-    datum = told(world(place + "<model name='m'><link name='l'/></model>")).datum
+    datum = read_upload(world(place + "<model name='m'><link name='l'/></model>")).datum
     frame = Layers({}, datum).frame
     assert frame is not None
     earth = frame.to_wgs84(np.array([[100.0, 0.0], [0.0, 100.0]]))
@@ -209,8 +209,8 @@ def test_a_place_as_libignition_math_finds_it() -> None:
 
 
 def test_an_orchard_from_a_list() -> None:
-    found = told(folder(SAMPLES / "orchard"))
-    part = objects(found)
+    bundle = read_upload(folder(SAMPLES / "orchard"))
+    part = objects(bundle)
     assert part.ids == ("grass", "tree", "tree#2", "shed", "barrow")
     by = {f.id: f for f in part}
     # The trunk stands 1 m along x of the tree's frame, which is turned by 90 degrees at (4, 3): at (4, 4).
@@ -220,14 +220,14 @@ def test_an_orchard_from_a_list() -> None:
     assert [s.get("visual", False) for s in by["tree"].properties["shapes"]] == [False, True], "crowns do not collide"
     assert by["shed"].geometry.bounds == (9.0, -1.5, 11.0, 1.5)
     assert by["grass"].properties["size"] == [30.0, 20.0, 0.0]
-    assert any("custom_models/barrow.yaml is not in the upload" in w.problem for w in found.warnings)
+    assert any("custom_models/barrow.yaml is not in the upload" in w.problem for w in bundle.warnings)
     answer = offline(folder(SAMPLES / "orchard"), "gazebo")
     assert check(answer.files) == []
-    made = tree(answer.files)
-    assert [m.get("name") for m in made.iterchildren("model")] == ["grass", "ground_plane", "shed", "tree", "tree_2"]
-    assert len(made.findall("model[@name='tree']//collision")) == 1
-    assert len(made.findall("model[@name='tree']//visual")) == 2
-    assert made.findtext("model[@name='grass']//script/name") == "Gazebo/DarkGrey"
+    world = tree(answer.files)
+    assert [m.get("name") for m in world.iterchildren("model")] == ["grass", "ground_plane", "shed", "tree", "tree_2"]
+    assert len(world.findall("model[@name='tree']//collision")) == 1
+    assert len(world.findall("model[@name='tree']//visual")) == 2
+    assert world.findtext("model[@name='grass']//script/name") == "Gazebo/DarkGrey"
     assert {t["what"]: t["option"] for t in answer.report["template"]} == {
         "ground plane": "ground",
         "colour of ground": "ground_colour",
@@ -240,12 +240,12 @@ def test_an_orchard_from_a_list() -> None:
 
 
 def test_a_lone_model_is_a_world_of_one() -> None:
-    found = told(folder(SAMPLES / "cart"))
-    (cart,) = objects(found)
+    bundle = read_upload(folder(SAMPLES / "cart"))
+    (cart,) = objects(bundle)
     assert cart.properties["pose"] == [2.0, 3.0, 0.0, 0.0, 0.0, 0.0]
     assert cart.geometry.bounds == pytest.approx((1.4, 2.6, 2.6, 3.4))
     assert cart.properties["size"] == [1.2, 0.8, 0.8]
-    assert all(use.used for use in found.files.values()), "its model.config goes along"
+    assert all(use.used for use in bundle.files.values()), "its model.config goes along"
     out = offline(folder(SAMPLES / "cart"), "gazebo").files
     assert {m.get("name") for m in tree(out).iterchildren("model")} == {"cart", "ground_plane"}
     assert set(out) == {"world.sdf"}
@@ -258,7 +258,9 @@ def test_a_lone_model_keeps_its_meshes() -> None:
         mesh = f"<collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision>"
         model = f"<sdf version='1.6'><model name='cart'><link name='l'>{mesh}</link></model></sdf>".encode()
         files = {"my/cart/model.sdf": model, "my/cart/meshes/a.stl": cube}
-        assert objects(told(files)).properties[0]["shapes"] == [{"type": "mesh", "file": served, "scale": [1, 1, 1]}]
+        assert objects(read_upload(files)).properties[0]["shapes"] == [
+            {"type": "mesh", "file": served, "scale": [1, 1, 1]}
+        ]
         out = offline(files, "gazebo").files
         assert out[served] == cube
         assert offline(out, "gazebo").files == out
@@ -271,7 +273,7 @@ LINK = "<link name='l'><collision name='c'><geometry><box><size>2 1 1</size></bo
 def test_poses_of_every_kind() -> None:
     quarter = round(math.pi / 2, 9)
     turned = "0 0 0.7071067811865476 0.7071067811865476"
-    for said, pose in {
+    for xml, pose in {
         "<pose>1 2 3 0.1 0.2 0.3</pose>": [1.0, 2.0, 3.0, 0.1, 0.2, 0.3],
         "<pose degrees='true'>1 2 3 0 0 90</pose>": [1.0, 2.0, 3.0, 0.0, 0.0, quarter],
         f"<pose rotation_format='quat_xyzw'>1 2 3 {turned}</pose>": [1.0, 2.0, 3.0, 0.0, 0.0, quarter],
@@ -279,19 +281,19 @@ def test_poses_of_every_kind() -> None:
         "<pose/>": [0.0] * 6,
         "<pose frame=''>1 0 0 0 0 0</pose>": [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
     }.items():
-        assert one(f"<model name='m'>{said}{LINK}</model>")["pose"] == pytest.approx(pose, abs=1e-9), said
+        assert one(f"<model name='m'>{xml}{LINK}</model>")["pose"] == pytest.approx(pose, abs=1e-9), xml
     for bad in ("1 2 3 4 5 6 7", "nan 0 0 0 0 0", "1e999 0 0 0 0 0", "a b c d e f", "1_0 0 0 0 0 0", "1e8 0 0 0 0 0"):
         with pytest.raises(UnreadableFile) as caught:
-            told(world(f"<model name='m'><pose>{bad}</pose>{LINK}</model>"))
+            read_upload(world(f"<model name='m'><pose>{bad}</pose>{LINK}</model>"))
         assert caught.value.problems[0].file == "a.world"
         assert caught.value.problems[0].line == 1
     with pytest.raises(UnreadableFile):
-        told(world("<model name='m'><pose rotation_format='quat_xyzw'>0 0 0 0 0 0 0</pose></model>"))
+        read_upload(world("<model name='m'><pose rotation_format='quat_xyzw'>0 0 0 0 0 0 0</pose></model>"))
 
 
 def test_frames_in_a_world_and_in_models() -> None:
-    found = objects(
-        told(
+    part = objects(
+        read_upload(
             world(
                 "<model name='a'><pose>10 0 0 0 0 1.5707963267948966</pose>"
                 "<link name='l'><pose>1 0 0 0 0 0</pose></link></model>"
@@ -304,7 +306,7 @@ def test_frames_in_a_world_and_in_models() -> None:
             )
         )
     )
-    pose = {f.id: [round(v, 6) + 0.0 for v in f.properties["pose"][:3]] for f in found}
+    pose = {f.id: [round(v, 6) + 0.0 for v in f.properties["pose"][:3]] for f in part}
     # a looks north at (10, 0); b is 2 m in front of it; a's link 1 m in front, c 2 m in front of that; f is 1 m left of
     # b, which is west; e stands so that its link is at (5, 5).
     assert pose == {
@@ -325,15 +327,15 @@ def test_frames_in_a_world_and_in_models() -> None:
 
 
 def test_frames_that_are_not_there_or_run_in_a_circle_are_warned_of() -> None:
-    found = told(
+    bundle = read_upload(
         world(
             "<model name='a'><pose relative_to='b'>1 0 0 0 0 0</pose></model>"
             "<model name='b'><pose relative_to='a'>1 0 0 0 0 0</pose></model>"
             "<model name='c'><pose relative_to='nowhere'>1 0 0 0 0 0</pose></model>"
         )
     )
-    assert len(objects(found)) == 3
-    problems = " ".join(w.problem for w in found.warnings)
+    assert len(objects(bundle)) == 3
+    problems = " ".join(w.problem for w in bundle.warnings)
     assert "circle" in problems
     assert "'nowhere' is not known" in problems
 
@@ -389,7 +391,7 @@ def test_each_shape_is_written_as_it_was_read() -> None:
     assert check(files) == []
     assert files["models/m/cube.stl"] == cube
     assert etree.fromstring(files["world.sdf"]).get("version") == "1.8", "capsules came with 1.8"
-    back = {f.id: f for f in objects(told(files))}["a"]
+    back = {f.id: f for f in objects(read_upload(files))}["a"]
     assert back.properties["pose"] == rows[0][2]["pose"]
     assert back.properties["shapes"] == [
         {**s, "file": "models/m/cube.stl"} if s["type"] == "mesh" else s for s in shapes if not s.get("visual")
@@ -402,9 +404,9 @@ def test_several_worlds_lie_side_by_side() -> None:
     first = b'<sdf version="1.5"><world name="one"><gravity>0 0 -1</gravity><model name="m"><link name="l"/></model></world></sdf>'
     second = b'<sdf version="1.6"><world name="two"><wind/><model name="m"><link name="k"/></model></world></sdf>'
     files = {"w/short.world": first, "w/longer.world.xml": second}
-    found = told(files)
-    assert objects(found).ids == ("m", "m#2")
-    assert set(objects(found).document["gazebo"]["worlds"]) == {"w/short", "w/longer"}
+    bundle = read_upload(files)
+    assert objects(bundle).ids == ("m", "m#2")
+    assert set(objects(bundle).document["gazebo"]["worlds"]) == {"w/short", "w/longer"}
     answer = offline(files, "gazebo")
     assert tree(answer.files).get("name") == "one"
     assert tree(answer.files).findtext("gravity") == "0 0 -1"
@@ -425,30 +427,32 @@ def test_several_worlds_lie_side_by_side() -> None:
 def test_the_four_worlds_of_the_limo_track(shared: Path, same: Same) -> None:
     root = shared / "data/environment_template/indoor-agilex-limo-track"
     files = folder(root)
-    found = told(files)
-    here = "config/world/"
+    bundle = read_upload(files)
+    prefix = "config/world/"
     names = ["potholes", "potholes_simple", "simple", "simulation_table"]
-    assert sorted(objects(found).document["gazebo"]["worlds"]) == [here + n for n in names]
+    assert sorted(objects(bundle).document["gazebo"]["worlds"]) == [prefix + n for n in names]
     for name in names:
-        mine = {
-            n: d for n, d in files.items() if n.startswith(here + "custom_models/") or n == f"{here}{name}.world.xml"
+        world_files = {
+            n: d
+            for n, d in files.items()
+            if n.startswith(prefix + "custom_models/") or n == f"{prefix}{name}.world.xml"
         }
         out = offline(files, "gazebo", options={"world": name}).files
-        assert same("gazebo", mine, out) == []
-        wanted = {"simple": {"simple.stl"}}.get(name, {name})
-        assert {n.split("/")[1] for n in out if n.startswith("models/")} == wanted, "only what this world needs"
+        assert same("gazebo", world_files, out) == []
+        model_names = {"simple": {"simple.stl"}}.get(name, {name})
+        assert {n.split("/")[1] for n in out if n.startswith("models/")} == model_names, "only what this world needs"
 
 
 def test_a_model_is_a_world_only_without_one() -> None:
     model = b'<sdf version="1.6"><model name="%s">%s<link name="l"/></model></sdf>'
     files = {"models/a/model.sdf": model % (b"a", b""), "models/b/model.sdf": model % (b"b", b"")}
-    assert set(objects(told(files)).ids) == {"a", "b"}
+    assert set(objects(read_upload(files)).ids) == {"a", "b"}
     include = b"<include><uri>model://b</uri></include>"
-    assert objects(told({**files, "models/a/model.sdf": model % (b"a", include)})).ids == ("a",)
-    found = told({**files, **world("<include><uri>model://a</uri></include>")})
-    assert objects(found).ids == ("a",)
-    assert not found.files["models/b/model.sdf"].used
-    assert any(w.file == "models/b/model.sdf" for w in found.warnings)
+    assert objects(read_upload({**files, "models/a/model.sdf": model % (b"a", include)})).ids == ("a",)
+    bundle = read_upload({**files, **world("<include><uri>model://a</uri></include>")})
+    assert objects(bundle).ids == ("a",)
+    assert not bundle.files["models/b/model.sdf"].used
+    assert any(w.file == "models/b/model.sdf" for w in bundle.warnings)
 
 
 def test_what_belongs_to_a_world_is_nothing_else() -> None:
@@ -466,7 +470,7 @@ def test_what_belongs_to_a_world_is_nothing_else() -> None:
     assert {(g.format.name, g.main) for g in groups} == {("gazebo", "a.world"), ("kml", "b.kml")}
     assert set(groups[0].files) == {"a.world", "x/a/model.sdf", "x/a/notes.kml"}
     assert rest == []
-    assert resources(told(files))["models/a/notes.kml"] == kml
+    assert resources(read_upload(files))["models/a/notes.kml"] == kml
 
 
 @pytest.mark.parametrize(
@@ -485,12 +489,12 @@ def test_meshes_are_found_in_the_upload(uri: str, file: str, served: str) -> Non
     cube = (SAMPLES / "yard/models/crate/meshes/crate.stl").read_bytes()
     mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
     files = {**world(f"<model name='m'>{mesh}</model>"), file: cube}
-    found = told(files)
-    assert objects(found).properties[0]["shapes"] == [{"type": "mesh", "file": served, "scale": [1, 1, 1]}]
-    assert objects(found).geometry[0].area == pytest.approx(1.0)
+    bundle = read_upload(files)
+    assert objects(bundle).properties[0]["shapes"] == [{"type": "mesh", "file": served, "scale": [1, 1, 1]}]
+    assert objects(bundle).geometry[0].area == pytest.approx(1.0)
     out = offline(files, "gazebo").files
     assert out[served] == cube
-    assert objects(told(out)).properties[0]["shapes"] == objects(found).properties[0]["shapes"]
+    assert objects(read_upload(out)).properties[0]["shapes"] == objects(bundle).properties[0]["shapes"]
 
 
 @pytest.mark.parametrize(
@@ -503,9 +507,9 @@ def test_meshes_are_found_in_the_upload(uri: str, file: str, served: str) -> Non
 def test_nothing_else_is_looked_for(uri: str) -> None:
     mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
     files = {**world(f"<model name='m'>{mesh}</model>"), "sub/x.stl": b"x"}
-    found = told(files)
-    assert objects(found).properties[0]["shapes"] == [{"type": "mesh", "uri": uri}], "a solid that nobody can read"
-    assert any("supply" in w.problem or "kept" in w.problem for w in found.warnings)
+    bundle = read_upload(files)
+    assert objects(bundle).properties[0]["shapes"] == [{"type": "mesh", "uri": uri}], "a solid that nobody can read"
+    assert any("supply" in w.problem or "kept" in w.problem for w in bundle.warnings)
     assert uri in offline(files, "gazebo").files["world.sdf"].decode()
 
 
@@ -514,7 +518,7 @@ def test_includes_that_go_round_are_refused_with_the_file() -> None:
     files = {"models/a/model.sdf": model % (b"a", b"b"), "models/b/model.sdf": model % (b"b", b"a")}
     for upload in (files, {**files, **world("<include><uri>model://a</uri></include>")}):
         with pytest.raises(UnreadableFile, match="includes itself") as caught:
-            told(upload)
+            read_upload(upload)
         assert caught.value.problems[0].file
 
 
@@ -525,53 +529,53 @@ def test_includes_that_unfold_to_very_much_are_refused() -> None:
         files[f"m{k}/model.sdf"] = f"<sdf version='1.7'><model name='m'>{inner}</model></sdf>".encode()
     files["m8/model.sdf"] = f"<sdf version='1.7'><model name='m'>{LINK}</model></sdf>".encode()
     with pytest.raises(TooLarge, match="shapes"):
-        told(files)
+        read_upload(files)
 
 
 def test_a_broken_mesh_is_warned_of() -> None:
     lies = b"\0" * 80 + struct.pack("<I", 2**31) + bytes(50)
     mesh = "<link name='l'><collision name='c'><geometry><mesh><uri>model://m.stl</uri></mesh></geometry></collision></link>"
-    found = told({**world(f"<model name='m'><pose>1 2 0 0 0 0</pose>{mesh}</model>"), "m.stl": lies})
-    assert objects(found).geometry[0] == shapely.Point(1, 2)
-    assert any(w.file and w.file.endswith("m.stl") and "solids are not known" in w.problem for w in found.warnings)
+    bundle = read_upload({**world(f"<model name='m'><pose>1 2 0 0 0 0</pose>{mesh}</model>"), "m.stl": lies})
+    assert objects(bundle).geometry[0] == shapely.Point(1, 2)
+    assert any(w.file and w.file.endswith("m.stl") and "solids are not known" in w.problem for w in bundle.warnings)
 
 
 def test_zero_zero_is_no_place_and_a_known_datum_stays() -> None:
     place = "<spherical_coordinates><latitude_deg>{}</latitude_deg><longitude_deg>{}</longitude_deg><elevation>0</elevation><heading_deg>{}</heading_deg></spherical_coordinates><model name='m'><link name='l'/></model>"
-    assert told(world(place.format(0, 0, 0))).datum is None
-    assert told(world(place.format(10, 20, 270))).datum == Datum(10, 20, heading=90.0)
-    here = Datum(10.0, 20.5)
-    found = told(world(place.format(10, 20, 0)), known=Known(here))
-    assert found.datum is None
-    assert any("not the environment's datum" in w.problem for w in found.warnings)
+    assert read_upload(world(place.format(0, 0, 0))).datum is None
+    assert read_upload(world(place.format(10, 20, 270))).datum == Datum(10, 20, heading=90.0)
+    datum = Datum(10.0, 20.5)
+    bundle = read_upload(world(place.format(10, 20, 0)), context=Known(datum))
+    assert bundle.datum is None
+    assert any("not the environment's datum" in w.problem for w in bundle.warnings)
     files = world(place.format(10, 20, 0))
-    parts = told(files).parts
-    assert "<longitude_deg>20.5<" in write(parts, here)["world.sdf"].decode(), "the environment's datum is written"
-    kept = write(parts, Datum(10.0, 20.0))["world.sdf"].decode()
-    assert "<longitude_deg>20<" in kept, "what means the same stays as it was"
-    default = told(world(place.format(0, 0, 0))).parts
-    out, context = report(default, here)
+    parts = read_upload(files).parts
+    assert "<longitude_deg>20.5<" in write(parts, datum)["world.sdf"].decode(), "the environment's datum is written"
+    text = write(parts, Datum(10.0, 20.0))["world.sdf"].decode()
+    assert "<longitude_deg>20<" in text, "what means the same stays as it was"
+    default = read_upload(world(place.format(0, 0, 0))).parts
+    out, context = report(default, datum)
     assert "<longitude_deg>0<" in out["world.sdf"].decode()
     assert any("georeference=true" in w.problem for w in context.warnings)
-    assert "<longitude_deg>20.5<" in write(default, here, georeference=True)["world.sdf"].decode()
+    assert "<longitude_deg>20.5<" in write(default, datum, georeference=True)["world.sdf"].decode()
     moon = "<spherical_coordinates><surface_model>MOON_SCS</surface_model><latitude_deg>1</latitude_deg></spherical_coordinates>"
-    found = told(world(moon + "<model name='m'/>"))
-    assert found.datum is None
-    assert any("MOON_SCS" in w.problem for w in found.warnings)
+    bundle = read_upload(world(moon + "<model name='m'/>"))
+    assert bundle.datum is None
+    assert any("MOON_SCS" in w.problem for w in bundle.warnings)
 
 
 def test_an_object_that_is_moved_or_renamed_is_written_so() -> None:
-    found = told(folder(SAMPLES / "yard"))
-    part = objects(found)
+    bundle = read_upload(folder(SAMPLES / "yard"))
+    part = objects(bundle)
     moved = {"sign": [1.0, 1.0, 0.0, 0.0, 0.0, 0.0], "spare crate": [0.0] * 6, "crate": [9.0, 9.0, 0.0, 0.0, 0.0, 0.0]}
     names = {"crate": "box 1", "post": "pole"}
     properties = [
         {**p, "pose": moved.get(i, p["pose"]), "name": names.get(i, p["name"])}
         for i, p in zip(part.ids, part.properties, strict=True)
     ]
-    parts = {**found.parts, OBJECTS: Features(part.ids, part.geometry, tuple(properties), part.local, part.document)}
+    parts = {**bundle.parts, OBJECTS: Features(part.ids, part.geometry, tuple(properties), part.local, part.document)}
     files = write(parts)
-    back = {f.properties["name"]: f.properties["pose"] for f in objects(told(files))}
+    back = {f.properties["name"]: f.properties["pose"] for f in objects(read_upload(files))}
     assert back["sign"] == moved["sign"]
     assert back["spare crate"] == moved["spare crate"], "an include's zero pose is not its model's own"
     assert back["box 1"] == moved["crate"]
@@ -597,7 +601,7 @@ def test_objects_of_other_formats_become_static_models() -> None:
     parts = {PartKey("objects", name="osm", level="L2"): features(rows, "local")}
     files, context = report(parts, None, (Level(), Level("L2", 3.0)), wall_height=2.0, building_height=5.0)
     assert check(files) == []
-    by = {f.properties["name"]: f for f in objects(told(files))}
+    by = {f.properties["name"]: f for f in objects(read_upload(files))}
     assert set(by) == {"a_b", "hall", "w", "floor", "door", "field", "tree", "bin", "ground_plane", "sun"}
     box = solids.Solids({}, False, True)
 
@@ -642,7 +646,7 @@ def test_what_no_source_tells_can_be_said() -> None:
         parts, **measures, building_colour=(0.0, 0.5, 1.0), sun=False, ground_colour=(0.1, 0.2, 0.1)
     )
     assert check(files) == []
-    by = {f.properties["name"]: f for f in objects(told(files))}
+    by = {f.properties["name"]: f for f in objects(read_upload(files))}
     box = solids.Solids({}, False, True)
 
     def extent(name: str) -> Any:
@@ -658,9 +662,9 @@ def test_what_no_source_tells_can_be_said() -> None:
     ground = next(m for m in tree(files).iter("model") if m.get("name") == "ground_plane")
     assert ground.findtext(".//diffuse") == "0.1 0.2 0.1 1"
     assert tree(files).find(".//light") is None
-    said = {t["option"]: t["value"] for t in context.template if "option" in t}
-    assert {name: said[name] for name in measures} == measures
-    assert "sun" not in said
+    options = {t["option"]: t["value"] for t in context.template if "option" in t}
+    assert {name: options[name] for name in measures} == measures
+    assert "sun" not in options
     bare = tree(write(parts, ground=False, sun=False))
     assert "ground_plane" not in {m.get("name") for m in bare.iter("model")}
 
@@ -688,15 +692,15 @@ def test_places_on_earth_are_brought_to_the_local_frame() -> None:
     parts = {PartKey("objects", name="osm"): features([("h", shapely.Polygon(corner), {"kind": "building"})], "wgs84")}
     files = write(parts, datum)
     assert check(files) == []
-    by = {f.id: f for f in objects(told(files))}
+    by = {f.id: f for f in objects(read_upload(files))}
     assert by["h"].geometry.bounds == pytest.approx((0, 0, 10, 5), abs=1e-6)
-    assert told(files).datum == datum
+    assert read_upload(files).datum == datum
     with pytest.raises(MissingDatum):
         write(parts)
 
 
 def test_a_stored_world_stands_alone_unless_all_is_asked_for() -> None:
-    parts: dict[PartKey, Any] = dict(told(world("<model name='m'><link name='l'/></model>")).parts)
+    parts: dict[PartKey, Any] = dict(read_upload(world("<model name='m'><link name='l'/></model>")).parts)
     parts[PartKey("objects", name="osm")] = features([("h", shapely.box(0, 0, 1, 1), {"kind": "building"})], "local")
     parts[PartKey("occupancy")] = OccupancyGrid(np.full((2, 2), 100, np.uint8), 0.5)
     files, context = report(parts)
@@ -724,7 +728,7 @@ def test_walls_of_a_grid() -> None:
     corners = mesh.vertices[mesh.faces]
     volume = float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
     assert volume == pytest.approx(11 * 0.25 * 3.0), "closed, its faces outward: 11 cells, 3 m high"
-    walls = {f.id: f for f in objects(told(files))}["walls_map"]
+    walls = {f.id: f for f in objects(read_upload(files))}["walls_map"]
     assert walls.geometry.area == pytest.approx(11 * 0.25, abs=1e-6)
     # The grid's x axis looks north: its 6 × 4 cells of half a metre lie west of (10, 20).
     assert walls.geometry.bounds == pytest.approx((8.0, 20.0, 10.0, 23.0), abs=1e-6)
@@ -784,7 +788,7 @@ def test_versions_that_libsdformat_takes(version: str) -> None:
     files = write({PartKey("objects", name="osm"): features(rows, "local")}, Datum(1.0, 2.0, 3.0, 4.0), version=version)
     assert check(files) == []
     assert etree.fromstring(files["world.sdf"]).get("version") == version
-    assert told(files).datum == Datum(1.0, 2.0, 3.0, 4.0)
+    assert read_upload(files).datum == Datum(1.0, 2.0, 3.0, 4.0)
 
 
 # --- real worlds -------------------------------------------------------------------------------------------------
@@ -809,24 +813,24 @@ def test_real_worlds_have_their_facts_and_come_back(shared: Path, facts_json: di
     worlds = real_worlds(shared)
     assert len(worlds) > 10
     for key, path, files in worlds:
-        known = facts_json[key]["facts"]
-        found = told(files, "gazebo")
-        kinds = Counter(p["kind"] for p in objects(found).properties)
-        assert kinds["model"] == known["top_level_models"], key
-        assert kinds["include"] == known["includes"] - known["includes_inside_model"], key
-        assert kinds["light"] == known["light_count"], key
-        names = known["top_level_model_names"]
-        models = [p["name"] for p in objects(found).properties if p["kind"] == "model"]
+        facts = facts_json[key]["facts"]
+        bundle = read_upload(files, "gazebo")
+        kinds = Counter(p["kind"] for p in objects(bundle).properties)
+        assert kinds["model"] == facts["top_level_models"], key
+        assert kinds["include"] == facts["includes"] - facts["includes_inside_model"], key
+        assert kinds["light"] == facts["light_count"], key
+        names = facts["top_level_model_names"]
+        models = [p["name"] for p in objects(bundle).properties if p["kind"] == "model"]
         assert models[: len(names)] == names
-        moved = [p for p in objects(found).properties if "state" in p["gazebo"] and p["kind"] == "model"]
-        assert len(moved) == known.get("state_pose_differs", 0), key
-        for name, text in known["poses_top_level"].items():
+        moved = [p for p in objects(bundle).properties if "state" in p["gazebo"] and p["kind"] == "model"]
+        assert len(moved) == facts.get("state_pose_differs", 0), key
+        for name, text in facts["poses_top_level"].items():
             if text:
-                said = next(p for p in objects(found).properties if p["name"] == name and p["kind"] == "model")
-                assert said["pose"] == pytest.approx([float(v) for v in text.split()]), (key, name)
+                properties = next(p for p in objects(bundle).properties if p["name"] == name and p["kind"] == "model")
+                assert properties["pose"] == pytest.approx([float(v) for v in text.split()]), (key, name)
         out = offline(files, "gazebo", hints=Hints("gazebo")).files
         assert same("gazebo", files, out) == [], key
-        assert etree.fromstring(out["world.sdf"]).get("version") == known["sdf_version"]
+        assert etree.fromstring(out["world.sdf"]).get("version") == facts["sdf_version"]
         again = offline(out, "gazebo").files
         assert {n: out[n] for n in again} == again, "what only a comment names goes along, until the comment is gone"
         base = path.relative_to(path.parent.parent if path.parent.name == "worlds" else path.parent).as_posix()
@@ -841,8 +845,8 @@ def test_real_models_have_their_shapes(shared: Path, facts_json: dict[str, Any])
     """Collision geometry of lone models by kind, against the independent count; meshes only where they are there."""
     seen = 0
     for key, entry in facts_json.items():
-        known = entry.get("facts") or {}
-        if entry["kind"] != "sdf" or known["worlds"] or known["includes"] or not known["collisions"]:
+        facts = entry.get("facts") or {}
+        if entry["kind"] != "sdf" or facts["worlds"] or facts["includes"] or not facts["collisions"]:
             continue
         path = shared / "data" / key
         root = path.parent.parent
@@ -850,13 +854,13 @@ def test_real_models_have_their_shapes(shared: Path, facts_json: dict[str, Any])
         name = path.relative_to(root).as_posix()
         files = {n: d for n, d in files.items() if n == name or not n.endswith(".sdf")}
         files.pop(f"{path.parent.name}/model.config", None)
-        (model,) = objects(told(files, "gazebo"))
+        (model,) = objects(read_upload(files, "gazebo"))
         shapes = Counter(s["type"] for s in model.properties.get("shapes", ()) if not s.get("visual"))
-        wanted = Counter(known["collision_geometry"])
-        for kind in wanted:
+        expected_shapes = Counter(facts["collision_geometry"])
+        for kind in expected_shapes:
             if kind != "mesh":
-                assert shapes[kind] == wanted[kind], (key, kind)
-        assert shapes["mesh"] <= wanted["mesh"]
+                assert shapes[kind] == expected_shapes[kind], (key, kind)
+        assert shapes["mesh"] <= expected_shapes["mesh"]
         seen += 1
     assert seen > 20
 
@@ -867,10 +871,10 @@ def test_collada_units_are_applied_and_the_up_axis_is_not(shared: Path, facts_js
     root = shared / "data/gazebo_sdf/turtlebot3_world"
     wall = facts_json["gazebo_sdf/turtlebot3_world/models/turtlebot3_world/meshes/wall.dae"]["facts"]
     assert (wall["unit_meter"], wall["up_axis"]) == ("0.0254", "Y_UP")
-    found = told({n: d for n, d in folder(root).items() if not n.startswith("maps/")})
-    (place,) = [f for f in objects(found) if f.id == "turtlebot3_world"]
+    bundle = read_upload({n: d for n, d in folder(root).items() if not n.startswith("maps/")})
+    (place,) = [f for f in objects(bundle) if f.id == "turtlebot3_world"]
     assert place.properties["kind"] == "model"
-    maps = told({n: d for n, d in folder(root).items() if n.startswith("maps/")})
+    maps = read_upload({n: d for n, d in folder(root).items() if n.startswith("maps/")})
     (grid,) = [p for p in maps.parts.values() if isinstance(p, OccupancyGrid)]
     rows, columns = np.nonzero(grid.cells == 100)
     x = grid.origin[0] + (columns + 0.5) * grid.resolution
@@ -881,12 +885,12 @@ def test_collada_units_are_applied_and_the_up_axis_is_not(shared: Path, facts_js
 
 def test_known_obstacles_are_points_in_rows(shared: Path) -> None:
     path = shared / "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config/world"
-    found = told({"known_obstacles.yaml": (path / "known_obstacles.yaml").read_bytes()})
-    part = objects(found)
+    bundle = read_upload({"known_obstacles.yaml": (path / "known_obstacles.yaml").read_bytes()})
+    part = objects(bundle)
     assert part.ids[0] == "tunnel_0/row_0/0"
     assert part.properties[0]["pose"] == pytest.approx([20.47, -11.17, 0, 0, 0, 4.86 - 2 * math.pi])
     # They are the feet of the world's poles.
-    poles = told({"gazebo.world": (path / "gazebo.world").read_bytes()})
+    poles = read_upload({"gazebo.world": (path / "gazebo.world").read_bytes()})
     feet = {tuple(np.round(p["pose"][:2], 2)) for p in objects(poles).properties if str(p["name"]).startswith("pole_")}
     rows = {tuple(np.round(p["pose"][:2], 2)) for p in part.properties}
     assert len(rows & feet) > 0.9 * len(rows)
@@ -897,15 +901,15 @@ def test_known_obstacles_are_points_in_rows(shared: Path) -> None:
 
 def test_the_generators_lists(shared: Path) -> None:
     root = shared / "data/gazebo_sdf/environment_common_test_files"
-    found = told({n: (root / n).read_bytes() for n in ("objects.yaml", "models.yaml")})
-    part = objects(found)
+    bundle = read_upload({n: (root / n).read_bytes() for n in ("objects.yaml", "models.yaml")})
+    part = objects(bundle)
     assert part.ids == ("ground_plane", "item_a", "item_b", "item_c", "item_d", "item_e", "item_d#2")
     assert part.geometry[0].bounds == (-5.0, -10.0, 5.0, 10.0)
     assert part.properties[4]["pose"] == [-10.0, 20.0, 0.0, 0.0, 0.0, 0.0]
     assert part.properties[4]["gazebo"]["type"] == "model_3"
-    assert found.files["models.yaml"].used
+    assert bundle.files["models.yaml"].used
     shelf = b'<sdf version="1.6"><model name="m"><pose>0 0 1 0 0 0</pose>' + LINK.encode() + b"</model></sdf>"
-    more = told({"objects.yaml": (root / "objects.yaml").read_bytes(), "custom_models/model_3/model.sdf": shelf})
+    more = read_upload({"objects.yaml": (root / "objects.yaml").read_bytes(), "custom_models/model_3/model.sdf": shelf})
     by = {f.id: f for f in objects(more)}
     assert by["item_d"].properties["shapes"] == [{"type": "box", "size": [2, 1, 1], "pose": [0, 0, 1, 0, 0, 0]}]
     assert by["item_d"].geometry.bounds == (-11.0, 19.5, -9.0, 20.5)
@@ -955,7 +959,7 @@ def test_empty_worlds_are_kept_and_come_back() -> None:
 )  # fmt: skip
 def test_what_cannot_be_used_is_refused_with_a_reason(inner: str, reason: str) -> None:
     with pytest.raises(BadUpload) as caught:
-        told(world(inner))
+        read_upload(world(inner))
     assert reason in caught.value.detail
     assert caught.value.problems[0].file == "a.world"
 
@@ -976,15 +980,17 @@ def test_what_cannot_be_used_is_refused_with_a_reason(inner: str, reason: str) -
 )
 def test_lists_that_cannot_be_used(text: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
-        told({"objects.yaml": text.encode()}, "gazebo")
+        read_upload({"objects.yaml": text.encode()}, "gazebo")
     assert caught.value.problems[0].file == "objects.yaml"
 
 
 def test_stored_text_that_was_tampered_with_is_made_anew() -> None:
-    part = objects(told(world(f"<model name='m'>{LINK}</model>")))
+    part = objects(read_upload(world(f"<model name='m'>{LINK}</model>")))
     for text in ("<model", "<plugin/>", "<!DOCTYPE a><model/>", 5):
-        own = {**part.properties[0]["gazebo"], "sdf": text}
-        bad = Features(part.ids, part.geometry, ({**part.properties[0], "gazebo": own},), part.local, part.document)
+        source_properties = {**part.properties[0]["gazebo"], "sdf": text}
+        bad = Features(
+            part.ids, part.geometry, ({**part.properties[0], "gazebo": source_properties},), part.local, part.document
+        )
         files = write({OBJECTS: bad})
         (model,) = tree(files).findall("model")
         assert model.findtext("link/collision/geometry/box/size") == "2.0 1.0 1.0"
@@ -1010,6 +1016,6 @@ def test_unknown_elements_are_named_but_those_of_plugins() -> None:
         "<plugin name='p' filename='f'><anything/></plugin></link></model>"
     )
     text = f"<sdf version='1.7'><world name='w'>\n{model}</world></sdf>"
-    (warning,) = told({"w.world": text.encode()}).warnings
+    (warning,) = read_upload({"w.world": text.encode()}).warnings
     assert warning.problem == "unknown elements, kept without effect: <colision> (did you mean collision?)"
     assert warning.line == 2

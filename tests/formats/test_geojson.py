@@ -37,8 +37,8 @@ def read(data: bytes | str | dict[str, Any], context: ReadContext | None = None,
     if isinstance(data, dict):
         data = json.dumps(data)
     raw = data.encode() if isinstance(data, str) else data
-    known = formats.get_format("geojson")
-    return formats.read(Group(known, "a.geojson", {"a.geojson": raw}), context or ReadContext(**options))
+    fmt = formats.get_format("geojson")
+    return formats.read(Group(fmt, "a.geojson", {"a.geojson": raw}), context or ReadContext(**options))
 
 
 def write(layers: Layers, context: WriteContext | None = None) -> bytes:
@@ -47,9 +47,9 @@ def write(layers: Layers, context: WriteContext | None = None) -> bytes:
 
 
 def part(layers: Layers, key: PartKey) -> Features:
-    found = layers.parts[key]
-    assert isinstance(found, Features)
-    return found
+    content = layers.parts[key]
+    assert isinstance(content, Features)
+    return content
 
 
 def feature(geometry: Any, properties: Any = None, **members: Any) -> dict[str, Any]:
@@ -80,9 +80,9 @@ def same_features(a: Features, b: Features, metres: float = 0.0) -> None:
 def test_a_collection_comes_back_whole(datum: Datum | None) -> None:
     served = orjson.loads(write(Layers(read(SAMPLE.read_bytes()).parts, datum)))
     original = orjson.loads(SAMPLE.read_bytes())
-    own = served.pop("fleet_map", None)
+    fleet_map = served.pop("fleet_map", None)
     assert served == original
-    assert (own is None) == (datum is None)
+    assert (fleet_map is None) == (datum is None)
     assert geojson.detect("x", SAMPLE.read_bytes())
 
 
@@ -277,14 +277,14 @@ def test_a_drawing_is_not_written_twice() -> None:
     drawing = read(SAMPLE.read_bytes())
     from app.model.network import from_drawing
 
-    made = from_drawing(part(drawing, HOME))
-    assert len(made) > 4
-    served = orjson.loads(write(Layers({**drawing.parts, TOPOLOGY: made})))
+    network = from_drawing(part(drawing, HOME))
+    assert len(network) > 4
+    served = orjson.loads(write(Layers({**drawing.parts, TOPOLOGY: network})))
     assert [f.get("id") for f in served["features"]] == [
         f.get("id") for f in orjson.loads(SAMPLE.read_bytes())["features"]
     ]
-    alone = orjson.loads(write(Layers({TOPOLOGY: made})))
-    assert len(alone["features"]) == len(made)
+    alone = orjson.loads(write(Layers({TOPOLOGY: network})))
+    assert len(alone["features"]) == len(network)
 
 
 def test_local_objects_of_an_upload_stay_local() -> None:
@@ -331,8 +331,10 @@ def test_ogr_reads_it(tmp_path: Path) -> None:
     ):
         path = tmp_path / f"{name}.geojson"
         path.write_bytes(write(layers))
-        said = subprocess.run([tool, "-ro", "-so", "-al", str(path)], check=True, capture_output=True, text=True).stdout
-        assert sum(int(line.split(":")[1]) for line in said.splitlines() if line.startswith("Feature Count")) == count
+        output = subprocess.run(
+            [tool, "-ro", "-so", "-al", str(path)], check=True, capture_output=True, text=True
+        ).stdout
+        assert sum(int(line.split(":")[1]) for line in output.splitlines() if line.startswith("Feature Count")) == count
 
 
 # --- hostile bytes -----------------------------------------------------------------------------------------------

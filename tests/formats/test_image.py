@@ -230,7 +230,7 @@ def test_an_unknown_critical_chunk_and_a_late_header_are_refused() -> None:
 @pytest.mark.parametrize("name", pictures())
 def test_a_cut_picture_is_refused_or_whole(name: str) -> None:
     data = pictures()[name]
-    whole, opaque = _image.read_grey(data, LIMITS).pixels()
+    original, opaque = _image.read_grey(data, LIMITS).pixels()
     refused = 0
     for end in sorted({*range(0, len(data), max(1, len(data) // 60)), *range(max(0, len(data) - 20), len(data))}):
         try:
@@ -238,7 +238,7 @@ def test_a_cut_picture_is_refused_or_whole(name: str) -> None:
         except BadUpload:
             refused += 1
         else:
-            assert (cut == whole).all()
+            assert (cut == original).all()
             assert (clear is None) == (opaque is None)
     assert refused > 50
 
@@ -246,7 +246,7 @@ def test_a_cut_picture_is_refused_or_whole(name: str) -> None:
 @pytest.mark.parametrize("name", pictures())
 def test_a_flipped_bit_never_crashes_and_a_png_never_lies(name: str) -> None:
     data = pictures()[name]
-    whole = grey(data)
+    original = grey(data)
     dice = random.Random(name)
     for _ in range(60):
         damaged = bytearray(data)
@@ -256,7 +256,7 @@ def test_a_flipped_bit_never_crashes_and_a_png_never_lies(name: str) -> None:
         except BadUpload:
             continue
         if name.endswith(".png"):
-            assert (shades == whole).all()  # every byte of a chunk is under its checksum
+            assert (shades == original).all()  # every byte of a chunk is under its checksum
 
 
 @given(
@@ -266,11 +266,11 @@ def test_a_flipped_bit_never_crashes_and_a_png_never_lies(name: str) -> None:
 @settings(max_examples=300, deadline=None)
 def test_any_bytes_are_refused_or_read(body: bytes, head: bytes) -> None:
     try:
-        found = _image.read_grey(head + body, Limits(pixels=10_000))
-        shades, _ = found.pixels()
+        image = _image.read_grey(head + body, Limits(pixels=10_000))
+        shades, _ = image.pixels()
     except BadUpload:
         return
-    assert shades.shape == (found.height, found.width)
+    assert shades.shape == (image.height, image.width)
 
 
 @pytest.mark.parametrize("bands", [1, 2, 3, 4])
@@ -336,10 +336,10 @@ def test_a_coloured_png_in_strips_is_what_pillow_decodes_in_one(mode: str, shape
     hills = np.add.outer(np.arange(shape[0]), np.arange(shape[1]))[..., None] // 3 + np.arange(len(mode)) * 40
     pixels = (hills + dice.integers(0, 3, hills.shape)).astype(np.uint8)  # so that Pillow takes each of PNG's filters
     data = saved(Image.fromarray(pixels, mode), "png")
-    told = _image.png_pixels(data, LIMITS)
-    assert told is not None
-    assert told.dtype == np.uint8
-    assert np.array_equal(told, pixels)
+    decoded_pixels = _image.png_pixels(data, LIMITS)
+    assert decoded_pixels is not None
+    assert decoded_pixels.dtype == np.uint8
+    assert np.array_equal(decoded_pixels, pixels)
 
 
 def test_each_filter_of_a_png_and_many_small_chunks() -> None:
@@ -355,9 +355,9 @@ def test_each_filter_of_a_png_and_many_small_chunks() -> None:
     packed = zlib.compress(b"".join(rows))
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, len(rows), 8, 2, 0, 0, 0))
     small = b"".join(chunk(b"IDAT", packed[k : k + 3]) for k in range(0, len(packed), 3))
-    told = _image.png_pixels(_image.PNG_MAGIC + header + small + chunk(b"IEND", b""), LIMITS)
-    assert told is not None
-    assert told.reshape(len(rows), width * bands).tolist() == [
+    decoded_pixels = _image.png_pixels(_image.PNG_MAGIC + header + small + chunk(b"IEND", b""), LIMITS)
+    assert decoded_pixels is not None
+    assert decoded_pixels.reshape(len(rows), width * bands).tolist() == [
         [1, 2, 3, 4, 5, 6],
         [10, 10, 10, 11, 11, 11],
         [11, 11, 11, 12, 12, 12],
@@ -384,10 +384,10 @@ def test_a_coloured_png_that_ends_too_soon_is_refused() -> None:
 
 
 def test_long_packed_pixels_stand_in_several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = _image.encode_png(COLOURS)
+    original = _image.encode_png(COLOURS)
     monkeypatch.setattr(_image._Packed, "MOST", 1000)
     parted = _image.encode_png(COLOURS)
-    assert parted.count(b"IDAT") == -(-whole.index(b"IEND") // 1000) > whole.count(b"IDAT") == 1
+    assert parted.count(b"IDAT") == -(-original.index(b"IEND") // 1000) > original.count(b"IDAT") == 1
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(parted))), COLOURS)
 
 
@@ -395,9 +395,9 @@ def test_memory_of_reading_a_coloured_png_stays_near_its_pixels() -> None:
     data = saved(Image.fromarray(RANDOM.integers(0, 256, (3000, 2000, 3), np.uint8)), "png")
     tracemalloc.start()
     try:
-        told = _image.png_pixels(data, LIMITS)
+        decoded_pixels = _image.png_pixels(data, LIMITS)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert told is not None
-    assert peak < 1.5 * told.nbytes
+    assert decoded_pixels is not None
+    assert peak < 1.5 * decoded_pixels.nbytes

@@ -32,8 +32,8 @@ DATUM = Datum(50.0, 7.0, 60.0, 33.0)
 
 
 def load(data: bytes, name: str = "a.kml", **context: Any) -> tuple[Layers, ReadContext]:
-    told = ReadContext(**context)
-    return read(Group(get_format("kml"), name, {name: data}), told), told
+    read_context = ReadContext(**context)
+    return read(Group(get_format("kml"), name, {name: data}), read_context), read_context
 
 
 def save(layers: Layers, **context: Any) -> bytes:
@@ -56,9 +56,11 @@ def changed(layers: Layers, place: int, geometry: Any = None, **properties: Any)
     shapes = part.geometry.copy()
     if geometry is not None:
         shapes[place] = geometry
-    told = list(part.properties)
-    told[place] = {k: v for k, v in {**told[place], **properties}.items() if v is not None}
-    return Layers({**layers.parts, OBJECTS: Features(part.ids, shapes, tuple(told), part.local.copy(), part.document)})
+    new_properties = list(part.properties)
+    new_properties[place] = {k: v for k, v in {**new_properties[place], **properties}.items() if v is not None}
+    return Layers(
+        {**layers.parts, OBJECTS: Features(part.ids, shapes, tuple(new_properties), part.local.copy(), part.document)}
+    )
 
 
 def equal(a: Layers, b: Layers) -> None:
@@ -91,9 +93,9 @@ UNCOUNTABLE = {"kml/libkml/all-unknown-input.kml"}
 
 @pytest.fixture(scope="session")
 def real(shared: Path, facts_json: dict[str, Any]) -> dict[str, bytes]:
-    found = {name: (shared / "data" / name).read_bytes() for name in facts_json if name.endswith(".kml")}
-    assert len(found) >= 30
-    return found
+    files = {name: (shared / "data" / name).read_bytes() for name in facts_json if name.endswith(".kml")}
+    assert len(files) >= 30
+    return files
 
 
 def test_every_real_drawing_comes_back_whole(real, same):
@@ -129,23 +131,23 @@ def test_placemarks_geometries_and_bounds_are_those_counted_by_others(real, fact
         "Polygon": {"Polygon"},
     }
     for name, data in real.items():
-        known = facts_json[name].get("facts", {})
+        facts = facts_json[name].get("facts", {})
         if name in REFUSED | UNCOUNTABLE | {"kml/libkml/old_schema_example.kml", "kml/togeojson/addresses.kml"}:
             continue
         layers, _ = load(data)
         part = objects(layers)
         drawn = [k for k, p in enumerate(part.properties) if p["kml"]["xml"].startswith("<Placemark")]
-        assert len(drawn) == known["placemarks"], name
-        counted = known["placemarks_by_geometry"]
+        assert len(drawn) == facts["placemarks"], name
+        counted = facts["placemarks_by_geometry"]
         for ours, theirs in types.items():
             expected = sum(counted.get(t, 0) for t in theirs)
             empty = sum(part.geometry[k].is_empty for k in drawn) - counted.get("none", 0)
-            found = sum(part.geometry[k].geom_type == ours for k in drawn)
-            assert found in (expected, expected - empty), name
-        tracks = "gx:coord" in known["coordinate_tuples_by_parent"]  # not in the counted box
-        if "bbox_lonlat" in known and not tracks and "all-altitudemodes" not in name and "badcoords" not in name:
+            geometry_count = sum(part.geometry[k].geom_type == ours for k in drawn)
+            assert geometry_count in (expected, expected - empty), name
+        tracks = "gx:coord" in facts["coordinate_tuples_by_parent"]  # not in the counted box
+        if "bbox_lonlat" in facts and not tracks and "all-altitudemodes" not in name and "badcoords" not in name:
             shapes = [g for g, p in zip(part.geometry, part.properties, strict=True) if p["kind"] != "overlay"]
-            assert np.allclose(shapely.total_bounds(shapes), known["bbox_lonlat"], rtol=0, atol=1e-9), name
+            assert np.allclose(shapely.total_bounds(shapes), facts["bbox_lonlat"], rtol=0, atol=1e-9), name
 
 
 def test_repeated_names_are_stored_with_one_warning(real):
@@ -331,10 +333,10 @@ def test_several_drawings_in_one_part_keep_their_own_styles(same):
     assert save(Layers({OBJECTS: again})) == data
     for part, (name, original) in zip(parts, files.items(), strict=True):
         (key,) = part.document["kml"]["documents"]
-        mine = [k for k, p in enumerate(again.properties) if p["kml"]["document"] == key]
+        indices = [k for k, p in enumerate(again.properties) if p["kml"]["document"] == key]
         alone = {"kml": {"documents": {key: again.document["kml"]["documents"][key]}}}
         assert (
-            same("kml", {name: original}, {"b.kml": save(Layers({OBJECTS: again.take(mine).with_document(alone)}))})
+            same("kml", {name: original}, {"b.kml": save(Layers({OBJECTS: again.take(indices).with_document(alone)}))})
             == []
         )
 
@@ -367,13 +369,13 @@ def test_placemarks_of_the_oldest_form_are_kept_with_a_warning(real, same):
 
 def test_what_only_kml_knows_can_be_left_out():
     data = (SAMPLES / "orchard.kml").read_bytes()
-    whole, short = objects(load(data)[0]), objects(load(data, whole=False)[0])
-    assert short.ids == whole.ids
-    assert all(a.equals(b) for a, b in zip(short.geometry, whole.geometry, strict=True))
-    assert [{**p, "kml": 0} for p in short.properties] == [{**p, "kml": 0} for p in whole.properties]
+    complete, short = objects(load(data)[0]), objects(load(data, whole=False)[0])
+    assert short.ids == complete.ids
+    assert all(a.equals(b) for a, b in zip(short.geometry, complete.geometry, strict=True))
+    assert [{**p, "kml": 0} for p in short.properties] == [{**p, "kml": 0} for p in complete.properties]
     assert short.properties[1]["kml"]["data"] == {"kind": "apple"}
     assert short.document == {}
-    assert sorted(objects(load(save(Layers({OBJECTS: short})))[0]).ids) == sorted(whole.ids)
+    assert sorted(objects(load(save(Layers({OBJECTS: short})))[0]).ids) == sorted(complete.ids)
 
 
 def test_documents_are_merged_by_key_at_every_depth():
@@ -404,21 +406,35 @@ def network(n: int = 12) -> Features:
     rows: list[tuple[str, Any, dict[str, Any]]] = []
     for k in range(n):
         verts = [{"x": 0.1 * v, "y": -0.3} for v in range(4)]
-        told = {"meta": {"map": "m & m", "pointset": "<p>"}, "verts": verts, "restrictions_runtime": "'True'"}
+        source_properties = {
+            "meta": {"map": "m & m", "pointset": "<p>"},
+            "verts": verts,
+            "restrictions_runtime": "'True'",
+        }
         turn = [0.0, 0.0, math.sin(angle[k] / 2), math.cos(angle[k] / 2)]
         rows.append(
-            (f"P{k}", shapely.Point(xy[k]), {"kind": "node", "name": f"P{k}", "orientation": turn, "tmap2": told})
+            (
+                f"P{k}",
+                shapely.Point(xy[k]),
+                {"kind": "node", "name": f"P{k}", "orientation": turn, "tmap2": source_properties},
+            )
         )
     for k in range(n):
         for m in ((k + 1) % n, k - 1 if k else n - 1):
-            told = {
+            source_properties = {
                 "config": [],
                 "fluid_navigation": True,
                 "goal": {"target_pose": {"pose": "$node.pose"}},
                 "n": 1,
                 "r": 1.0,
             }
-            edge = {"kind": "edge", "source": f"P{k}", "target": f"P{m}", "action": "NavigateToPose", "tmap2": told}
+            edge = {
+                "kind": "edge",
+                "source": f"P{k}",
+                "target": f"P{m}",
+                "action": "NavigateToPose",
+                "tmap2": source_properties,
+            }
             rows.append((f"P{k}_P{m}", shapely.LineString(xy[[k, m]]), edge))
     return features(rows, "local", {"tmap2": {"name": "ring", "metric_map": "m"}})
 
@@ -465,12 +481,12 @@ def test_all_vector_layers_travel_whole():
     )
     data = save(layers, attribution=("© somebody & co",))
     again, _ = load(data)
-    said = {
+    parts = {
         k: p.with_document({**p.document, "attribution": ["© somebody & co"]})
         for k, p in layers.parts.items()
         if isinstance(p, Features)
     }
-    equal(Layers({**layers.parts, **said}, layers.datum, layers.levels), again)
+    equal(Layers({**layers.parts, **parts}, layers.datum, layers.levels), again)
     assert again.elevation("upper") == 3.5
     assert "© somebody &amp; co" in data.decode()
     assert save(again, attribution=("© somebody & co",)) == data
@@ -519,12 +535,12 @@ def test_what_was_moved_in_the_drawing_moves_in_metres():
 
 
 def test_a_network_made_from_the_drawing_is_not_drawn_twice(orchard, same):
-    made = features([("a", shapely.Point(7.0011, 50.0006), {"kind": "node", "drawn_from": "Row"})], "wgs84")
+    drawn_network = features([("a", shapely.Point(7.0011, 50.0006), {"kind": "node", "drawn_from": "Row"})], "wgs84")
     other = features([("b", shapely.Point(7.0011, 50.0006), {"kind": "node", "drawn_from": "gone"})], "wgs84")
-    data = save(Layers({**orchard.parts, TOPOLOGY: made}))
+    data = save(Layers({**orchard.parts, TOPOLOGY: drawn_network}))
     assert same("kml", {"a.kml": (SAMPLES / "orchard.kml").read_bytes()}, {"b.kml": data}) == []
-    kept, _ = load(save(Layers({**orchard.parts, TOPOLOGY: concatenate([made, other])})))
-    part = kept.parts[TOPOLOGY]
+    layers, _ = load(save(Layers({**orchard.parts, TOPOLOGY: concatenate([drawn_network, other])})))
+    part = layers.parts[TOPOLOGY]
     assert isinstance(part, Features)
     assert part.ids == ("b",)
 
@@ -550,9 +566,9 @@ def test_a_grid_tells_where_it_lies():
         np.array([[(sides["east"] + sides["west"]) / 2, (sides["north"] + sides["south"]) / 2]])
     )
     assert np.allclose(middle, grid.corners().mean(axis=0), atol=1e-3)
-    again, told = load(save(layers))
+    again, read_context = load(save(layers))
     assert not again.of("occupancy")
-    assert any("KMZ" in w.problem for w in told.warnings)
+    assert any("KMZ" in w.problem for w in read_context.warnings)
     assert again.datum == DATUM
 
 
@@ -574,8 +590,8 @@ VALUES = st.recursive(
 @settings(deadline=None, max_examples=200)
 @given(name=TEXTS, properties=st.dictionaries(TEXTS, VALUES, max_size=5))
 def test_any_property_travels_whole(name, properties):
-    told = {"kind": "node", **properties, "name": name}
-    part = features([("p", shapely.Point(1.0, 2.0), told)], "local", {"x": {"y": name}})
+    node_properties = {"kind": "node", **properties, "name": name}
+    part = features([("p", shapely.Point(1.0, 2.0), node_properties)], "local", {"x": {"y": name}})
     layers = Layers({TOPOLOGY: part}, DATUM)
     equal(layers, load(save(layers))[0])
 
@@ -742,8 +758,8 @@ def test_another_reader_reads_what_we_write(orchard, tmp_path):
             pytest.fail("ogrinfo is absent")
         pytest.skip("ogrinfo is absent")
     layers = Layers({**orchard.parts, TOPOLOGY: network()}, DATUM)
-    for name, told in (("both.kml", layers), ("alone.kml", Layers({TOPOLOGY: network()}, DATUM))):
-        (tmp_path / name).write_bytes(save(told))
+    for name, content in (("both.kml", layers), ("alone.kml", Layers({TOPOLOGY: network()}, DATUM))):
+        (tmp_path / name).write_bytes(save(content))
         command = [tool, "-ro", "-al", "-so", str(tmp_path / name)]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         assert "ERROR" not in done.stdout + done.stderr

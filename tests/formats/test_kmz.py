@@ -57,9 +57,9 @@ def save(layers: Layers) -> bytes:
 
 @pytest.fixture(scope="session")
 def real(shared: Path, facts_json: dict[str, Any]) -> dict[str, bytes]:
-    found = {name: (shared / "data" / name).read_bytes() for name in facts_json if name.endswith(".kmz")}
-    assert len(found) >= 10
-    return found
+    files = {name: (shared / "data" / name).read_bytes() for name in facts_json if name.endswith(".kmz")}
+    assert len(files) >= 10
+    return files
 
 
 REFUSED = {
@@ -77,13 +77,13 @@ def test_every_real_archive_comes_back_whole(real, same, facts_json):
         once = save(layers)
         assert same("kmz", {"a.kmz": data}, {"b.kmz": once}) == [], name
         assert save(load(once)) == once, name
-        known = facts_json[name]["facts"]
+        facts = facts_json[name]["facts"]
         with zipfile.ZipFile(io.BytesIO(once)) as archive:
-            assert archive.namelist()[0] == known["first_kml_entry"]
+            assert archive.namelist()[0] == facts["first_kml_entry"]
         part = layers.parts[OBJECTS]
         assert isinstance(part, Features)
         drawn = [p for p in part.properties if p["kml"]["xml"].startswith("<Placemark")]
-        assert len(drawn) == known["first_kml"]["placemarks"], name
+        assert len(drawn) == facts["first_kml"]["placemarks"], name
 
 
 def test_hostile_and_damaged_archives_are_refused(real):
@@ -232,10 +232,10 @@ def test_pictures_come_back_from_kmz_at_the_same_place(bands: int, place: dict[s
     assert context.dropped == []
     again = load(data).parts
     assert list(again) == [key]
-    made = again[key]
-    assert isinstance(made, Picture)
-    assert (made.pixels == picture.pixels).all()
-    assert (made.transform, made.crs, made.properties) == (picture.transform, picture.crs, picture.properties)
+    image = again[key]
+    assert isinstance(image, Picture)
+    assert (image.pixels == picture.pixels).all()
+    assert (image.transform, image.crs, image.properties) == (picture.transform, picture.crs, picture.properties)
 
 
 def test_a_picture_s_overlay_lies_where_pyproj_says() -> None:
@@ -258,19 +258,19 @@ def test_a_picture_s_overlay_lies_where_pyproj_says() -> None:
 
 
 def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
-    known, key = get_format("kml"), PartKey("imagery", name="aerial")
+    fmt, key = get_format("kml"), PartKey("imagery", name="aerial")
     layers = Layers({key: a_picture(**EARTH)}, DATUM)
     bare = WriteContext()
-    assert list(write(known, layers, bare)) == ["map.kml"]
+    assert list(write(fmt, layers, bare)) == ["map.kml"]
     assert [(d["what"], d["count"]) for d in bare.dropped] == [("imagery", 1)]
-    files = write(known, layers, WriteContext(options=write_options(known, {"pictures": "true"})))
+    files = write(fmt, layers, WriteContext(options=write_options(fmt, {"pictures": "true"})))
     assert list(files) == ["map.kml", "aerial.png"]
     (item,), rest = group({f"a/{name}": data for name, data in files.items()})
     assert (item.format.name, sorted(item.files), rest) == ("kml", ["a/aerial.png", "a/map.kml"], [])
     assert list(read(item, ReadContext()).parts) == [key]
-    told = ReadContext()
-    assert not read(Group(known, "map.kml", {"map.kml": files["map.kml"]}), told).parts
-    assert "'aerial.png' is not in the upload" in told.warnings[0].problem
+    context = ReadContext()
+    assert not read(Group(fmt, "map.kml", {"map.kml": files["map.kml"]}), context).parts
+    assert "'aerial.png' is not in the upload" in context.warnings[0].problem
 
 
 @pytest.mark.parametrize(
@@ -285,29 +285,29 @@ def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
     ids=["no datum", "off earth", "antimeridian", "polar", "no such CRS"],
 )
 def test_pictures_without_a_place_are_dropped_and_told(picture: Picture, datum: Datum | None, reason: str) -> None:
-    told = WriteContext()
-    data = write(get_format("kmz"), Layers({PartKey("imagery", name="p"): picture}, datum), told)["map.kmz"]
+    context = WriteContext()
+    data = write(get_format("kmz"), Layers({PartKey("imagery", name="p"): picture}, datum), context)["map.kmz"]
     assert list(_archive.unpack(data, Limits())) == ["doc.kml"]
-    (line,) = told.dropped
+    (line,) = context.dropped
     assert (line["what"], line["count"]) == ("imagery ground/p", 1)
     assert line["why"].startswith("it cannot be placed: ")
     assert reason in line["why"]
 
 
 def test_values_that_an_overlay_cannot_show_are_told() -> None:
-    told = WriteContext()
+    context = WriteContext()
     heights = Picture(np.arange(24, dtype=np.float32).reshape(4, 6, 1), **EARTH, properties={"nodata": 3})
-    data = write(get_format("kmz"), Layers({PartKey("imagery", name="dem"): heights}), told)["map.kmz"]
-    assert [d["what"] for d in told.dropped] == ["imagery ground/dem: pixel values"]
-    made = load(data).parts[PartKey("imagery", name="dem")]
-    assert isinstance(made, Picture)
-    assert (made.pixels.shape, made.transform) == ((4, 6, 2), EARTH["transform"])
+    data = write(get_format("kmz"), Layers({PartKey("imagery", name="dem"): heights}), context)["map.kmz"]
+    assert [d["what"] for d in context.dropped] == ["imagery ground/dem: pixel values"]
+    image = load(data).parts[PartKey("imagery", name="dem")]
+    assert isinstance(image, Picture)
+    assert (image.pixels.shape, image.transform) == ((4, 6, 2), EARTH["transform"])
 
 
 def test_images_beside_a_kml_are_those_of_the_files() -> None:
     room = SAMPLES.parent / "occupancy_grid" / "room"
     files = {p.name: p.read_bytes() for p in room.iterdir()}
     kmz = _archive.unpack(offline(files, "kmz", datum=DATUM).files["map.kmz"], Limits())
-    made = offline(files, "kml", datum=DATUM, options={"pictures": "true"}).files
-    assert made["room.png"] == kmz["room.png"]
+    output = offline(files, "kml", datum=DATUM, options={"pictures": "true"}).files
+    assert output["room.png"] == kmz["room.png"]
     assert list(offline(files, "kml", datum=DATUM).files) == ["map.kml"]

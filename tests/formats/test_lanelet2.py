@@ -39,32 +39,32 @@ HERE = Datum(53.2686, -0.5245, heading=20.0)
 
 
 def read(files: bytes | dict[str, bytes], **context: Any) -> tuple[Layers, ReadContext]:
-    said = {"map.osm": files} if isinstance(files, bytes) else files
-    main = next(n for n in said if n.endswith(".osm"))
-    told = ReadContext(main=main, **context)
-    return formats.read(Group(FORMAT, main, said), told), told
+    contents = {"map.osm": files} if isinstance(files, bytes) else files
+    main = next(n for n in contents if n.endswith(".osm"))
+    read_context = ReadContext(main=main, **context)
+    return formats.read(Group(FORMAT, main, contents), read_context), read_context
 
 
 def write(layers: Layers, **context: Any) -> tuple[dict[str, bytes], WriteContext]:
-    told = WriteContext(**context)
-    return formats.write(FORMAT, layers, told), told
+    write_context = WriteContext(**context)
+    return formats.write(FORMAT, layers, write_context), write_context
 
 
 def edited(layers: Layers, key: PartKey, change: Callable[[str, dict[str, Any]], dict[str, Any] | None]) -> Layers:
     """The layers with other properties of one part's items; None takes an item out."""
     part = layers.parts[key]
     assert isinstance(part, Features)
-    said = [change(i, dict(p)) for i, p in zip(part.ids, part.properties, strict=True)]
-    keep = [k for k, p in enumerate(said) if p is not None]
+    properties = [change(i, dict(p)) for i, p in zip(part.ids, part.properties, strict=True)]
+    keep = [k for k, p in enumerate(properties) if p is not None]
     left = part.take(keep)
-    new = Features(left.ids, left.geometry, tuple(p for p in said if p is not None), left.local, left.document)
+    new = Features(left.ids, left.geometry, tuple(p for p in properties if p is not None), left.local, left.document)
     return Layers({**layers.parts, key: new}, layers.datum, layers.levels)
 
 
 def part(layers: Layers, key: PartKey = NETWORK) -> Features:
-    found = layers.parts[key]
-    assert isinstance(found, Features)
-    return found
+    content = layers.parts[key]
+    assert isinstance(content, Features)
+    return content
 
 
 def items(layers: Layers) -> dict[str, tuple[dict[str, Any], Any]]:
@@ -95,9 +95,9 @@ def elements(data: bytes) -> dict[tuple[str, int], dict[str, Any]]:
 
 def further(data: bytes) -> list[tuple[str, dict[str, str]]]:
     root = etree.fromstring(data)
-    known = {k: v for k, v in root.attrib.items() if k != "version"}
+    attributes = {k: v for k, v in root.attrib.items() if k != "version"}
     others = [(e.tag, dict(e.attrib)) for e in root if e.tag not in ("node", "way", "relation")]
-    return [("osm", known), *others]
+    return [("osm", attributes), *others]
 
 
 def assert_same(a: bytes, b: bytes) -> None:
@@ -133,8 +133,8 @@ def test_real_maps_come_back_whole(shared: Path, facts_json: dict[str, Any], nam
     assert_same(files[path.name], back[MAIN])
     assert back.get(PROJECTOR) == files.get(PROJECTOR)
     facts = facts_json[f"lanelet2/{name}"]["facts"]
-    layers, told = read(files)
-    assert not told.warnings
+    layers, context = read(files)
+    assert not context.warnings
     objects = part(layers, OBJECTS)
     kinds = Counter(p["kind"] for p in objects.properties)
     assert kinds["lanelet"] == facts["lanelets"]
@@ -165,9 +165,11 @@ def test_real_lanelets_are_two_way_where_they_say_so(shared: Path) -> None:
 def test_real_lanelets_follow_each_other_as_lanelet2_means_it(shared: Path) -> None:
     """Worked out a second time, one lanelet after the other, from the XML alone."""
     data = (shared / "data/lanelet2/fzi_mapping_example/mapping_example.osm").read_bytes()
-    found = elements(data)
+    osm_elements = elements(data)
     rad = math.radians(49.0)
-    place = {i: (e["place"][1] * math.cos(rad), e["place"][0]) for (kind, i), e in found.items() if kind == "node"}
+    place = {
+        i: (e["place"][1] * math.cos(rad), e["place"][0]) for (kind, i), e in osm_elements.items() if kind == "node"
+    }
 
     def side(line: list[int], at: tuple[float, float]) -> float:
         points = [place[r] for r in line]
@@ -186,11 +188,11 @@ def test_real_lanelets_follow_each_other_as_lanelet2_means_it(shared: Path) -> N
 
     starts: dict[str, tuple[int, int]] = {}
     ends: dict[str, tuple[int, int]] = {}
-    for (kind, i), e in found.items():
+    for (kind, i), e in osm_elements.items():
         if kind != "relation" or e["tags"]["type"] != "lanelet":
             continue
         left, right = (
-            next(found["way", r]["refs"] for _, r, role in e["members"] if role == w) for w in ("left", "right")
+            next(osm_elements["way", r]["refs"] for _, r, role in e["members"] if role == w) for w in ("left", "right")
         )
         left = left[::-1] if side(left, middle(right)) >= 0 else left
         right = right[::-1] if side(right, middle(left)) <= 0 else right
@@ -212,25 +214,25 @@ def test_real_lanelets_follow_each_other_as_lanelet2_means_it(shared: Path) -> N
 
 
 def test_facts_of_a_junction() -> None:
-    layers, told = read(JUNCTION)
+    layers, context = read(JUNCTION)
     facts = FACTS["junction.osm"]
-    found = items(layers)
-    assert found.keys() == facts["nodes"].keys() | facts["edges"].keys()
+    network_items = items(layers)
+    assert network_items.keys() == facts["nodes"].keys() | facts["edges"].keys()
     for i, place in facts["nodes"].items():
-        p, g = found[i]
+        p, g = network_items[i]
         assert p["kind"] == "node"
         np.testing.assert_allclose(shapely.get_coordinates(g, include_z=len(place) > 2)[0], place, atol=1e-12)
         assert g.has_z == (len(place) > 2)
     for i, (source, target, width, speed) in facts["edges"].items():
-        p, g = found[i]
+        p, g = network_items[i]
         assert (p["source"], p["target"]) == (source, target)
         assert p["width"] == pytest.approx(width, abs=1e-3)
         assert p.get("speed_limit") == speed
         ends = [facts["nodes"][n][:2] for n in (source, target)]
         np.testing.assert_allclose(shapely.get_coordinates(g)[[0, -1]], ends, atol=1e-12)
-    assert found["l102"][0]["name"] == "Short Street"
-    assert found["l103"][0]["lanelet2"]["tags"]["subtype"] == "crosswalk"
-    assert [w.where for w in told.warnings] == ["relation 106"], "the deleted lanelet is no road"
+    assert network_items["l102"][0]["name"] == "Short Street"
+    assert network_items["l103"][0]["lanelet2"]["tags"]["subtype"] == "crosswalk"
+    assert [w.where for w in context.warnings] == ["relation 106"], "the deleted lanelet is no road"
     objects = dict(zip(part(layers, OBJECTS).ids, part(layers, OBJECTS).properties, strict=True))
     assert objects["r105"]["kind"] == "area"
     assert objects["w29"]["kind"] == "wall"
@@ -241,16 +243,16 @@ def test_facts_of_a_junction() -> None:
 
 
 def test_facts_of_a_map_in_metres() -> None:
-    layers, told = read(AUTOWARE)
-    assert not told.warnings
+    layers, context = read(AUTOWARE)
+    assert not context.warnings
     facts = FACTS["local"]
     net = part(layers)
     assert net.local.all(), "the projector is Local, so metres count"
-    found = items(layers)
-    assert found.keys() == {*facts["nodes"], "l8", "l8:back"}
+    network_items = items(layers)
+    assert network_items.keys() == {*facts["nodes"], "l8", "l8:back"}
     for i, place in facts["nodes"].items():
-        np.testing.assert_allclose(shapely.get_coordinates(found[i][1], include_z=True)[0], place, atol=1e-9)
-    p, g = found["l8"]
+        np.testing.assert_allclose(shapely.get_coordinates(network_items[i][1], include_z=True)[0], place, atol=1e-9)
+    p, g = network_items["l8"]
     np.testing.assert_allclose(shapely.get_coordinates(g, include_z=True)[1], facts["bend"], atol=1e-6)
     assert (p["width"], p["speed_limit"]) == (facts["width"], facts["speed_limit"])
     back = offline(AUTOWARE, "lanelet2").files
@@ -272,19 +274,19 @@ def test_metres_of_another_frame_are_not_ours() -> None:
     data = f"<osm version='0.6'>{body}</osm>".encode()
     layers, _ = read({"map.osm": data, PROJECTOR: b"projector_type: MGRS\nmgrs_grid: 54SUE\n"})
     assert not part(layers).local.any()
-    files, told = write(layers, options=WriteOptions())
+    files, context = write(layers, options=WriteOptions())
     assert_same(data, files[MAIN].replace(b' generator="Fleet Map Server"', b""))
-    assert not told.dropped
+    assert not context.dropped
     objects = part(layers, OBJECTS)
     moved = objects.geometry.copy()
     k = objects.ids.index("w5")
     moved[k] = shapely.LineString([(0.0, 0.0001), (0.0001, 0.00012)])
     other = Features(objects.ids, moved, objects.properties, objects.local.copy(), objects.document)
-    files, told = write(Layers({OBJECTS: other}), options=WriteOptions())
+    files, context = write(Layers({OBJECTS: other}), options=WriteOptions())
     tags = elements(files[MAIN])["node", 2]["tags"]
     assert tags == {}, "metres that are no longer true are left out"
     assert elements(files[MAIN])["node", 1]["tags"] == {"local_x": "7", "local_y": "5"}
-    assert told.dropped == [
+    assert context.dropped == [
         {"what": "local_x and local_y of moved points", "count": 1, "why": "a Lanelet2 map has no place for them"}
     ]
 
@@ -297,9 +299,9 @@ def test_plain_osm_stays_osm(shared: Path) -> None:
     assert not detect("a.osm", quarter)
     for path in sorted((shared / "data/osm").rglob("*.osm")) + sorted((shared / "data/osm").rglob("osm.xml")):
         assert not detect(path.name, path.read_bytes()), path
-    known = formats.detect("a.osm", quarter)
-    assert known is not None
-    assert known.name == "osm"
+    fmt = formats.detect("a.osm", quarter)
+    assert fmt is not None
+    assert fmt.name == "osm"
     near = quarter.replace(b"</osm>", b'<way id="1"><tag k="name" v="lanelet"/></way></osm>')
     assert near != quarter
     assert not detect("a.osm", near)
@@ -307,9 +309,9 @@ def test_plain_osm_stays_osm(shared: Path) -> None:
 
 def test_lanelets_are_detected_whatever_the_quotes() -> None:
     for data in (JUNCTION, JUNCTION.replace(b"k='type' v='lanelet'", b'v = "lanelet"\n k = "type"')):
-        known = formats.detect("map.osm", data)
-        assert known is not None
-        assert known.name == "lanelet2"
+        fmt = formats.detect("map.osm", data)
+        assert fmt is not None
+        assert fmt.name == "lanelet2"
     assert not detect("a.kml", b"<kml><tag k='type' v='lanelet'/></kml>")
 
 
@@ -375,7 +377,7 @@ def test_a_speed_of_the_network_reaches_the_lanelet() -> None:
 @pytest.mark.parametrize(("gone", "turned"), [("l103:back", False), ("l103", True)])
 def test_a_direction_that_is_gone_makes_the_lanelet_one_way(gone: str, turned: bool) -> None:
     layers, _ = read(JUNCTION)
-    files, told = write(edited(layers, NETWORK, lambda i, p: None if i == gone else p))
+    files, context = write(edited(layers, NETWORK, lambda i, p: None if i == gone else p))
     lanelet = elements(files[MAIN])["relation", 103]
     assert lanelet["tags"]["one_way"] == "yes"
     assert lanelet["members"] == [
@@ -387,19 +389,19 @@ def test_a_direction_that_is_gone_makes_the_lanelet_one_way(gone: str, turned: b
     ends = {(p["source"], p["target"]) for i, (p, _) in items(layers).items() if i in left and p["kind"] == "edge"}
     place = {i: g.coords[0][:2] for i, (p, g) in items(layers).items() if p["kind"] == "node"}
     now = {i: g.coords[0][:2] for i, (p, g) in items(again).items() if p["kind"] == "node"}
-    there = {(now[p["source"]], now[p["target"]]) for p, _ in items(again).values() if p["kind"] == "edge"}
-    assert there == {(place[a], place[b]) for a, b in ends}
-    assert not told.warnings
+    pairs = {(now[p["source"]], now[p["target"]]) for p, _ in items(again).values() if p["kind"] == "edge"}
+    assert pairs == {(place[a], place[b]) for a, b in ends}
+    assert not context.warnings
 
 
 def test_a_lanelet_without_edges_goes_and_its_bounds_stay() -> None:
     layers, _ = read(JUNCTION)
-    files, told = write(edited(layers, NETWORK, lambda i, p: None if i == "l102" else p))
-    found = elements(files[MAIN])
-    assert ("relation", 102) not in found
-    assert {("way", 23), ("way", 24)} <= found.keys()
+    files, context = write(edited(layers, NETWORK, lambda i, p: None if i == "l102" else p))
+    osm_elements = elements(files[MAIN])
+    assert ("relation", 102) not in osm_elements
+    assert {("way", 23), ("way", 24)} <= osm_elements.keys()
     why = "a Lanelet2 map has no place for them"
-    assert told.dropped == [{"what": "lanelets whose edges are no longer in the network", "count": 1, "why": why}]
+    assert context.dropped == [{"what": "lanelets whose edges are no longer in the network", "count": 1, "why": why}]
 
 
 def test_a_redrawn_bound_stays_with_its_lanelet() -> None:
@@ -409,9 +411,9 @@ def test_a_redrawn_bound_stays_with_its_lanelet() -> None:
     shapes[objects.ids.index("w22")] = shapely.LineString([(0.0, 0.0), (0.00005, -0.00001), (0.0001, 0.0)])
     new = Features(objects.ids, shapes, objects.properties, objects.local.copy(), objects.document)
     files, _ = write(Layers({**layers.parts, OBJECTS: new}, Datum(0.0, 0.0)))
-    found = elements(files[MAIN])
-    assert [kind for kind, _ in found].count("relation") == 7, "no lanelet beside it and none lost"
-    refs = found["way", 22]["refs"]
+    osm_elements = elements(files[MAIN])
+    assert [kind for kind, _ in osm_elements].count("relation") == 7, "no lanelet beside it and none lost"
+    refs = osm_elements["way", 22]["refs"]
     assert (refs[0], refs[-1], len(refs)) == (11, 12, 3)
     again, _ = read(files[MAIN])
     assert items(again).keys() == items(layers).keys()
@@ -426,46 +428,46 @@ def test_a_new_edge_joins_the_lanelets_that_are_there() -> None:
     rows += [("end", shapely.Point(0.0003, 0.000015, 3.0), {"kind": "node", "name": "Gate"})]
     rows += [("more", line, {"kind": "edge", "source": "n3:13", "target": "end", "width": 3.0})]
     new = Layers({**layers.parts, NETWORK: features(rows, "wgs84")}, Datum(0.0, 0.0))
-    files, told = write(new)
-    found = elements(files[MAIN])
+    files, context = write(new)
+    osm_elements = elements(files[MAIN])
     before = elements(JUNCTION)
-    assert all(found[key] == before[key] for key in before), "what was there stays as it was"
+    assert all(osm_elements[key] == before[key] for key in before), "what was there stays as it was"
     lanelet = next(
-        e for (kind, i), e in found.items() if kind == "relation" and e["tags"].get("fleetmap:edge") == "more"
+        e for (kind, i), e in osm_elements.items() if kind == "relation" and e["tags"].get("fleetmap:edge") == "more"
     )
-    sides = {role: found["way", i]["refs"] for _, i, role in lanelet["members"]}
+    sides = {role: osm_elements["way", i]["refs"] for _, i, role in lanelet["members"]}
     assert (sides["left"][0], sides["right"][0]) == (3, 13), "its bounds begin where those of the one before end"
     again, _ = read(files[MAIN])
     ids = items(again)
     assert {"more", "end"} <= ids.keys()
     assert ids["end"][0]["name"] == "Gate"
     assert ids["more"][0]["width"] == 3.0
-    assert not told.warnings
+    assert not context.warnings
 
 
 # --- networks from elsewhere ---------------------------------------------------------------------------------------
 
 
-def net(edges: list[tuple[str, str]], places: dict[str, tuple[float, ...]], **said: Any) -> Features:
+def net(edges: list[tuple[str, str]], places: dict[str, tuple[float, ...]], **edge_properties: Any) -> Features:
     rows: list[tuple[str, Any, dict[str, Any]]] = []
     rows += [(i, shapely.Point(*at), {"kind": "node", "name": i}) for i, at in places.items()]
     for a, b in edges:
         line = shapely.LineString([places[a], places[b]])
-        rows.append((f"{a}_{b}", line, {"kind": "edge", "source": a, "target": b, **said}))
+        rows.append((f"{a}_{b}", line, {"kind": "edge", "source": a, "target": b, **edge_properties}))
     return features(rows, "local")
 
 
 def lanelets(data: bytes) -> dict[str, tuple[dict[str, str], dict[str, list[int]], dict[int, tuple[float, float]]]]:
     """By edge: tags, refs by role, and the metres that each point says."""
-    found = elements(data)
+    osm_elements = elements(data)
     metres = {
         i: (float(e["tags"]["local_x"]), float(e["tags"]["local_y"]))
-        for (kind, i), e in found.items()
+        for (kind, i), e in osm_elements.items()
         if kind == "node"
     }
     return {
-        e["tags"]["fleetmap:edge"]: (e["tags"], {r: found["way", i]["refs"] for _, i, r in e["members"]}, metres)
-        for (kind, _), e in found.items()
+        e["tags"]["fleetmap:edge"]: (e["tags"], {r: osm_elements["way", i]["refs"] for _, i, r in e["members"]}, metres)
+        for (kind, _), e in osm_elements.items()
         if kind == "relation"
     }
 
@@ -483,24 +485,24 @@ def valid(data: bytes) -> None:
 def test_a_straight_road_is_worked_out_by_hand() -> None:
     places = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (20.0, 10.0)}
     two = net([("a", "b"), ("b", "a"), ("b", "c")], places, width=2.0, speed_limit=1.5)
-    files, told = write(Layers({NETWORK: two}, HERE))
+    files, context = write(Layers({NETWORK: two}, HERE))
     assert list(files) == [MAIN]
-    found = lanelets(files[MAIN])
-    assert found.keys() == {"a_b", "b_c"}
-    tags, sides, at = found["a_b"]
+    by_edge = lanelets(files[MAIN])
+    assert by_edge.keys() == {"a_b", "b_c"}
+    tags, sides, at = by_edge["a_b"]
     assert (tags["one_way"], tags["fleetmap:back"], tags["speed_limit"], tags["subtype"]) == (
         "no",
         "b_a",
         "5.4",
         "road",
     )
-    assert found["b_c"][0]["one_way"] == "yes"
+    assert by_edge["b_c"][0]["one_way"] == "yes"
     # At b the border stands on the bisector: tan(22.5°) = 0.414214 back on the left, as far ahead on the right.
     corner = math.tan(math.radians(22.5))
     np.testing.assert_allclose([at[r] for r in sides["left"]], [(0, 1), (10 - corner, 1)], atol=1e-6)
     np.testing.assert_allclose([at[r] for r in sides["right"]], [(0, -1), (10 + corner, -1)], atol=1e-6)
-    assert sides["left"][-1] == found["b_c"][1]["left"][0], "lanelets that follow each other share their points"
-    assert sides["right"][-1] == found["b_c"][1]["right"][0]
+    assert sides["left"][-1] == by_edge["b_c"][1]["left"][0], "lanelets that follow each other share their points"
+    assert sides["right"][-1] == by_edge["b_c"][1]["right"][0]
     valid(files[MAIN])
     frame = Layers({}, HERE).frame
     assert frame is not None
@@ -508,8 +510,8 @@ def test_a_straight_road_is_worked_out_by_hand() -> None:
         if kind == "node":
             lat, lon = e["place"]
             np.testing.assert_allclose(frame.to_local(np.array([[lon, lat]]))[0], at[i], atol=1e-6)
-    assert not told.warnings
-    assert {f["what"] for f in told.template} == {"type of bounds", "location of lanelets", "subtype of lanelets"}
+    assert not context.warnings
+    assert {f["what"] for f in context.template} == {"type of bounds", "location of lanelets", "subtype of lanelets"}
 
 
 @pytest.mark.parametrize("arms", [3, 4, 5, 6])
@@ -518,7 +520,7 @@ def test_a_crossing_connects_what_it_can_and_says_what_not(arms: int) -> None:
     for k in range(arms):
         places[f"p{k}"] = (20 * math.cos(k * math.tau / arms), 20 * math.sin(k * math.tau / arms))
     edges = [pair for k in range(arms) for pair in (("m", f"p{k}"), (f"p{k}", "m"))]
-    files, told = write(Layers({NETWORK: net(edges, places)}, HERE))
+    files, context = write(Layers({NETWORK: net(edges, places)}, HERE))
     valid(files[MAIN])
     assert files == write(Layers({NETWORK: net(edges, places)}, HERE))[0]
     ends = []
@@ -528,9 +530,9 @@ def test_a_crossing_connects_what_it_can_and_says_what_not(arms: int) -> None:
         pair = (sides["left"][k], sides["right"][k])
         ends.append(pair if far else pair[::-1])  # looking towards the crossing
     connected = sum(a == b[::-1] for a in ends for b in ends)
-    said = next(w.problem for w in told.warnings)
+    warning = next(w.problem for w in context.warnings)
     possible = arms * (arms - 1)
-    assert said.startswith(f"{possible - connected} of {possible} ways")
+    assert warning.startswith(f"{possible - connected} of {possible} ways")
     assert connected >= possible / 2
     again, _ = read(files[MAIN])
     assert {(p["source"], p["target"]) for p, _ in items(again).values() if p["kind"] == "edge"} == set(edges)
@@ -546,10 +548,10 @@ def test_real_networks_become_valid_lanelets_and_come_back(shared: Path, tmp_pat
     path = shared / "data" / name
     files = {path.name: path.read_bytes()}
     datum = Datum(53.268642038, -0.524509505881) if to == "tmap2" else Datum(44.7644, -93.2073)
-    made = offline(files, "lanelet2", datum=datum)
-    valid(made.files[MAIN])
+    converted = offline(files, "lanelet2", datum=datum)
+    valid(converted.files[MAIN])
     before = read_bundle(files, Hints(), Known(datum), Limits()).layers(datum)
-    after = read_bundle(made.files, Hints(), Known(datum), Limits()).layers(datum)
+    after = read_bundle(converted.files, Hints(), Known(datum), Limits()).layers(datum)
     one, two = part(before), part(after)
     places = dict(zip(two.ids, two.in_local(after.frame), strict=True))
     assert set(one.ids) == set(two.ids)
@@ -560,26 +562,26 @@ def test_real_networks_become_valid_lanelets_and_come_back(shared: Path, tmp_pat
             assert [p.get(w) for w in ("kind", "source", "target", "width")] == [
                 q.get(w) for w in ("kind", "source", "target", "width")
             ]
-    assert offline(made.files, "lanelet2", datum=datum).files == made.files
+    assert offline(converted.files, "lanelet2", datum=datum).files == converted.files
     if shutil.which("osmium"):
-        (tmp_path / MAIN).write_bytes(made.files[MAIN])
-        said = subprocess.run(
+        (tmp_path / MAIN).write_bytes(converted.files[MAIN])
+        process = subprocess.run(
             ["osmium", "fileinfo", "-e", "-j", str(tmp_path / MAIN)], capture_output=True, check=True, timeout=60
         )
-        data = json.loads(said.stdout)["data"]
+        data = json.loads(process.stdout)["data"]
         assert data["objects_ordered"]
-        assert data["count"]["relations"] == len(lanelets(made.files[MAIN]))
+        assert data["count"]["relations"] == len(lanelets(converted.files[MAIN]))
 
 
 @pytest.mark.skipif(not shutil.which("osmium"), reason="osmium is not installed")
 def test_osmium_reads_what_is_written(shared: Path, facts_json: dict[str, Any], tmp_path: Path) -> None:
     name = "lanelet2/fzi_mapping_example/mapping_example.osm"
-    made = offline({"a.osm": (shared / "data" / name).read_bytes()}, "lanelet2").files[MAIN]
-    (tmp_path / MAIN).write_bytes(made)
-    said = subprocess.run(
+    content = offline({"a.osm": (shared / "data" / name).read_bytes()}, "lanelet2").files[MAIN]
+    (tmp_path / MAIN).write_bytes(content)
+    process = subprocess.run(
         ["osmium", "fileinfo", "-e", "-j", str(tmp_path / MAIN)], capture_output=True, check=True, timeout=60
     )
-    data = json.loads(said.stdout)["data"]
+    data = json.loads(process.stdout)["data"]
     facts = facts_json[name]["facts"]["osmium"]
     assert {k: data["count"][k] for k in ("nodes", "ways", "relations")} == {
         k: facts[k] for k in ("nodes", "ways", "relations")
@@ -591,12 +593,12 @@ def test_osmium_reads_what_is_written(shared: Path, facts_json: dict[str, Any], 
 def test_options_are_heeded() -> None:
     one = net([("a", "b")], {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 2.0)})
     options = WriteOptions(width=3.0, subtype="walkway", location="nonurban", bounds="curbstone", projector_info=True)
-    files, told = write(Layers({NETWORK: one}, HERE), options=options)
+    files, context = write(Layers({NETWORK: one}, HERE), options=options)
     tags, sides, at = lanelets(files[MAIN])["a_b"]
     assert (tags["subtype"], tags["location"], "width" in tags) == ("walkway", "nonurban", False)
     assert {at[r][1] for r in sides["left"]} == {1.5}
     assert files[PROJECTOR].startswith(b"projector_type: Local")
-    assert {"what": "width of lanes", "value": 3.0, "why": "1 edges say none", "option": "width"} in told.template
+    assert {"what": "width of lanes", "value": 3.0, "why": "1 edges say none", "option": "width"} in context.template
     assert [e["tags"]["type"] for (kind, _), e in elements(files[MAIN]).items() if kind == "way"].count(
         "curbstone"
     ) == 2
@@ -621,11 +623,11 @@ def test_sharp_bends_and_narrow_places_stay_sound() -> None:
         ("c", shapely.Point(0, 5), {"kind": "node"}),
         ("nothing", shapely.LineString([(0, 5), (0, 5)]), {"kind": "edge", "source": "b", "target": "c"}),
     ]
-    files, told = write(Layers({NETWORK: features(rows, "local")}, HERE))
+    files, context = write(Layers({NETWORK: features(rows, "local")}, HERE))
     valid(files[MAIN])
     assert lanelets(files[MAIN]).keys() == {"e"}
-    assert any("narrower" in w.problem for w in told.warnings)
-    assert {"edges without length", "edges from a node to itself"} <= {d["what"] for d in told.dropped}
+    assert any("narrower" in w.problem for w in context.warnings)
+    assert {"edges without length", "edges from a node to itself"} <= {d["what"] for d in context.dropped}
 
 
 def test_without_a_datum_it_says_what_to_supply() -> None:
@@ -675,9 +677,9 @@ def test_limits_hold() -> None:
 def test_broken_lanelets_are_kept_and_told(old: bytes, new: bytes) -> None:
     data = JUNCTION.replace(old, new, 1)
     assert data != JUNCTION
-    layers, told = read(data)
+    layers, context = read(data)
     assert "l102" not in items(layers)
-    assert any(w.where == "relation 102" for w in told.warnings)
+    assert any(w.where == "relation 102" for w in context.warnings)
     files, _ = write(layers)
     assert_same(data, files[MAIN])
 

@@ -65,8 +65,8 @@ def test_places_by_the_files_own_crs() -> None:
     pipe = f"+proj=tmerc +lat_0={layers.datum.latitude} +lon_0={layers.datum.longitude} +k=1 +ellps=WGS84"
     x, y = Transformer.from_crs("EPSG:4326", pipe, always_xy=True).transform(lon, lat)
     want = {tuple(int(np.floor(round(v / 0.01, 4))) for v in p) for p in zip(x, y, (50.0, 51.0, 52.5), strict=True)}
-    mine = set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
-    assert mine == want
+    cells = set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
+    assert cells == want
     assert any("no datum" in w.problem for w in context.warnings)
 
 
@@ -136,8 +136,8 @@ def test_the_same_file_comes_back_and_the_other_kind_holds_the_same() -> None:
 
 
 def test_dimensions_of_a_real_las_reach_the_others() -> None:
-    told, rows = clouds.pcd(written({"a.las": FIELD}, "pcd", frame="source"))
-    fields = told["FIELDS"].split()
+    header, rows = clouds.pcd(written({"a.las": FIELD}, "pcd", frame="source"))
+    fields = header["FIELDS"].split()
     assert fields[:4] == ["x", "y", "z", "intensity"]
     assert {"return_number", "classification", "gps_time", "user_data", "point_source_id", "scan_angle_rank"} <= {
         *fields
@@ -151,15 +151,15 @@ def test_dimensions_of_a_real_las_reach_the_others() -> None:
 def test_local_coordinates_in_other_formats_agree_with_the_voxels() -> None:
     voxels, _, _ = read(FIELD)
     _, rows = clouds.ply(written({"a.las": FIELD}, "ply"))
-    mine = {tuple(int(np.floor(v / 0.05)) for v in row[:3]) for row in rows}
-    assert mine == set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
+    cells = {tuple(int(np.floor(v / 0.05)) for v in row[:3]) for row in rows}
+    assert cells == set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
 
 
 def test_another_cloud_as_las() -> None:
     shelf = (SAMPLES / "pcd" / "shelf.pcd").read_bytes()
-    told = offline({"shelf.pcd": shelf}, "las")
-    las = points(told.files["map.las"])
-    assert ("points", 1) in [(d["what"], d["count"]) for d in told.report["dropped"]], "the NaN"
+    converted = offline({"shelf.pcd": shelf}, "las")
+    las = points(converted.files["map.las"])
+    assert ("points", 1) in [(d["what"], d["count"]) for d in converted.report["dropped"]], "the NaN"
     assert str(las.header.version) == "1.4"
     assert las.point_format.id == 7
     assert list(las.header.scales) == [0.001] * 3
@@ -168,7 +168,7 @@ def test_another_cloud_as_las() -> None:
     assert las.red.tolist() == [(p[3] >> 16) * 257 for p in truth]
     assert las["label"].tolist() == [p[4] for p in truth]
     assert las["feature_1"].tolist() == [p[6] for p in truth]
-    assert told.files["map.las"][90:94] == bytes(4), "no date, so the same bytes tomorrow"
+    assert converted.files["map.las"][90:94] == bytes(4), "no date, so the same bytes tomorrow"
     intensity = points(written({"i.pcd": (SAMPLES / "pcd" / "intensity.pcd").read_bytes()}))
     assert intensity.point_format.id == 6
     assert intensity.intensity.tolist() == [0, 10, 20, 30], "whole numbers are LAS's own intensity"

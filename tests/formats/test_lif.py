@@ -30,17 +30,17 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 
 
 def read(data: Any, **context: Any) -> tuple[Layers, ReadContext]:
-    said = data if isinstance(data, bytes) else json.dumps(data).encode()
-    told = ReadContext(main="layout.lif.json", **context)
-    return formats.read(Group(FORMAT, "layout.lif.json", {"layout.lif.json": said}), told), told
+    content = data if isinstance(data, bytes) else json.dumps(data).encode()
+    read_context = ReadContext(main="layout.lif.json", **context)
+    return formats.read(Group(FORMAT, "layout.lif.json", {"layout.lif.json": content}), read_context), read_context
 
 
 def write(part: Features | Layers, **context: Any) -> tuple[bytes, WriteContext]:
-    told = WriteContext(**context)
+    write_context = WriteContext(**context)
     layers = part if isinstance(part, Layers) else Layers({NETWORK: part})
-    files = formats.write(FORMAT, layers, told)
+    files = formats.write(FORMAT, layers, write_context)
     assert list(files) == ["layout.lif.json"]
-    return files["layout.lif.json"], told
+    return files["layout.lif.json"], write_context
 
 
 def warnings(context: ReadContext | WriteContext) -> str:
@@ -48,11 +48,11 @@ def warnings(context: ReadContext | WriteContext) -> str:
 
 
 def item(layers: Layers, i: str, layer: Any = "topology") -> dict[str, Any]:
-    found = [
+    matches = [
         p for part in layers.vector(layer).values() for k, p in zip(part.ids, part.properties, strict=True) if k == i
     ]
-    assert len(found) == 1, i
-    return dict(found[0])
+    assert len(matches) == 1, i
+    return dict(matches[0])
 
 
 def check(data: bytes) -> dict[str, Any]:
@@ -95,9 +95,13 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
         data = path.read_bytes()
         assert formats.detect(path.name, data) is FORMAT, path
         layers, context = read(data)
-        served, told = write(layers)
+        served, write_context = write(layers)
         assert same("lif", {path.name: data}, {"layout.lif.json": served}) == [], path
-        assert (told.dropped, told.template, [w for w in told.warnings if not w.level]) == ([], [], [])
+        assert (write_context.dropped, write_context.template, [w for w in write_context.warnings if not w.level]) == (
+            [],
+            [],
+            [],
+        )
         assert json.loads(served)["metaInformation"] == json.loads(data)["metaInformation"]
         assert write(read(served)[0])[0] == served
         assert ("is a draft" in warnings(context)) == ("2_0" in str(path))
@@ -129,8 +133,8 @@ def test_facts_of_the_sample() -> None:
         ("station", "stations", "objects"),
     ):
         for level, n in fact[word].items():
-            found = layers.vector(layer, level).values()  # type: ignore[arg-type]
-            assert sum(p["kind"] == kind for part in found for p in part.properties) == n
+            parts = layers.vector(layer, level).values()  # type: ignore[arg-type]
+            assert sum(p["kind"] == kind for part in parts for p in part.properties) == n
     rows = [(i, p, g) for part in layers.vector("topology").values()
             for i, p, g in zip(part.ids, part.properties, part.geometry, strict=True)]  # fmt: skip
     assert {i: p["speed_limit"] for i, p, _ in rows if "speed_limit" in p} == fact["speed_limits"]
@@ -161,9 +165,9 @@ def test_the_sample_in_full(same: Same) -> None:
     assert isinstance(stations, Features)
     assert stations.geometry[0].equals(shapely.Point(11, -1))
     assert stations.geometry[1].is_empty
-    served, told = write(layers)
+    served, context = write(layers)
     assert same("lif", {"a.json": data}, {"b.json": served}) == []
-    assert (told.dropped, told.template, [w for w in told.warnings if not w.level]) == ([], [], [])
+    assert (context.dropped, context.template, [w for w in context.warnings if not w.level]) == ([], [], [])
     top = json.loads(served)
     assert [layout["layoutId"] for layout in top["layouts"]] == ["Hall", "Upstairs", "Empty"]
     assert [n["nodeId"] for n in top["layouts"][0]["nodes"]] == ["N2", "N1", "E1"]
@@ -202,7 +206,7 @@ def test_what_an_edit_changes_is_served() -> None:
         (*part.ids, "new"), np.concatenate([geometry, added.geometry]), (*properties, *added.properties),
         np.concatenate([part.local, added.local]), part.document,
     )  # fmt: skip
-    served, told = write(Layers({**layers.parts, key: changed}, None, layers.levels))
+    served, context = write(Layers({**layers.parts, key: changed}, None, layers.levels))
     hall = json.loads(served)["layouts"][0]
     ramp = hall["nodes"][0]
     assert (ramp["nodeId"], ramp["nodeName"], ramp["nodePosition"]) == ("N2", "Ramp", {"x": 12.0, "y": 1.0})
@@ -211,7 +215,7 @@ def test_what_an_edit_changes_is_served() -> None:
     assert [e["maxSpeed"] for e in hall["edges"][0]["vehicleTypeEdgeProperties"]] == [0.75, 0.75]
     assert hall["nodes"][-1]["nodeId"] == "new"
     assert hall["nodes"][-1]["vehicleTypeNodeProperties"] == [{"vehicleTypeId": "any"}]
-    assert [(t["what"], t["option"]) for t in told.template] == [("nodes: type of vehicle", "vehicle_type")]
+    assert [(t["what"], t["option"]) for t in context.template] == [("nodes: type of vehicle", "vehicle_type")]
 
 
 def test_what_no_source_says_can_be_said() -> None:
@@ -221,20 +225,20 @@ def test_what_no_source_says_can_be_said() -> None:
         ("b", shapely.Point(3, 0), {"kind": "node"}),
         ("e", shapely.LineString([(0, 0), (3, 0)]), edge),
     ]
-    wish = {
+    options = {
         "vehicle_type": "fork", "creator": "me", "project": "hall", "orientation_type": "GLOBAL",
         "vehicle_orientation": 1.5, "rotation_allowed": True, "layout_version": "7",
     }  # fmt: skip
-    told = WriteContext(options=formats.write_options(FORMAT, wish))
+    context = WriteContext(options=formats.write_options(FORMAT, options))
     layers = Layers({PartKey("topology", "ground", "network"): features(rows, "local")})
-    top = json.loads(formats.write(FORMAT, layers, told)["layout.lif.json"])
+    top = json.loads(formats.write(FORMAT, layers, context)["layout.lif.json"])
     assert (top["metaInformation"]["creator"], top["metaInformation"]["projectIdentification"]) == ("me", "hall")
     (layout,) = top["layouts"]
     assert layout["layoutVersion"] == "7"
     assert layout["edges"][0]["vehicleTypeEdgeProperties"] == [
         {"vehicleTypeId": "fork", "vehicleOrientation": 1.5, "orientationType": "GLOBAL", "rotationAllowed": True}
     ]
-    assert {t["option"]: t["value"] for t in told.template if "option" in t} == wish
+    assert {t["option"]: t["value"] for t in context.template if "option" in t} == options
 
 
 def test_drafts_speak_their_own_words(shared: Path) -> None:
@@ -282,7 +286,7 @@ def test_a_network_of_another_format() -> None:
     part = street("A", "B", speed_limit=2.5, action="row_traversal")
     up = PartKey("topology", "up", "network")
     layers = Layers({NETWORK: part, up: street("A", "C")}, None, (Level(), Level("up", 3.0)))
-    served, told = write(layers, title="farm", options=WriteOptions(vehicle_type="robot"))
+    served, context = write(layers, title="farm", options=WriteOptions(vehicle_type="robot"))
     top = check(served)
     assert [(v["layoutId"], v.get("layoutLevelId")) for v in top["layouts"]] == [("ground", None), ("up", "up")]
     assert [[n["nodeId"] for n in v["nodes"]] for v in top["layouts"]] == [["A", "B"], ["C", "A#2"]]
@@ -290,8 +294,8 @@ def test_a_network_of_another_format() -> None:
     assert entry["vehicleTypeId"] == "robot"
     assert entry["maxSpeed"] == 2.5
     assert entry["trajectory"]["controlPoints"][1] == {"x": 0.5, "y": 1.0}
-    assert [(d["what"], d["count"]) for d in told.dropped] == [("attributes of edges", 1)]
-    assert "got a number" in warnings(told)
+    assert [(d["what"], d["count"]) for d in context.dropped] == [("attributes of edges", 1)]
+    assert "got a number" in warnings(context)
     back, _ = read(served)
     assert item(back, "e0")["speed_limit"] == 2.5
     line = back.parts[NETWORK]
@@ -303,29 +307,29 @@ def test_a_network_of_another_format() -> None:
 def test_tmap2_to_lif_and_back(shared: Path) -> None:
     farm = shared / "data" / "environment_template" / "riseholme_park_farm_vineyard" / "config" / "topological"
     data = (farm / "network.tmap2.yaml").read_bytes()
-    made = offline({"network.tmap2.yaml": data}, "lif").files["layout.lif.json"]
-    top = check(made)
+    lif_data = offline({"network.tmap2.yaml": data}, "lif").files["layout.lif.json"]
+    top = check(lif_data)
     tmap2 = get_format("tmap2")
     group = Group(tmap2, "n.tmap2.yaml", {"n.tmap2.yaml": data})
     part = formats.read(group, ReadContext(main="n.tmap2.yaml")).parts[NETWORK]
     assert isinstance(part, Features)
     nodes = {i: (g.x, g.y) for i, g in zip(part.ids, part.geometry, strict=True) if g.geom_type == "Point"}
-    found = {n["nodeId"]: (n["nodePosition"]["x"], n["nodePosition"]["y"]) for n in top["layouts"][0]["nodes"]}
-    assert found.keys() == nodes.keys()
-    assert all(found[i] == pytest.approx(at) for i, at in nodes.items())
+    positions = {n["nodeId"]: (n["nodePosition"]["x"], n["nodePosition"]["y"]) for n in top["layouts"][0]["nodes"]}
+    assert positions.keys() == nodes.keys()
+    assert all(positions[i] == pytest.approx(at) for i, at in nodes.items())
     assert {(e["edgeId"], e["startNodeId"], e["endNodeId"]) for e in top["layouts"][0]["edges"]} == {
         (i, p["source"], p["target"]) for i, p in zip(part.ids, part.properties, strict=True) if p["kind"] == "edge"
     }
-    assert offline({"layout.lif.json": made}, "tmap2").files
+    assert offline({"layout.lif.json": lif_data}, "tmap2").files
 
 
 def test_through_our_geojson_nothing_is_lost(same: Same) -> None:
     data = (SAMPLES / "plant.lif.json").read_bytes()
     layers, _ = read(data)
-    made = formats.write(get_format("geojson"), layers, WriteContext())["map.geojson"]
-    assert formats.detect("map.geojson", made) is get_format("geojson")
-    told = ReadContext(main="map.geojson")
-    again = formats.read(Group(get_format("geojson"), "map.geojson", {"map.geojson": made}), told)
+    geojson_data = formats.write(get_format("geojson"), layers, WriteContext())["map.geojson"]
+    assert formats.detect("map.geojson", geojson_data) is get_format("geojson")
+    context = ReadContext(main="map.geojson")
+    again = formats.read(Group(get_format("geojson"), "map.geojson", {"map.geojson": geojson_data}), context)
     assert same("lif", {"a.json": data}, {"b.json": write(again)[0]}) == []
 
 
@@ -428,26 +432,28 @@ def test_a_layout_without_a_level_goes_where_it_is_asked_to() -> None:
     layers, _ = read(layout(), level="cellar")
     assert {k.level for k in layers.parts} == {"cellar"}
     assert "layoutLevelId" not in json.loads(write(layers)[0])["layouts"][0]
-    made = offline({"a.json": json.dumps(layout()).encode()}, "lif", hints=Hints("lif")).files["layout.lif.json"]
-    assert check(made)
+    lif_data = offline({"a.json": json.dumps(layout()).encode()}, "lif", hints=Hints("lif")).files["layout.lif.json"]
+    assert check(lif_data)
 
 
 def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
     for value in (5, "x", [1], {"a": 1}, None, [[1]], True, {"layoutId": 3}, [{"layoutId": "x", "head": 4}]):
-        own = dict.fromkeys(("id", "layout", "at", "item", "dangling"), value)
+        source_properties = dict.fromkeys(("id", "layout", "at", "item", "dangling"), value)
         words = ("vehicleTypeNodeProperties", "vehicleTypeEdgeProperties", "nodePosition", "trajectory", "nodeName")
         inner = {"item": dict.fromkeys(words, value), "dangling": [{"item": {"edgeId": "z"}, "layout": value}]}
         rows: list[tuple[str, Any, dict[str, Any]]] = [
-            ("a", shapely.Point(0, 0), {"kind": "node", "name": value, "orientation": value, "lif": own}),
+            ("a", shapely.Point(0, 0), {"kind": "node", "name": value, "orientation": value, "lif": source_properties}),
             ("b", shapely.Point(1, 0), {"kind": "node", "orientation": [0, 0, 0, 1], "lif": inner}),
             (
                 "e",
                 shapely.Point(1, 0),
-                {"kind": "edge", "source": "a", "target": "b", "speed_limit": value, "lif": own},
+                {"kind": "edge", "source": "a", "target": "b", "speed_limit": value, "lif": source_properties},
             ),
             ("f", shapely.Point(1, 0), {"kind": "edge", "source": "b", "target": "a", "speed_limit": 1, "lif": inner}),
         ]
-        stations = features([("s", shapely.Point(1, 0), {"kind": "station", "name": value, "lif": own})], "local")
+        stations = features(
+            [("s", shapely.Point(1, 0), {"kind": "station", "name": value, "lif": source_properties})], "local"
+        )
         document = {"lif": dict.fromkeys(("top", "layouts", "origins", "dangling"), value)}
         layers = Layers({NETWORK: features(rows, "local", document), PartKey("objects", "ground", "lif"): stations})
         top = json.loads(write(layers)[0])

@@ -28,19 +28,19 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 
 
 def read(data: Any, **context: Any) -> tuple[Features, ReadContext]:
-    said = data if isinstance(data, bytes) else json.dumps(data).encode()
-    told = ReadContext(main="graph.geojson", **context)
-    part = formats.read(Group(FORMAT, "graph.geojson", {"graph.geojson": said}), told).parts[NETWORK]
+    content = data if isinstance(data, bytes) else json.dumps(data).encode()
+    read_context = ReadContext(main="graph.geojson", **context)
+    part = formats.read(Group(FORMAT, "graph.geojson", {"graph.geojson": content}), read_context).parts[NETWORK]
     assert isinstance(part, Features)
-    return part, told
+    return part, read_context
 
 
 def write(part: Features | Layers, **context: Any) -> tuple[bytes, WriteContext]:
-    told = WriteContext(**context)
+    write_context = WriteContext(**context)
     layers = part if isinstance(part, Layers) else Layers({NETWORK: part})
-    files = formats.write(FORMAT, layers, told)
+    files = formats.write(FORMAT, layers, write_context)
     assert list(files) == ["graph.geojson"]
-    return files["graph.geojson"], told
+    return files["graph.geojson"], write_context
 
 
 def warnings(context: ReadContext | WriteContext) -> str:
@@ -57,16 +57,16 @@ class RouteServer:
     def __init__(self, data: bytes) -> None:
         top = json.loads(data)
         kinds = {"Point": 0, "LineString": 1, "MultiLineString": 1}
-        found: tuple[list[Any], list[Any]] = ([], [])
+        by_kind: tuple[list[Any], list[Any]] = ([], [])
         for feature in top["features"]:
             kind = kinds.get(feature["geometry"]["type"])
             if kind is not None:
-                found[kind].append(feature)
-        assert found[0], "no nodes"
-        assert found[1], "no edges"
+                by_kind[kind].append(feature)
+        assert by_kind[0], "no nodes"
+        assert by_kind[1], "no edges"
         self.nodes: dict[int, tuple[float, float]] = {}
         self.metadata: dict[tuple[str, int], dict[str, Any]] = {}
-        for node in found[0]:
+        for node in by_kind[0]:
             p = node["properties"]
             n = self.number(p["id"])
             assert n not in self.nodes, "two nodes with one id"
@@ -75,7 +75,7 @@ class RouteServer:
             self.nodes[n] = (float(x), float(y))
             self.both("node", n, p)
         self.edges: dict[int, tuple[int, int]] = {}
-        for edge in found[1]:
+        for edge in by_kind[1]:
             p = edge["properties"]
             n, start, end = (self.number(p[w]) for w in ("id", "startid", "endid"))
             assert start in self.nodes, "Start id does not exist"
@@ -123,9 +123,9 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
     for path in real(shared):
         data = path.read_bytes()
         assert formats.detect(path.name, data) is FORMAT, path
-        served, told = write(read(data)[0])
+        served, context = write(read(data)[0])
         assert same("nav2_route", {path.name: data}, {"graph.geojson": served}) == [], path
-        assert (told.dropped, told.template, told.warnings) == ([], [], [])
+        assert (context.dropped, context.template, context.warnings) == ([], [], [])
         assert write(read(served)[0])[0] == served
         before, after = RouteServer(data), RouteServer(served)
         assert (before.edges, before.metadata) == (after.edges, after.metadata)
@@ -179,10 +179,10 @@ def test_the_sample_in_full(same: Same) -> None:
     assert back["nav2_route"] == {"id": 1, "line": True}
     assert gap["nav2_route"]["geometry"]["coordinates"][1][0] == [4.5, 4.0]
     assert blank["nav2_route"] == {"id": 9}
-    served, told = write(part)
+    served, context = write(part)
     assert same("nav2_route", {"a.geojson": data}, {"b.geojson": served}) == []
-    assert told.dropped == told.template == []
-    assert "1 nodes have an id above 65535" in warnings(told)
+    assert context.dropped == context.template == []
+    assert "1 nodes have an id above 65535" in warnings(context)
     server = RouteServer(served)
     assert server.edges[1] == (1, 0)
     assert b'"speed_limit":85.0' in served
@@ -200,9 +200,9 @@ def test_the_sample_in_full(same: Same) -> None:
 
 def test_our_geojson_of_it_is_not_taken_for_a_route_graph() -> None:
     data = (SAMPLES / "hall.geojson").read_bytes()
-    made = offline({"hall.geojson": data}, "geojson").files["map.geojson"]
-    assert formats.detect("map.geojson", made) is get_format("geojson")
-    again = offline({"map.geojson": made}, "nav2_route").files["graph.geojson"]
+    geojson_data = offline({"hall.geojson": data}, "geojson").files["map.geojson"]
+    assert formats.detect("map.geojson", geojson_data) is get_format("geojson")
+    again = offline({"map.geojson": geojson_data}, "nav2_route").files["graph.geojson"]
     assert again == offline({"hall.geojson": data}, "nav2_route").files["graph.geojson"]
 
 
@@ -222,8 +222,8 @@ def street(names: list[str], **more: Any) -> Features:
 
 
 def numbers(data: bytes) -> dict[str, int]:
-    found = [f["properties"] for f in json.loads(data)["features"]]
-    return {p["metadata"]["name"]: p["id"] for p in found if "startid" not in p and "metadata" in p}
+    properties = [f["properties"] for f in json.loads(data)["features"]]
+    return {p["metadata"]["name"]: p["id"] for p in properties if "startid" not in p and "metadata" in p}
 
 
 def test_numbers_follow_from_ids_and_stay_when_others_come_and_go() -> None:
@@ -269,8 +269,8 @@ def test_repeated_numbers_are_made_distinct() -> None:
     part, context = read(data)
     assert "share an id" in warnings(context)
     assert part.properties[part.ids.index("7")]["target"] == "1#2"  # the last one, as Nav2 does
-    served, told = write(part)
-    assert "mix up" in warnings(told)
+    served, write_context = write(part)
+    assert "mix up" in warnings(write_context)
     server = RouteServer(served)
     assert len(server.nodes) == 4
     _, end = server.edges[7]
@@ -278,10 +278,10 @@ def test_repeated_numbers_are_made_distinct() -> None:
 
 
 def test_many_items_get_more_than_16_bit_with_a_warning() -> None:
-    served, told = write(street([f"n{k}" for k in range(33_000)]))
+    served, context = write(street([f"n{k}" for k in range(33_000)]))
     RouteServer(served)
-    assert "ComputeRoute" in warnings(told)
-    assert "DynamicEdges" in warnings(told)
+    assert "ComputeRoute" in warnings(context)
+    assert "DynamicEdges" in warnings(context)
 
 
 # --- from other formats ----------------------------------------------------------------------------------------------
@@ -289,7 +289,7 @@ def test_many_items_get_more_than_16_bit_with_a_warning() -> None:
 
 def test_a_network_of_another_format() -> None:
     part = street(["A", "B", "C"], speed_limit=2, action="row_traversal", tmap2={"fail_policy": "fail"})
-    served, told = write(part, title="farm", attribution=("© somebody",))
+    served, write_context = write(part, title="farm", attribution=("© somebody",))
     top = json.loads(served)
     assert (top["name"], top["attribution"]) == ("farm", "© somebody")
     server = RouteServer(served)
@@ -297,14 +297,18 @@ def test_a_network_of_another_format() -> None:
     assert all(
         m == {"action": "row_traversal", "abs_speed_limit": 2.0} for (k, _), m in server.metadata.items() if k == "edge"
     )
-    assert {t["what"] for t in told.template} == {"id", "name", "crs", "frame"}
+    assert {t["what"] for t in write_context.template} == {"id", "name", "crs", "frame"}
     options = formats.write_options(FORMAT, {"graph_name": "rows", "frame_id": "farm_map"})
     context = WriteContext(options=options)
-    said = json.loads(formats.write(FORMAT, Layers({NETWORK: part}), context)["graph.geojson"])
-    assert said["name"] == "rows"
-    assert {f["properties"].get("frame") for f in said["features"] if f["geometry"]["type"] == "Point"} == {"farm_map"}
+    document = json.loads(formats.write(FORMAT, Layers({NETWORK: part}), context)["graph.geojson"])
+    assert document["name"] == "rows"
+    assert {f["properties"].get("frame") for f in document["features"] if f["geometry"]["type"] == "Point"} == {
+        "farm_map"
+    }
     assert {t["option"] for t in context.template if "option" in t} == {"graph_name", "frame_id"}
-    assert [(d["what"], d["count"]) for d in told.dropped] == [("items with attributes that Nav2 has no word for", 4)]
+    assert [(d["what"], d["count"]) for d in write_context.dropped] == [
+        ("items with attributes that Nav2 has no word for", 4)
+    ]
     back, _ = read(served)
     assert {p["name"] for p in back.properties if p["kind"] == "node"} == {"A", "B", "C"}
     assert {p.get("action") for p in back.properties if p["kind"] == "edge"} == {"row_traversal"}
@@ -346,9 +350,9 @@ def test_places_on_earth_need_a_datum_and_levels_are_joined() -> None:
     with pytest.raises(MissingDatum):
         write(part)
     up = PartKey("topology", "up", "network")
-    served, told = write(Layers({NETWORK: part, up: part}, Datum(53.0, -0.5), (Level(), Level("up", 3.0))))
+    served, context = write(Layers({NETWORK: part, up: part}, Datum(53.0, -0.5), (Level(), Level("up", 3.0))))
     assert len(RouteServer(served).nodes) == 4
-    assert "levels of nodes" in {d["what"] for d in told.dropped}
+    assert "levels of nodes" in {d["what"] for d in context.dropped}
 
 
 def test_far_coordinates_are_warned_about() -> None:
@@ -457,10 +461,10 @@ def test_what_is_doubtful_is_taken_with_a_warning(data: dict[str, Any], warning:
     data["features"].append({**extra, "properties": {"id": 90, "startid": 2, "endid": 1}})
     part, context = read(data)
     assert warning in warnings(context)
-    served, told = write(part)
+    served, write_context = write(part)
     assert write(read(served)[0])[0] == served
     if "speed_limit" not in str(data) and not re.search("node$|itself$|frame is", warning):
-        assert warning in warnings(told)
+        assert warning in warnings(write_context)
 
 
 def test_edges_to_nowhere_are_kept_but_not_served() -> None:
@@ -473,20 +477,20 @@ def test_edges_to_nowhere_are_kept_but_not_served() -> None:
     )
     assert part.properties[0]["nav2_route"]["dangling"] == [{"id": 11, "from": 1, "to": 99, "properties": {"cost": 2}}]
     assert part.document["nav2_route"]["dangling"] == [{"id": 12, "from": 98, "to": 99, "properties": {}}]
-    served, told = write(part)
+    served, context = write(part)
     assert set(RouteServer(served).edges) == {3}
-    assert [(d["what"], d["count"]) for d in told.dropped] == [("edges to nowhere", 2)]
+    assert [(d["what"], d["count"]) for d in context.dropped] == [("edges to nowhere", 2)]
 
 
 def test_words_of_other_types_stay_where_they_are() -> None:
-    said = {"name": "", "action": 5, "width": "wide", "abs_speed_limit": True}
-    part, _ = read(graph(node(id=4, metadata={"name": "4"}), metadata=said))
-    assert part.properties[-1]["nav2_route"]["properties"]["metadata"] == said
+    metadata = {"name": "", "action": 5, "width": "wide", "abs_speed_limit": True}
+    part, _ = read(graph(node(id=4, metadata={"name": "4"}), metadata=metadata))
+    assert part.properties[-1]["nav2_route"]["properties"]["metadata"] == metadata
     assert "speed_limit" not in part.properties[-1]
     top = json.loads(write(part)[0])
     assert [f["properties"]["metadata"] for f in top["features"] if "metadata" in f["properties"]] == [
         {"name": "4"},
-        said,
+        metadata,
     ]
 
 
@@ -506,12 +510,12 @@ def test_detection() -> None:
 def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
     odd: list[Any] = [5, "x", [1], {"a": 1}, None, [[1]], True, {"id": -1}]
     for value in odd:
-        own = dict.fromkeys(("id", "properties", "members", "geometry", "dangling", "line"), value)
+        source_properties = dict.fromkeys(("id", "properties", "members", "geometry", "dangling", "line"), value)
         inner = {"properties": dict.fromkeys(("id", "startid", "metadata", "operations", "cost", "frame"), value)}
         rows: list[tuple[str, Any, dict[str, Any]]] = [
-            ("a", shapely.Point(0, 0), {"kind": "node", "name": value, "nav2_route": own}),
+            ("a", shapely.Point(0, 0), {"kind": "node", "name": value, "nav2_route": source_properties}),
             ("b", shapely.Point(1, 0), {"kind": "node", "width": value, "nav2_route": inner}),
-            ("e", shapely.Point(1, 0), {"kind": "edge", "source": "a", "target": "b", "nav2_route": own}),
+            ("e", shapely.Point(1, 0), {"kind": "edge", "source": "a", "target": "b", "nav2_route": source_properties}),
             ("f", shapely.Point(1, 0), {"kind": "edge", "source": "b", "target": "a", "nav2_route": inner}),
             ("g", shapely.Point(1, 0), {"kind": "edge", "source": value, "target": value, "nav2_route": value}),
         ]

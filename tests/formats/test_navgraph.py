@@ -33,19 +33,19 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 
 
 def read(data: bytes | str, **context: Any) -> tuple[Features, ReadContext]:
-    said = data.encode() if isinstance(data, str) else data
-    told = ReadContext(main="navgraph.yaml", **context)
-    part = formats.read(Group(FORMAT, "navgraph.yaml", {"navgraph.yaml": said}), told).parts[NETWORK]
+    content = data.encode() if isinstance(data, str) else data
+    read_context = ReadContext(main="navgraph.yaml", **context)
+    part = formats.read(Group(FORMAT, "navgraph.yaml", {"navgraph.yaml": content}), read_context).parts[NETWORK]
     assert isinstance(part, Features)
-    return part, told
+    return part, read_context
 
 
 def write(part: Features | Layers, **context: Any) -> tuple[str, WriteContext]:
-    told = WriteContext(**context)
+    write_context = WriteContext(**context)
     layers = part if isinstance(part, Layers) else Layers({NETWORK: part})
-    files = formats.write(FORMAT, layers, told)
+    files = formats.write(FORMAT, layers, write_context)
     assert list(files) == ["navgraph.yaml"]
-    return files["navgraph.yaml"].decode(), told
+    return files["navgraph.yaml"].decode(), write_context
 
 
 def warnings(context: ReadContext | WriteContext) -> str:
@@ -131,14 +131,14 @@ class Fawkes:
 
 
 def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
-    found = sorted((shared / "data" / "navgraph").rglob("*.yaml"))
-    assert len(found) == sum(f.get("kind") == "fawkes_navgraph" for f in facts_json.values()) == 3
-    for path in found:
+    paths = sorted((shared / "data" / "navgraph").rglob("*.yaml"))
+    assert len(paths) == sum(f.get("kind") == "fawkes_navgraph" for f in facts_json.values()) == 3
+    for path in paths:
         data = path.read_bytes()
         assert formats.detect(path.name, data) is FORMAT, path
-        served, told = write(read(data)[0])
+        served, context = write(read(data)[0])
         assert same("navgraph", {path.name: data}, {"navgraph.yaml": served.encode()}) == [], path
-        assert (told.dropped, told.template) == ([], [])
+        assert (context.dropped, context.template) == ([], [])
         assert write(read(served)[0])[0] == served
 
 
@@ -206,9 +206,9 @@ def test_facts_of_the_sample() -> None:
 def test_the_sample_in_full(same: Same) -> None:
     data = (SAMPLES / "depot.yaml").read_bytes()
     part, _ = read(data)
-    served, told = write(part)
+    served, context = write(part)
     assert same("navgraph", {"a.yaml": data}, {"b.yaml": served.encode()}) == []
-    assert (told.dropped, told.template) == ([], [])
+    assert (context.dropped, context.template) == ([], [])
     assert "graph-name: Depot\nroot: Nowhere\nrevision: 7\n" in served
     assert "  - !unconnected\n    name: 'shelf 4'\n" in served or "  - !unconnected\n    name: shelf 4\n" in served
     assert "      - highway_exit\n" in served
@@ -227,12 +227,12 @@ def test_what_an_edit_changes_is_served() -> None:
     properties[place["A"]]["name"] = "Bay"
     keep = [k for k, i in enumerate(part.ids) if i not in ("Dock_A", "C 1_010")]
     changed = Features(part.ids, part.geometry, tuple(properties), part.local, part.document).take(keep)
-    served, told = write(changed)
+    served, context = write(changed)
     assert "      - orientation: 0.5\n" in served
     assert "      - name: Bay\n" in served
     assert "  - !dir [A, Dock]\n" in served
     assert "  - !dir ['010', 'C 1']\n" in served or "  - !dir ['010', C 1]\n" in served
-    assert [d["what"] for d in told.dropped] == ["intersection tags"]
+    assert [d["what"] for d in context.dropped] == ["intersection tags"]
 
 
 # --- from other formats ----------------------------------------------------------------------------------------------
@@ -255,7 +255,7 @@ def cross(**more: Any) -> Features:
 
 
 def test_a_network_of_another_format_is_one_that_fawkes_takes() -> None:
-    served, told = write(cross(), title="quarter")
+    served, context = write(cross(), title="quarter")
     graph = Fawkes(served)
     assert graph.name == "quarter"
     assert graph.unconnected == {"alone"}
@@ -269,15 +269,15 @@ def test_a_network_of_another_format_is_one_that_fawkes_takes() -> None:
     }
     assert graph.properties["W"] == {"name": "West gate", "floor": "2"}
     assert served.count("!allow-intersection") == 2
-    assert {d["what"]: d["count"] for d in told.dropped} == {
+    assert {d["what"]: d["count"] for d in context.dropped} == {
         "altitudes of nodes": 1,
         "ids of edges": 9,
         "edges with attributes (action, speed limit …)": 7,
         "attributes of nodes that are no scalars": 1,
     }
-    assert {t["what"] for t in told.template} == {"graph-name", "nodes: !unconnected", "nodes at bends"}
-    assert next(t["option"] for t in told.template if t["what"] == "graph-name") == "graph_name"
-    assert told.warnings == []
+    assert {t["what"] for t in context.template} == {"graph-name", "nodes: !unconnected", "nodes at bends"}
+    assert next(t["option"] for t in context.template if t["what"] == "graph-name") == "graph_name"
+    assert context.warnings == []
     assert write(read(served)[0])[0] == served
 
 
@@ -293,18 +293,18 @@ def one_way(*pairs: str) -> Features:
 
 
 def test_the_first_node_is_one_that_reaches_all() -> None:
-    served, told = write(one_way("DC", "CB", "BA"))
+    served, context = write(one_way("DC", "CB", "BA"))
     assert next(iter(Fawkes(served).nodes)) == "D"
-    assert told.warnings == []
-    served, told = write(one_way("AC", "BC"))
-    assert "no node reaches all others" in warnings(told)
+    assert context.warnings == []
+    served, context = write(one_way("AC", "BC"))
+    assert "no node reaches all others" in warnings(context)
     with pytest.raises(AssertionError, match="cannot reach"):
         Fawkes(served)
 
 
 def test_one_way_crossings_are_warned_about() -> None:
-    served, told = write(one_way("AC", "BD", "CB"))
-    assert "2 one-way connections cross" in warnings(told)
+    served, context = write(one_way("AC", "BD", "CB"))
+    assert "2 one-way connections cross" in warnings(context)
     with pytest.raises(AssertionError, match="intersects"):
         Fawkes(served)
 
@@ -326,18 +326,18 @@ def test_places_on_earth_need_a_datum() -> None:
 def test_levels_are_joined_with_distinct_names() -> None:
     up = PartKey("topology", "up", "network")
     layers = Layers({NETWORK: one_way("AB", "BA"), up: one_way("AB", "BA")}, None, (Level(), Level("up", 3.0)))
-    served, told = write(layers)
+    served, context = write(layers)
     assert "name: A#2" in served or "name: 'A#2'" in served
-    assert {d["what"] for d in told.dropped} >= {"levels of nodes"}
-    assert "got a number" in warnings(told)
+    assert {d["what"] for d in context.dropped} >= {"levels of nodes"}
+    assert "got a number" in warnings(context)
 
 
 def test_from_tmap2_and_from_a_drawing(shared: Path) -> None:
     farm = shared / "data" / "environment_template" / "riseholme_park_farm_vineyard" / "config" / "topological"
     data = (farm / "network.tmap2.yaml").read_bytes()
-    made = offline({"network.tmap2.yaml": data}, "navgraph").files["navgraph.yaml"]
-    graph = Fawkes(made.decode())
-    again = offline({"navgraph.yaml": made}, "tmap2").files["network.tmap2.yaml"]
+    navgraph_data = offline({"network.tmap2.yaml": data}, "navgraph").files["navgraph.yaml"]
+    graph = Fawkes(navgraph_data.decode())
+    again = offline({"navgraph.yaml": navgraph_data}, "tmap2").files["network.tmap2.yaml"]
     names = {n["node"]["name"]: n["node"]["pose"]["position"] for n in yaml.safe_load(data)["nodes"]}
     back = {n["node"]["name"]: n["node"] for n in yaml.safe_load(again)["nodes"]}
     assert set(back) == set(names) == set(graph.nodes)
@@ -448,18 +448,18 @@ def test_connections_to_nowhere_are_kept_but_not_served() -> None:
     assert part.properties[0]["navgraph"]["dangling"] == [{"tag": "dir", "ends": ["A", "X"]}]
     assert part.properties[1]["navgraph"]["dangling"] == [{"ends": ["Y", "B"]}]
     assert part.document["navgraph"]["dangling"] == [{"ends": ["X", "Y"]}]
-    served, told = write(part)
+    served, context = write(part)
     assert len(Fawkes(served).edges) == 1
-    assert [(d["what"], d["count"]) for d in told.dropped] == [("connections to nowhere", 3)]
+    assert [(d["what"], d["count"]) for d in context.dropped] == [("connections to nowhere", 3)]
 
 
 def test_a_repeated_name_is_served_as_it_was() -> None:
     part, _ = read(graph("- name: A\n  pos: [5, 5]\n"))
     assert part.ids[:3] == ("A", "B", "A#2")
     assert part.properties[2]["name"] == "A"
-    served, told = write(part)
+    served, context = write(part)
     assert served.count("name: A\n") == 2
-    assert "Fawkes refuses" in warnings(told)
+    assert "Fawkes refuses" in warnings(context)
 
 
 def test_nothing_is_read_that_nobody_wants() -> None:
@@ -517,11 +517,17 @@ def test_hints_name_the_format() -> None:
 def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
     odd: list[Any] = [5, "x", [1], {"a": 1}, None, [[1]], True]
     for value in odd:
-        own = dict.fromkeys(("name", "tag", "properties", "words", "more", "dangling", "order", "backward"), value)
+        source_properties = dict.fromkeys(
+            ("name", "tag", "properties", "words", "more", "dangling", "order", "backward"), value
+        )
         rows: list[tuple[str, Any, dict[str, Any]]] = [
-            ("a", shapely.Point(0, 0), {"kind": "node", "orientation": value, "name": value, "navgraph": own}),
+            (
+                "a",
+                shapely.Point(0, 0),
+                {"kind": "node", "orientation": value, "name": value, "navgraph": source_properties},
+            ),
             ("b", shapely.Point(1, 0), {"kind": "node", "navgraph": {"more": {"name": "c", "pos": 1}}}),
-            ("e", shapely.Point(1, 0), {"kind": "edge", "source": "a", "target": "b", "navgraph": own}),
+            ("e", shapely.Point(1, 0), {"kind": "edge", "source": "a", "target": "b", "navgraph": source_properties}),
             ("f", shapely.Point(1, 0), {"kind": "edge", "source": value, "target": value, "navgraph": value}),
         ]
         top = dict.fromkeys(("top", "defaults", "words", "dangling"), value)

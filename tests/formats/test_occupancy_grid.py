@@ -82,48 +82,48 @@ def real_maps(shared: Path, facts_json: dict[str, Any]) -> list[tuple[str, dict[
 
 
 def test_real_maps_have_the_counted_cells_and_come_back(shared: Path, facts_json: dict[str, Any], same: Same) -> None:
-    for name, files, known in real_maps(shared, facts_json):
+    for name, files, facts in real_maps(shared, facts_json):
         main = name.rpartition("/")[2]
         layers, context = read_layers(files, main=main)
         (key,), (grid,) = layers.parts, layers.grids().values()
-        said = known["yaml"]
+        yaml_facts = facts["yaml"]
         assert key == PartKey("occupancy", "ground", main.removesuffix(".yaml")), name
-        assert (grid.width, grid.height) == (known["width"], known["height"]), name
-        assert grid.resolution == said["resolution"], name
-        assert list(grid.origin) == said["origin"], name
+        assert (grid.width, grid.height) == (facts["width"], facts["height"]), name
+        assert grid.resolution == yaml_facts["resolution"], name
+        assert list(grid.origin) == yaml_facts["origin"], name
         counts = grid.counts()
-        assert (counts["occupied"], counts["free"], counts["unknown"]) == tuple(known["cells"].values())[:3], name
-        if "other_values" in known["cells"]:
+        assert (counts["occupied"], counts["free"], counts["unknown"]) == tuple(facts["cells"].values())[:3], name
+        if "other_values" in facts["cells"]:
             values, numbers = np.unique(grid.cells, return_counts=True)
-            found = {str(-1 if v == 255 else v): int(n) for v, n in zip(values, numbers, strict=True)}
-            assert found == known["cells"]["other_values"], name
+            other_values = {str(-1 if v == 255 else v): int(n) for v, n in zip(values, numbers, strict=True)}
+            assert other_values == facts["cells"]["other_values"], name
         bottom_left = int(grid.cells[0, 0])
-        assert (-1 if bottom_left == 255 else bottom_left) == known["bottom_left_cell"], name
-        assert bool(context.warnings) == (not known["image_reference_resolves"]), name
+        assert (-1 if bottom_left == 255 else bottom_left) == facts["bottom_left_cell"], name
+        assert bool(context.warnings) == (not facts["image_reference_resolves"]), name
         picture = next(iter(FORMAT.companions(main, files[main], sorted(files))))
         original = {main: files[main], picture: files[picture]}
         for kind in ("pgm", "png"):
-            served, told = write(layers, file_type=kind)
+            served, write_context = write(layers, file_type=kind)
             mask = [main.replace(".yaml", "_filter_info.yaml")] if re.search("keepout|speed|nogo", main) else []
             assert list(served) == [main, main.removesuffix("yaml") + kind, *mask]
             assert same("occupancy_grid", original, served) == [], (name, kind)
             grey = ["free_thresh"] if UNKNOWN_GREY in grid.properties else []
-            assert [w.where for w in told.warnings] == grey, name
-            assert told.dropped == [], name
+            assert [w.where for w in write_context.warnings] == grey, name
+            assert write_context.dropped == [], name
 
 
 def test_bounds_of_what_is_occupied(shared: Path, facts_json: dict[str, Any]) -> None:
     """Catches what counts cannot: rows upside down, columns mirrored, an origin off by a cell."""
-    for name, files, known in real_maps(shared, facts_json):
+    for name, files, facts in real_maps(shared, facts_json):
         grid, _ = read(files, main=name.rpartition("/")[2])
         rows, columns = np.nonzero(grid.cells == 100)
         x, y, _ = grid.origin
-        if "occupied_bbox_m_unrotated" not in known:
+        if "occupied_bbox_m_unrotated" not in facts:
             assert not len(rows), name
             continue
         low = [x + grid.resolution * columns.min(), y + grid.resolution * rows.min()]
         high = [x + grid.resolution * (columns.max() + 1), y + grid.resolution * (rows.max() + 1)]
-        assert np.allclose([*low, *high], known["occupied_bbox_m_unrotated"], atol=1e-6), name
+        assert np.allclose([*low, *high], facts["occupied_bbox_m_unrotated"], atol=1e-6), name
 
 
 def test_a_picture_of_another_machine_is_found_by_its_base_name(shared: Path) -> None:
@@ -169,19 +169,19 @@ def test_memory_of_a_large_map_is_a_few_times_its_cells(shared: Path) -> None:
 # --- samples ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", json.loads((SAMPLES / "facts.json").read_text()))
 def test_samples_have_their_facts(name: str, facts: Any, same: Same) -> None:
-    known = json.loads((SAMPLES / "facts.json").read_text())[name]
+    expected = json.loads((SAMPLES / "facts.json").read_text())[name]
     files = {p.name: p.read_bytes() for p in (SAMPLES / name).parent.iterdir()}
     grid, _ = read(files)
-    found = {**grid.counts(), "width": grid.width, "height": grid.height}
+    counts = {**grid.counts(), "width": grid.width, "height": grid.height}
     corners = {"bottom_left": grid.cells[0, 0], "bottom_right": grid.cells[0, -1], "top_right": grid.cells[-1, -1]}
-    assert {**found, **{k: int(v) for k, v in corners.items()}} == known
+    assert {**counts, **{k: int(v) for k, v in corners.items()}} == expected
     assert (independent(files, facts) == grid.cells).all()
     main = name.rpartition("/")[2]
-    served, told = write(Layers({PartKey("occupancy", name=main.removesuffix(".yaml")): grid}))
+    served, context = write(Layers({PartKey("occupancy", name=main.removesuffix(".yaml")): grid}))
     assert same("occupancy_grid", files, served) == []
     again, _ = read(served)
     assert (again.origin, again.negate) == (grid.origin, grid.negate)
-    filled = [t["what"] for t in told.template]
+    filled = [t["what"] for t in context.template]
     assert filled == (["filter info: type, base, multiplier"] if name == "speed/speed.yaml" else [])
     if not filled:
         assert again.properties == grid.properties
@@ -358,9 +358,9 @@ def test_a_yaw_is_kept_with_a_warning() -> None:
     assert grid.origin == (-1.0, -2.0, 0.5)
     assert "normalize" in context.warnings[0].problem
     assert context.warnings[0].line == 3
-    served, told = write(grid)
+    served, write_context = write(grid)
     assert b"origin: [-1.0, -2.0, 0.5]" in served["map.yaml"]
-    assert "normalize" in told.warnings[0].problem
+    assert "normalize" in write_context.warnings[0].problem
 
 
 def test_thresholds_the_wrong_way_round_are_read_as_nav2_does(facts: Any) -> None:
@@ -400,15 +400,19 @@ def test_the_grid_that_is_asked_for() -> None:
     def layers(*keys: PartKey) -> Layers:
         return Layers({key: grid_of([[0] * (i + 1)]) for i, key in enumerate(keys)})
 
-    def made(content: Layers, **options: str) -> list[str]:
+    def file_names(content: Layers, **options: str) -> list[str]:
         return list(write(content, **options)[0])
 
     ground, keepout = PartKey("occupancy"), PartKey("occupancy", name="keepout")
     speed, upper = PartKey("occupancy", name="speed"), PartKey("occupancy", "L1", "map")
     attic = PartKey("occupancy", "L2", "map")
-    assert made(layers(ground, keepout)) == ["map.yaml", "map.pgm"]
-    assert made(layers(keepout)) == ["keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"]
-    assert made(layers(ground, keepout), grid="keepout") == ["keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"]
+    assert file_names(layers(ground, keepout)) == ["map.yaml", "map.pgm"]
+    assert file_names(layers(keepout)) == ["keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"]
+    assert file_names(layers(ground, keepout), grid="keepout") == [
+        "keepout.yaml",
+        "keepout.pgm",
+        "keepout_filter_info.yaml",
+    ]
     assert b"P5\n1 1\n" in write(layers(ground, upper))[0]["map.pgm"]
     assert b"P5\n2 1\n" in write(layers(ground, upper), level="L1")[0]["map.pgm"]
     with pytest.raises(Ambiguous, match="keepout, speed"):
@@ -437,24 +441,24 @@ def test_odd_grid_names_make_files_that_read_back(name: str, facts: Any) -> None
 
 # --- writing ------------------------------------------------------------------------------------------------------
 def test_a_new_grid_is_written_as_map_saver_does() -> None:
-    served, told = write(grid_of([[0, 100], [255, 0]], 0.05, origin=(-1.0, 0.1, 0.0)))
+    served, context = write(grid_of([[0, 100], [255, 0]], 0.05, origin=(-1.0, 0.1, 0.0)))
     assert served == {
         "map.yaml": b"image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.0, 0.1, 0.0]\nnegate: 0\n"
         b"occupied_thresh: 0.65\nfree_thresh: 0.196\n",
         "map.pgm": b"P5\n2 2\n255\n" + bytes([254, 0, 205, 254]),
     }
-    assert told.warnings == []
+    assert context.warnings == []
 
 
 def test_a_value_that_trinary_cannot_say_goes_out_raw(facts: Any) -> None:
     grid = grid_of([[0, 100], [255, 37]])
-    served, told = write(grid)
+    served, context = write(grid)
     assert b"mode: raw\n" in served["map.yaml"]
     assert (independent(served, facts) == grid.cells).all()
-    assert "raw" in told.warnings[0].problem
-    forced, told = write(grid, mode="trinary")
+    assert "raw" in context.warnings[0].problem
+    forced, context = write(grid, mode="trinary")
     assert seen(read(forced)[0]) == [[0, 100], [255, 255]]
-    assert told.dropped[0]["count"] == 1
+    assert context.dropped[0]["count"] == 1
     scaled, _ = write(grid, mode="scale")
     assert list(scaled) == ["map.yaml", "map.png"]
     assert (independent(scaled, facts) == grid.cells).all()
@@ -464,27 +468,27 @@ def test_a_value_that_trinary_cannot_say_goes_out_raw(facts: Any) -> None:
 
 def test_unknown_in_scale_is_transparent_and_raw_where_pgm_was_asked(facts: Any) -> None:
     grid = grid_of([[0, 100, 255], [1, 50, 99]], mode="scale", occupied_thresh=1.0, free_thresh=0.0)
-    served, told = write(grid)
+    served, context = write(grid)
     assert list(served) == ["map.yaml", "map.png"]
     assert Image.open(io.BytesIO(served["map.png"])).mode == "LA"
     assert (independent(served, facts) == grid.cells).all()
-    assert told.warnings == []
-    plain, told = write(grid, file_type="pgm")
+    assert context.warnings == []
+    plain, context = write(grid, file_type="pgm")
     assert b"mode: raw\n" in plain["map.yaml"]
     assert (independent(plain, facts) == grid.cells).all()
-    assert "unknown" in told.warnings[0].problem
-    known = grid_of([[0, 100, 7]], mode="scale", occupied_thresh=1.0, free_thresh=0.0)
-    assert list(write(known)[0]) == ["map.yaml", "map.pgm"]
+    assert "unknown" in context.warnings[0].problem
+    complete_grid = grid_of([[0, 100, 7]], mode="scale", occupied_thresh=1.0, free_thresh=0.0)
+    assert list(write(complete_grid)[0]) == ["map.yaml", "map.pgm"]
 
 
 def test_every_cell_value_survives_the_usual_scales(facts: Any) -> None:
     every = OccupancyGrid(np.arange(101, dtype=np.uint8)[None, :].copy(), 1.0)
     for high, low in ((1.0, 0.0), (0.99, 0.01), (0.65, 0.196)):
         grid = OccupancyGrid(every.cells, 1.0, mode="scale", occupied_thresh=high, free_thresh=low)
-        served, told = write(grid)
+        served, context = write(grid)
         assert b"mode: scale" in served["map.yaml"]
         assert (independent(served, facts) == grid.cells).all()
-        assert told.warnings == []
+        assert context.warnings == []
 
 
 THRESHOLDS = st.one_of(st.floats(0, 1), st.sampled_from([0.0, 0.01, 0.196, 0.25, 0.5, 0.65, 0.99, 1.0]))
@@ -510,10 +514,10 @@ def test_any_uploaded_grid_survives(
     grid, _ = read(files)
     expected = independent(files, facts)
     assert (grid.cells == expected).all()
-    served, told = write(grid, **kind)
+    served, context = write(grid, **kind)
     assert (independent(served, facts) == expected).all()
     assert f"mode: {mode}\n".encode() in served["map.yaml"]
-    assert not any(w.level is None for w in told.warnings)
+    assert not any(w.level is None for w in context.warnings)
     again, _ = read(served)
     assert (again.occupied_thresh, again.free_thresh, again.negate) == (high, low, negate)
 
@@ -532,9 +536,9 @@ def test_any_stored_grid_survives(
 ) -> None:
     """Cells that the kept mode and thresholds cannot say (after an edit) go out in a mode that can."""
     grid = OccupancyGrid(np.array([cells], np.uint8), 0.1, (0.0, 0.0, 0.0), mode, high, low, negate)
-    served, told = write(grid, **kind)
+    served, context = write(grid, **kind)
     assert (independent(served, facts) == grid.cells).all()
-    assert any(w.level is None for w in told.warnings) == (f"mode: {mode}\n".encode() not in served["map.yaml"])
+    assert any(w.level is None for w in context.warnings) == (f"mode: {mode}\n".encode() not in served["map.yaml"])
 
 
 JSON = st.recursive(
@@ -577,8 +581,8 @@ def test_same_layers_same_bytes() -> None:
 
 
 def test_a_grid_too_wide_for_nav2_is_warned_of() -> None:
-    _, told = write(OccupancyGrid(np.zeros((1, 32768), np.uint8), 0.1))
-    assert "32767" in told.warnings[0].problem
+    _, context = write(OccupancyGrid(np.zeros((1, 32768), np.uint8), 0.1))
+    assert "32767" in context.warnings[0].problem
 
 
 # --- resampling ---------------------------------------------------------------------------------------------------
@@ -672,8 +676,8 @@ def test_baking_a_yaw_keeps_every_place(yaw: float, origin: tuple[float, float])
     index = np.floor((at - out.origin[:2]) / 0.2 + 1e-9).astype(int)
     assert (index >= 0).all()
     assert (index < [out.width, out.height]).all()
-    found = out.cells[index[:, 1], index[:, 0]]
-    assert (found[values == 100] == 100).all()
+    baked_cells = out.cells[index[:, 1], index[:, 0]]
+    assert (baked_cells[values == 100] == 100).all()
     # Every free cell was free at its centre, every cell outside is unknown, and no obstacle came from nowhere.
     at, values = place(out)
     turned = (at - np.array(origin)) @ np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]) / 0.2
@@ -706,8 +710,8 @@ def test_an_aligned_grid_stays_as_it_is() -> None:
 
 def test_normalize_is_a_parameter(facts: Any) -> None:
     grid = grid_of([[0, 100], [255, 0]], 1.0, origin=(0.3, 0.0, 0.5))
-    served, told = write(grid, normalize="true")
-    assert told.warnings == []
+    served, context = write(grid, normalize="true")
+    assert context.warnings == []
     assert facts.load_yaml(served["map.yaml"])["origin"][2] == 0.0
     assert (independent(served, facts) == occupancy_grid.normalized(grid).cells).all()
 
@@ -723,9 +727,9 @@ def test_turning_is_bounded() -> None:
 def test_cuts_and_flips_are_refused_or_read(name: str) -> None:
     files = {p.name: p.read_bytes() for p in (SAMPLES / name).iterdir()}
     dice = random.Random(name)
-    for victim, whole in files.items():
+    for victim, original in files.items():
         for _ in range(120):
-            data = bytearray(whole)
+            data = bytearray(original)
             if dice.random() < 0.5:
                 data = data[: dice.randrange(len(data))]
             else:
@@ -761,52 +765,52 @@ MASK = {p.name: p.read_bytes() for p in (SAMPLES / "mask").iterdir()}
 
 
 def info_of(files: dict[str, bytes], name: str) -> dict[str, Any]:
-    said: dict[str, Any] = yaml.safe_load(files[name])["costmap_filter_info_server"]["ros__parameters"]
-    return said
+    parameters: dict[str, Any] = yaml.safe_load(files[name])["costmap_filter_info_server"]["ros__parameters"]
+    return parameters
 
 
 def test_a_masks_parameters_come_back_with_it() -> None:
     grid, context = read(MASK)
     assert context.warnings == []
-    served, told = write(Layers({PartKey("occupancy", name="slow_mask"): grid}))
+    served, write_context = write(Layers({PartKey("occupancy", name="slow_mask"): grid}))
     assert list(served) == ["slow_mask.yaml", "slow_mask.pgm", "slow_mask_filter_info.yaml"]
     once, now = (yaml.safe_load(f) for f in (MASK["slow_params.yaml"], served["slow_mask_filter_info.yaml"]))
     assert now == once
     assert info_of(served, "slow_mask_filter_info.yaml")["type"] == 2
     base = info_of(served, "slow_mask_filter_info.yaml")["base"]
     assert type(base) is float, "ROS refuses a whole number for a parameter declared as double"
-    assert told.template == told.warnings == []
+    assert write_context.template == write_context.warnings == []
     again, _ = read(served)
     assert write(Layers({PartKey("occupancy", name="slow_mask"): again}))[0] == served
 
 
 def test_a_mask_that_does_not_say_what_it_means_gets_nav2s_usual_values() -> None:
     grid = grid_of([[0, 100]])
-    served, told = write(Layers({PartKey("occupancy", name="keepout"): grid}))
+    served, context = write(Layers({PartKey("occupancy", name="keepout"): grid}))
     assert info_of(served, "keepout_filter_info.yaml") == {
         "type": 0, "base": 0.0, "multiplier": 1.0, "mask_topic": "/keepout_filter_mask",
         "filter_info_topic": "/keepout_costmap_filter_info",
     }  # fmt: skip
     server = yaml.safe_load(served["keepout_filter_info.yaml"])["filter_mask_server"]["ros__parameters"]
     assert server == {"frame_id": "map", "topic_name": "/keepout_filter_mask", "yaml_filename": "keepout.yaml"}
-    assert [t["value"] for t in told.template] == [{"type": 0, "base": 0.0, "multiplier": 1.0}]
-    served, told = write(Layers({PartKey("occupancy", name="speed_zone"): grid_of([[0, 50], [255, 0]])}))
-    said = info_of(served, "speed_zone_filter_info.yaml")
-    assert (said["type"], said["base"], said["multiplier"]) == (1, 100.0, -1.0)
-    assert any("unknown cells" in w.problem for w in told.warnings)
+    assert [t["value"] for t in context.template] == [{"type": 0, "base": 0.0, "multiplier": 1.0}]
+    served, context = write(Layers({PartKey("occupancy", name="speed_zone"): grid_of([[0, 50], [255, 0]])}))
+    parameters = info_of(served, "speed_zone_filter_info.yaml")
+    assert (parameters["type"], parameters["base"], parameters["multiplier"]) == (1, 100.0, -1.0)
+    assert any("unknown cells" in w.problem for w in context.warnings)
     assert list(write(grid)[0]) == ["map.yaml", "map.pgm"]
 
 
 def test_parameter_files_of_namespaces_and_of_others() -> None:
-    told = yaml.safe_load(MASK["slow_params.yaml"])
-    within = {**MASK, "slow_params.yaml": yaml.safe_dump({"robot_1": {"nav": told}, "amcl": {"x": 1}}).encode()}
+    parameters = yaml.safe_load(MASK["slow_params.yaml"])
+    within = {**MASK, "slow_params.yaml": yaml.safe_dump({"robot_1": {"nav": parameters}, "amcl": {"x": 1}}).encode()}
     grid, _ = read(within)
     served, _ = write(Layers({PartKey("occupancy", name="slow_mask"): grid}))
-    assert yaml.safe_load(served["slow_mask_filter_info.yaml"]) == {"robot_1": {"nav": told}, "amcl": {"x": 1}}
+    assert yaml.safe_load(served["slow_mask_filter_info.yaml"]) == {"robot_1": {"nav": parameters}, "amcl": {"x": 1}}
     grid, context = read({**MASK, "slow_params.yaml": b"amcl: {ros__parameters: {alpha1: 0.2}}"})
     assert grid.properties == {}
     assert "no parameters" in context.warnings[0].problem
-    both = {"a": told["costmap_filter_info_server"], "b": told["costmap_filter_info_server"]}
+    both = {"a": parameters["costmap_filter_info_server"], "b": parameters["costmap_filter_info_server"]}
     _, context = read({**MASK, "slow_params.yaml": yaml.safe_dump(both).encode()})
     assert "2 filter info servers" in context.warnings[0].problem
 

@@ -230,18 +230,18 @@ def test_real_maps_hold_what_the_library_counts(shared: Path, facts_json: dict[s
     seen = real(shared)
     assert len(seen) >= 5
     for path in seen:
-        known = facts_json[path.relative_to(shared / "data").as_posix()]["facts"]
+        facts = facts_json[path.relative_to(shared / "data").as_posix()]["facts"]
         voxels, _ = read(path.read_bytes(), path.name)
-        assert voxels.resolution == known["resolution"]
-        assert voxels.leaf_counts() == {"occupied": known["occupied_leafs"], "free": known["free_leafs"]}
+        assert voxels.resolution == facts["resolution"]
+        assert voxels.leaf_counts() == {"occupied": facts["occupied_leafs"], "free": facts["free_leafs"]}
         names = {"occupied": "occupied_voxels_at_max_depth", "free": "free_voxels_at_max_depth"}
-        assert voxels.voxel_counts() == {k: known[n] for k, n in names.items()}
+        assert voxels.voxel_counts() == {k: facts[n] for k, n in names.items()}
         depths, counts = np.unique(voxels.depth, return_counts=True)
-        assert dict(zip(map(str, depths.tolist()), counts.tolist(), strict=True)) == known["leafs_by_depth"]
-        assert voxels.bounds() == pytest.approx([*known["bbox_known"][0], *known["bbox_known"][1]])
+        assert dict(zip(map(str, depths.tolist()), counts.tolist(), strict=True)) == facts["leafs_by_depth"]
+        assert voxels.bounds() == pytest.approx([*facts["bbox_known"][0], *facts["bbox_known"][1]])
         if voxels.binary:
-            assert float(voxels.log_odds.min()) == pytest.approx(known["logodds_min"], abs=1e-9)
-            assert float(voxels.log_odds.max()) == pytest.approx(known["logodds_max"], abs=1e-9)
+            assert float(voxels.log_odds.min()) == pytest.approx(facts["logodds_min"], abs=1e-9)
+            assert float(voxels.log_odds.max()) == pytest.approx(facts["logodds_max"], abs=1e-9)
 
 
 def test_real_maps_come_back_byte_for_byte(shared: Path, same: Same) -> None:
@@ -376,14 +376,14 @@ def test_a_cut_keeps_exactly_the_voxels_that_meet_the_box() -> None:
     given = [(size, base + 1, 1.0), (size, base + 2, -1.0), *((16, (base << 9) + k, 0.5) for k in range(0, 512, 3))]
     voxels = leaves(*given)
     box = (0.15, -1.0, 0.3, 0.95, 1.25, 0.52)
-    kept = smallest(cut(voxels, box))
+    remaining = smallest(cut(voxels, box))
     expected = {
         v: odds
         for v, odds in smallest(voxels).items()
         if all(v[k] * 0.1 < box[k + 3] - 1e-9 and (v[k] + 1) * 0.1 > box[k] + 1e-9 for k in range(3))
     }
-    assert kept == expected
-    assert kept
+    assert remaining == expected
+    assert remaining
     data = write(voxels, bbox=box)
     assert smallest(read(data, "a.ot")[0]) == expected
 
@@ -402,11 +402,11 @@ def test_cuts_on_faces_points_and_everything() -> None:
 
 
 def test_a_cut_does_not_grow_without_bound() -> None:
-    whole = leaves(*((1, k, -1.0) for k in range(8)))
+    voxels = leaves(*((1, k, -1.0) for k in range(8)))
     side = HALF * 0.1 - 0.15
     tracemalloc.start()
     with pytest.raises(Invalid, match="smaller box"):
-        cut(whole, (-side, -side, -side, side, side, side), most=100_000)
+        cut(voxels, (-side, -side, -side, side, side, side), limit=100_000)
     assert tracemalloc.get_traced_memory()[1] < 2**26
     tracemalloc.stop()
 

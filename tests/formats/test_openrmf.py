@@ -35,21 +35,21 @@ def sample(name: str) -> dict[str, bytes]:
 
 def read(files: dict[str, bytes] | str, **context: Any) -> tuple[Layers, ReadContext]:
     given = {"a.building.yaml": files.encode()} if isinstance(files, str) else files
-    told = ReadContext(**context)
+    read_context = ReadContext(**context)
     main = next(n for n in given if n.endswith(".building.yaml"))
-    return formats.read(Group(FORMAT, main, given), told), told
+    return formats.read(Group(FORMAT, main, given), read_context), read_context
 
 
 def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], dict[str, bytes], WriteContext]:
-    told = WriteContext(options=formats.write_options(FORMAT, options))
-    files = formats.write(FORMAT, layers, told)
-    return yaml.safe_load(files["building.yaml"]), files, told
+    context = WriteContext(options=formats.write_options(FORMAT, options))
+    files = formats.write(FORMAT, layers, context)
+    return yaml.safe_load(files["building.yaml"]), files, context
 
 
 def part(layers: Layers, layer: str, level: str) -> Features:
-    found = layers.parts[PartKey(layer, level, "network" if layer == "topology" else "openrmf")]  # type: ignore[arg-type]
-    assert isinstance(found, Features)
-    return found
+    content = layers.parts[PartKey(layer, level, "network" if layer == "topology" else "openrmf")]  # type: ignore[arg-type]
+    assert isinstance(content, Features)
+    return content
 
 
 def place(features_: Features, i: str) -> list[float]:
@@ -65,9 +65,9 @@ def with_part(layers: Layers, key: PartKey, new: Part) -> Layers:
 
 
 def real(shared: Path) -> list[Path]:
-    found = sorted((shared / "data" / "openrmf_building").glob("*/*.building.yaml"))
-    assert len(found) >= 7
-    return found
+    paths = sorted((shared / "data" / "openrmf_building").glob("*/*.building.yaml"))
+    assert len(paths) >= 7
+    return paths
 
 
 def test_every_real_building_comes_back_the_same_with_its_images(shared: Path, same: Same) -> None:
@@ -86,18 +86,18 @@ def test_facts_of_every_real_building_hold_in_the_layers(shared: Path, facts_jso
         facts = facts_json[path.relative_to(shared / "data").as_posix()]["facts"]
         layers, _ = read({path.name: path.read_bytes()})
         lifts = 0
-        for level, said in facts["levels"].items():
+        for level, level_facts in facts["levels"].items():
             network, objects = part(layers, "topology", level), part(layers, "objects", level)
             kinds = Counter(p["kind"] for p in [*network.properties, *objects.properties])
-            assert kinds["node"] == said["vertices"]
-            assert kinds["edge"] == said["directed_lanes"]
-            assert {k: kinds[k[:-1]] for k in counted} == {k: said[k] for k in counted}
-            assert sum("name" in p for p in network.properties if p["kind"] == "node") == said["named_vertices"]
+            assert kinds["node"] == level_facts["vertices"]
+            assert kinds["edge"] == level_facts["directed_lanes"]
+            assert {k: kinds[k[:-1]] for k in counted} == {k: level_facts[k] for k in counted}
+            assert sum("name" in p for p in network.properties if p["kind"] == "node") == level_facts["named_vertices"]
             graphs = Counter(
                 str(p["openrmf"]["parameters"]["graph_idx"][1]) for p in network.of_kind("edge").properties
             )
-            both = {k: v * 2 for k, v in said["lanes_by_graph_idx"].items()}
-            assert graphs == both or said["lanes_unidirectional"]
+            both = {k: v * 2 for k, v in level_facts["lanes_by_graph_idx"].items()}
+            assert graphs == both or level_facts["lanes_unidirectional"]
             lifts += kinds["lift"]
             official = facts["official_generator"]["levels"][level]
             scale, rotation, x, y = network.document["openrmf"]["transform"]
@@ -109,13 +109,13 @@ def test_facts_of_every_real_building_hold_in_the_layers(shared: Path, facts_jso
             assert np.abs([at.min(0), at.max(0)] - np.array(official["vertex_bounds_m"])).max() < 6e-5
             first = next(k for k, p in enumerate(nodes.properties) if p["openrmf"]["index"] == 0)
             assert at[first].tolist() == pytest.approx(official["first_vertex_m"], abs=6e-7)
-            assert layers.elevation(level) == said["elevation"]
+            assert layers.elevation(level) == level_facts["elevation"]
         assert lifts == len(facts["lifts"])
 
 
 def test_levels_are_placed_by_measurements_and_fiducials() -> None:
     """By hand: 0.098 m per pixel downstairs; upstairs half of it, turned by a quarter."""
-    layers, told = read(sample("clinic"))
+    layers, context = read(sample("clinic"))
     ground, up = part(layers, "topology", "Ground floor"), part(layers, "topology", "Upstairs")
     assert place(ground, "charger_1") == pytest.approx([2.94, -2.94])
     assert place(ground, "lift_ground") == pytest.approx([9.8, -4.41])
@@ -136,22 +136,22 @@ def test_levels_are_placed_by_measurements_and_fiducials() -> None:
     door = objects.index()["Ground floor/door/0"]
     assert objects.properties[door]["name"] == "ward_door"
     assert shapely.get_coordinates(objects.geometry[door]).ravel() == pytest.approx([5.88, -0.98, 5.88, -3.92])
-    assert "of another machine" in problems(told)
+    assert "of another machine" in problems(context)
     assert sorted(layers.resources()) == ["plans/ground.png", "scan.png", "up.png"]
 
 
 def test_an_image_of_another_machine_is_served_under_its_base_name() -> None:
-    said, files, _ = write(read(sample("clinic"))[0])
-    assert said["levels"]["Upstairs"]["drawing"]["filename"] == "up.png"
+    building, files, _ = write(read(sample("clinic"))[0])
+    assert building["levels"]["Upstairs"]["drawing"]["filename"] == "up.png"
     assert files["up.png"] == sample("clinic")["plans/up.png"]
-    assert said["levels"]["Ground floor"]["layers"]["laser"]["filename"] == "scan.png"
+    assert building["levels"]["Ground floor"]["layers"]["laser"]["filename"] == "scan.png"
 
 
 def test_our_samples_come_back_with_the_same_rows() -> None:
     for name in ("clinic", "yard", "quay"):
         files = sample(name)
         original = yaml.safe_load(files[f"{name}.building.yaml"])
-        said, _, told = write(read(files)[0])
+        building, _, context = write(read(files)[0])
         for level, one in original["levels"].items():
             for section, rows in one.items():
                 if section in ("drawing", "layers"):
@@ -159,22 +159,22 @@ def test_our_samples_come_back_with_the_same_rows() -> None:
                 if section == "floors":
                     rows = [{"parameters": {}, **row} for row in rows]
                 if section in ("vertices", "fiducials"):
-                    for row, new in zip(rows, said["levels"][level][section], strict=True):
+                    for row, new in zip(rows, building["levels"][level][section], strict=True):
                         assert new[:2] == pytest.approx(row[:2], abs=1e-9)
                         assert new[2:] == row[2:]
                 elif section == "models":
-                    for row, new in zip(rows, said["levels"][level][section], strict=True):
+                    for row, new in zip(rows, building["levels"][level][section], strict=True):
                         assert new == pytest.approx({"z": 0, **row}, abs=1e-9)
                 else:
-                    assert said["levels"][level].get(section) == rows or rows == {}, (name, level, section)
+                    assert building["levels"][level].get(section) == rows or rows == {}, (name, level, section)
         for key, value in original.items():
             if key == "lifts" and value:
-                old, new = value["Lift A"], said["lifts"]["Lift A"]
+                old, new = value["Lift A"], building["lifts"]["Lift A"]
                 assert [new.pop(axis) for axis in "xy"] == pytest.approx([old.pop(axis) for axis in "xy"], abs=1e-9)
                 assert new == old
             elif key != "levels":
-                assert said[key] == value
-        assert not told.dropped
+                assert building[key] == value
+        assert not context.dropped
 
 
 def test_degrees_stay_degrees_and_metres_stay_metres() -> None:
@@ -182,12 +182,12 @@ def test_degrees_stay_degrees_and_metres_stay_metres() -> None:
     network = part(quay, "topology", "L1")
     assert not network.local.any()
     assert place(network, "berth_1") == [103.78, 1.3]
-    yard, told = read(sample("yard"))
+    yard, context = read(sample("yard"))
     ground = part(yard, "topology", "ground")
     assert place(ground, "gate#2") == [12.5, -3.25]
     assert ground.geometry[ground.index()["ground/2"]].z == 0.5
-    assert "stand for several vertices" in problems(told)
-    assert "from a vertex to itself" in problems(told)
+    assert "stand for several vertices" in problems(context)
+    assert "from a vertex to itself" in problems(context)
 
 
 def test_web_mercator_is_brought_to_degrees_and_back() -> None:
@@ -203,8 +203,8 @@ levels:
     x, y = place(network, "x")
     assert x == pytest.approx((201.8 - 128) / 128 * 180)
     assert math.asinh(math.tan(math.radians(y))) == pytest.approx(0.9 / 128 * math.pi)
-    said, _, _ = write(layers)
-    assert said["levels"]["L"]["vertices"][1][:2] == pytest.approx([201.8, -127.1], abs=1e-9)
+    building, _, _ = write(layers)
+    assert building["levels"]["L"]["vertices"][1][:2] == pytest.approx([201.8, -127.1], abs=1e-9)
 
 
 def test_an_edge_that_is_gone_leaves_a_one_way_lane() -> None:
@@ -212,8 +212,8 @@ def test_an_edge_that_is_gone_leaves_a_one_way_lane() -> None:
     key = PartKey("topology", "Ground floor", "network")
     network = part(layers, "topology", "Ground floor")
     forward = network.index()["charger_1_ward: 3"]
-    said, _, _ = write(with_part(layers, key, network.take(np.arange(len(network)) != forward)))
-    lane = said["levels"]["Ground floor"]["lanes"][0]
+    building, _, _ = write(with_part(layers, key, network.take(np.arange(len(network)) != forward)))
+    lane = building["levels"]["Ground floor"]["lanes"][0]
     assert lane[:2] == [6, 5]
     assert lane[2]["bidirectional"] == [4, False]
     assert lane[2]["orientation"] == [1, "backward"]
@@ -227,8 +227,8 @@ def test_ways_of_different_speed_are_two_lanes() -> None:
     k = network.index()["charger_1_ward: 3"]
     properties[k] = {**properties[k], "speed_limit": 0.25}
     changed = Features(network.ids, network.geometry, tuple(properties), network.local, network.document)
-    said, _, _ = write(with_part(layers, key, changed))
-    first, second = said["levels"]["Ground floor"]["lanes"][:2]
+    building, _, _ = write(with_part(layers, key, changed))
+    first, second = building["levels"]["Ground floor"]["lanes"][:2]
     assert (first[:2], first[2]["speed_limit"], first[2]["bidirectional"]) == ([5, 6], [3, 0.25], [4, False])
     assert (second[:2], second[2]["speed_limit"], second[2]["bidirectional"]) == ([6, 5], [3, 0.5], [4, False])
 
@@ -240,13 +240,13 @@ def test_a_moved_node_leaves_its_walls_where_they_stood() -> None:
     geometry = network.geometry.copy()
     geometry[network.index()["Ground floor/0"]] = shapely.Point(9.8, -9.8)
     changed = Features(network.ids, geometry, network.properties, network.local, network.document)
-    said, _, told = write(with_part(layers, key, changed))
-    level = said["levels"]["Ground floor"]
+    building, _, context = write(with_part(layers, key, changed))
+    level = building["levels"]["Ground floor"]
     assert level["vertices"][0][:2] == pytest.approx([100, 100])
     assert level["walls"][0][:2] == [10, 1]
     assert level["vertices"][10][:2] == pytest.approx([10, 10])
-    assert said["coordinate_system"] == "reference_image"
-    assert not told.warnings
+    assert building["coordinate_system"] == "reference_image"
+    assert not context.warnings
 
 
 def test_a_changed_measurement_makes_it_metres_and_says_so() -> None:
@@ -255,20 +255,20 @@ def test_a_changed_measurement_makes_it_metres_and_says_so() -> None:
     objects = part(layers, "objects", "Ground floor")
     properties = list(objects.properties)
     k = objects.index()["Ground floor/measurement/0"]
-    own = properties[k]["openrmf"]
-    properties[k] = {**properties[k], "openrmf": {**own, "parameters": {"distance": [3, 20]}}}
+    source_properties = properties[k]["openrmf"]
+    properties[k] = {**properties[k], "openrmf": {**source_properties, "parameters": {"distance": [3, 20]}}}
     changed = Features(objects.ids, objects.geometry, tuple(properties), objects.local, objects.document)
-    said, _, told = write(with_part(layers, key, changed))
-    assert said["coordinate_system"] == "cartesian_meters"
-    assert said["levels"]["Upstairs"]["vertices"][0][:2] == pytest.approx([9.8, -4.41])
-    assert "drawing" not in said["levels"]["Ground floor"]
-    assert "no longer place level" in problems(told)
-    assert any("pixels" in line["what"] for line in told.dropped)
+    building, _, context = write(with_part(layers, key, changed))
+    assert building["coordinate_system"] == "cartesian_meters"
+    assert building["levels"]["Upstairs"]["vertices"][0][:2] == pytest.approx([9.8, -4.41])
+    assert "drawing" not in building["levels"]["Ground floor"]
+    assert "no longer place level" in problems(context)
+    assert any("pixels" in line["what"] for line in context.dropped)
 
 
 def test_a_network_of_another_format_is_written_in_metres() -> None:
-    here = Datum(53.0, -0.5)
-    at = local_frame(here).to_wgs84(np.array([[0.0, 0.0], [10.0, 5.0], [20.0, 5.0]]))
+    datum = Datum(53.0, -0.5)
+    at = local_frame(datum).to_wgs84(np.array([[0.0, 0.0], [10.0, 5.0], [20.0, 5.0]]))
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         (f"n{k}", shapely.Point(xy), {"kind": "node", "osm": {"tags": {}}}) for k, xy in enumerate(at)
     ]
@@ -277,9 +277,9 @@ def test_a_network_of_another_format_is_written_in_metres() -> None:
         limit = {"speed_limit": 1.5} if a + b == 1 else {}
         rows.append((f"w{a}{b}", line, {"kind": "edge", "source": f"n{a}", "target": f"n{b}", "width": 2.0, **limit}))
     key = PartKey("topology", "ground", "network")
-    said, _, told = write(Layers({key: features(rows, "wgs84")}, here))
-    assert said["coordinate_system"] == "cartesian_meters"
-    level = said["levels"]["ground"]
+    building, _, context = write(Layers({key: features(rows, "wgs84")}, datum))
+    assert building["coordinate_system"] == "cartesian_meters"
+    level = building["levels"]["ground"]
     assert [v[3] for v in level["vertices"]] == ["n0", "n1", "n2"]
     assert level["vertices"][1][:2] == pytest.approx([10, 5], abs=1e-6)
     assert [lane[:2] for lane in level["lanes"]] == [[0, 1], [1, 2]]
@@ -291,13 +291,13 @@ def test_a_network_of_another_format_is_written_in_metres() -> None:
         "orientation": [1, ""],
         "speed_limit": [3, 0],
     }
-    assert {line["what"] for line in told.dropped} >= {"edges' widths", "nodes' attributes of other formats"}
-    filled = {line["what"]: line["value"] for line in told.template}
+    assert {line["what"] for line in context.dropped} >= {"edges' widths", "nodes' attributes of other formats"}
+    filled = {line["what"]: line["value"] for line in context.template}
     assert filled == {"name": "map", "lanes: graph_idx": 0, "lanes: speed_limit": 0.0, "lanes: orientation": ""}
-    wish = {"chargers": "n1", "robot_name": "tractor", "graph": 2, "speed_limit": 0.8, "building": "Barn"}
-    said, _, told = write(Layers({key: features(rows, "wgs84")}, here), **wish)
-    level = said["levels"]["ground"]
-    assert said["name"] == "Barn"
+    options = {"chargers": "n1", "robot_name": "tractor", "graph": 2, "speed_limit": 0.8, "building": "Barn"}
+    building, _, context = write(Layers({key: features(rows, "wgs84")}, datum), **options)
+    level = building["levels"]["ground"]
+    assert building["name"] == "Barn"
     assert level["vertices"][1][4] == {
         "is_charger": [4, True],
         "is_holding_point": [4, True],
@@ -307,15 +307,15 @@ def test_a_network_of_another_format_is_written_in_metres() -> None:
     }
     assert [lane[2]["speed_limit"] for lane in level["lanes"]] == [[3, 1.5], [3, 0.8]]
     assert {lane[2]["graph_idx"][1] for lane in level["lanes"]} == {2}
-    assert {line["option"] for line in told.template if "option" in line} == {*wish, "robot_type"}
+    assert {line["option"] for line in context.template if "option" in line} == {*options, "robot_type"}
 
 
 def test_a_network_on_a_level_of_its_own_stands_beside_a_building_in_pixels() -> None:
     layers, _ = read(sample("clinic"))
     node = features([("a", shapely.Point(3.0, 4.0), {"kind": "node"})], "local")
-    said, files, _ = write(with_part(layers, PartKey("topology", "roof", "network"), node))
-    assert said["coordinate_system"] == "reference_image"
-    assert list(said["levels"])[-1] == "roof"
+    building, files, _ = write(with_part(layers, PartKey("topology", "roof", "network"), node))
+    assert building["coordinate_system"] == "reference_image"
+    assert list(building["levels"])[-1] == "roof"
     again, _ = read({"x.building.yaml": files["building.yaml"]})
     assert place(part(again, "topology", "roof"), "a") == pytest.approx([3.0, 4.0])
 
@@ -324,11 +324,11 @@ def test_two_buildings_are_written_in_metres() -> None:
     clinic, _ = read(sample("clinic"))
     yard, _ = read(sample("yard"))
     both = Layers({**clinic.parts, **yard.parts}, None, (*clinic.levels, *yard.levels))
-    said, _, told = write(both)
-    assert said["coordinate_system"] == "cartesian_meters"
-    assert said["levels"]["ground"]["vertices"][1][:2] == [12.5, -3.25]
-    assert said["levels"]["Ground floor"]["vertices"][5][:2] == pytest.approx([2.94, -2.94])
-    assert "different buildings" in problems(told)
+    building, _, context = write(both)
+    assert building["coordinate_system"] == "cartesian_meters"
+    assert building["levels"]["ground"]["vertices"][1][:2] == [12.5, -3.25]
+    assert building["levels"]["Ground floor"]["vertices"][5][:2] == pytest.approx([2.94, -2.94])
+    assert "different buildings" in problems(context)
 
 
 def test_a_building_without_vertices_is_a_map_of_its_own_format_only() -> None:
@@ -346,23 +346,23 @@ def test_rows_to_vertices_that_do_not_exist_are_kept_and_come_back() -> None:
     text += (
         "    lanes: [[0, 7, {graph_idx: [2, 0]}], [0, 1, {graph_idx: [2, 0]}]]\n    floors: [{vertices: [0, 1, 9]}]\n"
     )
-    layers, told = read(text)
-    assert "joins the vertices 0 and 7, but the level has 2" in problems(told)
-    said, _, warned = write(layers)
-    lanes = said["levels"]["L"]["lanes"]
+    layers, context = read(text)
+    assert "joins the vertices 0 and 7, but the level has 2" in problems(context)
+    building, _, warned = write(layers)
+    lanes = building["levels"]["L"]["lanes"]
     assert lanes == [[0, 1, {"graph_idx": [2, 0]}], [0, 7, {"graph_idx": [2, 0]}]]
-    assert said["levels"]["L"]["floors"] == [{"vertices": [0, 1, 9]}]
+    assert building["levels"]["L"]["floors"] == [{"vertices": [0, 1, 9]}]
     assert "will refuse the file" in problems(warned)
 
 
 def test_without_measurements_and_fiducials_a_pixel_is_a_metre_with_a_warning() -> None:
     text = "name: m\nlevels:\n  A: {elevation: 0, vertices: [[3, 4, 0, a]]}\n"
     text += "  B: {elevation: 1, vertices: [[5, 6, 0, b]]}\n"
-    layers, told = read(text)
+    layers, context = read(text)
     assert place(part(layers, "topology", "A"), "a") == [3, -4]
     assert place(part(layers, "topology", "B"), "b") == [5, -6]
-    assert "no measurement tells the scale" in problems(told)
-    assert "fewer than two fiducials" in problems(told)
+    assert "no measurement tells the scale" in problems(context)
+    assert "fewer than two fiducials" in problems(context)
 
 
 LEVEL = "name: m\nlevels:\n  L:\n    elevation: 0\n"
@@ -431,5 +431,5 @@ def test_a_large_building_is_read_and_written_in_bounded_time() -> None:
         for k in range(n - 1)
     )
     layers, _ = read(f"{LEVEL}    lanes:\n{lanes}    vertices:\n{vertices}", limits=Limits())
-    said, _, _ = write(layers)
-    assert len(said["levels"]["L"]["lanes"]) == n - 1
+    building, _, _ = write(layers)
+    assert len(building["levels"]["L"]["lanes"]) == n - 1

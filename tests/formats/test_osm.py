@@ -34,8 +34,8 @@ TOPOLOGY, OBJECTS = PartKey("topology", "ground", NETWORK), PartKey("objects", "
 
 
 def read(data: bytes, context: ReadContext | None = None, **options: Any) -> Layers:
-    known = formats.get_format("osm")
-    return formats.read(Group(known, "map.osm", {"map.osm": data}), context or ReadContext(**options))
+    fmt = formats.get_format("osm")
+    return formats.read(Group(fmt, "map.osm", {"map.osm": data}), context or ReadContext(**options))
 
 
 def write(layers: Layers, context: WriteContext | None = None) -> bytes:
@@ -44,9 +44,9 @@ def write(layers: Layers, context: WriteContext | None = None) -> bytes:
 
 
 def part(layers: Layers, key: PartKey) -> Features:
-    found = layers.parts[key]
-    assert isinstance(found, Features)
-    return found
+    content = layers.parts[key]
+    assert isinstance(content, Features)
+    return content
 
 
 def network(layers: Layers) -> networkx.MultiDiGraph:
@@ -98,20 +98,20 @@ def check_with_osmium(data: bytes, folder: Path) -> None:
 @pytest.mark.parametrize("name", REAL)
 def test_real_extracts_agree_with_counted_facts(name: str, shared: Path, facts_json: dict[str, Any]) -> None:
     path = f"osm/{name}/osm.xml"
-    known = facts_json[path]["facts"]
+    facts = facts_json[path]["facts"]
     layers = read((shared / "data" / path).read_bytes())
     graph = network(layers)
-    assert graph.number_of_nodes() == known["distinct_nodes_used_by_highway_ways"]
+    assert graph.number_of_nodes() == facts["distinct_nodes_used_by_highway_ways"]
     undirected = {frozenset((a, b)) for a, b, _ in graph.edges}
-    assert len(undirected) == known["undirected_highway_edges"]
-    assert networkx.number_weakly_connected_components(graph) == known["highway_connected_components"]
+    assert len(undirected) == facts["undirected_highway_edges"]
+    assert networkx.number_weakly_connected_components(graph) == facts["highway_connected_components"]
     objects = part(layers, OBJECTS)
     highways = objects.of_kind("highway")
-    ways = [p["osm"]["tags"]["highway"] for p, i in zip(highways.properties, highways.ids, strict=True) if i[0] == "w"]
-    assert {k: ways.count(k) for k in ways} == known["highway_kinds"]
-    assert sum(i[0] == "w" for i in objects.ids) == known["ways"]
-    assert sum(i[0] == "r" for i in objects.ids) == known["relations"]
-    box = known["bounds_element"]
+    kinds = [p["osm"]["tags"]["highway"] for p, i in zip(highways.properties, highways.ids, strict=True) if i[0] == "w"]
+    assert {k: kinds.count(k) for k in kinds} == facts["highway_kinds"]
+    assert sum(i[0] == "w" for i in objects.ids) == facts["ways"]
+    assert sum(i[0] == "r" for i in objects.ids) == facts["relations"]
+    box = facts["bounds_element"]
     assert objects.document["bounds"] == [box["minlon"], box["minlat"], box["maxlon"], box["maxlat"]]
     assert "http://opendatacommons.org/licenses/odbl/1-0/" in objects.document["attribution"]
     # A two-way street is two edges; a one-way street is one, in the direction of its tags.
@@ -122,9 +122,9 @@ def test_real_extracts_agree_with_counted_facts(name: str, shared: Path, facts_j
 
 @pytest.mark.parametrize("name", REAL)
 def test_committed_datums_are_the_corner_of_the_bounds(name: str, shared: Path, facts_json: dict[str, Any]) -> None:
-    known = facts_json[f"osm/{name}/datum_autogen.yaml"]["facts"]
+    facts = facts_json[f"osm/{name}/datum_autogen.yaml"]["facts"]
     west, south, _, _ = part(read((shared / "data/osm" / name / "osm.xml").read_bytes()), TOPOLOGY).document["bounds"]
-    assert [south, west] == [known["datum_latitude"], known["datum_longitude"]]
+    assert [south, west] == [facts["datum_latitude"], facts["datum_longitude"]]
 
 
 def test_the_datasets_own_network_has_our_nodes_and_edges(shared: Path, facts: Any) -> None:
@@ -166,14 +166,14 @@ def test_both_ways_through_xml_and_a_reader_who_wants_less(name: str, shared: Pa
     assert (quick.tags, quick.ways, quick.relations) == (careful.tags, careful.ways, careful.relations)
     assert (quick.root, quick.bounds) == (careful.root, careful.bounds)
     assert all(quick.attributes(k) == careful.attributes(k) for k in range(len(quick.ids)))
-    whole, less = read(data), read(data, wanted=frozenset({"topology"}))
+    complete, less = read(data), read(data, wanted=frozenset({"topology"}))
     assert set(less.parts) == {TOPOLOGY}
-    a, b = part(whole, TOPOLOGY), part(less, TOPOLOGY)
+    a, b = part(complete, TOPOLOGY), part(less, TOPOLOGY)
     assert (a.ids, a.properties, a.document) == (b.ids, b.properties, b.document)
     assert shapely.equals(a.geometry, b.geometry).all()
 
 
-def said(data: _osm.Data) -> Any:
+def contents(data: _osm.Data) -> Any:
     """All that was read, to be compared."""
     nodes = [(i, at, data.tags.get(k), data.attributes(k)) for k, (i, at) in enumerate(zip(data.ids, data.lonlat.tolist(), strict=True))]  # fmt: skip  # noqa: E501
     return nodes, data.ways, data.relations, data.root, data.bounds
@@ -189,12 +189,12 @@ def test_nodes_are_scanned_piece_by_piece(piece: int, monkeypatch: pytest.Monkey
     way = ' <way id="5" version="1">\n  <nd ref="1"/>\n  <nd ref="39"/>\n  <tag k="highway" v="path"/>\n </way>'
     text = "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6">', *nodes, way, "</osm>", ""])
     data = text.encode()
-    whole = _osm._events(data, Limits())
+    reference = _osm._events(data, Limits())
     monkeypatch.setattr(_osm, "SCANNED", piece)
     pieces = _osm._scan(data, Limits(), False)
     assert pieces is not None
     assert len(pieces.ids) > 5
-    assert said(pieces) == said(whole)
+    assert contents(pieces) == contents(reference)
 
 
 def test_attributes_of_any_name_are_kept_however_many_lists_of_them_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,12 +203,12 @@ def test_attributes_of_any_name_are_kept_however_many_lists_of_them_there_are(mo
     names = ["version", "__class__", "__dict__", "user", "uid", "changeset", "x:y", "a.b-c"]
     rows = [f'<node id="{k}" {n}="{k} &amp; {n}" visible="true" lat="1.5" lon="{k}"/>' for k, n in enumerate(names, 1)]
     text = f'<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6">\n{" ".join(rows)}\n</osm>'.encode()
-    found = _osm._scan(text.replace(b"x:y", b"x_y"), Limits(), False)
-    assert found is not None
+    content = _osm._scan(text.replace(b"x:y", b"x_y"), Limits(), False)
+    assert content is not None
     expected = [
         {n.replace(":", "_"): f"{k} & {n.replace(':', '_')}", "visible": "true"} for k, n in enumerate(names, 1)
     ]
-    assert [found.attributes(k) for k in range(len(names))] == expected
+    assert [content.attributes(k) for k in range(len(names))] == expected
 
 
 def test_defective_files_as_their_authors_mean_them(shared: Path, same: Callable[..., list[str]]) -> None:
@@ -250,10 +250,10 @@ def test_the_samples_network() -> None:
         *("w103:3-5", "w103:5-3", "w103:5-3#2", "w103:3-5#2"),
     }
     assert graph.nodes["n2"]["at"] == (7.001, 50.0)
-    said = {f.id: f.properties for f in part(layers, TOPOLOGY)}
-    assert said["n2"]["osm"]["tags"] == {"highway": "traffic_signals"}
-    assert said["n3"]["osm"]["attributes"]["user"] == 'Zoë & "Co"'
-    assert said["w100:1-2"]["osm"] == {"way": 100, "tags": {"highway": "residential", "name": "Straße"}}
+    properties = {f.id: f.properties for f in part(layers, TOPOLOGY)}
+    assert properties["n2"]["osm"]["tags"] == {"highway": "traffic_signals"}
+    assert properties["n3"]["osm"]["attributes"]["user"] == 'Zoë & "Co"'
+    assert properties["w100:1-2"]["osm"] == {"way": 100, "tags": {"highway": "residential", "name": "Straße"}}
     texts = " ".join(f"{p.where} {p.problem}" for p in context.warnings)
     for expected in ("way 103 the way goes from a node to itself", "way 106 the way is marked as deleted"):
         assert expected in texts
@@ -375,8 +375,8 @@ def test_a_deleted_edge_splits_its_way(tmp_path: Path) -> None:
     body += '<way id="9" version="2">' + "".join(f'<nd ref="{i}"/>' for i in range(1, 6))
     body += '<tag k="highway" v="path"/></way><relation id="1"><member type="way" ref="9" role="r"/></relation>'
     layers = read(xml(body))
-    gone = edited(layers, lambda rows: [r for r in rows if r[0] not in ("w9:2-3", "w9:3-2", "w9:4-3")])
-    served = write(gone)
+    edited_layers = edited(layers, lambda rows: [r for r in rows if r[0] not in ("w9:2-3", "w9:3-2", "w9:4-3")])
+    served = write(edited_layers)
     out = elements(served)
     assert refs(served, "w9") == ["1", "2"]
     assert refs(served, "w-1") == ["3", "4"]
@@ -384,7 +384,7 @@ def test_a_deleted_edge_splits_its_way(tmp_path: Path) -> None:
     assert refs(served, "w-2") == ["4", "5"]
     assert out["w-2"][2] == {"highway": "path"}
     assert [m["ref"] for m in out["r1"][1]] == ["9", "-1", "-2"]
-    before, after = network(gone), network(read(served))
+    before, after = network(edited_layers), network(read(served))
     assert {(a, b) for a, b, _ in before.edges} == {(a, b) for a, b, _ in after.edges}
     check_with_osmium(served, tmp_path)
 
@@ -508,16 +508,16 @@ def test_items_of_other_formats_get_tags() -> None:
         "maxlat": "50.001",
         "maxlon": "7.001",
     }
-    said = [v[2] for v in elements(served).values()]
-    assert {"name": 'North "field"', "kind": "region", "crop": "wheat", "area": "yes"} in said
-    assert {"name": "pond", "kind": "region", "type": "multipolygon"} in said
-    assert {"name": "tree", "kind": "poi", "height": "3.5", "alive": "yes"} in said
-    assert {"name": "z", "kind": "keepout", "zone": "keepout", "area": "yes"} in said
-    assert {"name": "up", "kind": "path", "level": "L2"} in said
-    assert not any(t.get("name") == "drawn" for t in said), "the network made from it stands there already"
+    tags = [v[2] for v in elements(served).values()]
+    assert {"name": 'North "field"', "kind": "region", "crop": "wheat", "area": "yes"} in tags
+    assert {"name": "pond", "kind": "region", "type": "multipolygon"} in tags
+    assert {"name": "tree", "kind": "poi", "height": "3.5", "alive": "yes"} in tags
+    assert {"name": "z", "kind": "keepout", "zone": "keepout", "area": "yes"} in tags
+    assert {"name": "up", "kind": "path", "level": "L2"} in tags
+    assert not any(t.get("name") == "drawn" for t in tags), "the network made from it stands there already"
     lost = {d["what"] for d in context.dropped}
     assert {"GNSS fence", "datum", "items without a geometry"} <= lost
-    assert any("nested" in what for what in lost)
+    assert any("nested" in item for item in lost)
 
 
 def test_two_levels_with_the_same_ids_do_not_melt() -> None:
@@ -539,7 +539,7 @@ def test_two_levels_with_the_same_ids_do_not_melt() -> None:
 
 
 def test_properties_that_anybody_edited_do_no_harm() -> None:
-    said: list[dict[str, Any]] = [
+    source_properties: list[dict[str, Any]] = [
         {"refs": "1,2", "tags": {"a": 1}},
         {"refs": [1.5, None], "tags": []},
         {"refs": [True], "tags": {"highway": "path"}},
@@ -553,7 +553,7 @@ def test_properties_that_anybody_edited_do_no_harm() -> None:
         },
     ]
     line = shapely.LineString([(7, 50), (7.1, 50)])
-    rows: list[Any] = [(f"w{k + 1}", line, {"kind": "line", "osm": s}) for k, s in enumerate(said)]
+    rows: list[Any] = [(f"w{k + 1}", line, {"kind": "line", "osm": s}) for k, s in enumerate(source_properties)]
     rows += [
         ("r1", None, {"osm": {"members": [["way"], "x", ["way", "1", "r"], ["node", 1, 5]]}}),
         ("n0x", line, {"osm": 5}),
@@ -631,9 +631,9 @@ def test_other_encodings_and_layouts_are_read() -> None:
         text.replace('"Zoë"', '"Zo&#235;"').encode(),
         text.replace('<tag k="name" v="Zoë"/>', "<tag\nv = 'Zoë'\n k='name' ></tag>").encode(),
     ):
-        found = part(read(data), OBJECTS)
-        assert found.ids == part(expected, OBJECTS).ids
-        assert found.properties == part(expected, OBJECTS).properties
+        content = part(read(data), OBJECTS)
+        assert content.ids == part(expected, OBJECTS).ids
+        assert content.properties == part(expected, OBJECTS).properties
         assert osm.detect("x", data)
 
 
@@ -722,18 +722,18 @@ TOWN = """<node id="1" lat="50" lon="7.0"/><node id="2" lat="50" lon="7.1"/><nod
 
 def test_tags_in_canonical_words() -> None:
     layers = read(xml(TOWN))
-    said = {f.id: {k: v for k, v in f.properties.items() if k != "osm"} for f in part(layers, OBJECTS)}
-    assert said["n6"] == {"kind": "tree", "height": 12.0, "width": pytest.approx(0.49974652)}
-    assert said["w4"] == {"kind": "building", "height": 12.0, "base": 3.0}
-    assert said["w5"] == {"kind": "water", "width": 2.0}
-    assert said["w6"] == {"kind": "barrier", "height": 1.5}
-    assert said["w7"] == {"kind": "waterway"}
-    assert said["w1"] == {"kind": "highway"}, "what a road measures is said of its edges"
+    properties = {f.id: {k: v for k, v in f.properties.items() if k != "osm"} for f in part(layers, OBJECTS)}
+    assert properties["n6"] == {"kind": "tree", "height": 12.0, "width": pytest.approx(0.49974652)}
+    assert properties["w4"] == {"kind": "building", "height": 12.0, "base": 3.0}
+    assert properties["w5"] == {"kind": "water", "width": 2.0}
+    assert properties["w6"] == {"kind": "barrier", "height": 1.5}
+    assert properties["w7"] == {"kind": "waterway"}
+    assert properties["w1"] == {"kind": "highway"}, "what a road measures is said of its edges"
     edges = {f.id: f.properties for f in part(layers, TOPOLOGY) if f.properties["kind"] == "edge"}
     road = {"width": 6.0, "surface": "asphalt"}
     for i, limit in (("w1:1-2", 13.4112), ("w1:2-1", 1.666666667)):
-        own = {k: v for k, v in edges[i].items() if k not in ("kind", "source", "target", "osm")}
-        assert own == {**road, "speed_limit": limit}
+        attributes = {k: v for k, v in edges[i].items() if k not in ("kind", "source", "target", "osm")}
+        assert attributes == {**road, "speed_limit": limit}
     assert (edges["w2:4-5"]["access"], edges["w2:4-5"]["width"]) == ("private", pytest.approx(2.0066))
     assert edges["w3:2-4"]["stairs"] is True
     # The bridge goes over the road and shares no node with it.
@@ -825,39 +825,39 @@ FURTHER = """\
 
 def test_elements_that_osm_does_not_know_come_back() -> None:
     data = xml(FURTHER, '<osm version="0.6" generator="JOSM" upload="false">')
-    told, said = ReadContext(), WriteContext()
-    layers = read(data, told)
-    served = write(layers, said)
+    read_context, write_context = ReadContext(), WriteContext()
+    layers = read(data, read_context)
+    served = write(layers, write_context)
 
     def tree(e: etree._Element) -> Any:
         return e.tag, sorted(e.attrib.items()), (e.text or "").strip(), [tree(c) for c in e]
 
     assert sorted(map(tree, etree.fromstring(served))) == sorted(map(tree, etree.fromstring(data)))
     assert dict(etree.fromstring(served).attrib) == {"version": "0.6", "generator": "JOSM", "upload": "false"}
-    assert said.dropped == []
-    assert [p.where for p in told.warnings] == ["node 1", "node 3", "way 4", "relation 5"]
+    assert write_context.dropped == []
+    assert [p.where for p in read_context.warnings] == ["node 1", "node 3", "way 4", "relation 5"]
     assert write(read(served)) == served
 
 
 @pytest.mark.parametrize("source", ["tmap2", "geojson"])
 def test_an_edge_from_a_node_to_itself_survives(source: str) -> None:
     datum = Datum(53.0, -0.5)
-    here, there = shapely.Point(0, 0), shapely.Point(5, 0)
+    start, end = shapely.Point(0, 0), shapely.Point(5, 0)
 
     def edge(i: str, a: str, b: str, line: list[tuple[float, float]]) -> Any:
         return i, shapely.LineString(line), {"kind": "edge", "source": a, "target": b, "action": "move_base"}
 
     rows = [
-        ("a", here, {"kind": "node"}),
-        ("b", there, {"kind": "node"}),
+        ("a", start, {"kind": "node"}),
+        ("b", end, {"kind": "node"}),
         edge("a_b", "a", "b", [(0, 0), (5, 0)]),
         edge("b_b", "b", "b", [(5, 0), (5, 0)]),
         edge("b_a", "b", "a", [(5, 0), (0, 0)]),
     ]
-    known = formats.get_format(source)
-    files = formats.write(known, Layers({TOPOLOGY: features(rows, "local")}, datum), WriteContext())
+    fmt = formats.get_format(source)
+    files = formats.write(fmt, Layers({TOPOLOGY: features(rows, "local")}, datum), WriteContext())
     main = next(iter(files))
-    uploaded = formats.read(Group(known, main, files), ReadContext(main=main))
+    uploaded = formats.read(Group(fmt, main, files), ReadContext(main=main))
     served = write(Layers(uploaded.parts, datum))
     again = network(read(served))
     assert sorted(a == b for a, b in again.edges()) == [False, False, True]
@@ -868,11 +868,11 @@ def test_an_edge_from_a_node_to_itself_survives(source: str) -> None:
 def test_a_node_twice_within_a_way_is_no_edge() -> None:
     nodes = "".join(f'<node id="{k}" lat="1.{k}" lon="1"/>' for k in (1, 2))
     refs = "".join(f'<nd ref="{k}"/>' for k in (1, 1, 2))
-    told = ReadContext()
+    context = ReadContext()
     twice = '<way id="4"><nd ref="2"/><nd ref="2"/><tag k="highway" v="path"/></way>'
-    found = network(read(xml(f'{nodes}<way id="3">{refs}<tag k="highway" v="path"/></way>{twice}'), told))
-    assert sorted(found.edges()) == [("n1", "n2"), ("n2", "n1")]
-    assert ["that segment is no edge" in p.problem for p in told.warnings] == [True, True]
+    graph = network(read(xml(f'{nodes}<way id="3">{refs}<tag k="highway" v="path"/></way>{twice}'), context))
+    assert sorted(graph.edges()) == [("n1", "n2"), ("n2", "n1")]
+    assert ["that segment is no edge" in p.problem for p in context.warnings] == [True, True]
 
 
 def test_values_that_are_not_understood_are_named_with_their_number() -> None:
@@ -887,8 +887,8 @@ def test_values_that_are_not_understood_are_named_with_their_number() -> None:
             {"railway": "rail", "maxspeed": "fast"},
         )
     ):
-        said = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
-        ways += f'<way id="{k}"><nd ref="1"/><nd ref="2"/>{said}</way>'
+        tag_xml = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        ways += f'<way id="{k}"><nd ref="1"/><nd ref="2"/>{tag_xml}</way>'
     context = ReadContext()
     read(f'<osm version="0.6">{nodes}{tree}{ways}</osm>'.encode(), context)
     assert [(p.where, p.problem) for p in context.warnings] == [

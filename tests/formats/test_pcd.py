@@ -53,19 +53,19 @@ def header(fields: str = "x y z", size: str = "4 4 4", kind: str = "F F F", n: i
 @pytest.mark.parametrize("name", REAL)
 def test_facts_of_real_clouds(shared: Path, facts_json: dict[str, Any], name: str) -> None:
     data = (shared / "data/pointcloud/pcl_data" / name).read_bytes()
-    said = facts_json[f"pointcloud/pcl_data/{name}"]["facts"]
+    facts = facts_json[f"pointcloud/pcl_data/{name}"]["facts"]
     cloud = parse(data, ReadContext())
     places = cloud.places(0, len(cloud))
-    assert len(cloud) == said["points"]
-    assert int(np.isfinite(places).all(axis=1).sum()) == said["finite_points"]
-    assert np.allclose([places.min(axis=0), places.max(axis=0)], said["bounds"], atol=1e-3)
+    assert len(cloud) == facts["points"]
+    assert int(np.isfinite(places).all(axis=1).sum()) == facts["finite_points"]
+    assert np.allclose([places.min(axis=0), places.max(axis=0)], facts["bounds"], atol=1e-3)
     voxels, context, _ = read(data)
     x, y, z = (places[:, k] - o for k, o in enumerate(voxels.properties["points"].get("origin", (0, 0, 0))))
     truth = {tuple(math.floor(v / 0.05) for v in p) for p in zip(x.tolist(), y.tolist(), z.tolist(), strict=True)}
-    mine = cells(voxels)
+    voxel_cells = cells(voxels)
     # A quotient and a product may round to two sides of a voxel's face.
-    assert len(truth ^ mine) <= 0.01 * len(truth)
-    assert all(any((i + a, j + b, k + c) in mine for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)) for i, j, k in truth)  # fmt: skip  # noqa: E501
+    assert len(truth ^ voxel_cells) <= 0.01 * len(truth)
+    assert all(any((i + a, j + b, k + c) in voxel_cells for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)) for i, j, k in truth)  # fmt: skip  # noqa: E501
     assert voxels.resolution == 0.05
     assert ("samp41" in name) == any("taken as the local origin" in w.problem for w in context.warnings)
 
@@ -76,9 +76,9 @@ def test_real_clouds_come_back_point_by_point(shared: Path, name: str, kind: str
     data = (shared / "data/pointcloud/pcl_data" / name).read_bytes()
     back = again(data) if kind is None else again(data, data=kind)
     _, before = clouds.pcd(data)
-    told, after = clouds.pcd(back)
+    header, after = clouds.pcd(back)
     assert after == before
-    assert told["FIELDS"] == "x y z"
+    assert header["FIELDS"] == "x y z"
     assert (back == data) == (kind is None), "asked for nothing special: the very file"
 
 

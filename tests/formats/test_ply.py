@@ -56,11 +56,11 @@ def header(kind: str = "binary_little_endian", n: int = 1, more: str = "") -> by
 
 def test_facts_of_the_real_cloud(shared: Path, facts_json: dict[str, Any]) -> None:
     data = (shared / "data" / REAL).read_bytes()
-    said = facts_json[REAL]["facts"]
+    facts = facts_json[REAL]["facts"]
     cloud = parse(data, ReadContext())
     places = cloud.places(0, len(cloud))
-    assert len(cloud) == said["points"]
-    assert np.allclose([places.min(axis=0), places.max(axis=0)], said["bounds"], atol=1e-4)
+    assert len(cloud) == facts["points"]
+    assert np.allclose([places.min(axis=0), places.max(axis=0)], facts["bounds"], atol=1e-4)
     assert np.array_equal(places, vertices(data).vertices)
     voxels, _ = read(data)
     assert set(map(tuple, np.floor(places / 0.05).astype(int).tolist())) == set(
@@ -73,9 +73,9 @@ def test_the_real_cloud_comes_back_vertex_by_vertex(shared: Path, kind: str | No
     data = (shared / "data" / REAL).read_bytes()
     back = again(data) if kind is None else again(data, data=kind)
     assert clouds.ply(back) == clouds.ply(data)
-    mine, theirs = vertices(back), vertices(data)
-    assert np.array_equal(mine.vertices, theirs.vertices)
-    assert np.array_equal(mine.colors, theirs.colors)
+    ours, theirs = vertices(back), vertices(data)
+    assert np.array_equal(ours.vertices, theirs.vertices)
+    assert np.array_equal(ours.colors, theirs.colors)
     assert b"comment Created by Open3D\n" in back
 
 
@@ -84,8 +84,8 @@ def test_faces_are_kept_with_the_file_and_declared_where_they_are_lost() -> None
     assert voxels.leaf_counts() == {"occupied": 5, "free": 0}
     assert any("5 × face" in w.problem for w in context.warnings)
     assert again(PYRAMID) == PYRAMID
-    told = offline({"a.ply": PYRAMID}, "ply", options={"data": "ascii"}).report["dropped"]
-    assert [(d["what"], d["count"]) for d in told] == [("face", 5)]
+    dropped_items = offline({"a.ply": PYRAMID}, "ply", options={"data": "ascii"}).report["dropped"]
+    assert [(d["what"], d["count"]) for d in dropped_items] == [("face", 5)]
     for to in ("pcd", "las"):
         dropped = offline({"a.ply": PYRAMID}, to).report["dropped"]
         assert ("face", 5) in [(d["what"], d["count"]) for d in dropped]
@@ -102,12 +102,12 @@ def test_vertices_behind_lists_in_the_other_byte_order() -> None:
 
 
 def test_normals_and_colours_become_pcls() -> None:
-    told, points = clouds.pcd(again(NORMALS, "pcd"))
-    assert told["FIELDS"] == "x y z normal_x normal_y normal_z intensity"
-    assert (told["TYPE"], told["SIZE"]) == ("F F F F F F U", "8 8 8 4 4 4 2")
+    header, points = clouds.pcd(again(NORMALS, "pcd"))
+    assert header["FIELDS"] == "x y z normal_x normal_y normal_z intensity"
+    assert (header["TYPE"], header["SIZE"]) == ("F F F F F F U", "8 8 8 4 4 4 2")
     assert points[0] == [0.1, 0.2, 0.3, 0.0, 0.0, 1.0, 7]
-    told, points = clouds.pcd(again(PYRAMID, "pcd"))
-    assert told["FIELDS"] == "x y z rgb"
+    header, points = clouds.pcd(again(PYRAMID, "pcd"))
+    assert header["FIELDS"] == "x y z rgb"
     assert [struct.unpack("<I", struct.pack("<f", p[3]))[0] for p in points] == [
         0xFF0000, 0x00FF00, 0x0000FF, 0x0A141E, 0x28323C,
     ]  # fmt: skip
@@ -164,8 +164,8 @@ def test_limits_are_kept() -> None:
 def test_centres_of_voxels_as_a_cloud() -> None:
     """The colour tree's occupied voxels, at full depth, by trimesh."""
     shelf = (SAMPLES / "octomap" / "shelf.ot").read_bytes()
-    told = offline({"shelf.ot": shelf}, "ply")
-    mesh = vertices(told.files["map.ply"])
+    converted = offline({"shelf.ot": shelf}, "ply")
+    mesh = vertices(converted.files["map.ply"])
     voxels = formats.read(Group(get_format("octomap"), "a.ot", {"a.ot": shelf}), ReadContext()).parts[
         PartKey("voxels", name="a")
     ]
@@ -176,4 +176,4 @@ def test_centres_of_voxels_as_a_cloud() -> None:
         spans = [range(int(a[row]), int(b[row])) for a, b in map(voxels.axis, range(3))]
         want |= {(x, y, z) for x in spans[0] for y in spans[1] for z in spans[2]}
     assert set(map(tuple, np.floor(mesh.vertices / voxels.resolution).astype(int).tolist())) == want
-    assert any(d["what"] == "free voxels" for d in told.report["dropped"]) == bool(voxels.leaf_counts()["free"])
+    assert any(d["what"] == "free voxels" for d in converted.report["dropped"]) == bool(voxels.leaf_counts()["free"])

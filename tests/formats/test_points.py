@@ -30,15 +30,15 @@ SHED = (SAMPLES / "octomap" / "shed.bt").read_bytes()
 
 
 def layers_of(name: str, data: bytes, **more: str) -> Layers:
-    known = get_format(name.rpartition(".")[2])
-    context = ReadContext(options=formats.read_options(known, more))
-    return formats.read(Group(known, name, {name: data}), context)
+    fmt = get_format(name.rpartition(".")[2])
+    context = ReadContext(options=formats.read_options(fmt, more))
+    return formats.read(Group(fmt, name, {name: data}), context)
 
 
 def written(layers: Layers, to: str, **options: str) -> tuple[bytes, WriteContext]:
-    known = get_format(to)
-    context = WriteContext(options=formats.write_options(known, options))
-    (data,) = formats.write(known, layers, context).values()
+    fmt = get_format(to)
+    context = WriteContext(options=formats.write_options(fmt, options))
+    (data,) = formats.write(fmt, layers, context).values()
     return data, context
 
 
@@ -50,13 +50,13 @@ def test_real_clouds_through_http(api: Api, shared: Path) -> None:  # noqa: F811
     for k, path in enumerate(sorted((shared / "data" / "pointcloud").rglob("*.p[cl]?"))):
         env, data = f"cloud-{k}", path.read_bytes()
         api.post("environments", {"name": env})
-        made = api.upload(env, {path.name: data}).json()
-        assert made["information"]["voxels"] == "raw"
+        version = api.upload(env, {path.name: data}).json()
+        assert version["information"]["voxels"] == "raw"
         kind = path.suffix[1:]
         assert api.get(f"/maps/{env}/{kind}").content == data
         assert api.get(f"/maps/{env}/octomap").content.startswith(b"# Octomap OcTree")
-        told = api.get(f"environments/{env}/versions/1/maps").json()
-        assert {t["format"]: t["state"] for t in told}["las"] == "direct"
+        coverage = api.get(f"environments/{env}/versions/1/maps").json()
+        assert {t["format"]: t["state"] for t in coverage}["las"] == "direct"
         report = api.get(f"environments/{env}/versions/1/reports/{kind}").json()
         assert {line["layer"] for line in report["layers"]} == {"voxels", "resources"}
         assert all(line["information"] == "raw" for line in report["layers"])
@@ -123,11 +123,11 @@ def test_changed_leaves_forget_the_cloud() -> None:
 def test_centres_fall_into_the_voxels_they_came_from(shared: Path) -> None:
     """octomap → pcd → voxels of the same resolution: the same occupied ones."""
     path = shared / "data/octomap/geb079/geb079.bt"
-    made = offline({"geb.bt": path.read_bytes()}, "pcd").files["map.pcd"]
+    pcd_data = offline({"geb.bt": path.read_bytes()}, "pcd").files["map.pcd"]
     voxels = formats.read(Group(get_format("octomap"), "a.bt", {"a.bt": path.read_bytes()}), ReadContext())
     (before,) = voxels.parts.values()
     assert isinstance(before, VoxelMap)
-    after = layers_of("map.pcd", made, resolution="0.08").parts[PartKey("voxels")]
+    after = layers_of("map.pcd", pcd_data, resolution="0.08").parts[PartKey("voxels")]
     assert isinstance(after, VoxelMap)
     assert np.array_equal(after.code, expanded(before, before.occupied)[0])
     assert len(after) == 185673, "as liboctomap counts"

@@ -30,10 +30,10 @@ Edges = set[tuple[str, str]]
 
 
 def read(files: dict[str, bytes], **options: str) -> tuple[Features, Any]:
-    told = read_bundle(files, Hints(options=options), Known(), Limits())
-    part = told.parts[NETWORK]
+    bundle = read_bundle(files, Hints(options=options), Known(), Limits())
+    part = bundle.parts[NETWORK]
     assert isinstance(part, Features)
-    return part, told
+    return part, bundle
 
 
 def write(layers: Layers) -> tuple[dict[str, Any], WriteContext]:
@@ -56,32 +56,32 @@ def seeds_own(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[st
     """What metric_to_prm.generate_prm dumps: integer pixels, an undirected graph, PyYAML's block style."""
     dice = np.random.default_rng(3)
     at = [(int(dice.integers(picture[0])), int(dice.integers(picture[1]))) for _ in range(count)]
-    told = [{"id": k, "x": x, "y": y} for k, (x, y) in enumerate(at)]
+    node_rows = [{"id": k, "x": x, "y": y} for k, (x, y) in enumerate(at)]
     graph = [
         {"from": a, "to": b, "weight": float(math.dist(at[a], at[b]))}
         for a in range(count)
         for b in range(a + 1, count)
         if math.dist(at[a], at[b]) < 60
     ]
-    return yaml.dump({"nodes": told, "edges": graph}, sort_keys=False).encode(), told, graph
+    return yaml.dump({"nodes": node_rows, "edges": graph}, sort_keys=False).encode(), node_rows, graph
 
 
 def test_facts_of_our_sample() -> None:
     fact = json.loads((SAMPLE / "facts.json").read_text())["meadow"]
-    part, told = read(MEADOW)
+    part, bundle = read(MEADOW)
     assert nodes(part) == fact["nodes"]
     assert len(edges(part)) == fact["edges"]
     assert edges(part) == {("0", "1"), ("1", "0"), ("0", "2"), ("2", "0"), ("1", "2"), ("2", "1")}
-    said = "\n".join(w.problem for w in told.warnings)
-    assert "'77'" in said
-    assert "no lines: 10" in said
-    assert {k.layer for k in told.parts} == {"topology", "occupancy"}
-    assert told.files["map.pgm"].format == "occupancy_grid"
-    assert told.origin[NETWORK] == (("prm.yaml",), "prm")
+    warnings = "\n".join(w.problem for w in bundle.warnings)
+    assert "'77'" in warnings
+    assert "no lines: 10" in warnings
+    assert {k.layer for k in bundle.parts} == {"topology", "occupancy"}
+    assert bundle.files["map.pgm"].format == "occupancy_grid"
+    assert bundle.origin[NETWORK] == (("prm.yaml",), "prm")
 
 
 def test_a_file_as_the_seed_writes_it_comes_back_the_same() -> None:
-    data, told, graph = seeds_own((200, 120), 300)
+    data, node_rows, graph = seeds_own((200, 120), 300)
     assert formats.detect("prm_autogen.yaml", data) is FORMAT
     files = {
         "config/topological/prm_autogen.yaml": data,
@@ -92,12 +92,12 @@ def test_a_file_as_the_seed_writes_it_comes_back_the_same() -> None:
     }
     part, _ = read(files)
     # The first node by hand: the centre of its pixel, turned by the yaw about the lower left corner.
-    u, v = (told[0]["x"] + 0.5) * 0.5, (120 - told[0]["y"] - 0.5) * 0.5
+    u, v = (node_rows[0]["x"] + 0.5) * 0.5, (120 - node_rows[0]["y"] - 0.5) * 0.5
     x, y = -2.0 + u * math.cos(0.3) - v * math.sin(0.3), 10.0 + u * math.sin(0.3) + v * math.cos(0.3)
     assert np.allclose(nodes(part)["0"], [x, y], rtol=0, atol=1e-9)
     served = offline(files, "prm").files["prm.yaml"]
     back = yaml.safe_load(served)
-    assert back["nodes"] == told
+    assert back["nodes"] == node_rows
     assert all(type(n["x"]) is int for n in back["nodes"])
     assert sorted(back["edges"], key=lambda e: (e["from"], e["to"])) == graph
     assert back["picture"] == {"height": 120, "origin": [-2.0, 10.0, 0.3], "resolution": 0.5}
@@ -149,9 +149,12 @@ def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
     network = features(rows, "local")
     grid = OccupancyGrid(np.zeros((100, 80), np.uint8), 0.1, (-1.0, -2.0, 0.0))
     layers = Layers({NETWORK: network, PartKey("occupancy", "ground", "map"): grid})
-    told, context = write(layers)
-    assert told["nodes"] == [{"id": 0, "x": 40, "y": 39, "name": "Barn"}, {"id": 1, "x": 20, "y": 59, "name": "gate"}]
-    assert told["edges"] == [{"from": 1, "to": 0, "weight": round(math.hypot(20, 20), 9), "oneway": True}]
+    roadmap, context = write(layers)
+    assert roadmap["nodes"] == [
+        {"id": 0, "x": 40, "y": 39, "name": "Barn"},
+        {"id": 1, "x": 20, "y": 59, "name": "gate"},
+    ]
+    assert roadmap["edges"] == [{"from": 1, "to": 0, "weight": round(math.hypot(20, 20), 9), "oneway": True}]
     assert any("one way" in w.problem for w in context.warnings)
     assert {d["what"]: d["count"] for d in context.dropped} == {
         "places of nodes within their pixels": 2,
@@ -162,8 +165,8 @@ def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
     assert alone["picture"] == {"resolution": 0.05, "origin": [0.0, 1.0, 0.0], "height": 80}
     assert "picture: resolution, origin, height" in [t["what"] for t in context.template]
     coarse = WriteContext(options=formats.write_options(FORMAT, {"pixel_size": 0.5}))
-    made = yaml.safe_load(formats.write(FORMAT, Layers({NETWORK: network}), coarse)["prm.yaml"])
-    assert made["picture"] == {"resolution": 0.5, "origin": [0.0, 1.0, 0.0], "height": 8}
+    coarse_roadmap = yaml.safe_load(formats.write(FORMAT, Layers({NETWORK: network}), coarse)["prm.yaml"])
+    assert coarse_roadmap["picture"] == {"resolution": 0.5, "origin": [0.0, 1.0, 0.0], "height": 8}
     assert [t["option"] for t in coarse.template if "option" in t] == ["pixel_size"]
     again, _ = read({"prm.yaml": yaml.safe_dump(alone).encode()})
     assert np.allclose(nodes(again)["0"], [3.0, 4.0], atol=0.05)
@@ -173,8 +176,8 @@ def test_without_its_map_it_says_what_to_supply() -> None:
     alone = {"prm.yaml": MEADOW["prm.yaml"]}
     with pytest.raises(UnreadableFile, match=r"add that map.*resolution, origin and height"):
         read(alone)
-    told, _ = read(alone, resolution="0.5", origin="-2,10,0", height="6")
-    assert nodes(told) == nodes(read(MEADOW)[0])
+    roadmap, _ = read(alone, resolution="0.5", origin="-2,10,0", height="6")
+    assert nodes(roadmap) == nodes(read(MEADOW)[0])
     with pytest.raises(Invalid):
         read(alone, resolution="0.5", height="0")
 
@@ -182,9 +185,9 @@ def test_without_its_map_it_says_what_to_supply() -> None:
 def test_beside_a_tmap2_in_a_template_the_roadmap_is_set_aside() -> None:
     tmap2 = (SAMPLE.parent / "tmap2" / "orchard.tmap2.yaml").read_bytes()
     files = {"config/topological/network.tmap2.yaml": tmap2, "config/topological/prm_autogen.yaml": MEADOW["prm.yaml"]}
-    told = read_bundle(files, Hints(), Known(), Limits())
-    assert not told.files["config/topological/prm_autogen.yaml"].used
-    assert any("richer tmap2" in w.problem for w in told.warnings)
+    bundle = read_bundle(files, Hints(), Known(), Limits())
+    assert not bundle.files["config/topological/prm_autogen.yaml"].used
+    assert any("richer tmap2" in w.problem for w in bundle.warnings)
 
 
 @pytest.mark.parametrize(

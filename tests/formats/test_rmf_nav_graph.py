@@ -33,27 +33,27 @@ def sample(kind: str, name: str) -> dict[str, bytes]:
 
 def read(files: dict[str, bytes] | str) -> tuple[Layers, ReadContext]:
     given = {"0.yaml": files.encode()} if isinstance(files, str) else files
-    told = ReadContext()
-    return formats.read(Group(FORMAT, next(iter(given)), given), told), told
+    context = ReadContext()
+    return formats.read(Group(FORMAT, next(iter(given)), given), context), context
 
 
 def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], WriteContext]:
-    told = WriteContext(options=formats.write_options(FORMAT, options))
-    files = formats.write(FORMAT, layers, told)
-    return {name: yaml.safe_load(data) for name, data in files.items()}, told
+    context = WriteContext(options=formats.write_options(FORMAT, options))
+    files = formats.write(FORMAT, layers, context)
+    return {name: yaml.safe_load(data) for name, data in files.items()}, context
 
 
 def part(layers: Layers, layer: str, level: str) -> Features:
     name = "network" if layer == "topology" else "rmf_nav_graph"
-    found = layers.parts[PartKey(layer, level, name)]  # type: ignore[arg-type]
-    assert isinstance(found, Features)
-    return found
+    content = layers.parts[PartKey(layer, level, name)]  # type: ignore[arg-type]
+    assert isinstance(content, Features)
+    return content
 
 
 def generated(shared: Path) -> list[Path]:
-    found = sorted((shared / "data" / "rmf_nav_graph").glob("generated_*"))
-    assert len(found) >= 6
-    return found
+    folders = sorted((shared / "data" / "rmf_nav_graph").glob("generated_*"))
+    assert len(folders) >= 6
+    return folders
 
 
 def test_every_real_graph_comes_back_the_same(shared: Path, same: Same) -> None:
@@ -70,21 +70,21 @@ def test_graphs_made_of_a_building_equal_those_of_the_official_generator(shared:
         building = shared / "data" / "openrmf_building" / folder.name.removeprefix("generated_")
         source = next(building.glob("*.building.yaml"))
         official = {p.name: p.read_bytes() for p in folder.rglob("*.yaml")}
-        made = offline({source.name: source.read_bytes()}, "rmf_nav_graph").files
-        assert sorted(made) == sorted(official)
-        assert same("rmf_nav_graph", official, made) == same("rmf_nav_graph", made, official) == [], folder
+        files = offline({source.name: source.read_bytes()}, "rmf_nav_graph").files
+        assert sorted(files) == sorted(official)
+        assert same("rmf_nav_graph", official, files) == same("rmf_nav_graph", files, official) == [], folder
 
 
 def test_vertices_are_numbered_as_the_official_generator_does(shared: Path) -> None:
     for folder in generated(shared):
         building = shared / "data" / "openrmf_building" / folder.name.removeprefix("generated_")
         source = next(building.glob("*.building.yaml"))
-        made = offline({source.name: source.read_bytes()}, "rmf_nav_graph").files
+        files = offline({source.name: source.read_bytes()}, "rmf_nav_graph").files
         for path in folder.rglob("*.yaml"):
-            ours, theirs = yaml.safe_load(made[path.name]), yaml.safe_load(path.read_bytes())
-            for level, said in theirs["levels"].items():
-                assert ours["levels"][level]["lanes"] == said["lanes"]
-                names = [v[2] for v in said["vertices"]]
+            ours, theirs = yaml.safe_load(files[path.name]), yaml.safe_load(path.read_bytes())
+            for level, level_graph in theirs["levels"].items():
+                assert ours["levels"][level]["lanes"] == level_graph["lanes"]
+                names = [v[2] for v in level_graph["vertices"]]
                 assert [v[2] for v in ours["levels"][level]["vertices"]] == names
 
 
@@ -94,13 +94,13 @@ def test_facts_of_every_real_graph_hold_in_the_layers(shared: Path, facts_json: 
             facts = facts_json[path.relative_to(shared / "data").as_posix()]["facts"]
             layers, _ = read({path.name: path.read_bytes()})
             doors = 0
-            for level, said in facts["levels"].items():
+            for level, level_facts in facts["levels"].items():
                 network = part(layers, "topology", level)
                 kinds = Counter(p["kind"] for p in network.properties)
-                assert (kinds["node"], kinds["edge"]) == (said["vertices"], said["lanes_directed"])
-                if said["vertices"]:
+                assert (kinds["node"], kinds["edge"]) == (level_facts["vertices"], level_facts["lanes_directed"])
+                if level_facts["vertices"]:
                     at = shapely.get_coordinates(network.of_kind("node").geometry)
-                    assert np.abs([at.min(0), at.max(0)] - np.array(said["bounds"])).max() < 6e-5
+                    assert np.abs([at.min(0), at.max(0)] - np.array(level_facts["bounds"])).max() < 6e-5
             for objects in layers.vector("objects").values():
                 doors += len(objects.of_kind("door"))
             assert doors == facts["doors"]
@@ -126,17 +126,17 @@ def test_the_graphs_of_a_folder_are_one_network() -> None:
 
 def test_our_sample_comes_back_row_by_row() -> None:
     files = sample("rmf_nav_graph", "clinic")
-    said, told = write(read(files)[0])
+    graphs, context = write(read(files)[0])
     for name, data in files.items():
-        assert said[name] == yaml.safe_load(data)
-    assert not told.dropped
-    assert not told.template
+        assert graphs[name] == yaml.safe_load(data)
+    assert not context.dropped
+    assert not context.template
 
 
 def test_a_building_gives_doors_lifts_mutexes_limits_and_orientations() -> None:
-    made = offline(sample("openrmf", "clinic"), "rmf_nav_graph")
-    zero, one = (yaml.safe_load(made.files[name]) for name in ("0.yaml", "1.yaml"))
-    assert list(made.files) == ["0.yaml", "1.yaml"]
+    converted = offline(sample("openrmf", "clinic"), "rmf_nav_graph")
+    zero, one = (yaml.safe_load(converted.files[name]) for name in ("0.yaml", "1.yaml"))
+    assert list(converted.files) == ["0.yaml", "1.yaml"]
     lane = {"door_name": "ward_door", "mutex": "hall", "speed_limit": 0.5}
     assert zero["levels"]["Ground floor"]["lanes"] == [
         [0, 1, {**lane, "orientation_constraint": "forward"}],
@@ -167,8 +167,8 @@ def test_a_building_gives_doors_lifts_mutexes_limits_and_orientations() -> None:
 
 
 def test_metres_tell_offset_and_crs_and_docks_tell_lanes() -> None:
-    made = offline(sample("openrmf", "yard"), "rmf_nav_graph").files
-    graph = yaml.safe_load(made["3.yaml"])
+    files = offline(sample("openrmf", "yard"), "rmf_nav_graph").files
+    graph = yaml.safe_load(files["3.yaml"])
     assert (graph["offset"], graph["crs_name"]) == ([22700.5, 15900], "EPSG:3414")
     text = (
         "name: d\ncoordinate_system: cartesian_meters\nlevels:\n  L:\n    elevation: 0\n"
@@ -194,19 +194,19 @@ def test_a_network_of_another_format_is_graph_0_with_its_ids_as_names() -> None:
         ("d", shapely.Point(4, 9), {"kind": "node"}),
     ]
     for a, b in ("ab", "ba", "bc"):
-        said = {"kind": "edge", "source": a, "target": b, "speed_limit": 0.5, "action": "move_base"}
-        rows.append((f"{a}_{b}", shapely.LineString([(0, 0), (1, 0)]), said))
-    said, told = write(Layers({PartKey("topology", "ground", "network"): features(rows, "local")}))
-    level = said["0.yaml"]["levels"]["ground"]
+        graphs = {"kind": "edge", "source": a, "target": b, "speed_limit": 0.5, "action": "move_base"}
+        rows.append((f"{a}_{b}", shapely.LineString([(0, 0), (1, 0)]), graphs))
+    graphs, context = write(Layers({PartKey("topology", "ground", "network"): features(rows, "local")}))
+    level = graphs["0.yaml"]["levels"]["ground"]
     assert [v[2]["name"] for v in level["vertices"]] == ["a", "Bee", "c"]
     assert level["lanes"] == [
         [0, 1, {"speed_limit": 0.5}],
         [1, 0, {"speed_limit": 0.5}],
         [1, 2, {"speed_limit": 0.5, "is_bidirectional": False}],
     ]
-    dropped = {line["what"]: line["count"] for line in told.dropped}
+    dropped = {line["what"]: line["count"] for line in context.dropped}
     assert dropped == {"edges' actions": 3, "nodes without lanes": 1, "nodes' attributes of other formats": 1}
-    assert [(line["what"], line["option"]) for line in told.template] == [
+    assert [(line["what"], line["option"]) for line in context.template] == [
         ("building_name", "building"),
         ("lanes: graph", "graph"),
     ]
@@ -217,30 +217,30 @@ def test_robots_and_lanes_that_no_source_tells_of() -> None:
     line = shapely.LineString([(0, 0), (1, 0)])
     rows += [(f"{a}_{b}", line, {"kind": "edge", "source": a, "target": b}) for a, b in (("a", "b9"), ("a", "b10"))]
     layers = Layers({PartKey("topology", "ground", "network"): features(rows, "local")})
-    wish = {"chargers": "b10, b9,nowhere", "robot_name": "mower", "robot_type": "Mower", "graph": "3"}
-    said, told = write(layers, **wish, speed_limit="0.7", building="Farm")
-    assert list(said) == ["3.yaml"]
-    assert said["3.yaml"]["building_name"] == "Farm"
-    level = said["3.yaml"]["levels"]["ground"]
-    here = {v[2]["name"]: v[2] for v in level["vertices"]}
+    options = {"chargers": "b10, b9,nowhere", "robot_name": "mower", "robot_type": "Mower", "graph": "3"}
+    graphs, context = write(layers, **options, speed_limit="0.7", building="Farm")
+    assert list(graphs) == ["3.yaml"]
+    assert graphs["3.yaml"]["building_name"] == "Farm"
+    level = graphs["3.yaml"]["levels"]["ground"]
+    vertices = {v[2]["name"]: v[2] for v in level["vertices"]}
     charger = {"is_charger": True, "is_parking_spot": True, "is_holding_point": True, "spawn_robot_type": "Mower"}
-    assert here["b9"] == {"name": "b9", **charger, "spawn_robot_name": "mower_1"}
-    assert here["b10"] == {"name": "b10", **charger, "spawn_robot_name": "mower_2"}
-    assert here["a"] == {"name": "a"}
+    assert vertices["b9"] == {"name": "b9", **charger, "spawn_robot_name": "mower_1"}
+    assert vertices["b10"] == {"name": "b10", **charger, "spawn_robot_name": "mower_2"}
+    assert vertices["a"] == {"name": "a"}
     assert {lane[2]["speed_limit"] for lane in level["lanes"]} == {0.7}
-    filled = {line["option"]: line["value"] for line in told.template}
+    filled = {line["option"]: line["value"] for line in context.template}
     assert filled["robot_name"] == ["mower_1", "mower_2"]
     assert (filled["robot_type"], filled["graph"], filled["speed_limit"]) == ("Mower", 3, 0.7)
-    assert [w.problem for w in told.warnings if "nowhere" in w.problem]
+    assert [w.problem for w in context.warnings if "nowhere" in w.problem]
     # A source's own chargers get only the robots that they do not name.
     stored, _ = read(CHARGERS)
-    own, _ = write(stored, robot_name="nurse", chargers="c")
-    at = own["0.yaml"]["levels"]["L"]["vertices"]
+    stored_graphs, _ = write(stored, robot_name="nurse", chargers="c")
+    at = stored_graphs["0.yaml"]["levels"]["L"]["vertices"]
     assert [v[2].get("spawn_robot_name") for v in at] == ["nurse_1", "nurse_2", "nurse_3"]
     assert "spawn_robot_type" not in at[0][2], "a robot that a source names is its own matter"
-    plain, told = write(stored)
+    plain, context = write(stored)
     assert plain["0.yaml"]["levels"]["L"]["vertices"][1][2] == {"name": "b", "is_charger": True}
-    assert not [line for line in told.template if "robot" in line["what"]]
+    assert not [line for line in context.template if "robot" in line["what"]]
 
 
 CHARGERS = """building_name: x
@@ -256,15 +256,17 @@ levels:
 
 def test_a_level_without_vertices_stays_a_level() -> None:
     text = "building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]], lanes: []}, M: {vertices: [], lanes: []}}\n"
-    said = yaml.safe_load(offline({"0.yaml": text.encode()}, "rmf_nav_graph").files["0.yaml"])
-    assert said["levels"]["M"] == {"lanes": [], "vertices": []}
+    graph = yaml.safe_load(offline({"0.yaml": text.encode()}, "rmf_nav_graph").files["0.yaml"])
+    assert graph["levels"]["M"] == {"lanes": [], "vertices": []}
     assert offline({"0.yaml": text.encode()}, "tmap2").files, "an empty level is no part of other maps"
 
 
 def test_names_that_stand_twice_are_warned_of() -> None:
-    said, told = write(read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}], [1, 0, {name: a}]]}}\n")[0])
-    assert len(said["0.yaml"]["levels"]["L"]["vertices"]) == 2
-    assert "which fleet adapters refuse: a" in told.warnings[0].problem
+    graphs, context = write(
+        read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}], [1, 0, {name: a}]]}}\n")[0]
+    )
+    assert len(graphs["0.yaml"]["levels"]["L"]["vertices"]) == 2
+    assert "which fleet adapters refuse: a" in context.warnings[0].problem
 
 
 def test_without_a_lane_there_is_no_graph() -> None:
@@ -274,10 +276,10 @@ def test_without_a_lane_there_is_no_graph() -> None:
 
 
 def test_lanes_to_vertices_that_do_not_exist_are_kept() -> None:
-    layers, told = read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]], lanes: [[0, 4, {}]]}}\n")
-    assert "joins the vertices 0 and 4" in told.warnings[0].problem
-    said, warned = write(layers)
-    assert said["0.yaml"]["levels"]["L"]["lanes"] == [[0, 4, {}]]
+    layers, context = read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]], lanes: [[0, 4, {}]]}}\n")
+    assert "joins the vertices 0 and 4" in context.warnings[0].problem
+    graphs, warned = write(layers)
+    assert graphs["0.yaml"]["levels"]["L"]["lanes"] == [[0, 4, {}]]
     assert "will refuse" in warned.warnings[0].problem
 
 
@@ -305,9 +307,9 @@ def test_what_is_wrong_is_named(text: str) -> None:
 
 def test_a_building_wins_over_its_graphs_on_the_same_level() -> None:
     files = {**sample("openrmf", "clinic"), **sample("rmf_nav_graph", "clinic")}
-    said = yaml.safe_load(offline(files, "openrmf", hints=Hints()).files["building.yaml"])
+    building = yaml.safe_load(offline(files, "openrmf", hints=Hints()).files["building.yaml"])
     alone = yaml.safe_load(offline(sample("openrmf", "clinic"), "openrmf").files["building.yaml"])
-    assert said == alone
+    assert building == alone
     assert offline(files, "rmf_nav_graph").files == offline(sample("openrmf", "clinic"), "rmf_nav_graph").files
 
 

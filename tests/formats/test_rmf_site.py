@@ -49,28 +49,28 @@ def ward(**changes: Any) -> dict[str, bytes]:
 
 
 def read(files: dict[str, bytes], **context: Any) -> tuple[Layers, ReadContext]:
-    told = ReadContext(**context)
-    return formats.read(Group(FORMAT, next(iter(files)), files), told), told
+    read_context = ReadContext(**context)
+    return formats.read(Group(FORMAT, next(iter(files)), files), read_context), read_context
 
 
 def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], dict[str, bytes], WriteContext]:
-    told = WriteContext(options=formats.write_options(FORMAT, options))
-    files = formats.write(FORMAT, layers, told)
+    context = WriteContext(options=formats.write_options(FORMAT, options))
+    files = formats.write(FORMAT, layers, context)
     main = next(iter(files))
-    said = json.loads(files[main]) if main.endswith(".json") else _ron.load(files[main], Limits())
-    return said, files, told
+    site = json.loads(files[main]) if main.endswith(".json") else _ron.load(files[main], Limits())
+    return site, files, context
 
 
 def network(layers: Layers, level: str = "Ground floor") -> Features:
-    found = layers.parts[PartKey("topology", level, "network")]
-    assert isinstance(found, Features)
-    return found
+    content = layers.parts[PartKey("topology", level, "network")]
+    assert isinstance(content, Features)
+    return content
 
 
 def objects(layers: Layers, level: str = "Ground floor") -> Features:
-    found = layers.parts[PartKey("objects", level, "openrmf")]
-    assert isinstance(found, Features)
-    return found
+    content = layers.parts[PartKey("objects", level, "openrmf")]
+    assert isinstance(content, Features)
+    return content
 
 
 def item(part: Features, i: str) -> tuple[dict[str, Any], list[list[float]]]:
@@ -84,10 +84,10 @@ def with_part(layers: Layers, key: PartKey, new: Part) -> Layers:
 
 def changed(part: Features, i: str, geometry: Any = None, **properties: Any) -> Features:
     k = part.index()[i]
-    places, said = part.geometry.copy(), list(part.properties)
+    places, new_properties = part.geometry.copy(), list(part.properties)
     places[k] = places[k] if geometry is None else geometry
-    said[k] = {**said[k], **properties}
-    return Features(part.ids, places, tuple(said), part.local, part.document)
+    new_properties[k] = {**new_properties[k], **properties}
+    return Features(part.ids, places, tuple(new_properties), part.local, part.document)
 
 
 def problems(context: ReadContext | WriteContext) -> str:
@@ -97,12 +97,12 @@ def problems(context: ReadContext | WriteContext) -> str:
 def test_a_site_comes_back_the_same_in_json_and_ron() -> None:
     layers, _ = read(WARD)
     original = json.loads(WARD["ward.site.json"])
-    said, files, told = write(layers)
-    assert said == original
+    site, files, context = write(layers)
+    assert site == original
     assert list(files) == ["map.site.json", "plans/ground.png"]
     assert files["plans/ground.png"] == WARD["plans/ground.png"]
-    assert not told.dropped
-    assert not told.warnings
+    assert not context.dropped
+    assert not context.warnings
     again, files, _ = write(layers, encoding="ron")
     assert again == original
     assert list(files) == ["map.site.ron", "plans/ground.png"]
@@ -123,7 +123,7 @@ def test_a_site_comes_back_the_same_in_json_and_ron() -> None:
 
 
 def test_what_stands_where_by_hand() -> None:
-    layers, told = read(WARD)
+    layers, context = read(WARD)
     assert layers.levels == (Level("Ground floor", 0.0), Level("Upstairs", 3.5))
     assert layers.datum == Datum(53.2686, -0.5245)
     ground, up = network(layers), network(layers, "Upstairs")
@@ -192,7 +192,7 @@ def test_what_stands_where_by_hand() -> None:
     assert item(objects(layers), "Ground floor/fiducial/44")[0]["name"] == "north east"
     robot, _ = item(objects(layers, "Upstairs"), "Upstairs/model/174")
     assert robot["pose"] == pytest.approx([5.0, 5.0, 3.5, 0.0, 0.0, 2 * math.atan2(0.6, 0.8)])
-    assert "2 lanes are of several graphs" in problems(told)
+    assert "2 lanes are of several graphs" in problems(context)
 
 
 def test_an_older_site_in_ron_reads_as_the_same_elements() -> None:
@@ -203,14 +203,14 @@ def test_an_older_site_in_ron_reads_as_the_same_elements() -> None:
     assert [e["openrmf"]["parameters"]["graph_idx"] for e in network(layers, "L1").of_kind("edge").properties] == [
         [2, 3]
     ]
-    said, _, told = write(layers)
-    assert said["properties"]["name"] == 'hut "two" é'
-    assert said["navigation"]["guided"]["locations"]["82"]["name"] == 'stop "1"'
-    (model,) = said["model_instances"].values()
-    (scenario,) = said["scenarios"].values()
-    assert said["model_descriptions"][str(model["description"])]["source"] == {"Search": "OpenRobotics/Desk"}
+    site, _, context = write(layers)
+    assert site["properties"]["name"] == 'hut "two" é'
+    assert site["navigation"]["guided"]["locations"]["82"]["name"] == 'stop "1"'
+    (model,) = site["model_instances"].values()
+    (scenario,) = site["scenarios"].values()
+    assert site["model_descriptions"][str(model["description"])]["source"] == {"Search": "OpenRobotics/Desk"}
     assert scenario["instances"]["50"] == {"pose": model["pose"], "inclusion": "Included", "on_level": 0}
-    assert "the image 'scan.png' was not in the upload" in problems(told)
+    assert "the image 'scan.png' was not in the upload" in problems(context)
 
 
 def test_unknown_members_are_told_by_name_and_come_back() -> None:
@@ -220,10 +220,10 @@ def test_unknown_members_are_told_by_name_and_come_back() -> None:
         levels__2__mood="red",
         navigation__guided__lanes__130__colour=[1, 2],
     )
-    layers, told = read(files)
-    assert "unknown member 'levels: mood' (2 times)" in problems(told)
-    assert "unknown member 'new_in_0_2'" in problems(told)
-    assert "unknown member 'lanes: colour'" in problems(told)
+    layers, context = read(files)
+    assert "unknown member 'levels: mood' (2 times)" in problems(context)
+    assert "unknown member 'new_in_0_2'" in problems(context)
+    assert "unknown member 'lanes: colour'" in problems(context)
     assert write(layers)[0] == json.loads(files["ward.site.json"])
 
 
@@ -260,16 +260,16 @@ def test_what_is_wrong_is_refused_with_its_place(changes: dict[str, Any], reason
 @pytest.mark.parametrize(("latitude", "good"), [(-80.1, False), (-80.0, True), (84.0, True), (84.1, False)])
 def test_places_beyond_the_zones_of_utm_are_refused_by_the_editor(latitude: float, good: bool) -> None:
     files = ward(properties__geographic_offset__anchor=[latitude, 0.0])
-    told = [p for p in formats.check(FORMAT, files) if p.where == "properties.geographic_offset.anchor"]
-    assert [p.level for p in told] == ([] if good else ["error"])
+    findings = [p for p in formats.check(FORMAT, files) if p.where == "properties.geographic_offset.anchor"]
+    assert [p.level for p in findings] == ([] if good else ["error"])
 
 
 def test_lanes_without_an_anchor_are_kept_for_the_way_back() -> None:
     lane = {"anchors": [14, 999], "graphs": "All"}
-    layers, told = read(ward(navigation__guided__lanes__136=lane))
-    assert "1 stand on no anchor" in problems(told)
-    said, _, told_back = write(layers)
-    assert said["navigation"]["guided"]["lanes"]["136"] == lane
+    layers, context = read(ward(navigation__guided__lanes__136=lane))
+    assert "1 stand on no anchor" in problems(context)
+    site, _, told_back = write(layers)
+    assert site["navigation"]["guided"]["lanes"]["136"] == lane
     assert "136 stand on anchors that are not there" in problems(told_back)
 
 
@@ -283,8 +283,8 @@ def test_geometry_decides_after_an_edit() -> None:
     thing = changed(objects(layers), "Ground floor/wall/60", shapely.LineString([[0.0, 0.0], [11.0, 0.5]]))
     thing = changed(thing, "Ground floor/lift/110", shapely.Point(8.5, 5.0), pose=[8.5, 5.0, 0, 0, 0, math.pi / 2])
     thing = thing.take([k for k, i in enumerate(thing.ids) if i != "Ground floor/model/172"])
-    said, _, _ = write(with_part(edited, solid, thing))
-    level, guided = said["levels"]["1"], said["navigation"]["guided"]
+    site, _, _ = write(with_part(edited, solid, thing))
+    level, guided = site["levels"]["1"], site["navigation"]["guided"]
     assert level["anchors"]["15"] == {"Translate2D": [7.0, 2.5]}
     assert guided["lanes"]["130"]["reverse"] == "Disable"
     new = next(one for one in guided["locations"].values() if one["name"] == "middle")
@@ -293,20 +293,20 @@ def test_geometry_decides_after_an_edit() -> None:
     assert first == 10
     assert level["anchors"][str(second)] == {"Translate2D": [11.0, 0.5]}
     left, right = (
-        said["anchors"][str(i)]["Translate2D"] for i in said["lifts"]["110"]["properties"]["reference_anchors"]
+        site["anchors"][str(i)]["Translate2D"] for i in site["lifts"]["110"]["properties"]["reference_anchors"]
     )
     assert [*left, *right] == pytest.approx([7.6, 6.135, 9.4, 6.135]), "the front points along y now"
-    assert said["model_instances"].keys() == {"173", "174"}
-    assert said["scenarios"]["160"]["instances"].keys() == {"173", "199"}
+    assert site["model_instances"].keys() == {"173", "174"}
+    assert site["scenarios"]["160"]["instances"].keys() == {"173", "199"}
 
 
 def test_a_site_of_another_place_keeps_the_datum_of_the_environment() -> None:
-    here = local_frame(Datum(1.0, 2.0, heading=10.0))
-    layers, told = read(WARD, frame=here)
+    frame = local_frame(Datum(1.0, 2.0, heading=10.0))
+    layers, context = read(WARD, frame=frame)
     assert layers.datum is None
-    assert "is not the environment's datum" in problems(told)
-    said, _, told_back = write(Layers(layers.parts, Datum(1.0, 2.0, 5.0, 10.0), layers.levels))
-    assert said["properties"]["geographic_offset"] == {"anchor": [1.0, 2.0], "zoom": 17, "visible": True}
+    assert "is not the environment's datum" in problems(context)
+    site, _, told_back = write(Layers(layers.parts, Datum(1.0, 2.0, 5.0, 10.0), layers.levels))
+    assert site["properties"]["geographic_offset"] == {"anchor": [1.0, 2.0], "zoom": 17, "visible": True}
     assert {d["what"] for d in told_back.dropped} == {"the datum's heading", "the datum's altitude"}
 
 
@@ -346,10 +346,10 @@ def test_real_buildings_go_through_a_site_with_all_that_both_can_say(shared: Pat
         files = {path.name: path.read_bytes(), **{p.name: p.read_bytes() for p in path.parent.glob("*.png")}}
         site = offline(files, "rmf_site").files
         back = offline(site, "openrmf", hints=Hints("rmf_site")).files
-        original, said = yaml.safe_load(files[path.name]), yaml.safe_load(back["building.yaml"])
-        assert summary(said) == summary(original), path
+        original, building = yaml.safe_load(files[path.name]), yaml.safe_load(back["building.yaml"])
+        assert summary(building) == summary(original), path
         assert all(back[name] == files[name] for name in back if name != "building.yaml")
-        lifts, again = original.get("lifts") or {}, said.get("lifts") or {}
+        lifts, again = original.get("lifts") or {}, building.get("lifts") or {}
         assert lifts.keys() == again.keys()
         for name, lift in lifts.items():
             for word in ("x", "y", "yaw", "width", "depth"):
@@ -387,12 +387,12 @@ def test_any_network_is_written_with_chargers_and_robots_as_asked() -> None:
         ),
     ]
     layers = Layers({PartKey("topology", "ground", "network"): features(rows, "local")}, Datum(53.0, -1.0))
-    said, _, told = write(layers, chargers="a", robot_name="tug", graph=2, building="barn", speed_limit=1.5)
-    assert said["properties"] == {
+    site, _, context = write(layers, chargers="a", robot_name="tug", graph=2, building="barn", speed_limit=1.5)
+    assert site["properties"] == {
         "name": "barn",
         "geographic_offset": {"anchor": [53.0, -1.0], "visible": False, "zoom": 15},
     }
-    guided = said["navigation"]["guided"]
+    guided = site["navigation"]["guided"]
     both, one = guided["lanes"].values()
     assert both.keys() == {"anchors", "forward", "graphs"}
     assert (one["reverse"], one["forward"], both["forward"]) == ("Disable", {"speed_limit": 0.5}, {"speed_limit": 1.5})
@@ -400,11 +400,11 @@ def test_any_network_is_written_with_chargers_and_robots_as_asked() -> None:
     assert graph["name"] == "2"
     tags = {location["name"]: location["tags"] for location in guided["locations"].values()}
     assert tags == {"a": ["Charger", "ParkingSpot", "HoldingPoint"], "b": [], "c": []}
-    (robot,) = said["model_instances"].values()
-    assert (robot["name"], str(robot["description"]) in said["robots"]) == ("tug_1", True)
-    assert {t["what"] for t in told.template} >= {"lanes: graphs", "lanes: speed_limit"}
-    assert ("heights of nodes above their level", 1) in {(d["what"], d["count"]) for d in told.dropped}
-    again, _ = read({"map.site.json": json.dumps(said).encode()})
+    (robot,) = site["model_instances"].values()
+    assert (robot["name"], str(robot["description"]) in site["robots"]) == ("tug_1", True)
+    assert {t["what"] for t in context.template} >= {"lanes: graphs", "lanes: speed_limit"}
+    assert ("heights of nodes above their level", 1) in {(d["what"], d["count"]) for d in context.dropped}
+    again, _ = read({"map.site.json": json.dumps(site).encode()})
     assert np.allclose(
         shapely.get_coordinates(network(again, "ground").of_kind("node").geometry), [[0, 0], [3, 0], [3, 4]]
     )
@@ -427,8 +427,8 @@ def test_the_rules_of_the_editor_find_what_it_refuses() -> None:
         navigation__guided__locations__151__name="charger_1",
         model_instances__172__description=999,
     )
-    found = {(p.where or "", p.level) for p in check(broken)}
-    assert found == {
+    findings = {(p.where or "", p.level) for p in check(broken)}
+    assert findings == {
         ("format_version", "error"),
         ("properties.geographic_offset.anchor", "error"),
         ("levels.1.doors.30", "error"),

@@ -34,7 +34,7 @@ ERROR, WARNING = "error", "warning"
 Found = set[tuple[str | None, str | None]]
 
 
-def found(name: str, files: dict[str, bytes]) -> Found:
+def findings_of(name: str, files: dict[str, bytes]) -> Found:
     """(level, place) of each finding."""
     return {(p.level, p.where) for p in formats.check(formats.get_format(name), files)}
 
@@ -63,10 +63,10 @@ def test_a_check_tells_errors_first_each_once_and_how_many_more() -> None:
         yield Problem("doubt", level="warning")
         yield from (Problem(f"wrong {k}") for k in range(formats.LISTED + 7))
 
-    told = formats.check(with_check(check), {"main": b""})
-    assert [p.level for p in told] == [ERROR] * (formats.LISTED + 1) + [WARNING]
-    assert told[0] == Problem("wrong 0", "main", level="error")
-    assert "7 more" in told[formats.LISTED].problem
+    findings = formats.check(with_check(check), {"main": b""})
+    assert [p.level for p in findings] == [ERROR] * (formats.LISTED + 1) + [WARNING]
+    assert findings[0] == Problem("wrong 0", "main", level="error")
+    assert "7 more" in findings[formats.LISTED].problem
     assert formats.check(with_check(None), {"main": b""}) == []
 
 
@@ -108,9 +108,9 @@ def test_findings_stand_in_the_report_once_at_their_level() -> None:
         yield Problem("told by both", "main", None, None, "warning")
         yield Problem("new", "main", None, None, "warning")
 
-    known = replace(with_check(check), write=write, needs=Needs((frozenset(),)))
+    fmt = replace(with_check(check), write=write, needs=Needs((frozenset(),)))
     context = WriteContext()
-    formats.write(known, Layers(), context)
+    formats.write(fmt, Layers(), context)
     assert [(p.problem, p.level) for p in context.warnings] == [
         ("ask for y=1", "error"),
         ("told by both", None),
@@ -131,8 +131,8 @@ MAP = {
 PGM = b"P5\n3 2\n255\n" + bytes([0, 205, 254, 254, 205, 0])
 
 
-def grid(said: dict[str, str | None], picture: bytes = PGM, stem: str = "map") -> dict[str, bytes]:
-    text = "".join(f"{k}: {v}\n" for k, v in {**MAP, **said}.items() if v is not None)
+def grid(members: dict[str, str | None], picture: bytes = PGM, stem: str = "map") -> dict[str, bytes]:
+    text = "".join(f"{k}: {v}\n" for k, v in {**MAP, **members}.items() if v is not None)
     return {f"{stem}.yaml": text.encode(), "map.pgm": picture}
 
 
@@ -163,12 +163,12 @@ def grid(said: dict[str, str | None], picture: bytes = PGM, stem: str = "map") -
     ],
 )
 def test_map_server(said: dict[str, str | None], expected: Found) -> None:
-    assert found("occupancy_grid", grid(said)) == expected
+    assert findings_of("occupancy_grid", grid(said)) == expected
 
 
 def test_map_server_finds_the_picture_from_the_yamls_folder() -> None:
     files = {"maps/a.yaml": grid({"image": "../pictures/map.pgm"})["map.yaml"], "pictures/map.pgm": PGM}
-    assert found("occupancy_grid", files) == set()
+    assert findings_of("occupancy_grid", files) == set()
 
 
 def png(width: int, height: int) -> bytes:
@@ -183,14 +183,14 @@ def png(width: int, height: int) -> bytes:
 @pytest.mark.parametrize(("width", "level"), [(32767, None), (32768, ERROR)])
 def test_nav2_takes_32767_cells_each_way(width: int, level: str | None) -> None:
     for picture in (png(width, 2), b"P5 %d 2 255\n" % width + bytes(2 * width)):
-        told = formats.check(formats.get_format("occupancy_grid"), grid({}, picture))
-        assert [p.level for p in told] == ([level] if level else [])
-        assert all(p.file == "map.pgm" for p in told)
+        findings = formats.check(formats.get_format("occupancy_grid"), grid({}, picture))
+        assert [p.level for p in findings] == ([level] if level else [])
+        assert all(p.file == "map.pgm" for p in findings)
 
 
 def test_damaged_and_missing_pictures_are_errors() -> None:
-    assert found("occupancy_grid", grid({}, PGM[:-1])) == {(ERROR, None)}
-    assert found("occupancy_grid", grid({}, b"GIF89a")) == {(WARNING, None)}
+    assert findings_of("occupancy_grid", grid({}, PGM[:-1])) == {(ERROR, None)}
+    assert findings_of("occupancy_grid", grid({}, b"GIF89a")) == {(WARNING, None)}
 
 
 @pytest.mark.parametrize(
@@ -202,16 +202,16 @@ def test_damaged_and_missing_pictures_are_errors() -> None:
     ],
 )
 def test_a_speed_mask_has_no_unknown_cells(said: dict[str, str | None], expected: Found) -> None:
-    assert found("occupancy_grid", grid(said, stem="speed_mask")) == expected
+    assert findings_of("occupancy_grid", grid(said, stem="speed_mask")) == expected
 
 
 def test_a_wide_grid_is_told_in_its_report() -> None:
     cells = np.zeros((1, 32768), np.uint8)
     layers = Layers({PartKey("occupancy", "ground", "map"): OccupancyGrid(cells, 0.05, (0.0, 0.0, 0.5))})
-    way = Chain((), tuple(layers.parts))
-    report = make.write(formats.get_format("occupancy_grid"), layers, {}, way).report
-    told = {(w["level"], w["file"], w.get("where")) for w in report["warnings"]}
-    assert told == {(ERROR, "map.pgm", None), (WARNING, "map.yaml", "origin")}
+    chain = Chain((), tuple(layers.parts))
+    report = make.write(formats.get_format("occupancy_grid"), layers, {}, chain).report
+    warnings = {(w["level"], w["file"], w.get("where")) for w in report["warnings"]}
+    assert warnings == {(ERROR, "map.pgm", None), (WARNING, "map.yaml", "origin")}
     assert any("normalize=true" in w["problem"] for w in report["warnings"]), "the writer's own words stay"
 
 
@@ -275,13 +275,13 @@ OPERATION = {"type": "Speed", "trigger": "ON_ENTER"}
     ],
 )
 def test_route_server(files: dict[str, bytes], expected: Found) -> None:
-    assert found("nav2_route", files) == expected
+    assert findings_of("nav2_route", files) == expected
 
 
 def test_far_nodes_lose_millimetres() -> None:
     files = {"g.geojson": graph()["g.geojson"].replace(b"[0, 2.5]", b"[16385, 2.5]")}
-    told = formats.check(formats.get_format("nav2_route"), files)
-    assert [(p.level, "2 mm" in p.problem) for p in told] == [(WARNING, True)]
+    findings = formats.check(formats.get_format("nav2_route"), files)
+    assert [(p.level, "2 mm" in p.problem) for p in findings] == [(WARNING, True)]
 
 
 # --- topological_navigation ---------------------------------------------------------------------------------------
@@ -332,9 +332,9 @@ TMAP2: list[Any] = [
 def test_topological_navigation(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
     """The same for a file that is laid out as PyYAML does, which is counted, and for one that is parsed."""
     top = tmap2(change)
-    assert found("tmap2", {"a.tmap2.yaml": json.dumps(top).encode()}) == expected, "parsed"
+    assert findings_of("tmap2", {"a.tmap2.yaml": json.dumps(top).encode()}) == expected, "parsed"
     block = yaml.dump(json.loads(json.dumps(top)), default_flow_style=False).encode()
-    assert found("tmap2", {"a.tmap2.yaml": block}) == expected, "counted"
+    assert findings_of("tmap2", {"a.tmap2.yaml": block}) == expected, "counted"
 
 
 def test_a_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,7 +345,7 @@ def test_a_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(_tmap2_rules._yaml, "load", parse)
     block = yaml.dump(tmap2(), default_flow_style=False).encode()
-    assert found("tmap2", {"a.tmap2.yaml": block}) == set()
+    assert findings_of("tmap2", {"a.tmap2.yaml": block}) == set()
 
 
 def test_of_a_large_network_that_is_served_the_head_is_looked_at() -> None:
@@ -353,7 +353,7 @@ def test_of_a_large_network_that_is_served_the_head_is_looked_at() -> None:
     files = {"a.tmap2.yaml": text + b"# " + bytes([120]) * 2**20 + b"\n"}
     token = formats.SERVED.set(True)
     try:
-        assert found("tmap2", files) == {(ERROR, "meta.last_updated")}
+        assert findings_of("tmap2", files) == {(ERROR, "meta.last_updated")}
     finally:
         formats.SERVED.reset(token)
 
@@ -423,7 +423,7 @@ RMF: list[Any] = [
 
 @pytest.mark.parametrize(("change", "expected"), RMF)
 def test_building_map_generator(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
-    assert found("openrmf", building(change)) == expected
+    assert findings_of("openrmf", building(change)) == expected
 
 
 def nav(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[str, bytes]:
@@ -457,7 +457,7 @@ def nav(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[s
     ],
 )
 def test_fleet_adapter(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
-    assert found("rmf_nav_graph", nav(change)) == expected
+    assert findings_of("rmf_nav_graph", nav(change)) == expected
 
 
 # --- Fawkes -------------------------------------------------------------------------------------------------------
@@ -495,7 +495,7 @@ connections:
 )
 def test_fawkes(old: str, new: str, expected: Found) -> None:
     assert old in FAWKES
-    assert found("navgraph", {"g.yaml": FAWKES.replace(old, new, 1).encode()}) == expected
+    assert findings_of("navgraph", {"g.yaml": FAWKES.replace(old, new, 1).encode()}) == expected
 
 
 # --- OctoMap ------------------------------------------------------------------------------------------------------
@@ -527,7 +527,7 @@ FULL = "# Octomap OcTree file"
     ],
 )
 def test_octomap(files: dict[str, bytes], expected: Found) -> None:
-    assert found("octomap", files) == expected
+    assert findings_of("octomap", files) == expected
 
 
 # --- LIF ----------------------------------------------------------------------------------------------------------
@@ -588,7 +588,7 @@ THETA = "layouts[0].nodes[0].vehicleTypeNodeProperties[0].theta"
     ],
 )
 def test_lif(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
-    assert found("lif", lif(change)) == expected
+    assert findings_of("lif", lif(change)) == expected
 
 
 # --- KML, KMZ, OSM ------------------------------------------------------------------------------------------------
@@ -613,7 +613,7 @@ KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Style id="s"/>
     ],
 )
 def test_kml(old: str, new: str, expected: Found) -> None:
-    assert found("kml", {"a.kml": KML.replace(old, new).encode() if old else KML.encode()}) == expected
+    assert findings_of("kml", {"a.kml": KML.replace(old, new).encode() if old else KML.encode()}) == expected
 
 
 @pytest.mark.parametrize(
@@ -631,7 +631,7 @@ def test_kmz(members: dict[str, str], expected: Found) -> None:
     with zipfile.ZipFile(data, "w") as z:
         for name, text in members.items():
             z.writestr(name, text)
-    assert found("kmz", {"a.kmz": data.getvalue()}) == expected
+    assert findings_of("kmz", {"a.kmz": data.getvalue()}) == expected
 
 
 OSM = """<osm version="0.6"><bounds/>
@@ -665,8 +665,8 @@ OSM = """<osm version="0.6"><bounds/>
 def test_osm(old: str, new: str, expected: Found) -> None:
     text = OSM.replace(old, new, 1) if old else OSM
     text = text.replace("</osm>", "</gpx>") if "gpx" in new else text
-    assert found("osm", {"a.osm": text.encode()}) == expected
-    assert found("osm", {"a.osm.gz": gzip.compress(text.encode())}) == expected
+    assert findings_of("osm", {"a.osm": text.encode()}) == expected
+    assert findings_of("osm", {"a.osm.gz": gzip.compress(text.encode())}) == expected
 
 
 # --- datum.yaml ---------------------------------------------------------------------------------------------------
@@ -695,7 +695,7 @@ navsat_transform_node: {wait_for_datum: true, datum: [53.25, -0.5, 0.0]}
     ],
 )
 def test_datum(old: str, new: str, expected: Found) -> None:
-    assert found("datum", {"datum.yaml": DATUM.replace(old, new, 1).encode()}) == expected
+    assert findings_of("datum", {"datum.yaml": DATUM.replace(old, new, 1).encode()}) == expected
 
 
 # --- all of them --------------------------------------------------------------------------------------------------
@@ -704,9 +704,9 @@ def test_datum(old: str, new: str, expected: Found) -> None:
 )
 def test_a_check_of_damaged_files_ends_in_findings(name: str, files: dict[str, bytes]) -> None:
     """Whatever the bytes are, there is no crash; what cannot be parsed is an error."""
-    known = formats.get_format(name)
+    fmt = formats.get_format(name)
     for victim, data in files.items():
         for damaged in mutations(data, seed=len(victim)):
-            for problem in formats.check(known, {**files, victim: damaged}):
+            for problem in formats.check(fmt, {**files, victim: damaged}):
                 assert problem.level in (ERROR, WARNING)
                 assert problem.file

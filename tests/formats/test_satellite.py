@@ -91,23 +91,23 @@ def gdalinfo(path: Path) -> dict[str, Any]:
 # --- samples and real maps ----------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", [n for n in FACTS if n != "made"])
 def test_samples(name: str) -> None:
-    said = FACTS[name]
+    facts = FACTS[name]
     files = sample(name)
     groups, rest = formats.group(files)
     assert [g.format.name for g in groups] == ["satellite"]
     assert rest == []
     picture, _ = read(files, groups[0].main)
     height, width, bands = picture.pixels.shape
-    assert [width, height] == said["size"]
-    assert (bands, picture.pixels.dtype.name, picture.crs) == (said["bands"], said["type"], said["crs"])
+    assert [width, height] == facts["size"]
+    assert (bands, picture.pixels.dtype.name, picture.crs) == (facts["bands"], facts["type"], facts["crs"])
     corners = placed(picture.transform, np.array([0.0, width]), np.array([0.0, height]))
-    assert np.abs(corners - [said["upper_left"], said["lower_right"]]).max() < 5.1e-4
-    if "nodata" in said:
-        assert picture.nodata == said["nodata"]
-    if "rows" in said:
-        assert picture.pixels[..., 0].tolist() == said["rows"]
-    if "pixel_row_2_column_3" in said:
-        assert picture.pixels[2, 3].tolist() == said["pixel_row_2_column_3"]
+    assert np.abs(corners - [facts["upper_left"], facts["lower_right"]]).max() < 5.1e-4
+    if "nodata" in facts:
+        assert picture.nodata == facts["nodata"]
+    if "rows" in facts:
+        assert picture.pixels[..., 0].tolist() == facts["rows"]
+    if "pixel_row_2_column_3" in facts:
+        assert picture.pixels[2, 3].tolist() == facts["pixel_row_2_column_3"]
 
 
 def real(shared: Path, name: str) -> dict[str, bytes]:
@@ -122,18 +122,18 @@ REAL = ("opengeos_dtm/dtm.tif", "rasterio/RGB.byte.tif", "rasterio/rgb-byte-tent
 def test_real_maps_hold_their_facts_and_come_back(
     shared: Path, same: Same, facts_json: dict[str, Any], name: str, tmp_path: Path
 ) -> None:
-    known = facts_json[f"geotiff/{name}"]["facts"]
+    facts = facts_json[f"geotiff/{name}"]["facts"]
     files = real(shared, name)
     picture, context = read(files)
     height, width, _ = picture.pixels.shape
-    assert [width, height] == known["size"]
+    assert [width, height] == facts["size"]
     a, b, c, d, e, f = picture.transform
-    assert np.abs(np.array([c, a, b, f, d, e]) - known["geoTransform"]).max() < 1e-9
-    if known["epsg"]:
-        assert picture.crs == f"EPSG:{known['epsg']}"
-    if known["wgs84Extent"]:
+    assert np.abs(np.array([c, a, b, f, d, e]) - facts["geoTransform"]).max() < 1e-9
+    if facts["epsg"]:
+        assert picture.crs == f"EPSG:{facts['epsg']}"
+    if facts["wgs84Extent"]:
         box = crs_bounds(picture.crs, picture.outline())
-        ring = np.array(known["wgs84Extent"][0])
+        ring = np.array(facts["wgs84Extent"][0])
         assert box is not None
         assert np.abs(np.array(box) - [*ring.min(axis=0), *ring.max(axis=0)]).max() < 2e-7
     else:
@@ -142,10 +142,10 @@ def test_real_maps_hold_their_facts_and_come_back(
     back, _ = written(picture)
     assert same("satellite", files, back) == []
     (tmp_path / "satellite.tif").write_bytes(back["satellite.tif"])
-    told = gdalinfo(tmp_path / "satellite.tif")
-    assert told["size"] == known["size"]
-    assert np.abs(np.array(told["geoTransform"]) - known["geoTransform"]).max() < 1e-9
-    assert told["metadata"]["IMAGE_STRUCTURE"]["LAYOUT"] == "COG"
+    info = gdalinfo(tmp_path / "satellite.tif")
+    assert info["size"] == facts["size"]
+    assert np.abs(np.array(info["geoTransform"]) - facts["geoTransform"]).max() < 1e-9
+    assert info["metadata"]["IMAGE_STRUCTURE"]["LAYOUT"] == "COG"
     again, _ = read(back)
     assert again.transform == picture.transform
     assert again.crs == picture.crs
@@ -164,15 +164,15 @@ def test_pictures_of_all_kinds_hold_their_facts(shared: Path, facts_json: dict[s
     plans = [n for n, e in facts_json.items() if e["kind"] == "image" and n.endswith((".png", ".bmp"))]
     assert len(plans) > 10
     for name in plans:
-        known = facts_json[name]["facts"]
-        if known["width"] * known["height"] > 5_000_000:
+        facts = facts_json[name]["facts"]
+        if facts["width"] * facts["height"] > 5_000_000:
             continue
         data = (shared / "data" / name).read_bytes()
         picture, _ = read({"plan.png": data}, options={"metres_per_pixel": 0.05})
-        assert picture.pixels.shape[:2] == (known["height"], known["width"])
-        assert picture.pixels.shape[2] == {"L": 1, "RGB": 3, "RGBA": 4}[known["mode"]]
-        if "transparent_pixels" in known and known["has_alpha"]:
-            assert int((picture.pixels[..., 3] == 0).sum()) == known["transparent_pixels"]
+        assert picture.pixels.shape[:2] == (facts["height"], facts["width"])
+        assert picture.pixels.shape[2] == {"L": 1, "RGB": 3, "RGBA": 4}[facts["mode"]]
+        if "transparent_pixels" in facts and facts["has_alpha"]:
+            assert int((picture.pixels[..., 3] == 0).sum()) == facts["transparent_pixels"]
 
 
 # --- GeoTIFF ------------------------------------------------------------------------------------------------------
@@ -349,19 +349,19 @@ def test_numbers_like_degrees_are_degrees_and_others_metres() -> None:
 def test_a_world_file_finds_its_picture(world: str, picture: str) -> None:
     kind = {"png": "PNG", "tif": "TIFF"}.get(picture[-3:].lower(), "JPEG")
     files = {picture: image(kind=kind), world: b"2\n0\n0\n-2\n665000\n5905000\n", "else.txt": b"?"}
-    told = bundle.read(files, Hints(options={"crs": UTM}), Known(), LIMITS)
-    assert [k.name for k in told.parts] == ["a"]
-    assert {n for n, use in told.files.items() if use.used} == {world, picture}
+    upload_bundle = bundle.read(files, Hints(options={"crs": UTM}), Known(), LIMITS)
+    assert [k.name for k in upload_bundle.parts] == ["a"]
+    assert {n for n, use in upload_bundle.files.items() if use.used} == {world, picture}
 
 
 def test_a_geotiff_is_believed_before_its_world_file() -> None:
     files = {"a.tif": tif(utm()), "a.tfw": b"9 0 0 -9 9 9"}
-    told = bundle.read(files, Hints(), Known(), LIMITS)
-    (picture,) = told.parts.values()
+    upload_bundle = bundle.read(files, Hints(), Known(), LIMITS)
+    (picture,) = upload_bundle.parts.values()
     assert isinstance(picture, Picture)
     assert picture.transform == utm().transform
-    assert [w.file for w in told.warnings] == ["a.tfw"]
-    assert told.files["a.tfw"].used
+    assert [w.file for w in upload_bundle.warnings] == ["a.tfw"]
+    assert upload_bundle.files["a.tfw"].used
 
 
 @pytest.mark.parametrize(
@@ -394,12 +394,12 @@ def test_a_crs_stands_beside_the_picture() -> None:
     world = b"2 0 0 -2 665000 5905000"
     for name, body in (("a.prj", wkt), ("a.png.aux.xml", b"<PAMDataset><SRS>" + wkt + b"</SRS></PAMDataset>")):
         files = {"a.png": image(), "a.pgw": world, name: body}
-        told = bundle.read(files, Hints(), Known(), LIMITS)
-        (picture,) = told.parts.values()
+        upload_bundle = bundle.read(files, Hints(), Known(), LIMITS)
+        (picture,) = upload_bundle.parts.values()
         assert isinstance(picture, Picture)
         assert picture.crs == UTM
-        assert told.warnings == []
-        assert all(use.used for use in told.files.values())
+        assert upload_bundle.warnings == []
+        assert all(use.used for use in upload_bundle.files.values())
 
 
 @pytest.mark.parametrize(
@@ -431,8 +431,8 @@ def test_two_opposite_corners() -> None:
 def test_four_corners_of_a_turned_picture() -> None:
     ends = np.array([[-0.5, 53.2], [-0.4992, 53.2003], [-0.4994, 53.1999], [-0.5002, 53.1996]])
     picture, context = read({"a.png": image((40, 80, 3))}, options={"corners": tuple(ends[:, ::-1].ravel().tolist())})
-    found = placed(picture.transform, np.array([0.0, 80.0, 80.0, 0.0]), np.array([0.0, 0.0, 40.0, 40.0]))
-    assert np.abs(found - ends).max() < 1e-12
+    corners = placed(picture.transform, np.array([0.0, 80.0, 80.0, 0.0]), np.array([0.0, 0.0, 40.0, 40.0]))
+    assert np.abs(corners - ends).max() < 1e-12
     assert context.warnings == []
 
 
@@ -451,8 +451,8 @@ def test_a_floor_plan_with_its_scale() -> None:
     )
     assert picture.crs == "local"
     # Turned a quarter to the left round its lower left corner: its right side points north, its upper side west.
-    found = placed(picture.transform, np.array([0.0, 40.0, 0.0]), np.array([30.0, 30.0, 0.0]))
-    assert np.abs(found - [[5.0, 6.0], [5.0, 10.0], [2.0, 6.0]]).max() < 1e-12
+    corners = placed(picture.transform, np.array([0.0, 40.0, 0.0]), np.array([30.0, 30.0, 0.0]))
+    assert np.abs(corners - [[5.0, 6.0], [5.0, 10.0], [2.0, 6.0]]).max() < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -492,15 +492,15 @@ def test_in_a_folder_a_picture_without_a_place_stays_a_source_unless_it_is_given
         "config/metric/map/map.yaml": ROOM,
         "config/metric/map/map.png": image((5, 5)),
     }
-    told = bundle.read(files, Hints(), Known(), LIMITS)
-    assert [k.layer for k in told.parts] == ["occupancy"]
-    (warning,) = told.warnings
+    upload_bundle = bundle.read(files, Hints(), Known(), LIMITS)
+    assert [k.layer for k in upload_bundle.parts] == ["occupancy"]
+    (warning,) = upload_bundle.warnings
     assert warning.file == "config/location/satellite-auto.png"
     assert "kept as a source" in warning.problem
     assert "corners=" in warning.problem
-    told = bundle.read(files, Hints(options={"corners": "53.2,-0.6,53.1,-0.5"}), Known(), LIMITS)
-    assert sorted(k.layer for k in told.parts) == ["imagery", "occupancy"]
-    assert told.files["config/location/satellite-auto.png"].format == "satellite"
+    upload_bundle = bundle.read(files, Hints(options={"corners": "53.2,-0.6,53.1,-0.5"}), Known(), LIMITS)
+    assert sorted(k.layer for k in upload_bundle.parts) == ["imagery", "occupancy"]
+    assert upload_bundle.files["config/location/satellite-auto.png"].format == "satellite"
 
 
 def test_of_several_pictures_the_options_place_the_one_that_is_named() -> None:
@@ -509,9 +509,9 @@ def test_of_several_pictures_the_options_place_the_one_that_is_named() -> None:
     for hints in (Hints(options=options), Hints("satellite", options=options)):
         with pytest.raises(Invalid, match=r"file=….*a\.png, b\.png"):
             bundle.read(files, hints, Known(), LIMITS)
-    told = bundle.read(files, Hints(options={**options, "file": "b.png", "picture": "roof"}), Known(), LIMITS)
-    assert [k.name for k in told.parts] == ["roof"]
-    assert {n for n, use in told.files.items() if use.used} == {"b.png"}
+    upload_bundle = bundle.read(files, Hints(options={**options, "file": "b.png", "picture": "roof"}), Known(), LIMITS)
+    assert [k.name for k in upload_bundle.parts] == ["roof"]
+    assert {n for n, use in upload_bundle.files.items() if use.used} == {"b.png"}
     with pytest.raises(Invalid, match="no file"):
         bundle.read(files, Hints(options={**options, "file": "c.png"}), Known(), LIMITS)
 
@@ -530,16 +530,16 @@ def test_a_cog_has_tiles_and_overviews_and_gdal_takes_it(tmp_path: Path) -> None
     data = tif(picture)
     assert data == tif(picture), "no clock in it"
     (tmp_path / "a.tif").write_bytes(data)
-    told = gdalinfo(tmp_path / "a.tif")
-    assert told["size"] == [1100, 1500]
-    assert told["geoTransform"] == [665000.0, 0.25, 0.0, 5905000.0, 0.0, -0.25]
-    assert 'ID["EPSG",32630]' in told["coordinateSystem"]["wkt"]
+    info = gdalinfo(tmp_path / "a.tif")
+    assert info["size"] == [1100, 1500]
+    assert info["geoTransform"] == [665000.0, 0.25, 0.0, 5905000.0, 0.0, -0.25]
+    assert 'ID["EPSG",32630]' in info["coordinateSystem"]["wkt"]
     assert (
-        told["metadata"]["IMAGE_STRUCTURE"] | {"COMPRESSION": "DEFLATE", "PREDICTOR": "2", "LAYOUT": "COG"}
-        == (told["metadata"]["IMAGE_STRUCTURE"])
+        info["metadata"]["IMAGE_STRUCTURE"] | {"COMPRESSION": "DEFLATE", "PREDICTOR": "2", "LAYOUT": "COG"}
+        == (info["metadata"]["IMAGE_STRUCTURE"])
     )
-    assert told["bands"][0]["block"] == [512, 512]
-    assert [o["size"] for o in told["bands"][0]["overviews"]] == [[550, 750], [275, 375]]
+    assert info["bands"][0]["block"] == [512, 512]
+    assert [o["size"] for o in info["bands"][0]["overviews"]] == [[550, 750], [275, 375]]
     assert np.array_equal(read({"a.tif": data})[0].pixels, pixels)
 
 
@@ -557,9 +557,9 @@ def test_png_with_world_file_as_gdal_reads_it(tmp_path: Path) -> None:
     assert context.dropped == []
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
-    told = gdalinfo(tmp_path / "satellite.png")
-    assert told["geoTransform"] == pytest.approx([665000.0, 0.4, 0.3, 5905000.0, 0.3, -0.4])
-    assert 'ID["EPSG",32630]' in told["coordinateSystem"]["wkt"]
+    info = gdalinfo(tmp_path / "satellite.png")
+    assert info["geoTransform"] == pytest.approx([665000.0, 0.4, 0.3, 5905000.0, 0.3, -0.4])
+    assert 'ID["EPSG",32630]' in info["coordinateSystem"]["wkt"]
     back, _ = read(files, "satellite.pgw")
     assert np.array_equal(back.pixels, turned.pixels)
     assert back.crs == UTM
@@ -583,8 +583,8 @@ def test_png_of_floats_declares_what_is_lost() -> None:
 def test_another_crs_on_request(tmp_path: Path) -> None:
     picture = utm((40, 60, 3))
     (tmp_path / "a.tif").write_bytes(written(picture, HERE, crs="local")[0]["satellite.tif"])
-    told = gdalinfo(tmp_path / "a.tif")
-    assert "Transverse Mercator" in told["coordinateSystem"]["wkt"]
+    info = gdalinfo(tmp_path / "a.tif")
+    assert "Transverse Mercator" in info["coordinateSystem"]["wkt"]
     (tmp_path / "b.tif").write_bytes(tif(picture, crs="wgs84"))
     box = crs_bounds(UTM, picture.outline(32))
     assert box is not None
@@ -611,17 +611,17 @@ def test_a_resolution_on_request() -> None:
 
 
 def test_which_picture() -> None:
-    known = get_format("satellite")
+    fmt = get_format("satellite")
     keys = [PartKey("imagery", name="a"), PartKey("imagery", name="b")]
     with pytest.raises(MissingLayer, match="GeoTIFF"):
-        known.choose([], WriteOptions())
+        fmt.choose([], WriteOptions())
     with pytest.raises(Ambiguous, match="picture=…: a, b"):
-        known.choose(keys, WriteOptions())
-    assert known.choose(keys, WriteOptions(picture="b")) == keys[1:]
+        fmt.choose(keys, WriteOptions())
+    assert fmt.choose(keys, WriteOptions(picture="b")) == keys[1:]
     usual = PartKey("imagery", name="satellite")
-    assert known.choose([*keys, usual], WriteOptions()) == [usual]
+    assert fmt.choose([*keys, usual], WriteOptions()) == [usual]
     with pytest.raises(NotFound):
-        known.choose(keys, WriteOptions(picture="c"))
+        fmt.choose(keys, WriteOptions(picture="c"))
     assert by_file("satellite.tif") == {"file_type": "tif"}
     assert by_file("satellite.pgw") == by_file("satellite.png.aux.xml") == {"file_type": "png"}
     assert by_file("plan.png") == {"file_type": "png", "picture": "plan"}
@@ -677,9 +677,9 @@ def test_lying_sizes(width: int, height: int) -> None:
 
 
 def test_resampled_is_the_same_function_for_everybody() -> None:
-    made = written(utm((8, 8, 1)), crs="wgs84")[0]["satellite.tif"]
+    data = written(utm((8, 8, 1)), crs="wgs84")[0]["satellite.tif"]
     direct = resampled(utm((8, 8, 1)), crs="EPSG:4326")
-    assert np.array_equal(read({"a.tif": made})[0].pixels, direct.pixels)
+    assert np.array_equal(read({"a.tif": data})[0].pixels, direct.pixels)
 
 
 def test_many_pictures_of_one_upload_are_sorted_in_time() -> None:

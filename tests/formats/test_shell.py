@@ -48,13 +48,13 @@ def values(text: str | bytes) -> dict[str, str]:
 
 
 def test_only_what_is_literal_on_every_run() -> None:
-    known, warnings = _shell.assignments(TEMPLATE)
-    assert known == {"COMMON_RELEASE": "v1.0.1", "FIELD_NAME": 'east "path"', "FIELD_ID": "p1"}
-    said = "\n".join(warnings)
+    variables, warnings = _shell.assignments(TEMPLATE)
+    assert variables == {"COMMON_RELEASE": "v1.0.1", "FIELD_NAME": 'east "path"', "FIELD_ID": "p1"}
+    text = "\n".join(warnings)
     for name in ("DATUM_FILE", "LOOPED", "INSIDE", "CASED", "PROPERTIES_FILE", "__dirname"):
-        assert f"{name} is left out" in said
-    assert "line 9: PROPERTIES_FILE" in said
-    assert "HIDDEN" not in said
+        assert f"{name} is left out" in text
+    assert "line 9: PROPERTIES_FILE" in text
+    assert "HIDDEN" not in text
 
 
 @pytest.mark.parametrize(
@@ -120,8 +120,8 @@ def test_only_what_is_literal_on_every_run() -> None:
     ],
 )
 def test_lines(text: str, expected: dict[str, str]) -> None:
-    known, warnings = _shell.assignments(text.encode())
-    assert known == expected
+    variables, warnings = _shell.assignments(text.encode())
+    assert variables == expected
     assert all("line" in w for w in warnings)
 
 
@@ -137,9 +137,9 @@ def test_literals_alone_need_no_warning() -> None:
 
 
 def test_real_property_files(shared: Path, facts_json: dict[str, Any]) -> None:
-    known = {n: f for n, f in facts_json.items() if f["kind"] == "environment_variables"}
-    assert len(known) == 3
-    for name, entry in known.items():
+    entries = {n: f for n, f in facts_json.items() if f["kind"] == "environment_variables"}
+    assert len(entries) == 3
+    for name, entry in entries.items():
         read, warnings = _shell.assignments((shared / "data" / name).read_bytes())
         assert read == entry["facts"]["literal_assignments"], name
         assert warnings == []
@@ -151,8 +151,8 @@ def test_bounds() -> None:
     with pytest.raises(UnreadableFile, match="not UTF-8"):
         _shell.assignments(b"A='\xff'")
     many = "".join(f"A{i}=1\n" for i in range(3000))
-    known, warnings = _shell.assignments(many.encode())
-    assert len(known) == _shell.MAX_VARIABLES
+    variables, warnings = _shell.assignments(many.encode())
+    assert len(variables) == _shell.MAX_VARIABLES
     assert len(warnings) == _shell.MAX_WARNINGS + 1
     assert values(f"A={'x' * (_shell.MAX_VALUE + 1)}") == {}
 
@@ -187,10 +187,10 @@ def test_hostile_repetition_is_quick(piece: str) -> None:
 @settings(max_examples=300, deadline=None)
 def test_any_bytes(data: bytes) -> None:
     try:
-        known, _ = _shell.assignments(data)
+        variables, _ = _shell.assignments(data)
     except UnreadableFile:
         return
-    assert all(name.isidentifier() for name in known)
+    assert all(name.isidentifier() for name in variables)
 
 
 PIECES = ["A=", "B=", "C", "export ", "'", '"', "\\", "$x", "`", ";", " ", "\n", "#", "x", "1", "é", "\t"]

@@ -34,15 +34,15 @@ EDGE_KEYS = {"edge_id", "node", "action", "top_vel", "map_2d", "inflation_radius
 
 
 def read(data: bytes, name: str = "map.tmap") -> tuple[Layers, ReadContext]:
-    told = ReadContext(main=name)
-    return formats.read(Group(FORMAT, name, {name: data}), told), told
+    context = ReadContext(main=name)
+    return formats.read(Group(FORMAT, name, {name: data}), context), context
 
 
 def write(layers: Layers, **options: Any) -> tuple[bytes, WriteContext]:
-    told = WriteContext(options=FORMAT.write_options(**options))
-    files = formats.write(FORMAT, layers, told)
+    context = WriteContext(options=FORMAT.write_options(**options))
+    files = formats.write(FORMAT, layers, context)
     assert list(files) == ["map.tmap"]
-    return files["map.tmap"], told
+    return files["map.tmap"], context
 
 
 def plain(data: bytes) -> dict[str, Any]:
@@ -99,10 +99,10 @@ def test_the_real_list_comes_back_the_same(shared: Path, same: Same, facts_json:
     data = (shared / "data" / name).read_bytes()
     assert formats.detect("tmap.tmap", data) is FORMAT
     layers, _ = read(data)
-    served, told = write(layers)
+    served, context = write(layers)
     assert alike(plain(served), plain(data))
     assert same("tmap2", {"a.tmap": data}, {"b.tmap": served}) == []
-    assert told.dropped == []
+    assert context.dropped == []
     assert write(read(served)[0])[0] == served
     facts = facts_json[name]["facts"]
     part = layers.parts[NETWORK]
@@ -133,22 +133,22 @@ def test_it_is_told_by_its_content_and_may_still_be_called_tmap2() -> None:
         assert formats.detect(name, mapping) is get_format("tmap2")
     assert formats.detect("list.txt", OLD) is None
     assert formats.detect("waypoints.yaml", b"- node: WayPoint3\n- node: WayPoint4\n") is None
-    for said in ("tmap", "tmap2", None):
-        told = read_bundle({"old.tmap": OLD}, Hints(said), Known(), Limits())
-        assert list(told.parts) == [NETWORK]
-        assert told.files["old.tmap"].format == (said or "tmap")
+    for format_name in ("tmap", "tmap2", None):
+        bundle = read_bundle({"old.tmap": OLD}, Hints(format_name), Known(), Limits())
+        assert list(bundle.parts) == [NETWORK]
+        assert bundle.files["old.tmap"].format == (format_name or "tmap")
 
 
 def test_beside_a_tmap2_the_tmap2_is_believed() -> None:
     files = {"old.tmap": OLD, "a_rather_long_name.tmap2.yaml": (SAMPLES / "tmap2" / "orchard.tmap2.yaml").read_bytes()}
-    told = read_bundle(files, Hints(), Known(), Limits())
-    assert told.parts[NETWORK].document["tmap2"]["name"] == "orchard_full"  # type: ignore[union-attr]
-    assert not told.files["old.tmap"].used
+    bundle = read_bundle(files, Hints(), Known(), Limits())
+    assert bundle.parts[NETWORK].document["tmap2"]["name"] == "orchard_full"  # type: ignore[union-attr]
+    assert not bundle.files["old.tmap"].used
 
 
 def test_to_tmap2_and_back_nothing_is_lost() -> None:
-    there = offline({"old.tmap": OLD}, "tmap2").files
-    back = offline(dict(there), "tmap").files["map.tmap"]
+    tmap2_files = offline({"old.tmap": OLD}, "tmap2").files
+    back = offline(dict(tmap2_files), "tmap").files["map.tmap"]
     first, last = plain(OLD), plain(back)
     for name, entry in first.items():
         assert last[name]["meta"] == entry["meta"]
@@ -161,9 +161,9 @@ def test_to_tmap2_and_back_nothing_is_lost() -> None:
 def test_a_tmap2_as_a_list_keeps_what_items_say_and_declares_what_the_top_said() -> None:
     data = (SAMPLES / "tmap2" / "orchard.tmap2.yaml").read_bytes()
     layers = formats.read(Group(get_format("tmap2"), "n.tmap2.yaml", {"n.tmap2.yaml": data}), ReadContext())
-    served, told = write(layers)
+    served, context = write(layers)
     assert len(load_v1(served)) == len(yaml.safe_load(data)["nodes"])
-    assert any("transformation" in d["why"] for d in told.dropped)
+    assert any("transformation" in d["why"] for d in context.dropped)
     assert all(e["node"].keys() >= NODE_KEYS for e in yaml.safe_load(served))
     twice = offline({"map.tmap": served}, "tmap2").files["network.tmap2.yaml"]
     once, now = ({e["node"]["name"]: e["node"] for e in yaml.safe_load(d)["nodes"]} for d in (data, twice))
@@ -176,18 +176,18 @@ def test_a_tmap2_as_a_list_keeps_what_items_say_and_declares_what_the_top_said()
 
 
 def test_a_network_from_elsewhere_is_completed_and_said_so() -> None:
-    served, told = write(drawn(), pointset="yard", top_vel=0.4, action="go")
+    served, context = write(drawn(), pointset="yard", top_vel=0.4, action="go")
     entries = yaml.safe_load(served)
     assert [e["node"]["name"] for e in entries] == ["a", "b"]
     assert entries[0]["meta"] == {"map": "map", "node": "a", "pointset": "yard"}
     assert all(e["node"].keys() >= NODE_KEYS for e in entries)
     assert entries[0]["node"]["properties"] == {"name": "Gate"}
-    there, back = (e["node"]["edges"][0] for e in entries)
-    assert there.keys() >= EDGE_KEYS
-    assert (there["top_vel"], back["top_vel"]) == (1.25, 0.4)
-    assert (there["action"], there["map_2d"]) == ("go", "map")
+    forward, back = (e["node"]["edges"][0] for e in entries)
+    assert forward.keys() >= EDGE_KEYS
+    assert (forward["top_vel"], back["top_vel"]) == (1.25, 0.4)
+    assert (forward["action"], forward["map_2d"]) == ("go", "map")
     assert load_v1(served)[0][:3] == ("a", "yard", [1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    filled = {t["what"] for t in told.template}
+    filled = {t["what"] for t in context.template}
     assert {"edges: action", "edges: top_vel", "nodes: verts", "nodes: pose.orientation"} <= filled
     assert "transformation" not in filled
     again, _ = read(served)

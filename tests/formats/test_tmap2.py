@@ -34,16 +34,16 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 
 
 def read(data: bytes | str, name: str = "network.tmap2.yaml", **context: Any) -> tuple[Layers, ReadContext]:
-    said = data.encode() if isinstance(data, str) else data
-    told = ReadContext(main=name, **context)
-    return formats.read(Group(FORMAT, name, {name: said}), told), told
+    content = data.encode() if isinstance(data, str) else data
+    read_context = ReadContext(main=name, **context)
+    return formats.read(Group(FORMAT, name, {name: content}), read_context), read_context
 
 
 def write(layers: Layers, **context: Any) -> tuple[bytes, WriteContext]:
-    told = WriteContext(**context)
-    files = formats.write(FORMAT, layers, told)
+    write_context = WriteContext(**context)
+    files = formats.write(FORMAT, layers, write_context)
     assert list(files) == ["network.tmap2.yaml"]
-    return files["network.tmap2.yaml"], told
+    return files["network.tmap2.yaml"], write_context
 
 
 def network(layers: Layers) -> Features:
@@ -75,24 +75,24 @@ def bounds(part: Features) -> list[list[float]]:
 
 def real(shared: Path) -> list[Path]:
     data = shared / "data"
-    found = [p for end in ("*.tmap2.yaml", "*.tmap2", "*.tmap", ".*.tmap2") for p in data.rglob(end)]
-    return sorted(set(found))
+    paths = [p for end in ("*.tmap2.yaml", "*.tmap2", "*.tmap", ".*.tmap2") for p in data.rglob(end)]
+    return sorted(set(paths))
 
 
 # --- real files ------------------------------------------------------------------------------------------------------
 
 
 def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
-    found = real(shared)
-    assert len(found) == sum(f.get("kind") == "tmap2" for f in facts_json.values()) == 9
-    for path in found:
+    paths = real(shared)
+    assert len(paths) == sum(f.get("kind") == "tmap2" for f in facts_json.values()) == 9
+    for path in paths:
         data = path.read_bytes()
         assert formats.detect(path.name, data) is (get_format("tmap") if path.suffix == ".tmap" else FORMAT), path
         assert [g.main for g in formats.group({path.name: data}, "tmap2")[0]] == [path.name]
         layers, _ = read(data, path.name)
-        served, told = again(layers)
+        served, context = again(layers)
         assert same("tmap2", {path.name: data}, {"network.tmap2.yaml": served}) == [], path
-        assert told.dropped == []
+        assert context.dropped == []
         once_more, _ = again(read(served)[0])
         assert once_more == served, path
 
@@ -163,11 +163,11 @@ def test_facts_of_samples() -> None:
     assert sum(p["source"] == p["target"] for p in edges) == fact["self_loops"]
     assert bounds(part) == fact["bounds"]
     assert part.document["tmap2"]["name"] == fact["name"]
-    said = warnings(context)
-    assert ("is no node" in said) == bool(fact["dangling"])
-    assert ("have no edges" in said) == bool(fact["lonely"])
-    assert ("stand twice" in said) == bool(fact["repeated_names"])
-    assert ("stand for several" in said) == bool(fact["repeated_edge_ids"])
+    text = warnings(context)
+    assert ("is no node" in text) == bool(fact["dangling"])
+    assert ("have no edges" in text) == bool(fact["lonely"])
+    assert ("stand twice" in text) == bool(fact["repeated_names"])
+    assert ("stand for several" in text) == bool(fact["repeated_edge_ids"])
 
 
 def test_points_of_interest_are_objects() -> None:
@@ -185,8 +185,8 @@ def test_points_of_interest_are_objects() -> None:
 
 def test_a_document_of_points_of_interest_names_the_network_made_from_them() -> None:
     layers, _ = read((SAMPLES / "stops.tmap2.yaml").read_bytes())
-    made = network(layers).with_document({})
-    served, _ = write(Layers({NETWORK: made, **layers.parts}), title="farm")
+    derived_network = network(layers).with_document({})
+    served, _ = write(Layers({NETWORK: derived_network, **layers.parts}), title="farm")
     assert yaml.safe_load(served)["name"] == "stops"
 
 
@@ -210,9 +210,9 @@ def test_the_orchard_in_full(same: Same) -> None:
     assert loop["tmap2"]["restrictions_planning"] is True
     assert part.properties[7]["tmap2"] == {"edge_id": "Row 1_Größe"}
     assert part.geometry[6].has_z
-    served, told = again(layers)
+    served, context = again(layers)
     assert same("tmap2", {"a.tmap2.yaml": data}, {"b.tmap2.yaml": served}) == []
-    assert told.dropped == []
+    assert context.dropped == []
     top = yaml.safe_load(served)
     check_schema(top)
     assert [n["node"]["name"] for n in top["nodes"]] == ["Gate", "Gate", "Größe", "Row 1"]
@@ -226,7 +226,7 @@ def test_the_orchard_in_full(same: Same) -> None:
 def test_the_older_list_is_served_completed() -> None:
     layers, _ = read(OLD.read_bytes(), "old.tmap")
     assert network(layers).document["tmap"] == {"layout": "list"}
-    served, told = again(layers)
+    served, context = again(layers)
     top = yaml.safe_load(served)
     check_schema(top)
     assert (top["name"], top["metric_map"], top["pointset"]) == ("yard_points", "yard", "yard_points")
@@ -236,7 +236,7 @@ def test_the_older_list_is_served_completed() -> None:
     edge = node["edges"][0]
     assert edge["top_vel"] == 0.55
     assert edge["goal"] == {"target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}}
-    assert any("edges" in t["what"] for t in told.template)
+    assert any("edges" in t["what"] for t in context.template)
 
 
 # --- names -----------------------------------------------------------------------------------------------------------
@@ -295,13 +295,13 @@ def test_names_that_are_no_texts_become_texts_with_their_edges() -> None:
 
 
 def test_long_edge_ids_and_edges_without_one() -> None:
-    said = yaml.safe_load(two("A" * 256, "B" * 256))
-    said["nodes"][0]["node"]["edges"] = [
+    document = yaml.safe_load(two("A" * 256, "B" * 256))
+    document["nodes"][0]["node"]["edges"] = [
         {"edge_id": "A" * 600, "node": "B" * 256},
         {"node": "B" * 256},
         {"edge_id": 7, "node": "B" * 256},
     ]
-    layers, _ = read(yaml.safe_dump(said))
+    layers, _ = read(yaml.safe_dump(document))
     part = network(layers)
     assert all(len(i) <= 512 for i in part.ids)
     edges = yaml.safe_load(again(layers)[0])["nodes"][0]["node"]["edges"]
@@ -332,32 +332,32 @@ DATUM = Datum(53.2686, -0.5245)
 
 @pytest.mark.parametrize("name", ["tmap2", "tmap"])
 def test_what_nodes_get_can_be_chosen(name: str) -> None:
-    known = formats.get_format(name)
-    asked = {"verts_radius": "1.5", "xy_goal_tolerance": "0.2", "yaw_goal_tolerance": "0.5"}
-    context = WriteContext(options=formats.write_options(known, asked), title="farm")
-    (served,) = formats.write(known, Layers({NETWORK: from_elsewhere()}, DATUM), context).values()
+    fmt = formats.get_format(name)
+    options = {"verts_radius": "1.5", "xy_goal_tolerance": "0.2", "yaw_goal_tolerance": "0.5"}
+    context = WriteContext(options=formats.write_options(fmt, options), title="farm")
+    (served,) = formats.write(fmt, Layers({NETWORK: from_elsewhere()}, DATUM), context).values()
     listed = yaml.safe_load(served)
     for entry in listed if name == "tmap" else listed["nodes"]:
         node = entry["node"]
         assert [math.hypot(v["x"], v["y"]) for v in node["verts"]] == pytest.approx([1.5] * 8)
-        said = node if name == "tmap" else node["properties"]
+        properties = node if name == "tmap" else node["properties"]
         turned = node["name"] == "n2"
-        assert (said["xy_goal_tolerance"], said["yaw_goal_tolerance"]) == (0.2, 0.5 if turned else 6.29)
+        assert (properties["xy_goal_tolerance"], properties["yaw_goal_tolerance"]) == (0.2, 0.5 if turned else 6.29)
     filled = {line["what"]: line["value"] for line in context.template}
     assert filled["nodes: verts"] == "an octagon of 1.5 m"
     assert (filled["nodes: xy_goal_tolerance"], filled["nodes: yaw_goal_tolerance"]) == (0.2, 0.5)
     assert filled["nodes without an orientation: yaw_goal_tolerance"] == 6.29
     for wrong in ({"verts_radius": "0"}, {"yaw_goal_tolerance": "7"}, {"xy_goal_tolerance": "nan"}):
         with pytest.raises(Invalid):
-            formats.write_options(known, wrong)
+            formats.write_options(fmt, wrong)
     # A network of its own keeps what it says.
     again = formats.read(formats.group({f"a.{name}": served}, name)[0][0], ReadContext())
-    (same,) = formats.write(known, again, WriteContext(title="farm")).values()
+    (same,) = formats.write(fmt, again, WriteContext(title="farm")).values()
     assert same == served
 
 
 def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> None:
-    served, told = write(Layers({NETWORK: from_elsewhere()}, DATUM), title="farm")
+    served, context = write(Layers({NETWORK: from_elsewhere()}, DATUM), title="farm")
     top = yaml.safe_load(served)
     check_schema(top)
     assert (top["name"], top["metric_map"], top["pointset"]) == ("farm", "farm", "farm")
@@ -379,8 +379,10 @@ def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> No
     assert edge["properties"] == {"speed_limit": 1.5, "width": 3, "name": "Lane"}
     assert edge["restrictions_planning"] == "True"
     assert n10["edges"][0]["action"] == "row_traversal"
-    assert {d["what"]: d["count"] for d in told.dropped} == {"osm tags and attributes": 2}
-    assert {"nodes at bends", "metric_map", "name", "pointset", "transformation"} <= {t["what"] for t in told.template}
+    assert {d["what"]: d["count"] for d in context.dropped} == {"osm tags and attributes": 2}
+    assert {"nodes at bends", "metric_map", "name", "pointset", "transformation"} <= {
+        t["what"] for t in context.template
+    }
 
     back = network(read(served)[0])
     by_id = dict(zip(back.ids, back.properties, strict=True))
@@ -396,13 +398,13 @@ def test_options_say_what_edges_do_and_whether_osm_is_written() -> None:
     options = formats.write_options(
         FORMAT, {"action": "NavigateToPose", "action_type": "nav2_msgs/NavigateToPose", "osm": "true", "pointset": "no"}
     )
-    served, told = write(Layers({NETWORK: from_elsewhere()}, DATUM), options=options)
+    served, context = write(Layers({NETWORK: from_elsewhere()}, DATUM), options=options)
     top = yaml.safe_load(served)
     assert (top["name"], top["pointset"]) == ("no", "no")
     edge = top["nodes"][0]["node"]["edges"][0]
     assert (edge["action"], edge["action_type"]) == ("NavigateToPose", "nav2_msgs/NavigateToPose")
     assert edge["properties"]["osm"] == {"way": 1}
-    assert told.dropped == []
+    assert context.dropped == []
     back = network(read(served)[0])
     assert back.properties[back.index()["n10"]]["osm"] == {"tags": {"a": "b"}}
 
@@ -421,7 +423,7 @@ def test_levels_are_joined_at_their_elevation_and_said_so() -> None:
 
     upper = PartKey("topology", "first", "network")
     levels = (Level(), Level("first", 3.5))
-    served, told = write(Layers({NETWORK: level(0.0), upper: level(10.0, 4.0)}, None, levels))
+    served, context = write(Layers({NETWORK: level(0.0), upper: level(10.0, 4.0)}, None, levels))
     nodes = {n["node"]["name"]: n["node"] for n in yaml.safe_load(served)["nodes"]}
     at = {name: tuple(node["pose"]["position"].values()) for name, node in nodes.items()}
     assert sorted(at.values()) == [(0.0, 0.0, 0.0), (0.0, 5.0, 0.0), (10.0, 0.0, 4.0), (10.0, 5.0, 3.5)]
@@ -431,54 +433,54 @@ def test_levels_are_joined_at_their_elevation_and_said_so() -> None:
         (by_place[(0.0, 0.0, 0.0)], by_place[(0.0, 5.0, 0.0)]),
         (by_place[(10.0, 0.0, 4.0)], by_place[(10.0, 5.0, 3.5)]),
     }
-    assert [(d["what"], d["count"]) for d in told.dropped] == [("levels of nodes and edges", 3)]
-    assert "several networks" in warnings(told)
-    only, told = write(Layers({upper: level(10.0)}, None, levels))
+    assert [(d["what"], d["count"]) for d in context.dropped] == [("levels of nodes and edges", 3)]
+    assert "several networks" in warnings(context)
+    only, context = write(Layers({upper: level(10.0)}, None, levels))
     assert yaml.safe_load(only)["nodes"][0]["node"]["pose"]["position"]["z"] == 3.5
-    assert told.dropped == []
+    assert context.dropped == []
 
 
 def test_a_last_updated_that_is_no_time_is_replaced_and_said_so() -> None:
-    said = yaml.safe_load(two("A"))
+    document = yaml.safe_load(two("A"))
     for value in (0, "yesterday", None, 20220623):
-        said["meta"]["last_updated"] = value
-        served, told = again(read(yaml.safe_dump(said))[0])
+        document["meta"]["last_updated"] = value
+        served, context = again(read(yaml.safe_dump(document))[0])
         assert yaml.safe_load(served)["meta"]["last_updated"] == _tmap.EPOCH
-        assert ("no time" in warnings(told)) == (value is not None)
-    said["meta"]["last_updated"] = "2022-06-23_13-10-11"
-    assert yaml.safe_load(again(read(yaml.safe_dump(said))[0])[0])["meta"]["last_updated"] == "2022-06-23_13-10-11"
+        assert ("no time" in warnings(context)) == (value is not None)
+    document["meta"]["last_updated"] = "2022-06-23_13-10-11"
+    assert yaml.safe_load(again(read(yaml.safe_dump(document))[0])[0])["meta"]["last_updated"] == "2022-06-23_13-10-11"
 
 
 def test_what_nobody_knows_is_kept_where_it_stood() -> None:
-    said = yaml.safe_load(two("A"))
-    said["definitions"] = {"default_bt": "<root>\n  <a b='c'/>\n</root>\n", "zz": [[1, [2]], {}, []]}
-    said["actions"] = {"navigate_to_pose": {"composable": False}}
-    said["meta"]["origin"] = {"latitude": 1.5, "longitude": 2, "altitude": 0.0}
-    entry = said["nodes"][0]
+    document = yaml.safe_load(two("A"))
+    document["definitions"] = {"default_bt": "<root>\n  <a b='c'/>\n</root>\n", "zz": [[1, [2]], {}, []]}
+    document["actions"] = {"navigate_to_pose": {"composable": False}}
+    document["meta"]["origin"] = {"latitude": 1.5, "longitude": 2, "altitude": 0.0}
+    entry = document["nodes"][0]
     entry |= {"extra": 1, "more": [None], "zone": {"a": True}}
     entry["meta"] |= {"sub": "x", "node": "other"}
     entry["node"] |= {"nav_frame": "topo", "edges_seen": 5, "zeta": "~"}
     entry["node"]["pose"] |= {"header": {"seq": 1}}
     entry["node"]["pose"]["position"]["accuracy"] = 0.1
     entry["node"]["edges"][0] |= {"action": None, "weight": 1e-09, "b": False}
-    served = yaml.safe_load(again(read(yaml.safe_dump(said))[0])[0])
-    said["transformation"] = _tmap.TRANSFORMATION
-    said["nodes"][1]["node"]["parent_frame"] = "map"
-    assert served == said
+    served = yaml.safe_load(again(read(yaml.safe_dump(document))[0])[0])
+    document["transformation"] = _tmap.TRANSFORMATION
+    document["nodes"][1]["node"]["parent_frame"] = "map"
+    assert served == document
 
 
 def test_nodes_in_the_child_frame_stand_where_the_transformation_puts_them() -> None:
-    said = yaml.safe_load(two("A"))
+    document = yaml.safe_load(two("A"))
     half = math.sqrt(0.5)
-    said["transformation"] = {
+    document["transformation"] = {
         "child": "topo_map",
         "parent": "map",
         "rotation": {"w": half, "x": 0.0, "y": 0.0, "z": half},  # a quarter turn to the left
         "translation": {"x": 100.0, "y": 0.0, "z": 1.0},
     }
-    said["nodes"][0]["node"]["parent_frame"] = "topo_map"
-    said["nodes"][1]["node"]["parent_frame"] = "map"
-    layers, context = read(yaml.safe_dump(said))
+    document["nodes"][0]["node"]["parent_frame"] = "topo_map"
+    document["nodes"][1]["node"]["parent_frame"] = "map"
+    layers, context = read(yaml.safe_dump(document))
     part = network(layers)
     assert part.geometry[0].x == pytest.approx(98.0)
     assert part.geometry[0].y == pytest.approx(1.0)
@@ -487,9 +489,9 @@ def test_nodes_in_the_child_frame_stand_where_the_transformation_puts_them() -> 
     assert part.geometry[1].coords[:] == [(5.0, 2.0)]
     assert "topo_map" in warnings(context)
     served = yaml.safe_load(again(layers)[0])
-    for before, after in zip(said["nodes"], served["nodes"], strict=True):
-        for what in ("position", "orientation"):
-            assert after["node"]["pose"][what] == pytest.approx(before["node"]["pose"][what], abs=1e-9)
+    for before, after in zip(document["nodes"], served["nodes"], strict=True):
+        for key in ("position", "orientation"):
+            assert after["node"]["pose"][key] == pytest.approx(before["node"]["pose"][key], abs=1e-9)
 
 
 # --- determinism and round trips -------------------------------------------------------------------------------------
@@ -505,13 +507,13 @@ def test_the_order_of_items_does_not_matter() -> None:
 
 
 def test_equal_edge_ids_stay_in_one_order() -> None:
-    said = yaml.safe_load(two("B", "A"))
-    said["nodes"][0]["node"]["edges"] = [
+    document = yaml.safe_load(two("B", "A"))
+    document["nodes"][0]["node"]["edges"] = [
         {"edge_id": "gg", "node": "A", "action": "x"},
         {"edge_id": "f", "node": "A", "action": "x"},
     ]
-    said["nodes"][1]["node"]["edges"] = [{"edge_id": "f", "node": "B", "action": "x"}]
-    served, _ = again(read(yaml.safe_dump(said))[0])
+    document["nodes"][1]["node"]["edges"] = [{"edge_id": "f", "node": "B", "action": "x"}]
+    served, _ = again(read(yaml.safe_dump(document))[0])
     assert [e["edge_id"] for e in yaml.safe_load(served)["nodes"][1]["node"]["edges"]] == ["f", "gg"]
     assert again(read(served)[0])[0] == served
 
@@ -528,7 +530,9 @@ names = st.text(st.characters(exclude_categories=["Cs", "Cc", "Zl", "Zp"]), min_
 scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | names | st.floats(-1e6, 1e6)
 nested = st.recursive(scalars, lambda v: st.lists(v, max_size=3) | st.dictionaries(names, v, max_size=3), max_leaves=6)
 metres = st.floats(-1e5, 1e5).map(lambda v: round(v, 9) + 0.0)
-own = st.dictionaries(names.filter(lambda k: k not in ("name", "edges", "pose", "properties")), nested, max_size=3)
+extra_members = st.dictionaries(
+    names.filter(lambda k: k not in ("name", "edges", "pose", "properties")), nested, max_size=3
+)
 
 
 @st.composite
@@ -537,13 +541,23 @@ def networks(draw: st.DrawFn) -> dict[str, Any]:
     nodes = []
     for name in called:
         edges = [
-            {**draw(own), "edge_id": draw(names), "node": draw(st.sampled_from(called) | names), "action": draw(names)}
+            {
+                **draw(extra_members),
+                "edge_id": draw(names),
+                "node": draw(st.sampled_from(called) | names),
+                "action": draw(names),
+            }
             for _ in range(draw(st.integers(0, 3)))
         ]
         position = {axis: draw(metres) for axis in "xyz"}
         orientation = {axis: draw(st.floats(-1, 1)) for axis in "wxyz"}
         properties = draw(st.dictionaries(names, nested, max_size=2))
-        node = {**draw(own), "name": name, "edges": edges, "pose": {"position": position, "orientation": orientation}}
+        node = {
+            **draw(extra_members),
+            "name": name,
+            "edges": edges,
+            "pose": {"position": position, "orientation": orientation},
+        }
         node |= {"parent_frame": "map", "properties": properties}
         nodes.append({"meta": {"map": draw(names), "node": name, "pointset": "p"}, "node": node})
     top = draw(st.dictionaries(names.filter(lambda k: k not in ("nodes", "transformation")), nested, max_size=2))
@@ -562,10 +576,10 @@ def plain(top: dict[str, Any]) -> dict[str, Any]:
 @settings(max_examples=150, deadline=None)
 @given(networks())
 def test_any_network_comes_back_the_same(top: dict[str, Any]) -> None:
-    said = yaml.safe_dump(top, allow_unicode=True)
-    layers, _ = read(said)
-    served, told = again(layers)
-    assert told.dropped == []
+    text = yaml.safe_dump(top, allow_unicode=True)
+    layers, _ = read(text)
+    served, context = again(layers)
+    assert context.dropped == []
     assert plain(yaml.safe_load(served)) == plain(json.loads(json.dumps(top)))
     assert again(read(served)[0])[0] == served
 
@@ -574,9 +588,9 @@ def test_any_network_comes_back_the_same(top: dict[str, Any]) -> None:
 
 
 def broken(change: Callable[[dict[str, Any]], Any]) -> str:
-    said: dict[str, Any] = yaml.safe_load(two("A"))
-    change(said)
-    return yaml.safe_dump(said)
+    document: dict[str, Any] = yaml.safe_load(two("A"))
+    change(document)
+    return yaml.safe_dump(document)
 
 
 @pytest.mark.parametrize(
@@ -613,10 +627,10 @@ def test_what_is_wrong_is_named(change: Callable[[dict[str, Any]], Any], where: 
 
 @pytest.mark.parametrize("value", [".nan", ".inf", "1.0e+999"])
 def test_positions_that_are_not_finite_are_refused_with_their_line(value: str) -> None:
-    said = two("A").replace("x: 5.0", f"x: {value}")
+    text = two("A").replace("x: 5.0", f"x: {value}")
     with pytest.raises(UnreadableFile) as caught:
-        read(said)
-    assert caught.value.problems[0].line == said[: said.index(f"x: {value}")].count("\n") + 1
+        read(text)
+    assert caught.value.problems[0].line == text[: text.index(f"x: {value}")].count("\n") + 1
 
 
 @pytest.mark.parametrize(
@@ -634,12 +648,12 @@ def test_truncated_and_mutated_files_are_read_or_refused() -> None:
     data = (SAMPLES / "orchard.tmap2.yaml").read_bytes()
     dice = random.Random(11)
     for k in range(300):
-        said = bytearray(data[: dice.randrange(len(data))] if k % 3 == 0 else data)
+        variant = bytearray(data[: dice.randrange(len(data))] if k % 3 == 0 else data)
         for _ in range(dice.randrange(4)):
-            if said:
-                said[dice.randrange(len(said))] = dice.randrange(256)
+            if variant:
+                variant[dice.randrange(len(variant))] = dice.randrange(256)
         try:
-            layers, _ = read(bytes(said))
+            layers, _ = read(bytes(variant))
         except BadUpload:
             continue
         if layers.parts:

@@ -72,8 +72,8 @@ def written(layers: Layers, to: str, **options: Any) -> dict[str, bytes]:
 
 def cut(layers: Layers, **options: Any) -> dict[str, OccupancyGrid]:
     """The derived grid of each level."""
-    made = objects_to_occupancy(layers, Parameters(outside_free=True, **options), Notes())
-    return {key.level: grid for key, grid in made.grids().items()}
+    derived_layers = objects_to_occupancy(layers, Parameters(outside_free=True, **options), Notes())
+    return {key.level: grid for key, grid in derived_layers.grids().items()}
 
 
 def square_metres(grid: OccupancyGrid) -> float:
@@ -115,18 +115,18 @@ def test_multipolygon_equals_the_area_that_osmium_assembles(tmp_path: Path) -> N
     path = tmp_path / "map.osm"
     path.write_bytes(courtyard())
     factory = osmium.geom.WKBFactory()
-    made = osmium.FileProcessor(path).with_areas()
-    (expected,) = [shapely.from_wkb(factory.create_multipolygon(o)) for o in made if o.is_area()]
+    processor = osmium.FileProcessor(path).with_areas()
+    (expected,) = [shapely.from_wkb(factory.create_multipolygon(o)) for o in processor if o.is_area()]
     part = next(iter(read({"map.osm": courtyard()}).layers(DATUM).vector("objects").values()))
-    (found,) = [g for i, g in zip(part.ids, part.geometry, strict=True) if i == "r7"]
-    assert shapely.symmetric_difference(found, expected).area < 1e-9 * expected.area
-    assert found.is_valid
+    (area,) = [g for i, g in zip(part.ids, part.geometry, strict=True) if i == "r7"]
+    assert shapely.symmetric_difference(area, expected).area < 1e-9 * expected.area
+    assert area.is_valid
 
 
 def test_multipolygon_without_one_of_its_ways_is_warned_of() -> None:
-    told = read({"map.osm": courtyard(without=3)})
-    assert any("1 multipolygons have no area" in w.problem and w.problem.endswith(": 7") for w in told.warnings)
-    part = next(iter(told.layers(DATUM).vector("objects").values()))
+    bundle = read({"map.osm": courtyard(without=3)})
+    assert any("1 multipolygons have no area" in w.problem and w.problem.endswith(": 7") for w in bundle.warnings)
+    part = next(iter(bundle.layers(DATUM).vector("objects").values()))
     assert part.geometry[part.index()["r7"]].is_empty
 
 
@@ -173,7 +173,7 @@ def content(path: Path) -> Layers | None:
     return Layers(parts, layers.datum or DATUM, layers.levels)
 
 
-def assert_law(layers: Layers, where: str, **options: Any) -> int:
+def assert_law(layers: Layers, label: str, **options: Any) -> int:
     """The slice of the written world, read back, equals the derived grid of each level; how many levels have one."""
     try:
         grids = cut(layers, **options)
@@ -182,18 +182,18 @@ def assert_law(layers: Layers, where: str, **options: Any) -> int:
     back = read(written(layers, "gazebo", content="all"), None).layers(None)
     for level, grid in grids.items():
         expected = grid.cells == OCCUPIED
-        found = np.zeros_like(expected)
+        occupied = np.zeros_like(expected)
         if not expected.any():
             continue
         height = layers.elevation(level) + 0.2
         (other,) = cut(Layers(back.parts), resolution=grid.resolution, height=height).values()
         shift = [round((other.origin[k] - grid.origin[k]) / grid.resolution) for k in (1, 0)]
         cells = np.argwhere(other.cells == OCCUPIED) + shift
-        assert (cells >= 0).all(), where
-        assert (cells < found.shape).all(), where
-        found[tuple(cells.T)] = True
-        assert (found == expected).mean() >= 0.99, (where, level)
-        assert (found & expected).sum() >= 0.99 * (found | expected).sum(), (where, level)
+        assert (cells >= 0).all(), label
+        assert (cells < occupied.shape).all(), label
+        occupied[tuple(cells.T)] = True
+        assert (occupied == expected).mean() >= 0.99, (label, level)
+        assert (occupied & expected).sum() >= 0.99 * (occupied | expected).sum(), (label, level)
     return len(grids)
 
 

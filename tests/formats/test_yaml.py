@@ -22,8 +22,8 @@ from app.formats._rmf import Flow
 LIMITS = Limits()
 
 
-def load(said: str | bytes) -> Any:
-    return _yaml.load(said.encode() if isinstance(said, str) else said, LIMITS)
+def load(text: str | bytes) -> Any:
+    return _yaml.load(text.encode() if isinstance(text, str) else text, LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_keys_are_texts_as_written() -> None:
 
 
 def test_aliases_and_a_byte_order_mark() -> None:
-    said = "\ufeffa: &a [1, 2]\nb: *a\nc: &t text\nd: {e: *t}\nf: &a 3\ng: *a\n"
-    assert load(said) == {"a": [1, 2], "b": [1, 2], "c": "text", "d": {"e": "text"}, "f": 3, "g": 3}
+    text = "\ufeffa: &a [1, 2]\nb: *a\nc: &t text\nd: {e: *t}\nf: &a 3\ng: *a\n"
+    assert load(text) == {"a": [1, 2], "b": [1, 2], "c": "text", "d": {"e": "text"}, "f": 3, "g": 3}
 
 
 def test_lines_may_end_as_windows_ends_them() -> None:
@@ -186,9 +186,9 @@ def test_an_alias_bomb_is_refused_before_it_unfolds() -> None:
 
 
 def test_a_long_text_repeated_by_aliases_is_refused() -> None:
-    for said in (f"a: &a {'x' * 100_000}\nb:\n", f"a: &a\n- {'x' * 100_000}\nb:\n"):
+    for text in (f"a: &a {'x' * 100_000}\nb:\n", f"a: &a\n- {'x' * 100_000}\nb:\n"):
         with pytest.raises(TooLarge, match="unfold"):
-            load(said + "- *a\n" * 1000)
+            load(text + "- *a\n" * 1000)
 
 
 @pytest.mark.parametrize(
@@ -196,10 +196,10 @@ def test_a_long_text_repeated_by_aliases_is_refused() -> None:
 )
 @pytest.mark.parametrize("start", ["", "a: ", "- ", "a: '", 'a: "'])
 def test_long_lines_take_time_in_proportion(start: str, filling: str) -> None:
-    said = start + filling * (200_000 // len(filling)) + "@"
+    text = start + filling * (200_000 // len(filling)) + "@"
     began = time.process_time()
     with suppress(BadUpload):
-        load(said)
+        load(text)
     assert time.process_time() - began < 20
 
 
@@ -211,27 +211,27 @@ def test_limits_on_nodes_and_bytes() -> None:
         _yaml.load(b"a: 1\n" * 100, Limits(text_bytes=50))
 
 
-def quick(said: str) -> Any:
+def quick(text: str) -> Any:
     """What the quick way makes of it, or a mark that it leaves it to the reference."""
     try:
-        return _yaml._load_lines(said, LIMITS)
+        return _yaml._load_lines(text, LIMITS)
     except _yaml._NotSimpleError:
         return NotImplemented
 
 
 def test_both_ways_agree_on_all_real_files(shared: Path) -> None:
-    found = [p for end in ("*.yaml", "*.tmap2", "*.tmap", ".*.tmap2") for p in (shared / "data").rglob(end)]
-    assert len(found) > 50
+    paths = [p for end in ("*.yaml", "*.tmap2", "*.tmap", ".*.tmap2") for p in (shared / "data").rglob(end)]
+    assert len(paths) > 50
     simple = set()
-    for path in found:
-        said = path.read_text()
+    for path in paths:
+        text = path.read_text()
         if path.parts[-3] == "navgraph":
             with pytest.raises(UnreadableFile, match="%TAG"):  # Fawkes' own tags
-                _yaml._load_events(said, LIMITS)
+                _yaml._load_events(text, LIMITS)
             continue
-        reference = _yaml._load_events(said, LIMITS)
-        assert reference == yaml.load(said, yaml.CSafeLoader) or "graphs" in said, path
-        value = quick(said)
+        reference = _yaml._load_events(text, LIMITS)
+        assert reference == yaml.load(text, yaml.CSafeLoader) or "graphs" in text, path
+        value = quick(text)
         if value is not NotImplemented:
             simple.add(path.name)
             assert value == reference, path
@@ -263,10 +263,10 @@ line = st.tuples(
 @example([(0, "", ["k: &n"], ""), (0, "- ", ["a"], ""), (0, "", ["b"], ": "), (0, "- ", ["*n"], "")], "\n")
 @example([(0, "", ["a", "1"], ": "), (2, "", ["b c"], "")], "\n")
 def test_both_ways_agree_on_whatever_the_quick_way_takes(rows: list[Any], end: str) -> None:
-    said = end.join(" " * indent + dash + glue.join(words) for indent, dash, words, glue in rows)
-    value = quick(said)
+    text = end.join(" " * indent + dash + glue.join(words) for indent, dash, words, glue in rows)
+    value = quick(text)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(text, LIMITS)), text
 
 
 FLOWING = [
@@ -291,10 +291,10 @@ FLOWING = [
 @example([("", "- ", ["[1, 2, {a: [4, true]}]"])] * 2)
 @example([("", "- [1, 2.5, ", ["1", ", ", "yes", "]"]), ("", "- [1, 2.5, ", ["08", ", ", "''", "]"])])
 def test_both_ways_agree_on_collections_in_flow_style(rows: list[Any]) -> None:
-    said = "\n".join(indent + start + "".join(words) for indent, start, words in rows)
-    value = quick(said)
+    text = "\n".join(indent + start + "".join(words) for indent, start, words in rows)
+    value = quick(text)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(text, LIMITS)), text
 
 
 floats = st.floats(allow_nan=False, allow_infinity=False)
@@ -310,12 +310,12 @@ flowing = st.recursive(
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.lists(flowing, min_size=1, max_size=5), min_size=1, max_size=5))
 def test_rows_in_flow_style_are_taken_the_quick_way(rows: list[Any]) -> None:
-    said = "rows:\n" + "".join(f"  - {Flow()(row)}\n" for row in rows)
-    reference = _yaml._load_events(said, LIMITS)
+    text = "rows:\n" + "".join(f"  - {Flow()(row)}\n" for row in rows)
+    reference = _yaml._load_events(text, LIMITS)
     assert orjson.dumps(reference) == orjson.dumps({"rows": rows}, option=orjson.OPT_SORT_KEYS)
-    value = quick(said)
-    assert value is not NotImplemented, said
-    assert orjson.dumps(value) == orjson.dumps(reference), said
+    value = quick(text)
+    assert value is not NotImplemented, text
+    assert orjson.dumps(value) == orjson.dumps(reference), text
 
 
 def test_limits_hold_for_collections_in_flow_style() -> None:
@@ -371,10 +371,10 @@ values = st.recursive(
 @settings(max_examples=500, deadline=None)
 @given(st.dictionaries(texts, values, min_size=1, max_size=5))
 def test_what_is_written_is_read_back_by_us_and_by_pyyaml(value: dict[str, Any]) -> None:
-    said = _yaml.mapping(value, 0)
-    assert orjson.dumps(load(said), option=orjson.OPT_SORT_KEYS) == orjson.dumps(value, option=orjson.OPT_SORT_KEYS)
-    assert yaml.safe_load(said) == value
-    assert _yaml.mapping(dict(reversed(value.items())), 0) == said
+    text = _yaml.mapping(value, 0)
+    assert orjson.dumps(load(text), option=orjson.OPT_SORT_KEYS) == orjson.dumps(value, option=orjson.OPT_SORT_KEYS)
+    assert yaml.safe_load(text) == value
+    assert _yaml.mapping(dict(reversed(value.items())), 0) == text
 
 
 @settings(max_examples=600, deadline=None)
@@ -397,15 +397,15 @@ def test_both_ways_agree_on_damaged_documents(value: dict[str, Any], random: Any
         else:
             lines.insert(k, random.choice(["", "  ", "# c", "   # c: d", "a: &a", "- *a", "  b: *a"]))
         lines = lines or [""]
-    said = "\n".join(lines)
-    taken = quick(said)
+    text = "\n".join(lines)
+    taken = quick(text)
     if taken is not NotImplemented:
-        assert orjson.dumps(taken) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+        assert orjson.dumps(taken) == orjson.dumps(_yaml._load_events(text, LIMITS)), text
 
 
 plain = st.text(st.characters(categories=["L", "N", "P", "Zs"], max_codepoint=0x2000), max_size=12).filter(
     # rapidyaml's JSON writes these as .inf and .nan even where YAML has them in quotes.
-    lambda said: said.lower().lstrip("+-.") not in ("inf", "infinity", "nan")
+    lambda text: text.lower().lstrip("+-.") not in ("inf", "infinity", "nan")
 )
 
 

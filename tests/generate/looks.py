@@ -35,8 +35,8 @@ def make(name: str, seed: int = 7, given: Layers | None = None, **values: Any) -
     """A site and what its generator said."""
     notes = Notes()
     before = given or Layers()
-    made = generate.run(name, seed, values, before, notes)
-    return Layers({**before.parts, **made.parts}, made.datum, made.levels), notes
+    new_layers = generate.run(name, seed, values, before, notes)
+    return Layers({**before.parts, **new_layers.parts}, new_layers.datum, new_layers.levels), notes
 
 
 def digest(layers: Layers) -> str:
@@ -65,15 +65,15 @@ def agrees_with_itself(layers: Layers, radius: float, height: float = 0.2) -> No
         free = (grid.cells == FREE).astype(np.uint8)
         assert cv2.connectedComponents(free, connectivity=4)[0] == 2, "free space is one piece"
     levels: dict[str, str] = {}
-    ways: list[tuple[str, str]] = []
+    pairs: list[tuple[str, str]] = []
     for key, part in layers.vector("topology").items():
         lines = [g for g, p in zip(part.geometry, part.properties, strict=True) if p["kind"] == "edge"]
         ends = [(p["source"], p["target"]) for p in part.properties if p["kind"] == "edge"]
         levels |= {i: key.level for i, p in zip(part.ids, part.properties, strict=True) if p["kind"] == "node"}
-        ways += ends
+        pairs += ends
         grid = next(g for k, g in grids.items() if k.level == key.level)
         assert _site.passable(grid, lines, radius).all(), "no edge leads through an obstacle"
-    near = {name: {b for a, b in ways if a == name} for name in levels}
+    near = {name: {b for a, b in pairs if a == name} for name in levels}
     seen = set(list(levels)[:1])
     waiting = list(seen)
     while waiting:
@@ -107,38 +107,38 @@ def sound_sdf(layers: Layers, folder: Path) -> None:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-    told = subprocess.run(
+    process = subprocess.run(
         [tool, "sdf", "--check", str(folder / "world.sdf")], capture_output=True, text=True, timeout=120, check=False
     )
-    assert told.returncode == 0, told.stdout + told.stderr
-    assert "Valid" in told.stdout
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert "Valid" in process.stdout
 
 
 def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
     """What each format leaves out; every one serves from the site, and nothing it writes would be refused."""
     out = {}
-    for name, known in formats.all_formats().items():
-        if known.write is None:
+    for name, fmt in formats.all_formats().items():
+        if fmt.write is None:
             continue
-        made = written(layers, name, {}, CAME)
-        assert made.files, name
-        errors = [w for w in made.report["warnings"] if w.get("level") == "error"]
+        written_map = written(layers, name, {}, CAME)
+        assert written_map.files, name
+        errors = [w for w in written_map.report["warnings"] if w.get("level") == "error"]
         assert not errors, (name, errors)
-        out[name] = made.report["dropped"]
-        if "topology" in known.carries and not known.holds:
-            clear_of_obstacles(layers, known, made.files)
+        out[name] = written_map.report["dropped"]
+        if "topology" in fmt.carries and not fmt.holds:
+            clear_of_obstacles(layers, fmt, written_map.files)
     return out
 
 
-def clear_of_obstacles(layers: Layers, known: formats.Format, files: dict[str, bytes]) -> None:
+def clear_of_obstacles(layers: Layers, fmt: formats.Format, files: dict[str, bytes]) -> None:
     """No edge of what was written leads through an occupied cell: as its shape in formats that have some, else straight
     from node to node. Cells are looked up along each line, so that the server's own check is not asked."""
-    shaped = known.bends == "shape"
+    shaped = fmt.bends == "shape"
     grids = {k.level: g for k, g in layers.grids().items()}
-    for group in formats.group(files, known.name)[0]:
-        assert known.read is not None
-        context = ReadContext(frame=layers.frame, main=group.main, options=known.read_options())
-        read = replace(known.read(group.files, context), datum=layers.datum)
+    for group in formats.group(files, fmt.name)[0]:
+        assert fmt.read is not None
+        context = ReadContext(frame=layers.frame, main=group.main, options=fmt.read_options())
+        read = replace(fmt.read(group.files, context), datum=layers.datum)
         for key, part in read.vector("topology").items():
             grid = grids.get(key.level) or next(iter(grids.values()))
             at = dict(zip(part.ids, part.in_local(layers.frame), strict=True))
@@ -151,7 +151,7 @@ def clear_of_obstacles(layers: Layers, known: formats.Format, files: dict[str, b
                 steps = np.arange(0.0, line.length, grid.resolution / 2)
                 xy = shapely.get_coordinates(shapely.line_interpolate_point(line, steps))
                 column, row = ((xy - grid.origin[:2]) / grid.resolution).astype(int).T
-                assert not (grid.cells[row, column] == OCCUPIED).any(), (known.name, i)
+                assert not (grid.cells[row, column] == OCCUPIED).any(), (fmt.name, i)
 
 
 def over_http(api: Api, name: str, formats_: tuple[str, ...], **values: Any) -> dict[str, Any]:
@@ -164,10 +164,10 @@ def over_http(api: Api, name: str, formats_: tuple[str, ...], **values: Any) -> 
     states = {row["format"]: row["state"] for row in api.get(f"environments/{env}/versions/latest/maps").json()}
     assert set(states.values()) <= {"direct", "derivable"}, states
     api.post("environments", {"name": f"{env}-back", "datum": version.get("datum")})
-    for wanted in formats_:
-        answer = api.get(f"environments/{env}/versions/latest/maps/{wanted}")
+    for format_name in formats_:
+        answer = api.get(f"environments/{env}/versions/latest/maps/{format_name}")
         inside = answer.headers.get("content-disposition", "")
         file = "map.zip" if "zip" in answer.headers["content-type"] else inside.rpartition("filename=")[2].strip('"')
-        told = api.upload(f"{env}-back", {file or "map": answer.content}, format=wanted).json()
-        assert told["version"], wanted
+        second_version = api.upload(f"{env}-back", {file or "map": answer.content}, format=format_name).json()
+        assert second_version["version"], format_name
     return version

@@ -28,17 +28,17 @@ def sites() -> list[str]:
 
 def tile(name: str) -> Image.Image:
     """A site from above, its lowest level, with the network's edges."""
-    made = generate.run(name, SEED, {}, Layers(), Notes())
-    key, picture = next(iter(made.of("imagery").items()))
+    layers = generate.run(name, SEED, {}, Layers(), Notes())
+    key, picture = next(iter(layers.of("imagery").items()))
     assert isinstance(picture, Picture)
     image = Image.fromarray(np.ascontiguousarray(displayed(picture)[..., :3]))
     scale = min(TILE[0] / image.width, TILE[1] / image.height)
     image = image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.BOX)
     pen = ImageDraw.Draw(image)
     a, _, c, _, e, f = picture.transform
-    for part in made.vector("topology", key.level).values():
+    for part in layers.vector("topology", key.level).values():
         edges: Features = part.of_kind("edge")
-        for line in edges.in_local(made.frame):
+        for line in edges.in_local(layers.frame):
             xy = shapely.get_coordinates(line)
             at = np.column_stack([(xy[:, 0] - c) / a, (xy[:, 1] - f) / e]) * scale
             pen.line([tuple(p) for p in np.round(at).astype(int).tolist()], fill=EDGE)

@@ -73,9 +73,9 @@ def test_rules_are_kept_as_by_hand(outside: bool, born: str, stays: str) -> None
 
 def test_many_rows_are_worked_on_in_strips(monkeypatch: pytest.MonkeyPatch) -> None:
     alive = np.random.default_rng(4).random((50, 40)) < 0.45
-    whole = _automata.grown(alive, *LIFE, 3, outside=True)
+    expected = _automata.grown(alive, *LIFE, 3, outside=True)
     monkeypatch.setattr(_automata, "STRIP", 40 * 7)
-    assert (_automata.grown(alive, *LIFE, 3, outside=True) == whole).all()
+    assert (_automata.grown(alive, *LIFE, 3, outside=True) == expected).all()
 
 
 def test_a_step_costs_no_more_than_twice_what_numpy_needs_for_the_sums_alone() -> None:
@@ -93,10 +93,10 @@ def test_a_step_costs_no_more_than_twice_what_numpy_needs_for_the_sums_alone() -
     def ours() -> None:
         _automata.grown(alive, (5, 6, 7, 8), (4, 5, 6, 7, 8), 1, outside=True)
 
-    assert least(ours) <= 2 * least(sums) + 0.02
+    assert shortest_time(ours) <= 2 * shortest_time(sums) + 0.02
 
 
-def least(work: Any) -> float:
+def shortest_time(work: Any) -> float:
     times = []
     for _ in range(3):
         started = time.process_time()
@@ -112,8 +112,8 @@ def test_rooms_are_joined_for_a_robot_and_holes_are_filled() -> None:
     rock[36:38, 24:26] = False  # no robot fits in
     rim = np.zeros_like(rock)
     rim[[0, -1]] = rim[:, [0, -1]] = True
-    out, filled, ways = _automata.joined(rock, rim, 1.2, 4, 4)
-    assert ways == 3
+    out, filled, passages = _automata.joined(rock, rim, 1.2, 4, 4)
+    assert passages == 3
     assert filled == 4
     assert pieces(~out) == 1
     assert out[rim].all()
@@ -122,9 +122,9 @@ def test_rooms_are_joined_for_a_robot_and_holes_are_filled() -> None:
     assert pieces(fits) == 1
     assert fits[8, 8]
     assert fits[29, 44]
-    none, gone, _ = _automata.joined(np.ones((9, 9), bool), np.zeros((9, 9), bool), 1.0, 3, 1)
+    none, filled_count, _ = _automata.joined(np.ones((9, 9), bool), np.zeros((9, 9), bool), 1.0, 3, 1)
     assert none.all()
-    assert gone == 0
+    assert filled_count == 0
 
 
 @pytest.mark.parametrize("name", list(SMALL))
@@ -143,13 +143,13 @@ def test_trees_have_trunks_to_run_into_and_crowns_to_see() -> None:
     site, _ = looks.make("forest", **SMALL["forest"])
     (trees,) = site.vector("objects").values()
     assert len(trees) > 20
-    for said in trees.properties:
-        trunk, crown = said["shapes"]
+    for properties in trees.properties:
+        trunk, crown = properties["shapes"]
         assert trunk["type"] == "cylinder"
         assert 0.1 <= trunk["radius"] <= 0.25
         assert crown["visual"] is True
-        assert 6.0 <= said["height"] <= 14.0
-        assert crown["pose"][2] + crown["radii"][2] == pytest.approx(said["height"], abs=0.002)
+        assert 6.0 <= properties["height"] <= 14.0
+        assert crown["pose"][2] + crown["radii"][2] == pytest.approx(properties["height"], abs=0.002)
     at = shapely.get_coordinates(trees.geometry)
     apart = np.sqrt(((at[:, None] - at[None]) ** 2).sum(axis=2)) + 1e9 * np.eye(len(at))
     assert apart.min() >= 2.5 * 0.4 - 0.01
@@ -206,8 +206,8 @@ def test_over_http(api: Api) -> None:
         version = looks.over_http(api, name, ("occupancy_grid", "tmap2", "gazebo"), **values)
         assert version["information"]["objects"] == "generated"
     env = "environments/made-cave/generations"
-    told = api.problem("POST", env, 422, json={"generator": "cave", "seed": 1, "parameters": {"rule": "x"}})
-    assert "B5678/S45678" in told["detail"]
+    problem = api.problem("POST", env, 422, json={"generator": "cave", "seed": 1, "parameters": {"rule": "x"}})
+    assert "B5678/S45678" in problem["detail"]
 
 
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -38,36 +38,36 @@ def test_an_office_agrees_with_itself_and_every_format_serves_from_it(office: La
 
 
 def test_a_ward_agrees_with_itself() -> None:
-    made, _ = looks.make("hospital", length=16)
-    looks.agrees_with_itself(made, 0.3)
-    assert looks.digest(made) == DIGESTS["hospital"]
-    kinds = {p["kind"] for part in made.vector("objects").values() for p in part.properties}
+    layers, _ = looks.make("hospital", length=16)
+    looks.agrees_with_itself(layers, 0.3)
+    assert looks.digest(layers) == DIGESTS["hospital"]
+    kinds = {p["kind"] for part in layers.vector("objects").values() for p in part.properties}
     assert {"wall", "door", "floor", "bed", "counter", "region", "charger"} <= kinds
     assert "lift" not in kinds
-    nodes = {i for part in made.vector("topology").values() for i in part.ids}
+    nodes = {i for part in layers.vector("topology").values() for i in part.ids}
     assert {"nurse_station_104", "dock_1", "entrance"} <= nodes
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_wards_above_each_other(seed: int) -> None:
-    made, _ = looks.make("hospital", seed, levels=2, length=24, robot_radius=0.45)
-    looks.agrees_with_itself(made, 0.45)
+    layers, _ = looks.make("hospital", seed, levels=2, length=24, robot_radius=0.45)
+    looks.agrees_with_itself(layers, 0.45)
 
 
 def test_open_rmf_reads_walls_doors_and_the_lift(office: Layers) -> None:
     files = written(office, "openrmf", {}, looks.CAME).files
-    said = yaml.safe_load(files["building.yaml"])
-    assert list(said["levels"]) == ["ground", "L2"]
-    assert said["levels"]["L2"]["elevation"] == 3.4
-    lift = said["lifts"]["lift_1"]
+    building = yaml.safe_load(files["building.yaml"])
+    assert list(building["levels"]) == ["ground", "L2"]
+    assert building["levels"]["L2"]["elevation"] == 3.4
+    lift = building["lifts"]["lift_1"]
     assert lift["level_doors"] == {"ground": ["lift_1_door"], "L2": ["lift_1_door"]}
     assert (lift["lowest_floor"], lift["highest_floor"], lift["reference_floor_name"]) == ("ground", "L2", "ground")
     assert lift["doors"]["lift_1_door"]["y"] == -0.95
-    doors = [row[2] for row in said["levels"]["ground"]["doors"]]
+    doors = [row[2] for row in building["levels"]["ground"]["doors"]]
     rooms = [p["name"] for p in office.vector("objects", GROUND)[PartKey("objects", GROUND, "generated")].properties
              if p["kind"] == "region"]  # fmt: skip
     assert {d["name"][1] for d in doors} == {"entrance_door", *(f"{name}_door" for name in rooms)}
-    chargers = [row for row in said["levels"]["ground"]["vertices"] if len(row) > 4 and "is_charger" in row[4]]
+    chargers = [row for row in building["levels"]["ground"]["vertices"] if len(row) > 4 and "is_charger" in row[4]]
     assert [row[3] for row in chargers] == ["dock_1", "dock_2"]
     back = read(Group(get_format("openrmf"), "building.yaml", files), ReadContext())
     for level in ("ground", "L2"):
@@ -84,7 +84,7 @@ def test_fleets_learn_which_lanes_lead_through_doors_and_into_the_lift(office: L
         inside = {row[2]["name"] for row in level["vertices"] if row[2].get("lift") == "lift_1"}
         assert inside == {f"lift_1_{name}"}
         through = {row[2]["door_name"] for row in level["lanes"] if "door_name" in row[2]}
-        assert through == {door for door, said in graph["doors"].items() if said["map"] == name}
+        assert through == {door for door, entry in graph["doors"].items() if entry["map"] == name}
     assert set(graph["lifts"]) == {"lift_1"}
 
 
@@ -92,9 +92,9 @@ def test_inside_a_fence() -> None:
     ring = shapely.Polygon([(100, 50), (140, 90), (115, 115), (75, 75)])
     fence = features([("f", ring, {"kind": "fence"})], "local")
     given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
-    made, _ = looks.make("office", given=given, length=20, levels=2)
-    looks.agrees_with_itself(made, 0.3)
-    for part in (*made.vector("objects").values(), *made.vector("topology").values()):
+    layers, _ = looks.make("office", given=given, length=20, levels=2)
+    looks.agrees_with_itself(layers, 0.3)
+    for part in (*layers.vector("objects").values(), *layers.vector("topology").values()):
         assert shapely.contains(ring, part.geometry).all()
     with pytest.raises(CannotGenerate, match=r"the fence has no room for the site, which needs 111\.4 × 17\.4 m"):
         looks.make("office", given=given, length=100)
@@ -126,8 +126,8 @@ def test_what_cannot_be_built_is_told(values: dict[str, Any], why: str) -> None:
 
 
 def test_over_http(api: Api) -> None:
-    wanted = ("openrmf", "rmf_nav_graph", "tmap2", "gazebo", "kml")
-    version = looks.over_http(api, "office", wanted, length=16)
+    format_names = ("openrmf", "rmf_nav_graph", "tmap2", "gazebo", "kml")
+    version = looks.over_http(api, "office", format_names, length=16)
     assert version["information"]["topology"] == "generated"
     looks.over_http(api, "hospital", ("openrmf",), length=16)
     grid = api.get("environments/made-office/versions/latest/maps/occupancy_grid?level=L2")

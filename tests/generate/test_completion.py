@@ -48,15 +48,15 @@ def grid_of(path: Path) -> OccupancyGrid:
     return grid
 
 
-def holes(known: Bool, side: int, centres: Sequence[int]) -> Bool:
+def holes(valid: Bool, side: int, centres: Sequence[int]) -> Bool:
     """Squares around known cells that do not touch, most of whose cells are known."""
-    out = np.zeros(known.shape, bool)
+    out = np.zeros(valid.shape, bool)
     count = 0
     for middle in centres:
-        row, column = divmod(int(middle), known.shape[1])
+        row, column = divmod(int(middle), valid.shape[1])
         top, left = max(0, row - side // 2), max(0, column - side // 2)
         around = np.s_[max(0, top - side) : top + 2 * side, max(0, left - side) : left + 2 * side]
-        if known[top : top + side, left : left + side].mean() > 0.9 and not out[around].any():
+        if valid[top : top + side, left : left + side].mean() > 0.9 and not out[around].any():
             out[top : top + side, left : left + side] = True
             count += 1
         if count == HOLES:
@@ -101,22 +101,22 @@ class Measure:
 def measured(grid: OccupancyGrid, seed: int = 3) -> Measure:
     """Holes anywhere, and holes in straight walls."""
     draw = np.random.default_rng(seed)
-    known = grid.cells != UNKNOWN
-    occupied = known & (grid.cells >= grid.occupied_thresh * OCCUPIED)
+    valid = grid.cells != UNKNOWN
+    occupied = valid & (grid.cells >= grid.occupied_thresh * OCCUPIED)
     side = round(HOLE / grid.resolution)
-    anywhere = draw.choice(np.flatnonzero(known), 2000).tolist()
+    anywhere = draw.choice(np.flatnonzero(valid), 2000).tolist()
     out = Measure()
     for centres in (anywhere, along_walls(occupied, side // 2, draw)):
-        hole = holes(known, side, centres)
+        hole = holes(valid, side, centres)
         if not hole.any():
             continue
         cut = OccupancyGrid(np.where(hole, UNKNOWN, grid.cells).astype(np.uint8), grid.resolution)
         try:
-            made = generate.run("complete_grid", 7, {}, Layers({KEY: cut}), Notes()).grids()[KEY].cells
+            result = generate.run("complete_grid", 7, {}, Layers({KEY: cut}), Notes()).grids()[KEY].cells
         except CannotGenerate:
-            made = cut.cells
-        assert (made == grid.cells)[known & ~hole].all(), "known cells stay"
-        free, wall = hole & known & (made == FREE), hole & known & (made == OCCUPIED)
+            result = cut.cells
+        assert (result == grid.cells)[valid & ~hole].all(), "known cells stay"
+        free, wall = hole & valid & (result == FREE), hole & valid & (result == OCCUPIED)
         near, back = (cv2.dilate(cells.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 for cells in (occupied, wall))
         straight = hole & occupied if centres is not anywhere else np.zeros_like(hole)
         counts = (free, free & ~occupied, wall, wall & near, straight, straight & back, hole)
@@ -126,11 +126,11 @@ def measured(grid: OccupancyGrid, seed: int = 3) -> Measure:
 
 @pytest.mark.parametrize("name", FAST)
 def test_holes_in_real_grids_get_no_false_free_cells_and_straight_walls_back(shared: Path, name: str) -> None:
-    found = measured(grid_of(shared / "data" / name))
-    assert found.free_right >= 0.98 * found.free
-    assert found.free >= 0.15 * found.cells, "better unknown than wrong, but not nothing"
-    assert found.wall_right >= 0.95 * found.wall
-    assert found.straight_back >= 0.5 * found.straight
+    measure = measured(grid_of(shared / "data" / name))
+    assert measure.free_right >= 0.98 * measure.free
+    assert measure.free >= 0.15 * measure.cells, "better unknown than wrong, but not nothing"
+    assert measure.wall_right >= 0.95 * measure.wall
+    assert measure.straight_back >= 0.5 * measure.straight
 
 
 def room() -> NDArray[np.uint8]:
@@ -152,12 +152,12 @@ def test_a_wall_goes_on_and_nothing_beyond_the_walls_becomes_free() -> None:
     hole = np.s_[30:70, 50:90]
     cells[hole] = UNKNOWN
     notes = Notes()
-    made = complete(cells, notes)
-    assert (made[30:70, 69:71] == OCCUPIED).all()
-    assert (made[hole] == OCCUPIED).sum() == 80
-    assert (made[hole] == FREE).mean() > 0.5
+    result = complete(cells, notes)
+    assert (result[30:70, 69:71] == OCCUPIED).all()
+    assert (result[hole] == OCCUPIED).sum() == 80
+    assert (result[hole] == FREE).mean() > 0.5
     beyond = room() == UNKNOWN
-    assert (made[beyond] == UNKNOWN).all()
+    assert (result[beyond] == UNKNOWN).all()
     (left,) = [d for d in notes.dropped if d["what"] == "unknown cells"]
     assert left["count"] > 0
     assert "confidence of 0.98" in left["why"]
@@ -178,9 +178,9 @@ def main() -> None:
     """Print a line for each grid, and one for all."""
     total = Measure()
     for name in GRIDS:
-        found = measured(grid_of(Path(__file__).parents[3] / "shared" / "data" / name))
-        total += found
-        print(name, found, flush=True)
+        measure = measured(grid_of(Path(__file__).parents[3] / "shared" / "data" / name))
+        total += measure
+        print(name, measure, flush=True)
     print(
         f"free {total.free_right / total.free:.4f} of {total.free} ({total.free / total.cells:.2f} of the holes), "
         f"walls {total.wall_right / total.wall:.4f} of {total.wall}, straight walls back "

@@ -67,28 +67,32 @@ def network(layers: Layers) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
 
 @pytest.mark.parametrize("name", sorted(SMALL))
 def test_a_site_agrees_with_itself_and_every_format_serves_from_it(name: str, tmp_path: Path) -> None:
-    made, notes = looks.make(name, **SMALL[name])
+    layers, notes = looks.make(name, **SMALL[name])
     assert not notes.dropped
     assert [t["what"] for t in notes.template] == ["datum"]
-    looks.agrees_with_itself(made, 0.3)
-    looks.sound_sdf(made, tmp_path)
-    looks.serves(made)
-    assert looks.digest(made) == DIGESTS[name]
+    looks.agrees_with_itself(layers, 0.3)
+    looks.sound_sdf(layers, tmp_path)
+    looks.serves(layers)
+    assert looks.digest(layers) == DIGESTS[name]
     other, _ = looks.make(name, 8, **SMALL[name])
     assert looks.digest(other) != DIGESTS[name]
-    assert network(other)[1].keys() == network(made)[1].keys(), "chance moves plants, not ways"
+    assert network(other)[1].keys() == network(layers)[1].keys(), "chance moves plants, not ways"
 
 
 @pytest.mark.parametrize(("name", "fence"), list(zip(sorted(SMALL), itertools.cycle(FENCES), strict=False)))
 def test_rows_keep_within_any_fence_along_its_longest_side(name: str, fence: str) -> None:
     given = fenced(fence)
-    made, _ = looks.make(name, given=given)
-    assert made.datum == HERE
-    looks.agrees_with_itself(Layers({**given.parts, **made.parts}, made.datum, made.levels), 0.3)
-    whole = shapely.Polygon(FENCES[fence]).buffer(0.002)
-    for part in (*made.vector("objects").values(), *made.vector("topology").values(), *made.vector("zones").values()):
-        assert shapely.contains(whole, part.geometry).all()
-    nodes, edges = network(made)
+    layers, _ = looks.make(name, given=given)
+    assert layers.datum == HERE
+    looks.agrees_with_itself(Layers({**given.parts, **layers.parts}, layers.datum, layers.levels), 0.3)
+    polygon = shapely.Polygon(FENCES[fence]).buffer(0.002)
+    for part in (
+        *layers.vector("objects").values(),
+        *layers.vector("topology").values(),
+        *layers.vector("zones").values(),
+    ):
+        assert shapely.contains(polygon, part.geometry).all()
+    nodes, edges = network(layers)
     sides = [(math.dist(a, b), a, b) for a, b in itertools.pairwise([*FENCES[fence], FENCES[fence][0]])]
     _, a, b = max(sides)
     along = math.atan2(b[1] - a[1], b[0] - a[0])
@@ -101,8 +105,8 @@ def test_rows_keep_within_any_fence_along_its_longest_side(name: str, fence: str
 
 
 def test_the_network_is_called_as_in_real_polytunnels() -> None:
-    made, _ = looks.make("polytunnels", tunnels=2, rows_per_tunnel=5, row_length=16)
-    nodes, edges = network(made)
+    layers, _ = looks.make("polytunnels", tunnels=2, rows_per_tunnel=5, row_length=16)
+    nodes, edges = network(layers)
     aisles = {n.rpartition("-")[0] for n in nodes if n.startswith("r")}
     between = ["r0.7", "r1.5", "r2.5", "r3.5", "r4.5", "r5.3", "r5.7", "r6.5", "r7.5", "r8.5", "r9.5", "r10.3"]
     assert aisles == set(between), "as in Riseholme's two tunnels"
@@ -119,22 +123,22 @@ def test_the_network_is_called_as_in_real_polytunnels() -> None:
     assert count["row_change"] == 11 * 2 * 2
     assert edges["r5.3-ca_r5.7-ca"]["action"] == "row_change"
     assert edges["LaneWest_r0.7-ca"]["action"] == "move_base"
-    objects = made.parts[OBJECTS]
+    objects = layers.parts[OBJECTS]
     assert isinstance(objects, Features)
     kinds = Counter(p["kind"] for p in objects.properties)
     assert (kinds["table"], kinds["tunnel"], kinds["post"]) == (10, 2, 3), "two tunnels share the legs between them"
-    (grid,) = made.grids().values()
+    (grid,) = layers.grids().values()
     table = objects.geometry[objects.index()["table1"]]
     x, y = shapely.centroid(table).x + 1.2, shapely.centroid(table).y
     assert grid.cells[int((y - grid.origin[1]) / 0.05), int((x - grid.origin[0]) / 0.05)] == FREE, "between its legs"
-    (zones,) = made.vector("zones").values()
+    (zones,) = layers.vector("zones").values()
     assert {i for i in zones.ids if i.startswith("row")} == {f"row{k}" for k in range(1, 11)}
 
 
 def test_trees_stand_where_they_were_asked_for() -> None:
-    asked = {"rows": 3, "row_length": 18, "row_spacing": 5.0, "tree_spacing": 3.0, "jitter": 0.2}
-    made, _ = looks.make("orchard", **asked)
-    part = made.parts[OBJECTS]
+    parameters = {"rows": 3, "row_length": 18, "row_spacing": 5.0, "tree_spacing": 3.0, "jitter": 0.2}
+    layers, _ = looks.make("orchard", **parameters)
+    part = layers.parts[OBJECTS]
     assert isinstance(part, Features)
     trees = [f for f in part if f.properties["kind"] == "tree"]
     trunk, crown = trees[0].properties["shapes"]
@@ -145,11 +149,11 @@ def test_trees_stand_where_they_were_asked_for() -> None:
     assert lines["Row 1"].distance(lines["Row 2"]) == pytest.approx(5.0)
     off = [lines[f"Row {f.id[4]}"].distance(f.geometry) for f in trees]
     assert 0.05 < max(off) <= 0.2
-    (grid,) = made.grids().values()
+    (grid,) = layers.grids().values()
     for tree in trees:
         x, y = tree.properties["pose"][:2]
         assert grid.cells[int((y - grid.origin[1]) / 0.05), int((x - grid.origin[0]) / 0.05)] == OCCUPIED
-    still, _ = looks.make("orchard", **{**asked, "jitter": 0})
+    still, _ = looks.make("orchard", **{**parameters, "jitter": 0})
     rows = still.parts[OBJECTS]
     assert isinstance(rows, Features)
     x = [f.geometry.x for f in rows if f.id.startswith("tree1-")]
@@ -168,9 +172,9 @@ def test_the_crown_is_a_closed_ball() -> None:
 def test_one_way_aisles_go_there_and_back() -> None:
     values = {**SMALL["warehouse"], "racks": 4}
     plain, _ = looks.make("warehouse", **values)
-    made, _ = looks.make("warehouse", one_way=True, **values)
-    looks.agrees_with_itself(made, 0.3)
-    edges = network(made)[1]
+    layers, _ = looks.make("warehouse", one_way=True, **values)
+    looks.agrees_with_itself(layers, 0.3)
+    edges = network(layers)[1]
     assert {f"A{k}-ca_A{k}-cb" in edges for k in (1, 3)} == {True}
     assert "A1-cb_A1-ca" not in edges
     assert "A2-cb_A2-ca" in edges
@@ -178,9 +182,9 @@ def test_one_way_aisles_go_there_and_back() -> None:
     aisles = [e for e in edges.values() if re.match(r"A\d-", e["source"]) and e["source"][:3] == e["target"][:3]]
     before = network(plain)[1]
     assert len(before) - len(edges) == len(aisles)
-    nodes, _ = network(made)
+    nodes, _ = network(layers)
     assert {"Dock1", "Dock2", "Charger1", "Charger2", "Parking1"} <= set(nodes)
-    part = made.parts[NETWORK]
+    part = layers.parts[NETWORK]
     assert isinstance(part, Features)
     charger = part.properties[part.index()["Charger1"]]
     assert charger["openrmf"]["parameters"]["is_charger"] == [4, True]
@@ -223,7 +227,7 @@ def test_what_cannot_be_made_is_told_before_any_work(name: str, values: dict[str
 def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
     chance = random.Random(f"fences for {name}")
     key = PartKey("location", GROUND, "site")
-    made = 0
+    site_count = 0
     for number in range(6):
         size = chance.uniform(35, 80)
         ring = [
@@ -242,10 +246,10 @@ def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
         except CannotGenerate as error:
             assert error.problems[0].where in {"yard", "docks", "headland", "rows_per_tunnel"}, error.detail
             continue
-        made += 1
-        for found in (*layers.vector("objects").values(), *layers.vector("topology").values()):
-            assert shapely.contains(fence.buffer(0.05), found.geometry).all()
-    assert made >= 3
+        site_count += 1
+        for layer_part in (*layers.vector("objects").values(), *layers.vector("topology").values()):
+            assert shapely.contains(fence.buffer(0.05), layer_part.geometry).all()
+    assert site_count >= 3
 
 
 def test_a_fence_that_holds_nothing_is_told() -> None:
@@ -259,15 +263,17 @@ def test_a_fence_that_holds_nothing_is_told() -> None:
 
 def test_large_fields_take_cells_that_still_show_the_ways() -> None:
     big = features([("f", shapely.box(0, 0, 120, 100), {"kind": "fence"})], "local")
-    made, notes = looks.make("vineyard", given=Layers({PartKey("location", GROUND, "site"): big}, HERE), vine_spacing=6)
-    (grid,) = made.grids().values()
+    layers, notes = looks.make(
+        "vineyard", given=Layers({PartKey("location", GROUND, "site"): big}, HERE), vine_spacing=6
+    )
+    (grid,) = layers.grids().values()
     assert grid.resolution == 0.1
     assert [t["what"] for t in notes.template] == ["resolution"]
 
 
 def test_over_http_and_edits(api: Api) -> None:
-    wanted = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "satellite", "openrmf")
-    version = looks.over_http(api, "polytunnels", wanted, **SMALL["polytunnels"])
+    format_names = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "satellite", "openrmf")
+    version = looks.over_http(api, "polytunnels", format_names, **SMALL["polytunnels"])
     assert set(version["information"].values()) >= {"generated"}
     env = "environments/made-polytunnels"
     before = api.get(f"{env}/versions/latest/layers/location").json()
@@ -283,5 +289,5 @@ def test_over_http_and_edits(api: Api) -> None:
     api.post(f"{env}/edits", {"changes": [{**change, "value": 100}]})
     world = api.get("/maps/made-polytunnels/gazebo").content
     assert b"walls_map" in world, "people have drawn in it"
-    told = api.problem("POST", f"{env}/generations", 422, json={**body, "parameters": {"racks": 1}})
-    assert "racks" in told["detail"]
+    problem = api.problem("POST", f"{env}/generations", 422, json={**body, "parameters": {"racks": 1}})
+    assert "racks" in problem["detail"]

@@ -25,8 +25,8 @@ def text(symbols: list[_lsystem.Symbol]) -> str:
     )
 
 
-def number(said: str, **names: float) -> float:
-    return _expressions.parse(said, frozenset(names), "here")(names, dice())
+def number(text: str, **names: float) -> float:
+    return _expressions.parse(text, frozenset(names), "here")(names, dice())
 
 
 def test_lindenmayers_algae() -> None:

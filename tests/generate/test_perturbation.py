@@ -36,8 +36,8 @@ ALONE = {**STILL, "shift": 0.0, "turn": 0.0, "row_shift": 0.0, "missing": 0.0, "
 def disturbed(given: Layers, seed: int = 7, **values: Any) -> tuple[Layers, Layers, Notes]:
     """(the environment after it, what was made, what was said)"""
     notes = Notes()
-    made = generate.run("perturbation", seed, values, given, notes)
-    return Layers({**given.parts, **made.parts}, made.datum, made.levels), made, notes
+    new_layers = generate.run("perturbation", seed, values, given, notes)
+    return Layers({**given.parts, **new_layers.parts}, new_layers.datum, new_layers.levels), new_layers, notes
 
 
 def orchard() -> Layers:
@@ -78,20 +78,20 @@ def places(part: Features) -> dict[str, Any]:
 
 def edges_are_free(layers: Layers, radius: float = 0.3) -> None:
     for key, part in layers.vector("topology").items():
-        known = layers.grids().get(PartKey("occupancy", key.level))
-        assert known is not None
+        grid = layers.grids().get(PartKey("occupancy", key.level))
+        assert grid is not None
         lines = [
             g
             for g, p in zip(part.geometry, part.properties, strict=True)
             if p["kind"] == "edge" and not p.get("blocked")
         ]
         assert lines
-        assert _site.passable(known, lines, radius).all()
+        assert _site.passable(grid, lines, radius).all()
 
 
 def test_the_grid_follows_the_objects_and_the_network_both() -> None:
     before = orchard()
-    after, made, notes = disturbed(before, **STILL, missing=0.2, obstacles=6)
+    after, new_layers, notes = disturbed(before, **STILL, missing=0.2, obstacles=6)
     then, now = places(objects(before)), places(objects(after))
     assert 0 < len(then) - len(now) < 20
     assert set(now) < set(then)
@@ -106,7 +106,7 @@ def test_the_grid_follows_the_objects_and_the_network_both() -> None:
     edges_are_free(after)
     assert set(network(after).ids) <= set(network(before).ids)
     assert any("6 new obstacles" in w.problem for w in notes.warnings)
-    assert {k.layer for k in made.parts} <= {"objects", "occupancy", "topology"}
+    assert {k.layer for k in new_layers.parts} <= {"objects", "occupancy", "topology"}
 
 
 @pytest.mark.parametrize("site", ["hospital", "warehouse", "cluttered_hall"])
@@ -141,8 +141,8 @@ def test_turned_things_keep_their_shape_and_do_not_run_into_each_other() -> None
     pieces = []
     for k in range(6):
         size = {"type": "box", "size": [1.0, 0.4, 1.0], "pose": [0, 0, 0.5, 0, 0, 0]}
-        said = {"kind": "table", "pose": [0.5 * k, 0.0, 0.0, 0.0, 0.0, math.pi / 2], "shapes": [size]}
-        pieces.append((f"t{k}", shapely.box(0.5 * k - 0.2, -0.5, 0.5 * k + 0.2, 0.5), said))
+        properties = {"kind": "table", "pose": [0.5 * k, 0.0, 0.0, 0.0, 0.0, math.pi / 2], "shapes": [size]}
+        pieces.append((f"t{k}", shapely.box(0.5 * k - 0.2, -0.5, 0.5 * k + 0.2, 0.5), properties))
     before = Layers({PartKey("objects", "ground", "gazebo"): features(pieces, "local")})
     after, _, notes = disturbed(before, **{**ALONE, "shift": 0.3, "turn": 40.0})
     part = objects(after, "gazebo")
@@ -181,15 +181,15 @@ def lane(*ys: float) -> Features:
 
 def test_a_grid_alone_has_its_pieces_moved() -> None:
     before = Layers({PartKey("occupancy"): room()})
-    after, made, notes = disturbed(before, **{**ALONE, "shift": 0.6})
-    assert {k.layer for k in made.parts} == {"occupancy"}
+    after, new_layers, notes = disturbed(before, **{**ALONE, "shift": 0.6})
+    assert {k.layer for k in new_layers.parts} == {"occupancy"}
     cells, old = grid(after).cells, grid(before).cells
     assert (cells == OCCUPIED).sum() == (old == OCCUPIED).sum()
     assert (cells[:2] == OCCUPIED).all(), "walls are too long to be things"
     assert ((cells == UNKNOWN) == (old == UNKNOWN)).all()
     assert any("3 things moved" in w.problem for w in notes.warnings)
-    gone, _, _ = disturbed(before, **{**ALONE, "missing": 1.0})
-    assert (grid(gone).cells == OCCUPIED).sum() == (old == OCCUPIED).sum() - 3 * 160
+    empty_site, _, _ = disturbed(before, **{**ALONE, "missing": 1.0})
+    assert (grid(empty_site).cells == OCCUPIED).sum() == (old == OCCUPIED).sum() - 3 * 160
     more, _, _ = disturbed(before, **{**ALONE, "obstacles": 5})
     assert (grid(more).cells == OCCUPIED).sum() > (old == OCCUPIED).sum() + 5 * 20
 
@@ -211,14 +211,14 @@ def test_edges_that_an_obstacle_crosses(edges: str) -> None:
         if p["kind"] == "edge" and shapely.distance(g, old).min() > 0.35:
             away = float(shapely.distance(g, at).min())  # to the middles of its cells
             assert (away < 0.27) <= (i in lost) <= (away < 0.34), i
-    kept = [i for i, p in zip(part.ids, part.properties, strict=True) if p["kind"] == "node"]
+    node_ids = [i for i, p in zip(part.ids, part.properties, strict=True) if p["kind"] == "node"]
     if edges == "block":
         assert part.ids == lanes.ids
     else:
-        assert all(p["source"] in kept and p["target"] in kept for p in part.properties if p["kind"] == "edge")
-    told = [w for w in notes.warnings if "an obstacle now stands there" in w.problem]
-    assert told
-    assert told[0].where == "ground/network"
+        assert all(p["source"] in node_ids and p["target"] in node_ids for p in part.properties if p["kind"] == "edge")
+    warnings = [w for w in notes.warnings if "an obstacle now stands there" in w.problem]
+    assert warnings
+    assert warnings[0].where == "ground/network"
 
 
 def test_noise_grows_with_the_distance_and_spares_the_ways() -> None:
@@ -226,8 +226,8 @@ def test_noise_grows_with_the_distance_and_spares_the_ways() -> None:
     cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = OCCUPIED
     line = shapely.LineString([(1, 10), (19, 10)])
     ends = [(n, shapely.Point(x, 10), {"kind": "node"}) for n, x in (("a", 1), ("b", 19))]
-    way = features([*ends, ("e", line, {"kind": "edge", "source": "a", "target": "b"})], "local")
-    before = Layers({PartKey("occupancy"): room(cells), PartKey("topology", "ground", "network"): way})
+    network = features([*ends, ("e", line, {"kind": "edge", "source": "a", "target": "b"})], "local")
+    before = Layers({PartKey("occupancy"): room(cells), PartKey("topology", "ground", "network"): network})
     after, _, _ = disturbed(before, **{**ALONE, "speckle": 0.2})
     wrong = (grid(after).cells == OCCUPIED) & (cells != OCCUPIED)
     away = np.abs((np.arange(400) + 0.5) * 0.05 - 10)
@@ -254,18 +254,18 @@ def test_noise_grows_with_the_distance_and_spares_the_ways() -> None:
 def test_a_grid_that_lies_askew_follows_too() -> None:
     """Turned by 30 degrees and coarser: the cells of the objects' places change, no others."""
     post = {"type": "cylinder", "radius": 0.4, "length": 1.0, "pose": [0, 0, 0.5, 0, 0, 0]}
-    said = {"kind": "post", "pose": [5.0, 3.0, 0.0, 0, 0, 0], "shapes": [post]}
+    properties = {"kind": "post", "pose": [5.0, 3.0, 0.0, 0, 0, 0], "shapes": [post]}
     circle = shapely.Point(5, 3).buffer(0.4)
     yaw = math.pi / 6
     y, x = np.mgrid[:100, :120]
     u, v = (x + 0.5) * 0.08, (y + 0.5) * 0.08
     east, north = 1 + math.cos(yaw) * u - math.sin(yaw) * v, -2 + math.sin(yaw) * u + math.cos(yaw) * v
     cells = np.where(np.hypot(east - 5, north - 3) <= 0.4, OCCUPIED, FREE).astype(np.uint8)
-    known = OccupancyGrid(cells, 0.08, (1.0, -2.0, yaw))
+    tilted_grid = OccupancyGrid(cells, 0.08, (1.0, -2.0, yaw))
     before = Layers(
         {
-            PartKey("occupancy"): known,
-            PartKey("objects", "ground", "gazebo"): features([("p", circle, said)], "local"),
+            PartKey("occupancy"): tilted_grid,
+            PartKey("objects", "ground", "gazebo"): features([("p", circle, properties)], "local"),
         }
     )
     after, _, _ = disturbed(before, **{**ALONE, "shift": 4.0})
@@ -319,10 +319,10 @@ def test_small_and_blank_grids_are_no_trouble(shape: tuple[int, int], value: int
 def test_masks_are_left_alone_unless_named() -> None:
     mask = OccupancyGrid(room().cells.copy(), 0.05)
     before = Layers({PartKey("occupancy"): room(), PartKey("occupancy", "ground", "keepout"): mask})
-    _, made, _ = disturbed(before)
-    assert [k.name for k in made.parts] == ["map"]
-    _, made, _ = disturbed(before, grid="keepout")
-    assert [k.name for k in made.parts] == ["keepout"]
+    _, new_layers, _ = disturbed(before)
+    assert [k.name for k in new_layers.parts] == ["map"]
+    _, new_layers, _ = disturbed(before, grid="keepout")
+    assert [k.name for k in new_layers.parts] == ["keepout"]
 
 
 def test_free_cells_of_unknowns_grey_stay_as_they_are() -> None:
@@ -357,8 +357,8 @@ STRAWBERRY = "environment_template/riseholme_park_farm_strawberry_polytunnels/co
 def counts(api: Api, env: str, version: int | str) -> dict[str, int]:
     """The cells of the stored map."""
     address = f"environments/{env}/versions/{version}/layers/occupancy?name=map"
-    told: dict[str, int] = api.get(address, headers={"Accept": "application/json"}).json()["counts"]
-    return told
+    cell_counts: dict[str, int] = api.get(address, headers={"Accept": "application/json"}).json()["counts"]
+    return cell_counts
 
 
 def test_the_strawberry_farm_disturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
@@ -373,17 +373,17 @@ def test_the_strawberry_farm_disturbed(api: Api, fresh: Callable[[], str], share
     ]
     api.upload(env, {f"config/{f.relative_to(root).as_posix()}": f.read_bytes() for f in chosen})
     then = counts(api, env, 1)
-    wish = {"generator": "perturbation", "seed": 3, "parameters": {"obstacles": 5}}
-    made = api.post(f"environments/{env}/generations", wish).json()
-    assert made["information"]["occupancy"] == "generated"
-    assert any("5 new obstacles" in w["problem"] for w in made["warnings"])
+    request = {"generator": "perturbation", "seed": 3, "parameters": {"obstacles": 5}}
+    version = api.post(f"environments/{env}/generations", request).json()
+    assert version["information"]["occupancy"] == "generated"
+    assert any("5 new obstacles" in w["problem"] for w in version["warnings"])
     now = counts(api, env, "latest")
     assert sum(now.values()) == sum(then.values()) == 4000 * 4000
     assert 0.9 < now["occupied"] / then["occupied"] < 1.2, "mild"
     assert 0 < now["unknown"] - then["unknown"] < 3 * math.pi * (0.75 / 0.05 + 1) ** 2, "two patches"
     texts = [api.get(f"environments/{env}/versions/{v}/maps/tmap2").content for v in (1, "latest")]
     nodes = [yaml.load(text, yaml.CSafeLoader)["nodes"] for text in texts]
-    edges = [sum(len(n["node"]["edges"]) for n in known) for known in nodes]
+    edges = [sum(len(n["node"]["edges"]) for n in network_nodes) for network_nodes in nodes]
     assert 0.7 * edges[0] < edges[1] <= edges[0]
     ids = {n["node"]["name"] for n in nodes[1]}
     assert all(e["node"] in ids for n in nodes[1] for e in n["node"]["edges"])
@@ -399,28 +399,28 @@ def test_a_building_disturbed(api: Api, fresh: Callable[[], str], shared: Path) 
     api.post("environments", {"name": env})
     file = shared / "data/openrmf_building/office/office.building.yaml"
     api.upload(env, {file.name: file.read_bytes()})
-    wish = {"generator": "perturbation", "seed": 7, "parameters": {"obstacles": 8}}
-    made = api.post(f"environments/{env}/generations", wish).json()
-    assert any("8 new obstacles" in w["problem"] for w in made["warnings"])
+    request = {"generator": "perturbation", "seed": 7, "parameters": {"obstacles": 8}}
+    body = api.post(f"environments/{env}/generations", request).json()
+    assert any("8 new obstacles" in w["problem"] for w in body["warnings"])
     grids = []
-    for version in (1, made["version"]):
+    for version in (1, body["version"]):
         answer = api.get(f"environments/{env}/versions/{version}/maps/occupancy_grid?resolution=0.1")
         with zipfile.ZipFile(io.BytesIO(answer.content)) as z:
-            said = yaml.safe_load(z.read("map.yaml"))
-            grids.append((np.asarray(Image.open(io.BytesIO(z.read(said["image"]))))[::-1], said))
-    (then, said), (now, also) = grids
-    assert said["origin"] == also["origin"]
+            content = yaml.safe_load(z.read("map.yaml"))
+            grids.append((np.asarray(Image.open(io.BytesIO(z.read(content["image"]))))[::-1], content))
+    (then, content), (now, also) = grids
+    assert content["origin"] == also["origin"]
     new = (now == 0) & (then != 0)
     assert 8 * 0.07 <= new.sum() * 0.01 <= 8 * 2.0
     topology = api.get(f"environments/{env}/versions/latest/layers/topology?crs=local").json()["features"]
     at = shapely.points(np.argwhere(new)[:, ::-1] * 0.1 + 0.05 + np.array(also["origin"][:2]))
     tree = shapely.STRtree(at)
-    said = [f.get("place") or f["geometry"] for f in topology if f["properties"]["kind"] == "edge"]
-    lanes = [shapely.geometry.shape(one) for one in said]
+    content = [f.get("place") or f["geometry"] for f in topology if f["properties"]["kind"] == "edge"]
+    lanes = [shapely.geometry.shape(one) for one in content]
     assert 40 < len(lanes) < 58
     assert not len(tree.query(np.array(lanes, object), predicate="dwithin", distance=0.15)[0])
     assert b"new/" in api.get(f"environments/{env}/versions/latest/maps/gazebo/world.sdf").content
     assert api.get(f"environments/{env}/versions/latest/maps/openrmf").status_code == 200
     api.post(f"environments/{env}/versions", {"revert_to": 1, "message": "as it was"})
-    again = api.post(f"environments/{env}/generations", wish).json()
-    assert again["root"] == made["root"], "the same seed, the same environment"
+    again = api.post(f"environments/{env}/generations", request).json()
+    assert again["root"] == body["root"], "the same seed, the same environment"

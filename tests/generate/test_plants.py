@@ -20,30 +20,30 @@ DIGEST = "87eeff483ded9d36ca488e3f8bf9f2aadc1dce9c523b322939c9189a799e715d"
 
 
 def test_a_stand_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Path) -> None:
-    made, _ = looks.make("plants", variants=2, columns=4)
-    looks.agrees_with_itself(made, 0.3)
-    looks.sound_sdf(made, tmp_path)
-    looks.serves(made)
-    assert looks.digest(made) == DIGEST
+    layers, _ = looks.make("plants", variants=2, columns=4)
+    looks.agrees_with_itself(layers, 0.3)
+    looks.sound_sdf(layers, tmp_path)
+    looks.serves(layers)
+    assert looks.digest(layers) == DIGEST
     assert looks.digest(looks.make("plants", 8, variants=2, columns=4)[0]) != DIGEST
 
 
 @pytest.mark.parametrize("species", ["vine", "bush", "pine"])
 def test_each_species(species: str) -> None:
-    made, _ = looks.make("plants", species=species, rows=2, columns=2, variants=1)
-    looks.agrees_with_itself(made, 0.3)
-    objects = made.vector("objects")[PartKey("objects", GROUND, "generated")]
+    layers, _ = looks.make("plants", species=species, rows=2, columns=2, variants=1)
+    looks.agrees_with_itself(layers, 0.3)
+    objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
     assert len(objects) == 4
-    files = written(made, "gazebo", {}, looks.CAME).files
-    assert {f for f in files if f.endswith(".obj")} == set(made.resources()), "the meshes go along"
+    files = written(layers, "gazebo", {}, looks.CAME).files
+    assert {f for f in files if f.endswith(".obj")} == set(layers.resources()), "the meshes go along"
 
 
 def test_rules_of_ones_own() -> None:
     rules = "axiom: !(0.05) F(0.5) A(1); A(l) : l > 0.3 -> F(l) [ +(30) A(l * 0.7) ] [ -(30) A(l * 0.7) ] L(0.2)"
-    made, _ = looks.make("plants", rules=rules, rows=1, columns=2, variants=1, body="crown", jitter=0)
-    looks.agrees_with_itself(made, 0.3)
-    assert set(made.resources()) == {"models/own_1/meshes/wood.obj", "models/own_1/meshes/leaves.obj"}
-    (first, _) = made.vector("objects")[PartKey("objects", GROUND, "generated")].properties
+    layers, _ = looks.make("plants", rules=rules, rows=1, columns=2, variants=1, body="crown", jitter=0)
+    looks.agrees_with_itself(layers, 0.3)
+    assert set(layers.resources()) == {"models/own_1/meshes/wood.obj", "models/own_1/meshes/leaves.obj"}
+    (first, _) = layers.vector("objects")[PartKey("objects", GROUND, "generated")].properties
     assert first["shapes"][0]["type"] == "cylinder"
     assert first["shapes"][0]["radius"] > 0.3, "a crown, not the trunk of 0.05 m"
 
@@ -51,9 +51,9 @@ def test_rules_of_ones_own() -> None:
 def test_inside_a_fence() -> None:
     fence = features([("f", shapely.Polygon([(0, 0), (60, 60), (40, 80), (-20, 20)]), {"kind": "fence"})], "local")
     given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
-    made, _ = looks.make("plants", given=given, rows=3, columns=4, variants=1)
-    assert made.datum == given.datum
-    for part in (*made.vector("objects").values(), *made.vector("topology").values()):
+    layers, _ = looks.make("plants", given=given, rows=3, columns=4, variants=1)
+    assert layers.datum == given.datum
+    for part in (*layers.vector("objects").values(), *layers.vector("topology").values()):
         assert shapely.contains(fence.geometry[0], part.geometry).all()
     with pytest.raises(CannotGenerate, match="the fence has no room for the site, which needs"):
         looks.make("plants", given=given, rows=50)
@@ -80,8 +80,8 @@ def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
 
 
 def test_over_http(api: Api) -> None:
-    wanted = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "geojson", "octomap")
-    version = looks.over_http(api, "plants", wanted, rows=2, columns=3, variants=1)
+    format_names = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "geojson", "octomap")
+    version = looks.over_http(api, "plants", format_names, rows=2, columns=3, variants=1)
     assert version["information"]["objects"] == "generated"
     detail = api.problem(
         "POST", "environments/made-plants/generations", 422,

@@ -51,19 +51,19 @@ def test_the_grid_is_the_slice_of_the_written_world() -> None:
     site = yard()
     site.post("mast", "pole", (3, 3), 0.2, 4.0)
     site.box("bridge", "building", (17, 5), (1, 8, 0.5), base=2.0)
-    made = site.finish()
-    grid = grid_of(made)
+    layers = site.finish()
+    grid = grid_of(layers)
     assert (grid.resolution, grid.width, grid.height) == (0.05, 400, 200)
     assert at(grid, 10, 7) == OCCUPIED
     assert at(grid, 3, 3) == OCCUPIED
     assert at(grid, 17, 5) == FREE, "the bridge is above the slice"
     assert grid.counts()["occupied"] == pytest.approx((8 + 0.04 * np.pi) / 0.05**2, rel=0.02)
-    files = formats.write(formats.get_format("gazebo"), made, WriteContext(title="yard"))
+    files = formats.write(formats.get_format("gazebo"), layers, WriteContext(title="yard"))
     assert b"walls_map" not in files["world.sdf"], "the objects are the walls"
     world = formats.read(Group(formats.get_format("gazebo"), "world.sdf", files), ReadContext())
-    fence = {k: p for k, p in made.parts.items() if k.layer == "location"}
+    fence = {k: p for k, p in layers.parts.items() if k.layer == "location"}
     again = objects_to_occupancy(
-        Layers({**world.parts, **fence}, made.datum), Parameters(height=0.2, resolution=0.05), Notes()
+        Layers({**world.parts, **fence}, layers.datum), Parameters(height=0.2, resolution=0.05), Notes()
     )
     assert (grid_of(again).cells == grid.cells).mean() >= 0.99
 
@@ -77,12 +77,12 @@ def test_solids_that_do_not_reach_the_slice_are_not_looked_at() -> None:
         ({**cylinder, "type": "capsule"}, 0.2, 1.8),
         ({"type": "mesh", "file": "crown.stl", "scale": [0.5, 0.5, 0.8], "pose": upright}, 0.2, 1.8),
     ):
-        known = solids.Solids({"crown.stl": crown_mesh()})
-        made = known.triangles({"shapes": [shape]})
-        assert made[:, :, 2].min() == pytest.approx(low, abs=0.15)
-        assert all(_site._reaches(shape, z, known, {}) for z in np.linspace(low, high, 9))
-        assert not _site._reaches(shape, -1.0, known, {})
-        assert not _site._reaches(shape, 3.0, known, {})
+        reader = solids.Solids({"crown.stl": crown_mesh()})
+        triangles = reader.triangles({"shapes": [shape]})
+        assert triangles[:, :, 2].min() == pytest.approx(low, abs=0.15)
+        assert all(_site._reaches(shape, z, reader, {}) for z in np.linspace(low, high, 9))
+        assert not _site._reaches(shape, -1.0, reader, {})
+        assert not _site._reaches(shape, 3.0, reader, {})
     assert _site._reaches({"type": "sphere", "radius": 1.0}, 99.0, solids.Solids({}), {}), "others are always looked at"
 
 
@@ -94,9 +94,9 @@ def test_free_space_is_one_piece_and_the_rest_is_told() -> None:
     grid = grid_of(site.finish())
     assert at(grid, 3, 3) == UNKNOWN
     assert at(grid, 1, 3) == FREE
-    (told,) = notes.dropped
-    assert told["what"] == "free cells"
-    assert told["count"] == pytest.approx(1.8 * 1.8 / 0.05**2, rel=0.05)
+    (entry,) = notes.dropped
+    assert entry["what"] == "free cells"
+    assert entry["count"] == pytest.approx(1.8 * 1.8 / 0.05**2, rel=0.05)
     cells, closed = _site.connected(np.zeros((3, 3), np.uint8))
     assert (closed, cells.tolist()) == (0, [[0] * 3] * 3)
 
@@ -169,10 +169,10 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
     site = yard(notes, given)
     assert site.is_given
     assert site.fence.bounds == pytest.approx((0, 0, 30, 12), abs=1e-6)
-    made = site.finish()
-    assert made.datum == HERE
-    assert made.parts[key] is fence, "passed on as it was given"
-    assert at(grid_of(made), 29, 11) == FREE
+    layers = site.finish()
+    assert layers.datum == HERE
+    assert layers.parts[key] is fence, "passed on as it was given"
+    assert at(grid_of(layers), 29, 11) == FREE
     assert [d["what"] for d in notes.dropped] == ["polygons of the fence"]
     assert notes.template == []
     with pytest.raises(Invalid, match="has a datum already"):
@@ -181,9 +181,9 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
     assert yard(notes).finish().datum == _site.DATUM
     assert [t["what"] for t in notes.template] == ["datum"]
     assert yard(datum=(52.0, 5.0)).finish().datum == Datum(52.0, 5.0)
-    own = yard().finish().parts[key]
-    assert isinstance(own, Features)
-    assert own.properties[0] == {"kind": "fence"}
+    default_fence = yard().finish().parts[key]
+    assert isinstance(default_fence, Features)
+    assert default_fence.properties[0] == {"kind": "fence"}
 
 
 def test_sizes_are_told_before_work_starts() -> None:
@@ -210,14 +210,14 @@ def test_the_picture_shows_what_stands_where() -> None:
     site = yard()
     site.draw(shapely.box(0, 0, 20, 3), "path")
     site.post("tree", "tree", (4, 6), 0.2, 4.0, colour="crown", seen=_site.disc(4, 6, 1.5))
-    made = site.finish(ground="meadow")
-    picture = made.parts[PartKey("imagery", GROUND, "satellite")]
+    layers = site.finish(ground="meadow")
+    picture = layers.parts[PartKey("imagery", GROUND, "satellite")]
     assert isinstance(picture, Picture)
     a, b, left, d, e, top = picture.transform
     assert (a, b, left, d, e, top) == (0.05, 0.0, 0.0, 0.0, -0.05, 10.0)
     for x, y, colour in ((10, 7, "roof"), (4, 6, "crown"), (4, 7.3, "crown"), (10, 1, "path"), (1, 9, "meadow")):
         assert tuple(picture.pixels[int((top - y) / 0.05), int(x / 0.05)]) == COLOURS[colour], (x, y)
-    grid = grid_of(made)
+    grid = grid_of(layers)
     assert at(grid, 4, 7.3) == FREE, "below the crown"
 
 
@@ -230,15 +230,15 @@ def test_levels_have_grids_and_pictures_of_their_own() -> None:
     site.node("lift", (2, 2))
     site.node("lift2", (2, 2), level="L2")
     site.way("lift", "lift2", action="lift")
-    made = site.finish(ground="floor")
+    layers = site.finish(ground="floor")
     for level, x in (("ground", 5), ("L2", 15)):
-        grid = made.parts[PartKey("occupancy", level, "map")]
+        grid = layers.parts[PartKey("occupancy", level, "map")]
         assert isinstance(grid, OccupancyGrid)
         assert at(grid, x, 5) == OCCUPIED
         assert at(grid, 20 - x, 5) == FREE
-        assert PartKey("imagery", level, "satellite") in made.parts
-        assert len(made.vector("topology", level)) == 1
-    lifted = made.vector("objects", "L2")[PartKey("objects", "L2", _site.NAME)]
+        assert PartKey("imagery", level, "satellite") in layers.parts
+        assert len(layers.vector("topology", level)) == 1
+    lifted = layers.vector("objects", "L2")[PartKey("objects", "L2", _site.NAME)]
     assert lifted.properties[0]["pose"][2] == 4.0
-    up = made.vector("topology", GROUND)[PartKey("topology", GROUND, "network")]
+    up = layers.vector("topology", GROUND)[PartKey("topology", GROUND, "network")]
     assert "width" not in up.properties[up.index()["lift_lift2"]]

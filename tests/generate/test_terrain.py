@@ -153,7 +153,7 @@ def test_noise_takes_no_longer_than_numpys_own_passes() -> None:
     _kernels_noise.perlin2(x, y, t, 1.0, out)
     assert np.abs(out - numpys(x, y, t)).max() < 1e-9
 
-    def least(work: Any) -> float:
+    def shortest_time(work: Any) -> float:
         times = []
         for _ in range(3):
             started = time.process_time()
@@ -161,9 +161,9 @@ def test_noise_takes_no_longer_than_numpys_own_passes() -> None:
             times.append(time.process_time() - started)
         return min(times)
 
-    slow = least(lambda: numpys(x, y, t))
+    slow = shortest_time(lambda: numpys(x, y, t))
     for kernel in (_kernels_noise.perlin2, _kernels_noise.simplex2):
-        assert least(lambda: kernel(x, y, t, 1.0, out)) <= 2 * slow  # noqa: B023
+        assert shortest_time(lambda: kernel(x, y, t, 1.0, out)) <= 2 * slow  # noqa: B023
 
 
 def without_costs(site: Layers) -> Layers:
@@ -200,11 +200,11 @@ def test_the_height_map_lies_below_the_floor_and_trees_stand_on_it() -> None:
     assert (low, high) == pytest.approx((-2.0, 0.0), abs=0.01)
     trees = objects.of_kind("tree")
     assert len(trees) > 3
-    for said in trees.properties:
-        x, y, z, *_ = said["pose"]
-        here = grey[::-1][round(y / 15 * 64), round(x / 20 * 64)] / 255 * 2.0 - 2.0
-        assert z == pytest.approx(here, abs=0.25)
-        trunk = said["shapes"][0]
+    for properties in trees.properties:
+        x, y, z, *_ = properties["pose"]
+        ground_height = grey[::-1][round(y / 15 * 64), round(x / 20 * 64)] / 255 * 2.0 - 2.0
+        assert z == pytest.approx(ground_height, abs=0.25)
+        trunk = properties["shapes"][0]
         assert z + trunk["length"] > 2.9, "it is met above the floor"
 
 
@@ -216,8 +216,8 @@ def test_slopes_cost_and_steep_ground_is_no_way() -> None:
     assert (costs.cells[grid.cells == OCCUPIED] == OCCUPIED).all()
     steep = (costs.cells == OCCUPIED) & (grid.cells == FREE)
     assert 0 < steep.sum() < grid.cells.size
-    (ways,) = site.vector("topology").values()
-    lines = [g for g, p in zip(ways.geometry, ways.properties, strict=True) if p["kind"] == "edge"]
+    (network,) = site.vector("topology").values()
+    lines = [g for g, p in zip(network.geometry, network.properties, strict=True) if p["kind"] == "edge"]
     at = shapely.get_coordinates(shapely.line_interpolate_point(np.array(lines, object), 0.5, normalized=True))
     column, row = ((at - grid.origin[:2]) / grid.resolution).astype(int).T
     assert not steep[row, column].any()
@@ -303,8 +303,8 @@ def test_over_http(api: Api) -> None:
     version = looks.over_http(api, "terrain", ("occupancy_grid", "gazebo", "tmap2"), **SMALL)
     assert version["information"]["occupancy"] == "generated"
     env = "environments/made-terrain/generations"
-    told = api.problem("POST", env, 422, json={"generator": "terrain", "seed": 1, "parameters": {"octaves": 99}})
-    assert "octaves" in told["detail"]
+    problem = api.problem("POST", env, 422, json={"generator": "terrain", "seed": 1, "parameters": {"octaves": 99}})
+    assert "octaves" in problem["detail"]
 
 
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

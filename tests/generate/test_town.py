@@ -28,16 +28,16 @@ def grown(rules: str, area: Any = SQUARE, seed: int = 7, **constants: float) -> 
 
 
 def test_a_town_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Path) -> None:
-    made, _ = looks.make("town", width=110, depth=80, block=2500, resolution=0.2)
-    looks.agrees_with_itself(made, 0.3)
-    looks.sound_sdf(made, tmp_path)
-    looks.serves(made)
-    assert looks.digest(made) == DIGEST
+    layers, _ = looks.make("town", width=110, depth=80, block=2500, resolution=0.2)
+    looks.agrees_with_itself(layers, 0.3)
+    looks.sound_sdf(layers, tmp_path)
+    looks.serves(layers)
+    assert looks.digest(layers) == DIGEST
 
 
 def test_rules_worked_out_by_hand() -> None:
     """100 × 60 m with a ring of 10 m: 80 × 40 m in it, cut in the middle by a street of 6 m: two blocks of 37 × 40."""
-    made = grown(
+    town = grown(
         """
         town -> ring(ring) inner      # a comment
         inner -> cut(0.5, 6) block block
@@ -48,11 +48,11 @@ def test_rules_worked_out_by_hand() -> None:
         """,
         ring=10,
     )
-    assert [s.width for s in made.streets] == [10, 6]
-    assert made.streets[0].line.length == 2 * (90 + 50)
-    assert made.streets[1].line.equals(shapely.LineString([(50, 5), (50, 55)]))
-    assert [b.area for b in made.blocks] == [37 * 40, 37 * 40]
-    assert [(round(lot.area.area, 3), lot.use, lot.storeys) for lot in made.lots] == [
+    assert [s.width for s in town.streets] == [10, 6]
+    assert town.streets[0].line.length == 2 * (90 + 50)
+    assert town.streets[1].line.equals(shapely.LineString([(50, 5), (50, 55)]))
+    assert [b.area for b in town.blocks] == [37 * 40, 37 * 40]
+    assert [(round(lot.area.area, 3), lot.use, lot.storeys) for lot in town.lots] == [
         (370, "garden", 0),
         (31 * 24, "flat", 2),
         (370, "garden", 0),
@@ -64,17 +64,17 @@ def test_frontage_is_the_edge_on_a_street() -> None:
     """Three lots in a row of 60 × 20 m: the middle one has 2 × 20 m of street, the others 20 + 2 × 20 m."""
     row = shapely.box(0, 0, 60, 20)
     rules = "a -> cut(0.3333333333, 0) end b; b -> cut(0.5, 0) mid end; mid : frontage > 39 & frontage < 41 -> flat(1)"
-    made = grown(rules + "; end : frontage > 59 & frontage < 61 -> gable(1)", row)
-    assert Counter(lot.use for lot in made.lots) == {"flat": 1, "gable": 2}
+    town = grown(rules + "; end : frontage > 59 & frontage < 61 -> gable(1)", row)
+    assert Counter(lot.use for lot in town.lots) == {"flat": 1, "gable": 2}
 
 
 def test_chance_by_weights_and_seed() -> None:
     rules = "a : area > 4 -> cut(0.5, 0) a a; a : area <= 4 @ 3 -> flat(1); a : area <= 4 @ 1 -> park; x -> a"
-    made = grown(rules, shapely.box(0, 0, 40, 40))
-    uses = Counter(lot.use for lot in made.lots)
+    town = grown(rules, shapely.box(0, 0, 40, 40))
+    uses = Counter(lot.use for lot in town.lots)
     assert 0.66 < uses["flat"] / sum(uses.values()) < 0.84
-    assert [lot.use for lot in made.lots] == [lot.use for lot in grown(rules, shapely.box(0, 0, 40, 40)).lots]
-    assert [lot.use for lot in made.lots] != [lot.use for lot in grown(rules, shapely.box(0, 0, 40, 40), 8).lots]
+    assert [lot.use for lot in town.lots] == [lot.use for lot in grown(rules, shapely.box(0, 0, 40, 40)).lots]
+    assert [lot.use for lot in town.lots] != [lot.use for lot in grown(rules, shapely.box(0, 0, 40, 40), 8).lots]
 
 
 @pytest.mark.parametrize(
@@ -141,18 +141,18 @@ def test_streets_that_cross_and_end_make_lanes_to_the_right() -> None:
 
 
 def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
-    made, notes = looks.make("town", width=160, depth=120, trees=False, resolution=0.2)
-    network = made.vector("topology")[PartKey("topology", GROUND, "network")]
+    layers, notes = looks.make("town", width=160, depth=120, trees=False, resolution=0.2)
+    network = layers.vector("topology")[PartKey("topology", GROUND, "network")]
     edges = [p for p in network.properties if p["kind"] == "edge"]
-    ways = {(p["source"], p["target"]) for p in edges}
+    pairs = {(p["source"], p["target"]) for p in edges}
     lanes = [p for p in edges if p["speed_limit"] == 5.0]
     assert len(lanes) >= 8
-    assert not any((p["target"], p["source"]) in ways for p in lanes), "lanes are one-way"
+    assert not any((p["target"], p["source"]) in pairs for p in lanes), "lanes are one-way"
     walks = [p for p in edges if p.get("surface") == "paving_stones"]
-    assert all((p["target"], p["source"]) in ways for p in walks), "sidewalks are not"
+    assert all((p["target"], p["source"]) in pairs for p in walks), "sidewalks are not"
     assert sum(p["action"] == "cross" for p in edges) >= 8
     assert not any(d["what"] == "sidewalks" for d in notes.dropped)
-    objects = made.vector("objects")[PartKey("objects", GROUND, "generated")]
+    objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
     roads = objects.of_kind("road")
     buildings = objects.of_kind("building")
     for road, p in zip(roads.geometry, roads.properties, strict=True):
@@ -164,21 +164,21 @@ def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
         assert p["osm"]["tags"]["building:levels"] == str(p["levels"])
     lamps = objects.of_kind("pole")
     assert len(lamps) > 5
-    assert b'k="roof:shape"' in written(made, "osm", {}, looks.CAME).files["map.osm"]
+    assert b'k="roof:shape"' in written(layers, "osm", {}, looks.CAME).files["map.osm"]
 
 
 def test_the_boundary_is_given_or_the_fence() -> None:
     ring = shapely.Polygon([(0, 0), (120, 20), (100, 110), (10, 90)])
-    said = ",".join(f"{v:g}" for point in ring.exterior.coords[:-1] for v in point)
-    made, _ = looks.make("town", boundary=said, resolution=0.2)
-    looks.agrees_with_itself(made, 0.3)
-    buildings = made.vector("objects")[PartKey("objects", GROUND, "generated")].of_kind("building")
+    boundary = ",".join(f"{v:g}" for point in ring.exterior.coords[:-1] for v in point)
+    layers, _ = looks.make("town", boundary=boundary, resolution=0.2)
+    looks.agrees_with_itself(layers, 0.3)
+    buildings = layers.vector("objects")[PartKey("objects", GROUND, "generated")].of_kind("building")
     assert len(buildings) > 4
     assert shapely.contains(ring, buildings.geometry).all()
     fence = features([("f", ring, {"kind": "fence"})], "local")
     given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
-    made, _ = looks.make("town", given=given, resolution=0.2)
-    for part in (*made.vector("objects").values(), *made.vector("topology").values()):
+    layers, _ = looks.make("town", given=given, resolution=0.2)
+    for part in (*layers.vector("objects").values(), *layers.vector("topology").values()):
         assert shapely.contains(shapely.buffer(ring, 1e-6), part.geometry).all()
     with pytest.raises(CannotGenerate, match="boundary: reaches beyond the fence"):
         looks.make("town", given=given, boundary="0,0,500,0,500,500")
@@ -211,15 +211,15 @@ def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
 def test_rules_of_ones_own_may_leave_streets_open() -> None:
     rules = "town -> cut(0.5, street) half half; half -> cut(0.5, street) use use; use -> inset(setback) house"
     rules += "; house -> hip(2)"
-    made, _ = looks.make("town", width=80, depth=60, rules=rules, resolution=0.1)
-    looks.agrees_with_itself(made, 0.3)
-    objects = made.vector("objects")[PartKey("objects", GROUND, "generated")]
+    layers, _ = looks.make("town", width=80, depth=60, rules=rules, resolution=0.1)
+    looks.agrees_with_itself(layers, 0.3)
+    objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
     assert Counter(p["kind"] for p in objects.properties)["building"] == 4
     assert {p["roof"] for p in objects.of_kind("building").properties} == {"hip"}
     assert np.isfinite(shapely.bounds(objects.geometry)).all()
 
 
 def test_over_http(api: Api) -> None:
-    wanted = ("osm", "gazebo", "tmap2", "geojson", "occupancy_grid")
-    version = looks.over_http(api, "town", wanted, width=70, depth=60, trees=False, resolution=0.2)
+    format_names = ("osm", "gazebo", "tmap2", "geojson", "occupancy_grid")
+    version = looks.over_http(api, "town", format_names, width=70, depth=60, trees=False, resolution=0.2)
     assert version["information"]["objects"] == "generated"

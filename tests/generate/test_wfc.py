@@ -37,11 +37,11 @@ SHARE = 0.05
 
 def windows(cells: U8, n: int) -> set[bytes]:
     """All windows of n × n cells."""
-    found = np.lib.stride_tricks.sliding_window_view(cells, (n, n)).reshape(-1, n * n)
-    return {row.tobytes() for row in np.unique(found, axis=0)}
+    views = np.lib.stride_tricks.sliding_window_view(cells, (n, n)).reshape(-1, n * n)
+    return {row.tobytes() for row in np.unique(views, axis=0)}
 
 
-def made(sample: U8, size: int, pattern: int, draw: Any = DRAW, symmetry: Any = "none", **more: Any) -> U8:
+def collapse(sample: U8, size: int, pattern: int, draw: Any = DRAW, symmetry: Any = "none", **more: Any) -> U8:
     """A grid of so many cells a side from a sample."""
     model = _wfc.learn(sample, tile=1, pattern=pattern, symmetry=symmetry, wrap=more.pop("wrap", False))
     fixed = more.pop("fixed", np.full((size, size), -1))
@@ -74,7 +74,7 @@ def test_a_board_of_two_colours_has_two_patterns() -> None:
     assert model.weights[0] == model.weights[1]
     assert model.allowed[:, :, 0].tolist() == [[2, 1]] * 4  # beside the one stands the other, in each direction
     for border in (False, True):
-        out = made(board(), 10, 2, wrap=True, periodic=border)
+        out = collapse(board(), 10, 2, wrap=True, periodic=border)
         assert windows(out, 2) == windows(board(), 2)
 
 
@@ -83,12 +83,15 @@ def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
     model = _wfc.learn(sample, tile=4, pattern=1, symmetry="none")
     tiles = _wfc.collapsed(model, (30, 40), np.full((30, 40), -1), DRAW)
     blocks = sample.reshape(25, 4, 25, 4).transpose(0, 2, 1, 3).reshape(25, 25, 16)
-    known = [
+    sample_pairs = [
         {(a.tobytes(), b.tobytes()) for a, b in zip(p.reshape(-1, 16), q.reshape(-1, 16), strict=True)}
         for p, q in ((blocks[:, :-1], blocks[:, 1:]), (blocks[:-1], blocks[1:]))
     ]
-    here = model.tiles[tiles].reshape(30, 40, 16)
-    for seen, p, q in ((known[0], here[:, :-1], here[:, 1:]), (known[1], here[:-1], here[1:])):
+    tile_grid = model.tiles[tiles].reshape(30, 40, 16)
+    for seen, p, q in (
+        (sample_pairs[0], tile_grid[:, :-1], tile_grid[:, 1:]),
+        (sample_pairs[1], tile_grid[:-1], tile_grid[1:]),
+    ):
         assert {(a.tobytes(), b.tobytes()) for a, b in zip(p.reshape(-1, 16), q.reshape(-1, 16), strict=True)} <= seen
     assert len(np.unique(tiles)) > 5
 
@@ -98,11 +101,11 @@ def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
 def test_every_window_stands_in_the_sample(scan: bool, symmetry: Any) -> None:
     sample = SAMPLES["office"].cells(0.1)
     sample[5:9, 40] = OCCUPIED
-    known = set().union(*(windows(np.ascontiguousarray(one), 3) for one in _wfc.turned(sample, symmetry)))
-    out = made(sample, 60, 3, symmetry=symmetry, scan=scan)
-    assert windows(out, 3) <= known
-    wide = made(sample, 40, 3, symmetry=symmetry, scan=scan, periodic=True)
-    assert windows(np.pad(wide, ((0, 2), (0, 2)), mode="wrap"), 3) <= known
+    sample_windows = set().union(*(windows(np.ascontiguousarray(one), 3) for one in _wfc.turned(sample, symmetry)))
+    out = collapse(sample, 60, 3, symmetry=symmetry, scan=scan)
+    assert windows(out, 3) <= sample_windows
+    wide = collapse(sample, 40, 3, symmetry=symmetry, scan=scan, periodic=True)
+    assert windows(np.pad(wide, ((0, 2), (0, 2)), mode="wrap"), 3) <= sample_windows
 
 
 def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
@@ -111,7 +114,7 @@ def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
     expected = pairs(sample)
     for seed in range(4):
         started = time.process_time()
-        out = made(sample, 200, 5, Source(seed, "tests").stream)
+        out = collapse(sample, 200, 5, Source(seed, "tests").stream)
         assert time.process_time() - started < 5.0
         assert abs((out == OCCUPIED).mean() - (sample == OCCUPIED).mean()) <= SHARE
         assert np.abs(np.array(pairs(out)) - expected).max() <= SHARE
@@ -123,13 +126,13 @@ def test_what_is_fixed_stays() -> None:
     fixed = np.full((50, 50), -1)
     fixed[10, 10:14] = 1
     fixed[30:40, 30:40] = 0
-    out = made(sample, 50, 3, fixed=fixed)
+    out = collapse(sample, 50, 3, fixed=fixed)
     assert (out[10, 10:14] == OCCUPIED).all()
     assert (out[30:40, 30:40] == FREE).all()
     assert windows(out, 3) <= windows(sample, 3)
     fixed[20, 22:25] = 1, 0, 1
     with pytest.raises(CannotGenerate, match=r"contradicts the sample at row (18|19|20), column 2[0-4]:"):
-        made(sample, 50, 3, fixed=fixed)
+        collapse(sample, 50, 3, fixed=fixed)
 
 
 def test_free_space_is_joined_where_that_is_asked() -> None:
@@ -139,8 +142,8 @@ def test_free_space_is_joined_where_that_is_asked() -> None:
     counts = []
     for seed in range(3):
         draw = Source(seed, "rooms").stream
-        counts.append(free_pieces(made(rooms(), 60, 3, draw)))
-        joined = made(rooms(), 60, 3, draw, joined=True)
+        counts.append(free_pieces(collapse(rooms(), 60, 3, draw)))
+        joined = collapse(rooms(), 60, 3, draw, joined=True)
         assert free_pieces(joined) == 1
         assert (joined == OCCUPIED).any()
         assert windows(joined, 3) <= windows(rooms(), 3)
@@ -148,19 +151,19 @@ def test_free_space_is_joined_where_that_is_asked() -> None:
 
 
 def test_a_sample_that_contradicts_itself_is_told() -> None:
-    made(board(), 4, 2)  # compiled, or loaded
+    collapse(board(), 4, 2)  # compiled, or loaded
     started = time.process_time()
     with pytest.raises(CannotGenerate, match="contradicts the sample"):
-        made(np.array([[0, 100], [100, 100]], np.uint8), 20, 2)
+        collapse(np.array([[0, 100], [100, 100]], np.uint8), 20, 2)
     hard = (np.random.default_rng(2).integers(0, 2, (6, 6)) * OCCUPIED).astype(np.uint8)
     with pytest.raises(CannotGenerate, match="11 contradictions could not be repaired in 4 attempts"):
-        made(hard, 30, 3, repairs=10, symmetry="all")
+        collapse(hard, 30, 3, repairs=10, symmetry="all")
     assert time.process_time() - started < 5.0
 
 
 def test_the_same_seed_gives_the_same_cells_everywhere() -> None:
-    out = made(SAMPLES["warehouse"].cells(0.1), 60, 4, Source(7, "hash").stream, joined=True)
-    free = made(rooms(), 40, 3, Source(7, "hash").stream, scan=False)
+    out = collapse(SAMPLES["warehouse"].cells(0.1), 60, 4, Source(7, "hash").stream, joined=True)
+    free = collapse(rooms(), 40, 3, Source(7, "hash").stream, scan=False)
     assert hashlib.sha256(out.tobytes() + free.tobytes()).hexdigest()[:16] == CELLS
 
 
@@ -228,11 +231,11 @@ def test_a_grid_of_the_environment_as_sample_inside_its_fence() -> None:
 
 def holed() -> tuple[U8, U8]:
     """A place, and the same with an unknown hole."""
-    whole = made(SAMPLES["warehouse"].cells(0.05), 120, 4)
-    cells = whole.copy()
+    complete = collapse(SAMPLES["warehouse"].cells(0.05), 120, 4)
+    cells = complete.copy()
     cells[40:70, 50:90] = UNKNOWN
     cells[5, 5] = 42
-    return whole, cells
+    return complete, cells
 
 
 def completed(cells: U8, seed: int = 7, **values: Any) -> tuple[U8, Notes]:
@@ -245,12 +248,12 @@ def completed(cells: U8, seed: int = 7, **values: Any) -> tuple[U8, Notes]:
 
 @pytest.mark.parametrize("order", ["rows", "entropy"])
 def test_an_unknown_part_is_made_of_what_is_known(order: str) -> None:
-    whole, cells = holed()
+    complete, cells = holed()
     out, notes = completed(cells, reach=0, confidence=0, order=order, symmetry="none")
     assert (out == cells)[cells != UNKNOWN].all()
     assert set(np.unique(out[cells == UNKNOWN])) <= {FREE, OCCUPIED}
     plain = np.where(out >= 65, OCCUPIED, FREE).astype(np.uint8)
-    strange = windows(plain[37:73, 47:93], 3) - windows(whole, 3)
+    strange = windows(plain[37:73, 47:93], 3) - windows(complete, 3)
     assert len(strange) <= sum("stand nowhere" in w.problem for w in notes.warnings) * 40
     near, _ = completed(cells, reach=0.25, confidence=0, order=order)
     filled = (near != UNKNOWN) & (cells == UNKNOWN)
@@ -302,10 +305,10 @@ def test_over_http(api: Api) -> None:
     version = looks.over_http(api, NAME, ("occupancy_grid", "tmap2", "gazebo"), width=6, depth=6)
     assert version["information"] | {"occupancy": "generated", "topology": "generated"} == version["information"]
     env = f"environments/made-{NAME}/generations"
-    told = api.problem("POST", env, 422, json={"generator": NAME, "seed": 1, "parameters": {"width": 0}})
-    assert "width" in told["detail"]
-    told = api.problem("POST", env, 422, json={"generator": "complete_grid", "seed": 1, "parameters": {}})
-    assert "no unknown cell" in told["detail"]
+    problem = api.problem("POST", env, 422, json={"generator": NAME, "seed": 1, "parameters": {"width": 0}})
+    assert "width" in problem["detail"]
+    problem = api.problem("POST", env, 422, json={"generator": "complete_grid", "seed": 1, "parameters": {}})
+    assert "no unknown cell" in problem["detail"]
 
 
 def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -197,10 +197,12 @@ def yaml_cases() -> Iterator[Case]:
         "../room.pgm", "/etc/passwd", "~/room.pgm", "file:///etc/passwd", "http://127.0.0.1/a.pgm", "..", ".", "room.yaml",
         "$HOME/x.pgm", "%2e%2e/room2.pgm", "a\\\\b.pgm", "C:\\\\x.pgm", "//host/share.pgm", "{}", "5", "''", "x" * 5000,
     )  # fmt: skip
-    for said in escapes:
-        text = ROOM.replace(b"image: room.pgm", f'image: "{said}"'.encode() if said != "{}" else b"image: {}")
-        alone = said.rpartition("/")[2] == "room.pgm"
-        yield Case(f"grid/image {said[:20]}", room(text), "read" if alone else "refused")
+    for image_path in escapes:
+        text = ROOM.replace(
+            b"image: room.pgm", f'image: "{image_path}"'.encode() if image_path != "{}" else b"image: {}"
+        )
+        alone = image_path.rpartition("/")[2] == "room.pgm"
+        yield Case(f"grid/image {image_path[:20]}", room(text), "read" if alone else "refused")
     yield Case("grid/image missing", {"room.yaml": ROOM}, "refused")
     yield Case(
         "grid/image twice elsewhere",
@@ -546,21 +548,21 @@ def json_cases() -> Iterator[Case]:
         yield Case(f"geojson/{name}", {"a.geojson": data}, "any")
     for word in ("layer", "level", "part", "kind", "source", "target", "more", "drawn_from"):
         for value in ("5", "[]", "{}", "null", '"topology"', '"' + "x" * 5000 + '"', '"a\\u0000"', '"\\n"'):
-            own = {"layer": '"topology"', "level": '"ground"', "part": '"network"', "kind": '"edge"', word: value}
-            text = "{" + ", ".join(f'"{k}": {v}' for k, v in own.items()) + "}"
+            members = {"layer": '"topology"', "level": '"ground"', "part": '"network"', "kind": '"edge"', word: value}
+            text = "{" + ", ".join(f'"{k}": {v}' for k, v in members.items()) + "}"
             for geometry in (point, "null"):
                 yield Case(
                     f"geojson/own {word} {value[:9]} {geometry[:4]}",
                     {"a.geojson": geojson(geometry, text, ', "id": "x"')},
                     "any",
                 )
-    for said in ("5", "[]", '{"datum": 5}', '{"datum": {"latitude": 1}}', '{"datum": {"latitude": 1e5, "longitude": 0}}',
+    for member in ("5", "[]", '{"datum": 5}', '{"datum": {"latitude": 1}}', '{"datum": {"latitude": 1e5, "longitude": 0}}',
                  '{"datum": {"latitude": "x", "longitude": []}}', '{"levels": 5}', '{"levels": [{"name": 5}]}',
                  '{"levels": [{"x": 5}]}', '{"documents": 5}', '{"documents": [{"layer": "topology", "document": {}}]}',
                  '{"documents": [{"layer": "topology", "level": [], "part": {}, "document": {"a": "\\u0000"}}]}',
                  '{"levels": [{"name": "ground", "elevation": 1e300}, {"name": "ground"}]}'):  # fmt: skip
-        body = geojson(point).replace(b'"features"', f'"fleet_map": {said}, "features"'.encode())
-        yield Case(f"geojson/fleet_map {said}", {"a.geojson": body}, "any")
+        body = geojson(point).replace(b'"features"', f'"fleet_map": {member}, "features"'.encode())
+        yield Case(f"geojson/fleet_map {member}", {"a.geojson": body}, "any")
 
 
 def picture_cases() -> Iterator[Case]:
@@ -811,25 +813,27 @@ def network_cases() -> Iterator[Case]:
             verdict,
             "rmf_nav_graph",
         )
-    for k, (name, found) in enumerate(names):
-        told: Verdict = "read" if found == "read" else "refused"
+    for k, (name, outcome) in enumerate(names):
+        expected_verdict: Verdict = "read" if outcome == "read" else "refused"
         yield Case(
             f"ffr/name {k}",
             {"n.ffr.yaml": FFR.format(name=name, x=1, end="{x: 5, y: 0}").encode()},
-            "any" if told == "read" else told,
+            "any" if expected_verdict == "read" else expected_verdict,
             "ffr_network",
         )
         yield Case(
             f"prm/id {k}",
             {"p.yaml": PRM.format(id=name, x=1, a=2, w=1, more=PICTURE).encode()},
-            "any" if told == "read" else told,
+            "any" if expected_verdict == "read" else expected_verdict,
             "prm",
         )
-        yield Case(f"tmap/name {k}", {"n.tmap": TMAP.format(name=name, edges="[]", x=1).encode()}, told, "tmap")
+        yield Case(
+            f"tmap/name {k}", {"n.tmap": TMAP.format(name=name, edges="[]", x=1).encode()}, expected_verdict, "tmap"
+        )
         yield Case(
             f"navgraph/name {k}",
             {"navgraph.yaml": NAVGRAPH.format(name=name, pos="[0, 0]", link="[b, b]").encode()},
-            "any" if told == "read" else told,
+            "any" if expected_verdict == "read" else expected_verdict,
             "navgraph",
         )
         yield Case(
@@ -1047,13 +1051,13 @@ def geotiff(
         278: (3, 1, 3), 279: (4, 1, len(pixels)), 33550: (12, 3, 0), 33922: (12, 6, 0),
     }  # fmt: skip
     changed = changed or {}
-    kept = {t: e for t, e in ({**tags, **changed}).items() if e is not None}
-    start = 8 + 2 + 12 * len(kept) + 4
+    entries = {t: e for t, e in ({**tags, **changed}).items() if e is not None}
+    start = 8 + 2 + 12 * len(entries) + 4
     place = struct.pack("<3d", 0.5, 0.5, 0.0), struct.pack("<6d", 0, 0, 0, 100.0, 200.0, 0)
     for tag, offset in ((33550, start), (33922, start + 24), (273, start + 72)):
-        if tag in kept and tag not in changed:
-            kept[tag] = (*kept[tag][:2], offset)
-    return tiff(kept, place[0] + place[1] + pixels, **more)
+        if tag in entries and tag not in changed:
+            entries[tag] = (*entries[tag][:2], offset)
+    return tiff(entries, place[0] + place[1] + pixels, **more)
 
 
 def satellite_cases() -> Iterator[Case]:

@@ -93,11 +93,11 @@ def _splice(data: bytes, dice: random.Random, other: bytes) -> bytes:
 
 def _token(pattern: re.Pattern[bytes], choices: tuple[bytes, ...]) -> Callable[[bytes, random.Random, bytes], bytes]:
     def change(data: bytes, dice: random.Random, other: bytes) -> bytes:
-        found = list(pattern.finditer(data))
-        if not found:
+        matches = list(pattern.finditer(data))
+        if not matches:
             return data
-        match = dice.choice(found)
-        new = dice.choice((*choices, dice.choice(found).group()))
+        match = dice.choice(matches)
+        new = dice.choice((*choices, dice.choice(matches).group()))
         return data[: match.start()] + new + data[match.end() :]
 
     return change
@@ -126,7 +126,7 @@ def outcome(name: str | None, files: Files) -> str:
 
 def _outcome(name: str | None, files: Files) -> str:
     try:
-        told = bundle.read(bundle.unpack(files, LIMITS), Hints(name), Known(HERE), LIMITS)
+        upload_bundle = bundle.read(bundle.unpack(files, LIMITS), Hints(name), Known(HERE), LIMITS)
     except (BadUpload, Invalid) as error:
         assert error.detail, "refused without a reason"
         if isinstance(error, BadUpload):
@@ -134,21 +134,21 @@ def _outcome(name: str | None, files: Files) -> str:
             assert all(p.file and p.problem for p in error.problems), f"no file: {error.detail}"
         result = "refused"
     else:
-        for part in told.parts.values():
+        for part in upload_bundle.parts.values():
             orjson.dumps([list(getattr(part, "ids", ())), list(getattr(part, "properties", ()))])
-        orjson.dumps([w.as_dict() for w in told.warnings])
-        result = _again(told)
+        orjson.dumps([w.as_dict() for w in upload_bundle.warnings])
+        result = _again(upload_bundle)
     return result
 
 
-def _again(told: bundle.Bundle) -> str:
-    layers = told.layers(HERE)
-    for name in sorted({use.format for use in told.files.values() if use.used and use.format}):
-        known = formats.all_formats().get(name)
-        if known is None or known.write is None or known.holds:
+def _again(upload_bundle: bundle.Bundle) -> str:
+    layers = upload_bundle.layers(HERE)
+    for name in sorted({use.format for use in upload_bundle.files.values() if use.used and use.format}):
+        fmt = formats.all_formats().get(name)
+        if fmt is None or fmt.write is None or fmt.holds:
             continue
         try:
-            written = formats.write(known, layers, WriteContext())
+            written = formats.write(fmt, layers, WriteContext())
         except FleetMapError as error:  # what was read lacks what the format needs: a network without an edge
             assert error.detail
             continue
@@ -156,16 +156,16 @@ def _again(told: bundle.Bundle) -> str:
     return "read"
 
 
-def run(seed: int, seconds: float, only: str | None = None, most: int = 10**9) -> tuple[Counter[str], list[str]]:
+def run(seed: int, seconds: float, only: str | None = None, limit: int = 10**9) -> tuple[Counter[str], list[str]]:
     """Mutate until the CPU time is used up; counts of outcomes, and what broke the law, each place once.
 
-    ``most``: mutations at most.
+    ``limit``: mutations at most.
     """
     maps = [(name, files) for name, files in sample_maps() if only in (None, name)]
     counts: Counter[str] = Counter()
-    found: dict[str, str] = {}
+    failures: dict[str, str] = {}
     start, number = time.process_time(), 0
-    while time.process_time() - start < seconds and number < most:
+    while time.process_time() - start < seconds and number < limit:
         dice = random.Random(f"{seed}/{number}")
         name, files = maps[number % len(maps)]
         victim = dice.choice(sorted(files))
@@ -179,11 +179,11 @@ def run(seed: int, seconds: float, only: str | None = None, most: int = 10**9) -
             counts[outcome(name if dice.random() < 0.5 else None, upload)] += 1
         except (Exception, OverrunError) as error:  # noqa: BLE001  every one is a finding
             place = [f for f in traceback.extract_tb(error.__traceback__) if f.name != "_overrun"][-1]
-            where = f"{type(error).__name__} {Path(place.filename).name}:{place.lineno} ({name})"
-            found.setdefault(where, f"--seed {seed}, number {number}, {victim}: {error}"[:400])
+            location = f"{type(error).__name__} {Path(place.filename).name}:{place.lineno} ({name})"
+            failures.setdefault(location, f"--seed {seed}, number {number}, {victim}: {error}"[:400])
             counts["broken"] += 1
         number += 1
-    return counts, [f"{where}: {text}" for where, text in sorted(found.items())]
+    return counts, [f"{location}: {text}" for location, text in sorted(failures.items())]
 
 
 def main() -> int:
@@ -194,10 +194,12 @@ def main() -> int:
     parser.add_argument("--format", help="mutate samples of this format only")
     values = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, resource.RLIM_INFINITY))
-    counts, found = run(values.seed, values.minutes * 60.0, values.format)
-    sys.stdout.write(f"seed {values.seed}: " + ", ".join(f"{n} {what}" for what, n in sorted(counts.items())) + "\n")
-    sys.stdout.writelines(f"{line}\n" for line in found)
-    return 1 if found else 0
+    counts, failures = run(values.seed, values.minutes * 60.0, values.format)
+    sys.stdout.write(
+        f"seed {values.seed}: " + ", ".join(f"{n} {outcome}" for outcome, n in sorted(counts.items())) + "\n"
+    )
+    sys.stdout.writelines(f"{line}\n" for line in failures)
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":

@@ -49,9 +49,9 @@ class Clock:
 
 def crowd(connections: Connections, number: int, address: str) -> list[FakeConnection]:
     """New connections of one address, all accepted."""
-    made = [FakeConnection() for _ in range(number)]
-    assert all(connections.open(one, address) for one in made)
-    return made
+    fakes = [FakeConnection() for _ in range(number)]
+    assert all(connections.open(one, address) for one in fakes)
+    return fakes
 
 
 def still_open(crowd: list[FakeConnection]) -> int:
@@ -340,15 +340,15 @@ def test_server_answers_during_a_flood_of_slow_connections(tmp_path: Path) -> No
     flood: list[socket.socket] = []
     try:
         process.ready()
-        with httpx.Client(base_url=process.address, headers=HEADERS, timeout=PATIENCE_SECONDS) as known:
-            assert known.get("/api/v1/formats").status_code == 200
-            stream = known.stream("GET", "/api/v1/events")
+        with httpx.Client(base_url=process.address, headers=HEADERS, timeout=PATIENCE_SECONDS) as client:
+            assert client.get("/api/v1/formats").status_code == 200
+            stream = client.stream("GET", "/api/v1/events")
             assert stream.__enter__().status_code == 200
             for _ in trickle(process.address, number, flood):
                 for path in ("/healthz", "/api/v1/environments"):
                     answer = httpx.get(f"{process.address}{path}", headers=HEADERS, timeout=PATIENCE_SECONDS)
                     assert answer.status_code == 200
-                assert known.get("/api/v1/formats").status_code == 200
+                assert client.get("/api/v1/formats").status_code == 200
             opened = len(list(Path(f"/proc/{process.process.pid}/fd").iterdir()))
             assert opened < 200 + 100
             stream.__exit__(None, None, None)

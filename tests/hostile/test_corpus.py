@@ -38,7 +38,7 @@ def outcome(case: Case) -> str:
     """``read`` or ``refused``; anything else fails here."""
     start = time.monotonic()
     try:
-        told = bundle.read(bundle.unpack(case.files, LIMITS), Hints(case.format), Known(), LIMITS)
+        upload_bundle = bundle.read(bundle.unpack(case.files, LIMITS), Hints(case.format), Known(), LIMITS)
     except (BadUpload, Invalid) as error:
         result = "refused"
         assert error.detail
@@ -49,9 +49,9 @@ def outcome(case: Case) -> str:
     else:
         result = "read"
         # What was read can be answered as JSON: no NaN, no integer beyond 64 bit, no lone surrogate.
-        for part in told.parts.values():
+        for part in upload_bundle.parts.values():
             orjson.dumps([list(getattr(part, "ids", ())), list(getattr(part, "properties", ()))])
-        orjson.dumps([w.as_dict() for w in told.warnings])
+        orjson.dumps([w.as_dict() for w in upload_bundle.warnings])
     assert time.monotonic() - start < SECONDS, f"{case.name} takes too long"
     return result
 

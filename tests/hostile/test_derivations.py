@@ -72,8 +72,8 @@ def test_grids_without_content_through_the_server(api: Api, fresh: Callable[[], 
     api.upload(env, GRIDS[case])
     for name in OF_GRIDS:
         for values in METHODS.get(name, [{}]):
-            wish = {"method": name, "parameters": values}
-            answer = api("POST", f"environments/{env}/derivations", json=wish)
+            request = {"method": name, "parameters": values}
+            answer = api("POST", f"environments/{env}/derivations", json=request)
             if (name, case) in GIVES:
                 assert answer.status_code == 201, (name, values, answer.text)
                 continue
@@ -150,17 +150,17 @@ def test_bad_meshes_are_cut_and_filled_or_told(api: Api, fresh: Callable[[], str
         assert case not in SOUND
         return
     for path in ("occupancy_grid/map.pgm?resolution=0.1", "octomap?resolution=0.1"):
-        made = api("GET", f"environments/{env}/versions/latest/maps/{path}")
+        response = api("GET", f"environments/{env}/versions/latest/maps/{path}")
         if case in SOUND:
-            assert made.status_code == 200, (path, made.text)
-        if made.status_code != 200:
-            assert made.status_code == 422, (path, made.status_code)
-            assert made.json()["detail"]
+            assert response.status_code == 200, (path, response.text)
+        if response.status_code != 200:
+            assert response.status_code == 422, (path, response.status_code)
+            assert response.json()["detail"]
         elif path.startswith("octomap"):
-            size = next(line for line in made.content.split(b"\n") if line.startswith(b"size "))
+            size = next(line for line in response.content.split(b"\n") if line.startswith(b"size "))
             assert int(size.split()[1]) > 1
         else:
-            assert 0 in made.content.split(b"255\n", 1)[1], "a map without an obstacle looks right"
+            assert 0 in response.content.split(b"255\n", 1)[1], "a map without an obstacle looks right"
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -170,9 +170,9 @@ def test_a_picture_without_a_place_is_refused_with_a_way_out(api: Api, fresh: Ca
     ok, png = cv2.imencode(".png", np.full((20, 30, 3), 90, np.uint8))
     assert ok
     refused = api.upload(env, {"above.png": png.tobytes()}, expect=422, format="satellite").json()
-    said = refused["detail"] + json.dumps(refused.get("errors", []))
-    assert "corners=" in said
-    assert "metres_per_pixel" in said
+    text = refused["detail"] + json.dumps(refused.get("errors", []))
+    assert "corners=" in text
+    assert "metres_per_pixel" in text
     # On earth, but in an environment that does not say where it lies.
     world_file = b"0.00001\n0\n0\n-0.00001\n10\n52\n"
     api.upload(env, {"above.png": png.tobytes(), "above.pgw": world_file}, format="satellite", crs="EPSG:4326")
@@ -203,8 +203,8 @@ def pictures(seed: int) -> Picture:
     pixels: NDArray[Any] = values.astype(rng.choice(["uint8", "uint8", "uint16", "int16", "float32", "float64"]))
     more: dict[str, Any] = {}
     if pixels.dtype.kind == "f":
-        most = float(np.finfo(pixels.dtype).max)
-        pixels.reshape(-1)[:: int(rng.integers(2, 9))] = rng.choice([np.nan, np.inf, -np.inf, most, 0.0])
+        maximum = float(np.finfo(pixels.dtype).max)
+        pixels.reshape(-1)[:: int(rng.integers(2, 9))] = rng.choice([np.nan, np.inf, -np.inf, maximum, 0.0])
     if seed % 5 == 0:
         more["nodata"] = float(pixels.reshape(-1)[0]) if np.isfinite(pixels.reshape(-1)[0]) else "nan"
     if seed % 6 == 0:
@@ -235,11 +235,11 @@ def test_any_picture_gives_something_or_a_clear_problem(seed: int) -> None:
     for module in (imagery_to_objects, imagery_to_occupancy):
         function = getattr(module, module.__name__.rpartition(".")[2])
         try:
-            made = function(layers, module.Parameters(**ODD[seed % len(ODD)]), Notes())
+            derived_layers = function(layers, module.Parameters(**ODD[seed % len(ODD)]), Notes())
         except FleetMapError as error:
             assert error.detail
             continue
-        (part,) = made.parts.values()
+        (part,) = derived_layers.parts.values()
         if isinstance(part, Features):
             assert len(part)
             assert shapely.is_valid(part.geometry).all()
@@ -280,26 +280,26 @@ HARD: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("seed", range(42))
 def test_any_grid_gives_objects_or_a_clear_problem(seed: int) -> None:
-    known = grids(seed)
-    layers = Layers({PartKey("occupancy"): known})
+    grid = grids(seed)
+    layers = Layers({PartKey("occupancy"): grid})
     try:
-        made = occupancy_to_objects.occupancy_to_objects(
+        derived_layers = occupancy_to_objects.occupancy_to_objects(
             layers, occupancy_to_objects.Parameters(**HARD[seed % len(HARD)]), Notes()
         )
     except FleetMapError as error:
         assert error.detail
         return
-    (part,) = made.parts.values()
+    (part,) = derived_layers.parts.values()
     assert isinstance(part, Features)
     assert len(part)
     assert shapely.is_valid(part.geometry).all()
     # They stand where the grid is, and a world can be written of them.
-    x, y, yaw = known.origin
+    x, y, yaw = grid.origin
     around = shapely.transform(
-        shapely.box(0, 0, known.width * known.resolution, known.height * known.resolution),
+        shapely.box(0, 0, grid.width * grid.resolution, grid.height * grid.resolution),
         lambda at: at @ np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]]) + [x, y],
     )
-    reach = 3 * known.resolution + 2 * HARD[seed % len(HARD)].get("tolerance", 0.0)
+    reach = 3 * grid.resolution + 2 * HARD[seed % len(HARD)].get("tolerance", 0.0)
     assert shapely.covered_by(shapely.centroid(part.geometry), around.buffer(reach)).all()
     gazebo = formats.get_format("gazebo")
-    assert gazebo.write(made, formats.WriteContext(options=gazebo.write_options()))
+    assert gazebo.write(derived_layers, formats.WriteContext(options=gazebo.write_options()))

@@ -14,8 +14,8 @@ MAPS = list(sample_maps())
 
 
 def test_mutated_samples_are_read_or_refused() -> None:
-    counts, found = run(seed=20261122, seconds=8.0, most=600)
-    assert not found, "\n".join(found)
+    counts, failures = run(seed=20261122, seconds=8.0, limit=600)
+    assert not failures, "\n".join(failures)
     assert counts["refused"] > counts.total() // 10, counts
     assert counts["read"] > counts.total() // 20, counts
 

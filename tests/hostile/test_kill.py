@@ -89,10 +89,10 @@ def check(folder: Path, address: str, ledger: Ledger) -> int:
             number = version["version"]
             place = f"{ENVIRONMENT}/versions/{number}"
             listed = client.get(f"{place}/sources").json()
-            told = frozenset((s["name"], s["sha256"]) for s in listed)
-            assert told in ledger.sent, f"version {number} is not one of the uploads"
-            expected = ledger.acknowledged.get(number, ledger.sent[told])
-            assert told == digests(expected)
+            listed_files = frozenset((s["name"], s["sha256"]) for s in listed)
+            assert listed_files in ledger.sent, f"version {number} is not one of the uploads"
+            expected = ledger.acknowledged.get(number, ledger.sent[listed_files])
+            assert listed_files == digests(expected)
             for name, data in expected.items():
                 assert client.get(f"{place}/sources/{name}").content == data
             assert client.get(f"{place}/layers/occupancy", params={"name": "room"}).status_code == 200

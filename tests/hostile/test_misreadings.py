@@ -142,14 +142,14 @@ def test_changed_sample_is_refused_or_reported(row: Row) -> None:
     if row.refused:
         with pytest.raises(BadUpload) as caught:
             read(files)
-        found = [p for p in caught.value.problems if row.refused in p.problem]
-        assert found, [p.problem for p in caught.value.problems]
-        assert found[0].file == row.sample
+        findings = [p for p in caught.value.problems if row.refused in p.problem]
+        assert findings, [p.problem for p in caught.value.problems]
+        assert findings[0].file == row.sample
     else:
         warnings = read(files)
-        found = [w for w in warnings if row.warned in w.problem and w.problem not in plain]
-        assert found, [w.problem for w in warnings]
-    assert row.where in (found[0].where or "")
+        findings = [w for w in warnings if row.warned in w.problem and w.problem not in plain]
+        assert findings, [w.problem for w in warnings]
+    assert row.where in (findings[0].where or "")
 
 
 def odd_files() -> list[tuple[str, Callable[[bytes], bytes], str]]:
@@ -193,8 +193,8 @@ def test_utf16_stylesheet_is_reported() -> None:
 def test_warnings_that_repeat_are_one() -> None:
     same = [Problem(f"the edge 'e{k}' leads to 'x{k}', which is no node", "a.yaml", where=f"n{k}") for k in range(41)]
     other = Problem("no list of nodes", "a.yaml")
-    told = grouped([*same, other, other], 1000)
-    assert [w.problem for w in told] == [
+    warnings = grouped([*same, other, other], 1000)
+    assert [w.problem for w in warnings] == [
         "the edge 'e0' leads to 'x0', which is no node (and 40 more like it: n1; n2)",
         "no list of nodes",
     ]
@@ -208,6 +208,6 @@ def test_nodes_with_the_same_unknown_key_are_one_warning() -> None:
     count = sample.count("    parent_frame:")
     assert count > 3
     text = sample.replace("    parent_frame:", "    colour: red\n    parent_frame:")
-    found = [w.problem for w in read({"a.tmap2.yaml": text.encode()}) if "colour" in w.problem]
-    assert len(found) == 1
-    assert f"nodes[].node.colour ({count} times)" in found[0]
+    warnings = [w.problem for w in read({"a.tmap2.yaml": text.encode()}) if "colour" in w.problem]
+    assert len(warnings) == 1
+    assert f"nodes[].node.colour ({count} times)" in warnings[0]

@@ -37,7 +37,7 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
 
 def test_every_answer_is_declared_and_no_call_makes_the_server_fail(api: Api) -> None:
     schema = schemathesis.openapi.from_dict(api.get("/openapi.json").json())
-    found: list[str] = []
+    failures: list[str] = []
     count = 0
 
     for result in schema.get_all_operations():
@@ -69,18 +69,18 @@ def test_every_answer_is_declared_and_no_call_makes_the_server_fail(api: Api) ->
                 return  # no header that can be sent
             spent = time.process_time() - before
             count += 1
-            where = f"{case.method} {case.operation.path} {arguments}"[:2000]
+            operation = f"{case.method} {case.operation.path} {arguments}"[:2000]
             if answer.status_code >= 500 and not (answer.status_code in (503, 507) and "retry-after" in answer.headers):
-                found.append(f"{answer.status_code} {answer.text[:300]}: {where}")
+                failures.append(f"{answer.status_code} {answer.text[:300]}: {operation}")
             declared = case.operation.definition.raw["responses"]
             if str(answer.status_code) not in declared:
-                found.append(f"{answer.status_code} is not declared: {answer.text[:300]}: {where}")
+                failures.append(f"{answer.status_code} is not declared: {answer.text[:300]}: {operation}")
             if spent > CPU_SECONDS:
-                found.append(f"{spent:.1f} s of CPU: {where}")
+                failures.append(f"{spent:.1f} s of CPU: {operation}")
 
         call()
     assert count > 200
-    assert not found, f"{len(found)} of {count}:\n" + "\n".join(found[:20])
+    assert not failures, f"{len(failures)} of {count}:\n" + "\n".join(failures[:20])
 
 
 KEPT = {"method", "url", "params", "json", "data", "files", "content"}

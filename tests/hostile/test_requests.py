@@ -78,8 +78,8 @@ def test_hostile_networks_over_http(api: Api) -> None:
     for k, case in enumerate(network_cases()):
         env = f"hostile-{k}"
         api.post("environments", {"name": env})
-        known = {"format": case.format} if case.format else {}
-        answer = api.upload(env, case.files, expect=None, **known)
+        format_option = {"format": case.format} if case.format else {}
+        answer = api.upload(env, case.files, expect=None, **format_option)
         assert answer.status_code in (200, 201, 422), f"{case.name}: {answer.status_code} {answer.text[:300]}"
         if answer.status_code == 422:
             assert case.verdict != "read", case.name

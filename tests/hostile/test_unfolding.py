@@ -130,6 +130,6 @@ def test_compressed_points_are_held_against_the_ratio() -> None:
 
 
 def _read(name: str, file: str, data: bytes) -> Any:
-    known = get_format(name)
-    assert known.read is not None
-    return known.read({file: data}, ReadContext(main=file))
+    fmt = get_format(name)
+    assert fmt.read is not None
+    return fmt.read({file: data}, ReadContext(main=file))

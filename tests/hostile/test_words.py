@@ -100,22 +100,22 @@ def bases() -> Iterator[tuple[str, Layers]]:
         for layer in (None, "topology"):
             if layer and not formats.get_format(name).drawing:
                 continue
-            told = bundle.read(bundle.unpack(files, Limits()), Hints(name, layer=layer), Known(HERE), Limits())
-            layers = told.layers(HERE)
+            upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(name, layer=layer), Known(HERE), Limits())
+            layers = upload_bundle.layers(HERE)
             parts = {key: smaller(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
             yield f"{name}/{min(files)}{f' as {layer}' if layer else ''}", Layers(parts, layers.datum, layers.levels)
 
 
 def smaller(part: Features) -> Features:
     """The part with everything near HERE that stands in degrees drawn smaller about it."""
-    here = np.array([HERE.longitude, HERE.latitude])
+    centre = np.array([HERE.longitude, HERE.latitude])
 
     def nearer(at: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.hstack([here + (at[:, :2] - here) * SMALLER, at[:, 2:]])
+        return np.hstack([centre + (at[:, :2] - centre) * SMALLER, at[:, 2:]])
 
     geometry = part.geometry.copy()
-    for flat, where in ((False, ~shapely.has_z(geometry)), (True, shapely.has_z(geometry))):
-        these = where & ~part.local & (shapely.distance(geometry, shapely.Point(here)) < 0.01)
+    for flat, mask in ((False, ~shapely.has_z(geometry)), (True, shapely.has_z(geometry))):
+        these = mask & ~part.local & (shapely.distance(geometry, shapely.Point(centre)) < 0.01)
         geometry[these] = shapely.transform(geometry[these], nearer, include_z=flat)
     return Features(part.ids, geometry, part.properties, part.local, part.document)
 
@@ -124,9 +124,9 @@ def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
     """Of writing every format, deriving what it takes: exceptions that nobody could tell a user."""
     out: list[tuple[str, BaseException]] = []
     stock = Stock(frozenset(layers.parts), layers.datum is not None)
-    for name, known in formats.all_formats().items():
+    for name, fmt in formats.all_formats().items():
         try:
-            written = write(known, layers, {}, chain(known, stock, known.write_options()))
+            written = write(fmt, layers, {}, chain(fmt, stock, fmt.write_options()))
         except FleetMapError as error:
             assert error.detail
         except Exception as error:  # noqa: BLE001  all of them are what is looked for
@@ -141,7 +141,7 @@ def test_no_value_of_a_word_breaks_a_writer(layers: Layers) -> None:
     vector = [key for key, part in layers.parts.items() if isinstance(part, Features)]
     if not vector:
         return
-    found: dict[str, str] = {}
+    failures: dict[str, str] = {}
     for seed in range(ROUNDS):
         dice = random.Random(seed)
         parts = dict(layers.parts)
@@ -150,5 +150,5 @@ def test_no_value_of_a_word_breaks_a_writer(layers: Layers) -> None:
             parts[key] = changed(parts[key], dice)  # type: ignore[arg-type]
         for name, error in bugs(Layers(parts, layers.datum, layers.levels)):
             place = traceback.extract_tb(error.__traceback__)[-1]
-            found.setdefault(f"{name}: {type(error).__name__} {place.filename}:{place.lineno}", f"{error}"[:200])
-    assert not found, "\n".join(f"{place}  {text}" for place, text in sorted(found.items()))
+            failures.setdefault(f"{name}: {type(error).__name__} {place.filename}:{place.lineno}", f"{error}"[:200])
+    assert not failures, "\n".join(f"{place}  {text}" for place, text in sorted(failures.items()))

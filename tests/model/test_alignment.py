@@ -36,8 +36,8 @@ def hall(resolution: float = 0.05, noise: float = 0.0) -> OccupancyGrid:
 def away(fit: Fit, x: float, y: float, yaw: float) -> tuple[float, float]:
     """(metres at the hall's middle, degrees) between a fit and a known motion."""
     middle = np.array([[3.0, 6.0]])
-    here, there = fit.of(middle), Fit(x, y, yaw, 0, 1).of(middle)
-    return float(np.linalg.norm(here - there)), abs(math.degrees(math.remainder(fit.yaw - yaw, 2 * math.pi)))
+    computed, expected = fit.of(middle), Fit(x, y, yaw, 0, 1).of(middle)
+    return float(np.linalg.norm(computed - expected)), abs(math.degrees(math.remainder(fit.yaw - yaw, 2 * math.pi)))
 
 
 @pytest.mark.parametrize(
@@ -65,12 +65,12 @@ def test_the_search_keeps_to_what_is_asked() -> None:
         assert abs(fit.yaw) <= math.radians(20) + 2e-3
     far = Fit(30.0, 0.0, 0.0, 0.0, 1.0).moved(hall())
     assert alignment.of_grids(far, onto)[0].x == pytest.approx(-30, abs=0.05)
-    found: list[Fit] = []
+    fits: list[Fit] = []
     try:
-        found = alignment.of_grids(far, onto, reach=25.0)
+        fits = alignment.of_grids(far, onto, reach=25.0)
     except CannotConvert as error:
         assert "nowhere" in error.detail
-    assert all(f.score < 0.7 for f in found)
+    assert all(f.score < 0.7 for f in fits)
 
 
 def test_of_equal_places_the_nearest_is_taken() -> None:
@@ -106,9 +106,9 @@ def test_points_by_least_squares(count: int) -> None:
 
 def test_wrong_pairs_are_left_out_and_told() -> None:
     truth = Fit(5.0, -1.0, math.radians(-120.0), 0, 1)
-    there = truth.of(POINTS)
-    there[2] += (6.0, -3.0)
-    fit, bad, _ = alignment.of_pairs(np.stack([POINTS, there], axis=1))
+    targets = truth.of(POINTS)
+    targets[2] += (6.0, -3.0)
+    fit, bad, _ = alignment.of_pairs(np.stack([POINTS, targets], axis=1))
     assert bad == [2]
     assert fit.agreement == 0.8
     assert away(fit, truth.x, truth.y, truth.yaw) == pytest.approx((0, 0), abs=1e-9)

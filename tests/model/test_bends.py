@@ -74,8 +74,8 @@ def test_straight_networks_are_returned_unchanged() -> None:
 
 
 def test_pieces_keep_properties_but_not_their_identity() -> None:
-    known = {"speed_limit": 1.5, "tmap2": {"edge_id": "old", "fail_policy": "retry"}}
-    straight = part_of(bends.split(network(("e", "b", "a", [(5.0, 5.0)]), **known))[0])
+    properties = {"speed_limit": 1.5, "tmap2": {"edge_id": "old", "fail_policy": "retry"}}
+    straight = part_of(bends.split(network(("e", "b", "a", [(5.0, 5.0)]), **properties))[0])
     rest = {"kind": "edge", "speed_limit": 1.5, "tmap2": {"fail_policy": "retry"}}
     assert straight.properties[-2:] == (
         {**rest, "source": "b", "target": "a~b~1"},
@@ -107,8 +107,8 @@ def test_parallel_edges_get_nodes_of_their_own() -> None:
 def test_an_edge_between_networks_and_one_to_nowhere_stay_whole() -> None:
     lost = network(("a_b", "a", "b", [(5.0, 5.0)]))
     part = part_of(lost)
-    gone = Layers({KEY: part.take([k for k, i in enumerate(part.ids) if i != "b"])})
-    assert bends.split(gone)[0] is gone
+    incomplete = Layers({KEY: part.take([k for k, i in enumerate(part.ids) if i != "b"])})
+    assert bends.split(incomplete)[0] is incomplete
 
 
 def test_places_on_earth_bend_by_metres() -> None:
@@ -120,8 +120,8 @@ def test_places_on_earth_bend_by_metres() -> None:
     straight = part_of(bends.split(Layers({KEY: earth}, datum))[0])
     assert not straight.local.any()
     index = straight.index()
-    there = shapely.get_coordinates(straight.take([index["a~b~2"]]).in_local(frame))
-    assert there == pytest.approx(np.array([[2.0, 6.0]]), abs=1e-6)
+    positions = shapely.get_coordinates(straight.take([index["a~b~2"]]).in_local(frame))
+    assert positions == pytest.approx(np.array([[2.0, 6.0]]), abs=1e-6)
     assert edges(bends.split(Layers({KEY: earth}))[0]) == edges(Layers({KEY: straight})), "without a datum, too"
 
 
@@ -153,13 +153,13 @@ def test_formats_without_shapes_of_edges() -> None:
 @pytest.mark.parametrize("name", STRAIGHT)
 def test_no_written_edge_leads_through_a_house(name: str) -> None:
     """Whoever drives straight from node to node goes around the house, and an upload gives the same way back."""
-    known = formats.get_format(name)
+    fmt = formats.get_format(name)
     context = WriteContext()
-    files = formats.write(known, both(), context)
+    files = formats.write(fmt, both(), context)
     assert {"what": "nodes at bends", "value": 3} in [{w: t[w] for w in ("what", "value")} for t in context.template]
-    assert known.read is not None
-    reading = ReadContext(main=next(iter(files)), options=known.read_options())
-    driven = known.read(files, reading)
+    assert fmt.read is not None
+    reading = ReadContext(main=next(iter(files)), options=fmt.read_options())
+    driven = fmt.read(files, reading)
     part = part_of(driven)
     at = {
         i: shapely.get_coordinates(g)[0] for i, g in zip(part.ids, part.geometry, strict=True) if g.geom_type == "Point"
@@ -167,8 +167,8 @@ def test_no_written_edge_leads_through_a_house(name: str) -> None:
     lines = [shapely.LineString([at[p["source"]], at[p["target"]]]) for p in part.properties if p["kind"] == "edge"]
     assert len(lines) == 9 if name not in ("openrmf", "prm", "ffr_network") else len(lines) >= 9
     assert not shapely.intersects(lines, HOUSE).any()
-    again = formats.read(Group(known, next(iter(files)), files), ReadContext())
-    assert formats.write(known, again, WriteContext()) == files
+    again = formats.read(Group(fmt, next(iter(files)), files), ReadContext())
+    assert formats.write(fmt, again, WriteContext()) == files
 
 
 NAMED = [name for name in STRAIGHT if name != "prm" and formats.get_format(name).bends == "nodes"]
@@ -177,9 +177,9 @@ NAMED = [name for name in STRAIGHT if name != "prm" and formats.get_format(name)
 
 @pytest.mark.parametrize("name", NAMED)
 def test_an_upload_of_what_was_written_has_its_bends(name: str) -> None:
-    known = formats.get_format(name)
-    files = formats.write(known, both(), WriteContext())
-    again = part_of(formats.read(Group(known, next(iter(files)), files), ReadContext()))
+    fmt = formats.get_format(name)
+    files = formats.write(fmt, both(), WriteContext())
+    again = part_of(formats.read(Group(fmt, next(iter(files)), files), ReadContext()))
     lines = [g for g, p in zip(again.geometry, again.properties, strict=True) if p["kind"] == "edge"]
     assert sorted(map(shapely.get_num_coordinates, lines)) == [2, 5, 5]
     assert len(again) == len(part_of(both()))

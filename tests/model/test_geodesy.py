@@ -126,18 +126,18 @@ def test_across_the_antimeridian_places_stay_neighbours() -> None:
 @settings(max_examples=300, deadline=None)
 def test_any_local_place_comes_back(datum: Datum, x: float, y: float) -> None:
     frame = local_frame(datum)
-    there = frame.to_wgs84(np.array([[x, y]]))
-    assert np.abs(frame.to_local(there) - [x, y]).max() < 1e-6
+    lonlat = frame.to_wgs84(np.array([[x, y]]))
+    assert np.abs(frame.to_local(lonlat) - [x, y]).max() < 1e-6
 
 
 def test_heights_pass_through_and_inputs_stay() -> None:
     frame = LocalFrame(Datum(53.0, 0.1, 40.0, 10.0))
     given_places = np.array([[0.1, 53.0, 7.5], [0.2, 53.1, -3.0]])
-    kept = given_places.copy()
+    original = given_places.copy()
     local = frame.to_local(given_places)
     assert local[:, 2].tolist() == [7.5, -3.0]
     assert frame.to_wgs84(local)[:, 2].tolist() == [7.5, -3.0]
-    assert (given_places == kept).all()
+    assert (given_places == original).all()
     assert frame.to_local(np.empty((0, 2))).shape == (0, 2)
 
 
@@ -198,9 +198,9 @@ def test_geometries_of_all_kinds_at_once() -> None:
 
 def test_only_what_is_anchored_otherwise_moves() -> None:
     frame = LocalFrame(Datum(53.0, 0.1))
-    here = features([("a", shapely.Point(3.0, 4.0), {})], "local")
+    local_items = features([("a", shapely.Point(3.0, 4.0), {})], "local")
     earth = features([("b", shapely.Point(0.1, 53.0), {}), ("c", shapely.Point(0.1, 53.001, 9.0), {})], "wgs84")
-    both = concatenate([here, earth])
+    both = concatenate([local_items, earth])
     local = both.in_local(frame)
     assert local[0] is both.geometry[0]
     assert (local[1].x, local[1].y) == (0.0, 0.0)
@@ -211,8 +211,8 @@ def test_only_what_is_anchored_otherwise_moves() -> None:
     assert degrees[1] is both.geometry[1]
     assert degrees[0].y == pytest.approx(53.0 + 0.001 * 4 / metres, abs=1e-9)
     assert both.needs_datum
-    assert not here.needs_datum
-    assert here.in_local(None)[0] is here.geometry[0]
-    for ask in (both.in_local, both.in_wgs84, here.in_wgs84, earth.in_local):
+    assert not local_items.needs_datum
+    assert local_items.in_local(None)[0] is local_items.geometry[0]
+    for ask in (both.in_local, both.in_wgs84, local_items.in_wgs84, earth.in_local):
         with pytest.raises(MissingDatum, match="datum"):
             ask(None)

@@ -27,11 +27,11 @@ def numbered(shape: tuple[int, int] = (60, 80), crs: str = UTM, transform: Any =
     return Picture(values, transform or (0.5, 0.0, EAST, 0.0, -0.5, NORTH), crs, properties)
 
 
-def truth(made: Picture, source: Picture, to_source: Any) -> tuple[np.ndarray, np.ndarray]:
+def truth(image: Picture, source: Picture, to_source: Any) -> tuple[np.ndarray, np.ndarray]:
     """For every pixel of the result: the value that stands there by PROJ alone, and how near to a pixel's edge."""
-    height, width = made.pixels.shape[:2]
+    height, width = image.pixels.shape[:2]
     rows, columns = (v.ravel() + 0.5 for v in np.mgrid[0:height, 0:width])
-    places = to_source(placed(made.transform, columns, rows))
+    places = to_source(placed(image.transform, columns, rows))
     a, b, c, d, e, f = source.transform
     back = np.linalg.inv(np.array([[a, b], [d, e]]))
     u, v = back @ (places - [c, f]).T
@@ -48,7 +48,7 @@ def truth(made: Picture, source: Picture, to_source: Any) -> tuple[np.ndarray, n
 def test_every_pixel_stands_where_proj_says(heading: float, transform: Any) -> None:
     source = numbered(transform=transform, nodata=0)
     frame = local_frame(Datum(HERE.latitude, HERE.longitude, heading=heading))
-    made = resampled(source, frame, method="nearest")
+    image = resampled(source, frame, method="nearest")
     earth = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
     tmerc = Transformer.from_crs(
         f"+proj=tmerc +lat_0={HERE.latitude} +lon_0={HERE.longitude} +k=1 +ellps=WGS84", "EPSG:4326", always_xy=True
@@ -61,17 +61,17 @@ def test_every_pixel_stands_where_proj_says(heading: float, transform: Any) -> N
         north = xy[:, 1] * math.cos(turn) - xy[:, 0] * math.sin(turn)
         return np.column_stack(earth.transform(*tmerc.transform(east, north)))
 
-    expected, edge = truth(made, source, to_source)
+    expected, edge = truth(image, source, to_source)
     sure = edge > 1e-3
     assert sure.mean() > 0.9
-    assert np.array_equal(made.pixels[..., 0][sure], expected[sure])
-    assert made.crs == "local"
+    assert np.array_equal(image.pixels[..., 0][sure], expected[sure])
+    assert image.crs == "local"
     # The corners to the millimetre: the result's outline holds the source's corners, and no more than a pixel beyond.
     corners = local_frame(frame.datum).to_local(
         np.column_stack(earth.transform(*source.outline().T, direction="INVERSE"))
     )
-    a, _, c, _, e, f = made.transform
-    height, width = made.pixels.shape[:2]
+    a, _, c, _, e, f = image.transform
+    height, width = image.pixels.shape[:2]
     low, high = np.array([c, f + e * height]), np.array([c + a * width, f])
     assert (corners.min(axis=0) - low > -1e-3).all()
     assert (corners.min(axis=0) - low < a + 1e-3).all()
@@ -83,12 +83,12 @@ def test_every_pixel_stands_where_proj_says(heading: float, transform: Any) -> N
 
 def test_degrees_and_back() -> None:
     source = numbered(nodata=0)
-    made = to_wgs84(source, method="nearest", resolution=2e-6)
+    image = to_wgs84(source, method="nearest", resolution=2e-6)
     forth = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
-    expected, edge = truth(made, source, lambda p: np.column_stack(forth.transform(p[:, 0], p[:, 1])))
+    expected, edge = truth(image, source, lambda p: np.column_stack(forth.transform(p[:, 0], p[:, 1])))
     sure = edge > 1e-3
-    assert np.array_equal(made.pixels[..., 0][sure], expected[sure])
-    assert set(np.unique(made.pixels)) >= set(range(1, 4801)), "at this resolution no pixel is missed"
+    assert np.array_equal(image.pixels[..., 0][sure], expected[sure])
+    assert set(np.unique(image.pixels)) >= set(range(1, 4801)), "at this resolution no pixel is missed"
 
 
 def test_a_plane_stays_a_plane() -> None:
@@ -97,27 +97,27 @@ def test_a_plane_stays_a_plane() -> None:
     heights = (0.25 * columns - 0.125 * rows)[..., None]
     source = Picture(heights, (0.5, 0.0, EAST, 0.0, -0.5, NORTH), UTM)
     frame = local_frame(HERE)
-    made = resampled(source, frame)
-    assert made.properties["nodata"] == "nan"
-    v, u = np.nonzero(np.isfinite(made.pixels[..., 0]))
-    earth = frame.to_wgs84(placed(made.transform, u + 0.5, v + 0.5))
-    there = np.column_stack(Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(earth[:, 0], earth[:, 1]))
-    column, row = (there[:, 0] - EAST) / 0.5, (NORTH - there[:, 1]) / 0.5
+    image = resampled(source, frame)
+    assert image.properties["nodata"] == "nan"
+    v, u = np.nonzero(np.isfinite(image.pixels[..., 0]))
+    earth = frame.to_wgs84(placed(image.transform, u + 0.5, v + 0.5))
+    xy = np.column_stack(Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(earth[:, 0], earth[:, 1]))
+    column, row = (xy[:, 0] - EAST) / 0.5, (NORTH - xy[:, 1]) / 0.5
     within = (column > 1) & (row > 1) & (column < 79) & (row < 59)
     expected = 0.25 * column - 0.125 * row
     assert within.sum() > 4000
-    assert np.abs(made.pixels[v, u, 0] - expected)[within].max() < 1e-3
+    assert np.abs(image.pixels[v, u, 0] - expected)[within].max() < 1e-3
 
 
 @pytest.mark.parametrize(("kind", "band"), [(np.uint8, "alpha"), (np.uint16, "mask"), (np.int8, "mask")])
 def test_outside_is_said_by_a_further_band(kind: Any, band: str) -> None:
     source = Picture(np.full((40, 40, 3), 100, kind), (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM)
-    made = resampled(source, local_frame(HERE))
-    assert made.colours == ("red", "green", "blue", band)
-    opaque = made.pixels[..., 3] != 0
+    image = resampled(source, local_frame(HERE))
+    assert image.colours == ("red", "green", "blue", band)
+    opaque = image.pixels[..., 3] != 0
     assert 0.4 < opaque.mean() < 0.6, "half of the box around a turned square"
-    assert (made.pixels[opaque][:, :3] == 100).all(), "transparency does not darken the edge"
-    assert displayed(made)[..., 3].tolist() == np.where(opaque, 255, 0).tolist() or band == "alpha"
+    assert (image.pixels[opaque][:, :3] == 100).all(), "transparency does not darken the edge"
+    assert displayed(image)[..., 3].tolist() == np.where(opaque, 255, 0).tolist() or band == "alpha"
 
 
 def test_what_lies_right_is_left_alone() -> None:
@@ -128,17 +128,17 @@ def test_what_lies_right_is_left_alone() -> None:
 
 def test_a_turned_plan_is_set_upright_without_a_datum() -> None:
     plan = numbered((40, 40), "local", (0.0, 0.5, 0.0, 0.5, 0.0, 0.0), nodata=0)
-    made = resampled(plan, method="nearest")
+    image = resampled(plan, method="nearest")
     # x runs along the rows, y along the columns: transposed, and upside down since rows run down.
-    assert made.transform == (0.5, 0.0, 0.0, 0.0, -0.5, 20.0)
-    assert np.array_equal(made.pixels[..., 0], plan.pixels[..., 0].T[::-1])
+    assert image.transform == (0.5, 0.0, 0.0, 0.0, -0.5, 20.0)
+    assert np.array_equal(image.pixels[..., 0], plan.pixels[..., 0].T[::-1])
 
 
 def test_palettes_are_never_mixed() -> None:
     values = (np.arange(1600).reshape(40, 40, 1) % 2 * 200).astype(np.uint8)
     properties = {"bands": [{"colour": "palette"}], "palette": [[k, 0, 0, 255] for k in range(256)], "nodata": 7}
-    made = resampled(Picture(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(HERE))
-    assert set(np.unique(made.pixels)) == {0, 7, 200}
+    image = resampled(Picture(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(HERE))
+    assert set(np.unique(image.pixels)) == {0, 7, 200}
 
 
 def test_what_cannot_be_is_said() -> None:

@@ -57,16 +57,16 @@ SHOWN = '<node name="n"><instance_geometry url="#g"/></node>'
 
 
 def of_files(data: Path) -> list[Path]:
-    found = [p for p in sorted(data.rglob("*")) if p.suffix.lower() in (".dae", ".stl")]
-    assert len(found) == 21
-    return found
+    paths = [p for p in sorted(data.rglob("*")) if p.suffix.lower() in (".dae", ".stl")]
+    assert len(paths) == 21
+    return paths
 
 
 def test_real_meshes_are_what_trimesh_reads(shared: Path, facts_json: dict[str, Any]) -> None:
     import trimesh
 
     data = shared / "data"
-    known = {name for name, fact in facts_json.items() if fact["kind"] == "collada"}
+    collada_names = {name for name, fact in facts_json.items() if fact["kind"] == "collada"}
     for path in of_files(data):
         name = path.relative_to(data).as_posix()
         content = path.read_bytes()
@@ -76,7 +76,7 @@ def test_real_meshes_are_what_trimesh_reads(shared: Path, facts_json: dict[str, 
             loaded: Any = trimesh.load(io.BytesIO(content), file_type=path.suffix[1:].lower(), process=False)
             other: Any = loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
         unit = 1.0
-        if name in known:
+        if name in collada_names:
             facts = facts_json[name]["facts"]
             unit = float(facts["unit_meter"])
             assert len({names[-1] for names in mesh.names}) == facts["geometries"], name

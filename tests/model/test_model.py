@@ -188,15 +188,15 @@ def test_features_cannot_be_changed() -> None:
 
 def test_parts_of_a_collection() -> None:
     rows = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", None, {"kind": "edge"}), ("c", None, {})]
-    whole = features(rows, "local", {"x": {"name": "n"}})
-    assert whole.of_kind("node", "edge").ids == ("a", "b")
-    assert whole.take(np.array([False, True, True])).ids == whole.take([1, 2]).ids == ("b", "c")
-    assert whole.take([2, 0]).ids == ("c", "a")
-    assert whole.take([]).document == {"x": {"name": "n"}}
-    assert whole.index() == {"a": 0, "b": 1, "c": 2}
-    assert [(f.id, f.anchor) for f in whole] == [("a", "local"), ("b", "local"), ("c", "local")]
+    collection = features(rows, "local", {"x": {"name": "n"}})
+    assert collection.of_kind("node", "edge").ids == ("a", "b")
+    assert collection.take(np.array([False, True, True])).ids == collection.take([1, 2]).ids == ("b", "c")
+    assert collection.take([2, 0]).ids == ("c", "a")
+    assert collection.take([]).document == {"x": {"name": "n"}}
+    assert collection.index() == {"a": 0, "b": 1, "c": 2}
+    assert [(f.id, f.anchor) for f in collection] == [("a", "local"), ("b", "local"), ("c", "local")]
     other = features([("d", None, {})], "wgs84", {"x": {"style": 1}, "y": 2})
-    both = concatenate([whole, other])
+    both = concatenate([collection, other])
     assert both.ids == ("a", "b", "c", "d")
     assert both.local.tolist() == [True, True, True, False]
     assert both.document == {"x": {"name": "n", "style": 1}, "y": 2}
@@ -306,12 +306,12 @@ def test_where_voxels_lie() -> None:
     x, y, z = axes[0], axes[1][::-1], axes[2] * 0 + 7
     code = morton(x, y, z)
     order = np.argsort(code)
-    made = VoxelMap(0.5, np.full(6, 16, np.uint8), code[order], np.zeros(6, np.float32))
+    voxel_map = VoxelMap(0.5, np.full(6, 16, np.uint8), code[order], np.zeros(6, np.float32))
     for k, axis in enumerate((x, y, z)):
-        low, end = made.axis(k)
+        low, end = voxel_map.axis(k)
         assert low.tolist() == axis[order].tolist()
         assert (end - low).tolist() == [1] * 6
-    assert made.bounds() == (-16384.0, -16384.0, 3.5, 16384.0, 16384.0, 4.0)
+    assert voxel_map.bounds() == (-16384.0, -16384.0, 3.5, 16384.0, 16384.0, 4.0)
     assert (spread(gather(code)) == code & np.uint64(0x249249249249)).all()
     big = VoxelMap(1.0, np.array([1, 1], np.uint8), np.array([0, 7], np.uint64), np.array([-1.0, 0.0], np.float32))
     assert big.bounds() == (-(2.0**15), -(2.0**15), -(2.0**15), 2.0**15, 2.0**15, 2.0**15)
@@ -321,9 +321,9 @@ def test_where_voxels_lie() -> None:
 
 
 def test_voxels_cannot_be_changed() -> None:
-    made = voxels(colour=np.zeros((2, 3), np.uint8))
-    assert made.colour is not None
-    for column in (made.depth, made.code, made.log_odds, made.colour):
+    voxel_map = voxels(colour=np.zeros((2, 3), np.uint8))
+    assert voxel_map.colour is not None
+    for column in (voxel_map.depth, voxel_map.code, voxel_map.log_odds, voxel_map.colour):
         with pytest.raises(ValueError, match="read-only"):
             column[0] = 1
     empty = VoxelMap(0.1, np.empty(0, np.uint8), np.empty(0, np.uint64), np.empty(0, np.float32))

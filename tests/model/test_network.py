@@ -44,13 +44,13 @@ def both(*pairs: tuple[str, str]) -> set[tuple[str, str]]:
 
 
 def test_a_segment_is_two_edges_and_each_end_a_node() -> None:
-    made = from_drawing(drawing(a=line((0, 0), (3, 4), (6, 4))))
-    assert nodes(made) == {"a/0": (0, 0), "a/1": (3, 4), "a/2": (6, 4)}
-    assert edges(made) == both(("a/0", "a/1"), ("a/1", "a/2"))
-    by = {f.id: f for f in made}
+    network = from_drawing(drawing(a=line((0, 0), (3, 4), (6, 4))))
+    assert nodes(network) == {"a/0": (0, 0), "a/1": (3, 4), "a/2": (6, 4)}
+    assert edges(network) == both(("a/0", "a/1"), ("a/1", "a/2"))
+    by = {f.id: f for f in network}
     assert by["a/0_a/1"].geometry.equals(line((0, 0), (3, 4)))
     assert by["a/1_a/0"].geometry.equals(line((3, 4), (0, 0)))
-    assert all(f.properties["drawn_from"] == "a" for f in made)
+    assert all(f.properties["drawn_from"] == "a" for f in network)
 
 
 @pytest.mark.parametrize(
@@ -75,50 +75,52 @@ def test_oneway_wherever_a_format_keeps_it(says: Any, expected: str) -> None:
 
 
 def test_oneway_binds_the_edges() -> None:
-    made = from_drawing(
+    network = from_drawing(
         drawing(a=(line((0, 0), (1, 0)), {"oneway": "yes"}), b=(line((5, 0), (6, 0)), {"oneway": "-1"}))
     )
-    assert edges(made) == {("a/0", "a/1"), ("b/1", "b/0")}
+    assert edges(network) == {("a/0", "a/1"), ("b/1", "b/0")}
 
 
 def test_near_vertices_are_one_node_at_the_first_place() -> None:
-    made = from_drawing(drawing(a=line((0, 0), (10, 0)), b=line((10.06, 0.05), (20, 0)), c=line((10.2, 0), (10.2, 5))))
-    assert nodes(made) == {"a/0": (0, 0), "a/1": (10, 0), "b/1": (20, 0), "c/0": (10.2, 0), "c/1": (10.2, 5)}
-    assert ("a/1", "c/0") in edges(made), "c starts on b's segment"
+    network = from_drawing(
+        drawing(a=line((0, 0), (10, 0)), b=line((10.06, 0.05), (20, 0)), c=line((10.2, 0), (10.2, 5)))
+    )
+    assert nodes(network) == {"a/0": (0, 0), "a/1": (10, 0), "b/1": (20, 0), "c/0": (10.2, 0), "c/1": (10.2, 5)}
+    assert ("a/1", "c/0") in edges(network), "c starts on b's segment"
 
 
 def test_a_dense_line_does_not_shrink_to_a_node() -> None:
     x = np.arange(0, 10, 0.01)
-    made = from_drawing(drawing(a=shapely.linestrings(np.column_stack([x, 0 * x]))))
-    at = sorted(p[0] for p in nodes(made).values())
+    network = from_drawing(drawing(a=shapely.linestrings(np.column_stack([x, 0 * x]))))
+    at = sorted(p[0] for p in nodes(network).values())
     assert len(at) >= 90
     assert min(np.diff(at)) >= 0.1 - 1e-9
-    assert shapely.union_all([f.geometry for f in made]).length == pytest.approx(9.99, abs=0.11)
+    assert shapely.union_all([f.geometry for f in network]).length == pytest.approx(9.99, abs=0.11)
 
 
 def test_crossing_lines_do_not_join_but_an_end_on_a_line_does() -> None:
-    made = from_drawing(drawing(a=line((0, 0), (10, 0)), bridge=line((5, -5), (5, 5)), t=line((2, 0.05), (2, 9))))
-    assert edges(made) == both(("a/0", "t/0"), ("t/0", "a/1"), ("bridge/0", "bridge/1"), ("t/0", "t/1"))
+    network = from_drawing(drawing(a=line((0, 0), (10, 0)), bridge=line((5, -5), (5, 5)), t=line((2, 0.05), (2, 9))))
+    assert edges(network) == both(("a/0", "t/0"), ("t/0", "a/1"), ("bridge/0", "bridge/1"), ("t/0", "t/1"))
 
 
 def test_a_ring_closes() -> None:
-    made = from_drawing(drawing(r=line((0, 0), (1, 0), (1, 1), (0, 0))))
-    assert edges(made) == both(("r/0", "r/1"), ("r/1", "r/2"), ("r/2", "r/0"))
+    network = from_drawing(drawing(r=line((0, 0), (1, 0), (1, 1), (0, 0))))
+    assert edges(network) == both(("r/0", "r/1"), ("r/1", "r/2"), ("r/2", "r/0"))
 
 
 def test_collections_and_outlines() -> None:
     square = shapely.Polygon([(0, 0), (4, 0), (4, 4), (0, 4)], [[(1, 1), (2, 1), (2, 2)]])
     mixed = shapely.GeometryCollection([shapely.MultiLineString([line((9, 9), (9, 8)), line((9, 8), (7, 7))]), square])
     assert len(edges(from_drawing(drawing(m=mixed)))) == 4
-    made = from_drawing(drawing(m=mixed), outlines=True)
-    assert len(edges(made)) == 4 + 2 * (4 + 3)
-    assert len(set(made.ids)) == len(made)
+    network = from_drawing(drawing(m=mixed), outlines=True)
+    assert len(edges(network)) == 4 + 2 * (4 + 3)
+    assert len(set(network.ids)) == len(network)
     assert not len(from_drawing(drawing(p=square)))
 
 
 def test_points_of_interest_are_nodes_and_keep_what_they_say() -> None:
     says = {"name": "Dock", "orientation": [0, 0, 0, 1], "tmap2": {"verts": []}}
-    made = from_drawing(
+    network = from_drawing(
         drawing(
             a=line((0, 0), (10, 0), (20, 0)),
             dock=(shapely.Point(10.04, 0), says),
@@ -126,20 +128,20 @@ def test_points_of_interest_are_nodes_and_keep_what_they_say() -> None:
             far=shapely.Point(99, 99),
         )
     )
-    assert nodes(made) == {"dock": (10.04, 0), "gate": (15, 0.02), "far": (99, 99), "a/0": (0, 0), "a/2": (20, 0)}
-    assert edges(made) == both(("a/0", "dock"), ("dock", "gate"), ("gate", "a/2"))
-    dock = next(f for f in made if f.id == "dock")
+    assert nodes(network) == {"dock": (10.04, 0), "gate": (15, 0.02), "far": (99, 99), "a/0": (0, 0), "a/2": (20, 0)}
+    assert edges(network) == both(("a/0", "dock"), ("dock", "gate"), ("gate", "a/2"))
+    dock = next(f for f in network if f.id == "dock")
     assert dock.properties == {**says, "kind": "node", "drawn_from": "dock"}
 
 
 def test_two_points_of_interest_never_melt_into_one() -> None:
-    made = from_drawing(drawing(p=shapely.Point(0, 0), q=shapely.Point(0.01, 0), a=line((0.02, 0), (5, 0))))
-    assert set(nodes(made)) == {"p", "q", "a/1"}
+    network = from_drawing(drawing(p=shapely.Point(0, 0), q=shapely.Point(0.01, 0), a=line((0.02, 0), (5, 0))))
+    assert set(nodes(network)) == {"p", "q", "a/1"}
 
 
 def test_edges_take_over_what_robots_need() -> None:
-    made = from_drawing(drawing(a=(line((0, 0), (1, 0)), {"speed_limit": 0.5, "action": "row", "colour": "red"})))
-    edge = next(f for f in made if f.properties["kind"] == "edge")
+    network = from_drawing(drawing(a=(line((0, 0), (1, 0)), {"speed_limit": 0.5, "action": "row", "colour": "red"})))
+    edge = next(f for f in network if f.properties["kind"] == "edge")
     assert edge.properties["speed_limit"] == 0.5
     assert edge.properties["action"] == "row"
     assert "colour" not in edge.properties
@@ -149,16 +151,16 @@ def test_ids_stay_unique_and_short() -> None:
     long = "ä" * 512
     rows = [("a", line((0, 0), (1, 0)), {}), (long, line((5, 0), (6, 0)), {}), ("a/0", line((8, 8), (9, 9)), {})]
     poi = ("a/0_a/1", shapely.Point(50, 50), {"kind": "poi"})
-    made = from_drawing(features([*rows, poi], "local"))
-    assert len(set(made.ids)) == len(made)
-    assert max(map(len, made.ids)) <= 512
-    assert edges(made) <= {(a, b) for a in nodes(made) for b in nodes(made)}
+    network = from_drawing(features([*rows, poi], "local"))
+    assert len(set(network.ids)) == len(network)
+    assert max(map(len, network.ids)) <= 512
+    assert edges(network) <= {(a, b) for a in nodes(network) for b in nodes(network)}
 
 
 def test_altitudes_are_kept() -> None:
-    made = from_drawing(drawing(a=line((0, 0, 3), (1, 0, 4)), b=line((5, 5), (6, 6))))
-    assert nodes(made) == {"a/0": (0, 0, 3), "a/1": (1, 0, 4), "b/0": (5, 5), "b/1": (6, 6)}
-    assert next(f for f in made if f.id == "a/0_a/1").geometry.has_z
+    network = from_drawing(drawing(a=line((0, 0, 3), (1, 0, 4)), b=line((5, 5), (6, 6))))
+    assert nodes(network) == {"a/0": (0, 0, 3), "a/1": (1, 0, 4), "b/0": (5, 5), "b/1": (6, 6)}
+    assert next(f for f in network if f.id == "a/0_a/1").geometry.has_z
 
 
 @pytest.mark.parametrize("longitude", [5.0, 179.99999, -180.0])
@@ -175,10 +177,10 @@ def test_on_earth_without_a_datum_metres_are_metres(longitude: float) -> None:
         ("b", line(at(10.05), at(20)), {}),
         ("c", line(at(10.3), at(10.3, 1e-4)), {}),
     ]
-    made = from_drawing(features(rows, "wgs84"))
-    assert set(nodes(made)) == {"a/0", "a/1", "b/1", "c/0", "c/1"}
-    assert not made.local.any()
-    assert nodes(made)["a/0"] == at(0)
+    network = from_drawing(features(rows, "wgs84"))
+    assert set(nodes(network)) == {"a/0", "a/1", "b/1", "c/0", "c/1"}
+    assert not network.local.any()
+    assert nodes(network)["a/0"] == at(0)
 
 
 def test_the_datums_frame_and_mixed_anchors() -> None:
@@ -186,8 +188,8 @@ def test_the_datums_frame_and_mixed_anchors() -> None:
     both_kinds = concatenate([drawing(a=line((500, 500), (510, 500))), earth])
     with pytest.raises(MissingDatum):
         from_drawing(both_kinds)
-    made = from_drawing(both_kinds, frame=local_frame(Datum(52.0, 5.0)))
-    assert made.local.tolist() == [True, True, False, False] * 2
+    network = from_drawing(both_kinds, frame=local_frame(Datum(52.0, 5.0)))
+    assert network.local.tolist() == [True, True, False, False] * 2
 
 
 def test_a_drawing_of_the_whole_earth_is_refused() -> None:
@@ -222,19 +224,19 @@ lines = st.lists(st.lists(st.tuples(coordinate, coordinate), min_size=2, max_siz
 def test_laws(drawn: list[list[tuple[float, float]]]) -> None:
     """Every vertex is within ``join`` of a node, nodes are apart, edges join nodes at their places, twice the same."""
     objects = features([(str(k), shapely.LineString(c), {"kind": "path"}) for k, c in enumerate(drawn)], "local")
-    made = from_drawing(objects, join=0.25)
-    known = nodes(made)
-    at = np.array(list(known.values()))
+    network = from_drawing(objects, join=0.25)
+    positions = nodes(network)
+    at = np.array(list(positions.values()))
     for vertex in (v for c in drawn for v in c):
         assert np.hypot(*(at - vertex).T).min() < 0.25
     gaps = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1)) + np.eye(len(at))
     assert gaps.min() >= 0.25
-    for f in made:
+    for f in network:
         if f.properties["kind"] == "edge":
             a, b = f.properties["source"], f.properties["target"]
             assert a != b
-            assert list(f.geometry.coords) == [known[a], known[b]]
-            assert (b, a) in edges(made)
+            assert list(f.geometry.coords) == [positions[a], positions[b]]
+            assert (b, a) in edges(network)
     again = from_drawing(objects, join=0.25)
-    assert again.ids == made.ids
-    assert again.properties == made.properties
+    assert again.ids == network.ids
+    assert again.properties == network.properties

@@ -52,13 +52,13 @@ def picture(rows: list[list[int]], mode: str = "L") -> bytes:
     ],
 )
 def test_volume_and_extent_of_primitives(shape: dict[str, Any], expected: float, half: tuple[float, ...]) -> None:
-    made = one(shape)
-    assert volume(made) == pytest.approx(expected, rel=0.01)
-    assert made.reshape(-1, 3).max(axis=0) == pytest.approx(half)
-    assert made.reshape(-1, 3).min(axis=0) == pytest.approx([-v for v in half])
-    edges = np.round(np.stack([made, np.roll(made, -1, axis=1)], axis=2).reshape(-1, 6), 9) + 0.0
-    there = {tuple(e) for e in edges}
-    assert all((*e[3:], *e[:3]) in there for e in there), "closed: each edge is met by its reverse"
+    triangles = one(shape)
+    assert volume(triangles) == pytest.approx(expected, rel=0.01)
+    assert triangles.reshape(-1, 3).max(axis=0) == pytest.approx(half)
+    assert triangles.reshape(-1, 3).min(axis=0) == pytest.approx([-v for v in half])
+    edges = np.round(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 6), 9) + 0.0
+    edge_set = {tuple(e) for e in edges}
+    assert all((*e[3:], *e[:3]) in edge_set for e in edge_set), "closed: each edge is met by its reverse"
 
 
 def test_a_round_solid_is_true_to_millimetres() -> None:
@@ -73,17 +73,17 @@ def test_a_round_solid_is_true_to_millimetres() -> None:
 def test_polyline_rings_count_by_even_and_odd() -> None:
     rings = [[[0, 0], [4, 0], [4, 4], [0, 4]], [[1, 1], [1, 3], [3, 3], [3, 1]], [[10, 0], [11, 0], [11, 1], [10, 1]]]
     shape = {"type": "polyline", "points": rings, "height": 2.5}
-    made = one(shape)
-    assert volume(made) == pytest.approx((16 - 4 + 1) * 2.5)
-    assert (made[:, :, 2].min(), made[:, :, 2].max()) == (0, 2.5)
+    triangles = one(shape)
+    assert volume(triangles) == pytest.approx((16 - 4 + 1) * 2.5)
+    assert (triangles[:, :, 2].min(), triangles[:, :, 2].max()) == (0, 2.5)
     ground = solids.footprint({"shapes": [shape]}, {})
     assert ground.area == pytest.approx(13)
     assert ground.is_valid
 
 
 def test_a_crossed_ring_is_still_a_solid() -> None:
-    made = one({"type": "polyline", "points": [[[0, 0], [2, 2], [2, 0], [0, 2]]], "height": 1})
-    assert volume(made) == pytest.approx(2)
+    triangles = one({"type": "polyline", "points": [[[0, 0], [2, 2], [2, 0], [0, 2]]], "height": 1})
+    assert volume(triangles) == pytest.approx(2)
 
 
 def test_rotation_is_about_fixed_axes() -> None:
@@ -104,9 +104,9 @@ def test_rotation_agrees_with_scipy(angles: tuple[float, float, float]) -> None:
 
 def test_object_pose_then_shape_pose_then_scale() -> None:
     shape = {"type": "mesh", "file": "m/a.stl", "scale": [10, 1, 1], "pose": [1, 0, 0, 0, 0, math.pi / 2]}
-    made = one(shape, {"m/a.stl": stl(TRIANGLE)}, pose=[100, 0, 5, 0, 0, math.pi / 2])
+    triangles = one(shape, {"m/a.stl": stl(TRIANGLE)}, pose=[100, 0, 5, 0, 0, math.pi / 2])
     # (2,0,0) -> scale (20,0,0) -> turned (0,20,0) -> shifted (1,20,0) -> turned (-20,1,0) -> (80,1,5)
-    assert made[0] == pytest.approx(np.array([[100, 1, 5], [80, 1, 5], [100, -2, 6]]))
+    assert triangles[0] == pytest.approx(np.array([[100, 1, 5], [80, 1, 5], [100, -2, 6]]))
 
 
 def test_a_mirrored_mesh_keeps_its_outside() -> None:
@@ -128,27 +128,27 @@ def test_a_part_of_a_mesh() -> None:
 
 def test_planes_and_visuals_count_only_where_asked() -> None:
     plane = {"type": "plane", "normal": [0, 0, 1], "size": [10, 20]}
-    said = {"shapes": [plane, {**BOX, "visual": True}]}
-    assert len(solids.triangles(said, {})) == 0
-    assert solids.bounds(said, {}) is None
-    assert solids.footprint(said, {}).is_empty
-    assert solids.bounds(said, {}, planes=True) == (-5, -10, 0, 5, 10, 0)
-    assert solids.size(said, {}, visuals=True) == (2, 4, 6)
+    properties = {"shapes": [plane, {**BOX, "visual": True}]}
+    assert len(solids.triangles(properties, {})) == 0
+    assert solids.bounds(properties, {}) is None
+    assert solids.footprint(properties, {}).is_empty
+    assert solids.bounds(properties, {}, planes=True) == (-5, -10, 0, 5, 10, 0)
+    assert solids.size(properties, {}, visuals=True) == (2, 4, 6)
     for normal, axis in (([0, 0, -1], 2), ([1, 0, 0], 0), ([0, 1, 0], 1)):
-        made = one({**plane, "normal": normal})
-        assert np.ptp(made.reshape(-1, 3)[:, axis]) == pytest.approx(0, abs=1e-12)
-        facing = np.cross(made[0, 1] - made[0, 0], made[0, 2] - made[0, 0])
+        triangles = one({**plane, "normal": normal})
+        assert np.ptp(triangles.reshape(-1, 3)[:, axis]) == pytest.approx(0, abs=1e-12)
+        facing = np.cross(triangles[0, 1] - triangles[0, 0], triangles[0, 2] - triangles[0, 0])
         assert facing / np.linalg.norm(facing) == pytest.approx(normal)
 
 
 def test_a_height_map_is_closed_and_north_is_up() -> None:
     files = {"h.png": picture([[0, 0, 200], [0, 0, 0], [0, 0, 0]])}
     shape = {"type": "heightmap", "file": "h.png", "size": [4, 2, 3], "position": [10, 0, 1]}
-    made = one(shape, files)
-    highest = made.reshape(-1, 3)[made.reshape(-1, 3)[:, 2].argmax()]
+    triangles = one(shape, files)
+    highest = triangles.reshape(-1, 3)[triangles.reshape(-1, 3)[:, 2].argmax()]
     assert highest.tolist() == [12, 1, 4], "the brightest pixel, top right, is at the full height"
     # Two triangles of area 1 rise to a height of 3 at one corner each, on a floor 3 mm thick.
-    assert volume(solids.placed(made, (-10, 0, -1, 0, 0, 0))) == pytest.approx(2 * 1 * 3 / 3 + 8 * 0.003)
+    assert volume(solids.placed(triangles, (-10, 0, -1, 0, 0, 0))) == pytest.approx(2 * 1 * 3 / 3 + 8 * 0.003)
     deep = one(shape, {"h.png": picture([[0, 65535], [0, 0]], "I;16")})
     assert deep[:, :, 2].max() == pytest.approx(4)
     assert volume(deep) > 0
@@ -159,12 +159,12 @@ def test_a_large_height_map_keeps_its_peaks(monkeypatch: pytest.MonkeyPatch) -> 
     rows = [[0] * 9 for _ in range(6)]
     rows[0][8] = 100
     rows[5][4] = 50
-    made = one({"type": "heightmap", "file": "h.png", "size": [3, 2, 10]}, {"h.png": picture(rows)})
-    assert len(made) == 2 * (3 - 1) * (3 - 1) + 2 + 2 * (2 + 2 + 2 + 2)
-    top = made.reshape(-1, 3)
+    triangles = one({"type": "heightmap", "file": "h.png", "size": [3, 2, 10]}, {"h.png": picture(rows)})
+    assert len(triangles) == 2 * (3 - 1) * (3 - 1) + 2 + 2 * (2 + 2 + 2 + 2)
+    top = triangles.reshape(-1, 3)
     assert top[top[:, 2] == 10][0].tolist() == [1.5, 1, 10]
     assert top[top[:, 2] == 5][0].tolist() == [0, -1, 5]
-    assert volume(made) > 0
+    assert volume(triangles) > 0
 
 
 def test_footprints() -> None:
@@ -243,8 +243,8 @@ def test_degenerate_solids_are_no_error() -> None:
         {"type": "cylinder", "radius": 0, "length": 0},
         {"type": "polyline", "points": [[[0, 0], [1, 1]]], "height": 1},
     ):
-        made = one(shape)
-        assert np.isfinite(made).all()
+        triangles = one(shape)
+        assert np.isfinite(triangles).all()
         assert solids.footprint({"shapes": [shape]}, {}).area == 0
 
 

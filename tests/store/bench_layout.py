@@ -51,12 +51,15 @@ def bench(store: Store, n: int) -> None:
     """All rows of the table."""
     store.migrate()
     store.create_environment("farm", datum=Datum(53.2, -0.5))
-    whole = network(n)
-    commit(store, "upload", Replace(KEY, whole))
+    network_part = network(n)
+    commit(store, "upload", Replace(KEY, network_part))
     first = store.version("farm")
-    row("the same upload again", least(lambda: store.prepare(first, Changes((Replace(KEY, whole),))), 3, store))
+    row(
+        "the same upload again",
+        shortest_time(lambda: store.prepare(first, Changes((Replace(KEY, network_part),))), 3, store),
+    )
     nodes = np.arange(n // 2)
-    xy = shapely.get_coordinates(whole.geometry[nodes])
+    xy = shapely.get_coordinates(network_part.geometry[nodes])
     near = nodes[np.argsort(((xy - [700, 900]) ** 2).sum(axis=1))[: n // 100]]
     scattered = np.random.default_rng(2).choice(nodes, n // 100, replace=False)
     for name, some, metres in (
@@ -65,27 +68,33 @@ def bench(store: Store, n: int) -> None:
         ("1 % close together, moved", near, 0.2),
         ("1 % scattered", scattered, 0.0),
     ):
-        commit(store, f"commit {name}", Put(KEY, edited(whole, some, metres, 0)))
+        commit(store, f"commit {name}", Put(KEY, edited(network_part, some, metres, 0)))
         for k in range(1, 4):
-            commit(store, "", Put(KEY, edited(whole, some, metres, k)))
+            commit(store, "", Put(KEY, edited(network_part, some, metres, k)))
     head = store.version("farm")
     for name, version in (("head", head), ("first version", first)):
-        row(f"read, {name}", least(lambda version=version: store.load(version), 4, store))  # type: ignore[misc]
+        row(f"read, {name}", shortest_time(lambda version=version: store.load(version), 4, store))  # type: ignore[misc]
         row(
             f"box of 1 %, {name}",
-            least(lambda version=version: store.features(version, KEY, bbox=BOX), 4, store),  # type: ignore[misc]
+            shortest_time(lambda version=version: store.features(version, KEY, bbox=BOX), 4, store),  # type: ignore[misc]
         )
-    row("diff, near (one feature)", least(lambda: store.diff(first, store.version("farm", first.number + 1)), 4, store))
-    row("diff, far (first to head)", least(lambda: store.diff(first, head), 3, store))
+    row(
+        "diff, near (one feature)",
+        shortest_time(lambda: store.diff(first, store.version("farm", first.number + 1)), 4, store),
+    )
+    row("diff, far (first to head)", shortest_time(lambda: store.diff(first, head), 3, store))
     changed = Features(
-        whole.ids, whole.geometry, tuple({**p, "speed_limit": 2.5} for p in whole.properties), whole.local
+        network_part.ids,
+        network_part.geometry,
+        tuple({**p, "speed_limit": 2.5} for p in network_part.properties),
+        network_part.local,
     )
     commit(store, "replace, all changed", Replace(KEY, changed))
 
 
-def edited(whole: Features, some: Any, metres: float, k: int) -> Features:
+def edited(original: Features, some: Any, metres: float, k: int) -> Features:
     """These features with another name, moved a little or not."""
-    part = whole.take(some)
+    part = original.take(some)
     moved = points(shapely.get_coordinates(part.geometry) + np.random.default_rng(k).random((len(part), 2)) * metres)
     return Features(part.ids, moved, tuple({**p, "name": f"v{k}"} for p in part.properties), part.local.copy())
 
@@ -105,7 +114,7 @@ def commit(store: Store, name: str, *operations: Operation) -> None:
         row(name, (end - start) * 1e3, more)
 
 
-def least(run: Callable[[], object], times: int, store: Store) -> float:
+def shortest_time(run: Callable[[], object], times: int, store: Store) -> float:
     """The least milliseconds of several runs, each with empty memory."""
     out = []
     for _ in range(times):

@@ -25,16 +25,16 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 @pytest.fixture
 def store(database_url: str, tmp_path: Path) -> Iterator[Store]:
     """A migrated store."""
-    made = Store(database_url, tmp_path / "blobs")
-    made.migrate()
-    yield made
-    made.close()
+    new_store = Store(database_url, tmp_path / "blobs")
+    new_store.migrate()
+    yield new_store
+    new_store.close()
 
 
 @pytest.fixture
 def sqlite_store(tmp_path: Path) -> Iterator[Store]:
     """A store on SQLite, for what does not depend on the database."""
-    made = Store(f"sqlite:///{tmp_path / 'only.sqlite'}", tmp_path / "only-blobs")
-    made.migrate()
-    yield made
-    made.close()
+    new_store = Store(f"sqlite:///{tmp_path / 'only.sqlite'}", tmp_path / "only-blobs")
+    new_store.migrate()
+    yield new_store
+    new_store.close()

@@ -65,10 +65,10 @@ def test_what_json_has_no_word_for_is_refused(bad):
 def test_kinds_of_numbers_stay_apart_and_zero_has_no_sign():
     hashes = {part_hash(features([("a", shapely.Point(0, 0), {"v": v})], "local")) for v in (1, 1.0, True, "1")}
     assert len(hashes) == 4
-    here = shapely.Point(0, 0)
-    zero = part_hash(features([("a", here, {"v": 0.0, "w": [0.0]})], "local"))
+    origin = shapely.Point(0, 0)
+    zero = part_hash(features([("a", origin, {"v": 0.0, "w": [0.0]})], "local"))
     assert zero == part_hash(features([("a", shapely.Point(-0.0, 0), {"v": -0.0, "w": [-0.0]})], "local"))
-    assert zero == part_hash(features([("a", here, {"w": (np.float64(0),), "v": np.float32(0)})], "local"))
+    assert zero == part_hash(features([("a", origin, {"w": (np.float64(0),), "v": np.float32(0)})], "local"))
 
 
 def test_order_of_items_and_keys_does_not_count():

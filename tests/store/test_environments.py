@@ -23,10 +23,18 @@ from tests.store.samples import DATUM, GRID, OBJECTS, TOPOLOGY, everything, grid
 
 
 def test_create_describe_find(store: Store):
-    made = store.create_environment("farm-1", title="The Farm", description="of apples", tags=("uk", "uk", "trial"))
-    assert (made.head, made.tags, made.datum, made.bounds, made.deleted) == (0, ("uk", "trial"), None, None, None)
-    assert made.created.tzinfo is not None
-    assert store.environment("farm-1") == made
+    environment = store.create_environment(
+        "farm-1", title="The Farm", description="of apples", tags=("uk", "uk", "trial")
+    )
+    assert (environment.head, environment.tags, environment.datum, environment.bounds, environment.deleted) == (
+        0,
+        ("uk", "trial"),
+        None,
+        None,
+        None,
+    )
+    assert environment.created.tzinfo is not None
+    assert store.environment("farm-1") == environment
     assert store.version("farm-1").number == 0
     assert store.version("farm-1").parts == ()
     for name in ("a" * 64, "", "Farm", "-a", "ä", "a/b", "robots", "server", "a b", "**"):
@@ -85,10 +93,10 @@ def test_extents_cross_the_antimeridian(store: Store, anchor: str):
     store.create_environment("fiji", datum=Datum(-17.0, 179.999))
     if anchor == "wgs84":
         rows_ = [("a", shapely.Point(179.99, -17.01), {}), ("b", shapely.Point(-179.98, -16.9), {})]
-        made = save(store, "fiji", Replace(OBJECTS, features(rows_, "wgs84")))
-        assert made.part(OBJECTS).bounds["wgs84"] == (179.99, -17.01, -179.98, -16.9)  # type: ignore[union-attr]
+        version = save(store, "fiji", Replace(OBJECTS, features(rows_, "wgs84")))
+        assert version.part(OBJECTS).bounds["wgs84"] == (179.99, -17.01, -179.98, -16.9)  # type: ignore[union-attr]
         again = save(store, "fiji", Put(OBJECTS, features([("c", shapely.Point(-179.99, -17), {})], "wgs84")))
-        assert again.part(OBJECTS).bounds == made.part(OBJECTS).bounds  # type: ignore[union-attr]
+        assert again.part(OBJECTS).bounds == version.part(OBJECTS).bounds  # type: ignore[union-attr]
     else:
         rows_ = [("a", shapely.Point(-900, -900), {}), ("b", shapely.Point(2000, 2000), {})]
         save(store, "fiji", Replace(OBJECTS, features(rows_, "local")))
@@ -96,16 +104,16 @@ def test_extents_cross_the_antimeridian(store: Store, anchor: str):
     assert west > 179.9
     assert east < -179.9
     for longitude in (179.9995, -179.9995, 180.0, -180.0):
-        here = (longitude, -17.0, longitude, -17.0)
-        assert [e.name for e in store.environments(bbox=here)[0]] == ["fiji"], longitude
+        bbox = (longitude, -17.0, longitude, -17.0)
+        assert [e.name for e in store.environments(bbox=bbox)[0]] == ["fiji"], longitude
     for longitude in (0.0, 179.5, -179.5):
         assert store.environments(bbox=(longitude, -17.0, longitude, -17.0))[0] == []
     assert store.environments(bbox=(179.0, -18, -179.0, -16))[0]
     assert store.environments(bbox=(-179.99, -18, -179.0, -16))[0]
     assert not store.environments(bbox=(-179.0, -18, 179.0, -16))[0]
-    found = {f.id for f in store.find((179.0, -18, -179.0, -16))}
-    assert {"a", "b"} <= found
-    assert {f.id for f in store.find((-180.0, -18, -179.0, -16))} == found - {"a"}
+    ids = {f.id for f in store.find((179.0, -18, -179.0, -16))}
+    assert {"a", "b"} <= ids
+    assert {f.id for f in store.find((-180.0, -18, -179.0, -16))} == ids - {"a"}
     inside = store.features(store.version("fiji"), OBJECTS, bbox=(179.0, -18, -179.0, -16), crs="wgs84")
     assert {"a", "b"} <= set(inside.ids)
 
@@ -138,38 +146,38 @@ def test_the_index_follows_every_head(store: Store):
                 out |= {(layer, i) for i in part.ids}
         return out
 
-    def found() -> set[tuple[str, str]]:
+    def indexed_items() -> set[tuple[str, str]]:
         return {(f.key.layer, f.id) for f in store.find(everywhere, limit=10_000)}
 
-    assert found() == expected()
+    assert indexed_items() == expected()
     far = features([("n3", shapely.Point(5000, 0), {})], "local")
     head = save(store, "farm", Delete(TOPOLOGY, ("n1", "n2")), Put(TOPOLOGY, far))
-    assert found() == expected()
-    assert ("topology", "n1") not in found()
+    assert indexed_items() == expected()
+    assert ("topology", "n1") not in indexed_items()
     (moved,) = [f for f in store.find(everywhere, layer="topology", limit=10_000) if f.id == "n3"]
     assert moved.box[0] > -0.43
     save(store, "farm", datum=Datum(10.0, 20.0))
-    assert found() == expected()
+    assert indexed_items() == expected()
     (moved,) = [f for f in store.find((19, 9, 21, 11), layer="topology", limit=10_000) if f.id == "n3"]
     assert moved.box[1] == pytest.approx(10.0, abs=0.01)
     store.revert("farm", head.number, author="a", message="")
     many = network(5000)
     save(store, "farm", Replace(TOPOLOGY, many))
-    assert found() == expected()
+    assert indexed_items() == expected()
     assert len(store.find(everywhere, limit=7)) == 7
     save(store, "farm", datum=None)
-    assert found() == {("objects", "e"), ("objects", "m"), ("location", "fence")}
+    assert indexed_items() == {("objects", "e"), ("objects", "m"), ("location", "fence")}
     store.rebuild_index()
-    assert found() == {("objects", "e"), ("objects", "m"), ("location", "fence")}
+    assert indexed_items() == {("objects", "e"), ("objects", "m"), ("location", "fence")}
     store.delete_environment("farm")
-    assert found() == set()
+    assert indexed_items() == set()
 
 
 def test_delete_restore_purge(store: Store):
     store.create_environment("farm", datum=DATUM)
     save(store, "farm", Replace(GRID, grid()))
-    gone = store.delete_environment("farm", "ann")
-    assert gone.deleted is not None
+    environment = store.delete_environment("farm", "ann")
+    assert environment.deleted is not None
     for call in (store.environment, store.version, store.delete_environment, store.channels):
         with pytest.raises(Gone):
             call("farm")
@@ -208,10 +216,10 @@ def test_a_clone_shares_content_and_keeps_its_own_history(store: Store):
     store.add_sources("farm", 2, [Source("o", 4, digest)])
     clone = store.create_environment("copy", clone=store.version("farm"), author="ann")
     assert (clone.head, clone.root, clone.datum) == (1, store.version("farm").root, DATUM)
-    made = store.version("copy")
-    assert made.changes["topology"]["added"] == 300
-    assert [s.name for s in made.sources] == ["o"]
-    assert made.author == "ann"
+    version = store.version("copy")
+    assert version.changes["topology"]["added"] == 300
+    assert [s.name for s in version.sources] == ["o"]
+    assert version.author == "ann"
     other = store.create_environment("moved", clone=store.version("farm"), datum=Datum(1, 2))
     assert other.datum == Datum(1, 2)
     assert other.root != clone.root
@@ -252,10 +260,10 @@ def test_the_last_events_of_all_environments(store: Store):
     store.update_environment("moved", new_name="here")
     end = store.last_position()
 
-    def last(each: int, most: int, position: int = end) -> list[tuple[str, int]]:
-        found = store.last_events(position, each, most)
-        assert [e.position for e in found] == sorted(e.position for e in found)
-        return [(e.environment, e.sequence) for e in found]
+    def last(each: int, limit: int, position: int = end) -> list[tuple[str, int]]:
+        events = store.last_events(position, each, limit)
+        assert [e.position for e in events] == sorted(e.position for e in events)
+        return [(e.environment, e.sequence) for e in events]
 
     begun = [("busy", n) for n in range(1, 7)] + [("calm", 1), ("calm", 2), ("gone", 1), ("gone", 2)]
     ended = [("gone", 3), ("moved", 4), ("here", 5)]
@@ -469,6 +477,6 @@ def test_jobs(store: Store):
 def test_parts_of_several_levels_are_told_apart(store: Store):
     store.create_environment("farm")
     first, second = PartKey("occupancy", "ground", "map"), PartKey("occupancy", "first", "map")
-    made = save(store, "farm", Replace(first, grid()), Replace(second, grid(seed=1)))
-    assert set(made.changes["occupancy"]) == {"first/map", "ground/map"}
+    version = save(store, "farm", Replace(first, grid()), Replace(second, grid(seed=1)))
+    assert set(version.changes["occupancy"]) == {"first/map", "ground/map"}
     assert rows(features([], "local")) == {}

@@ -79,8 +79,8 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
         child.send_signal(signal.SIGKILL)
         for line in (*lines, *child.stdout):
             if line.startswith("committed") and line.endswith("\n"):
-                _, number, known = line.split()
-                acknowledged[int(number)] = known
+                _, number, root_hash = line.split()
+                acknowledged[int(number)] = root_hash
         child.stdout.close()
         child.wait()
         again = Store(store.database_url, store.blob_dir)
@@ -90,8 +90,8 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
         head = again.version("farm")
         listed = again.versions("farm", limit=1000)
         assert [v.number for v in listed] == list(range(head.number, -1, -1))
-        for number, known in acknowledged.items():
-            assert again.version("farm", number).root == known
+        for number, root_hash in acknowledged.items():
+            assert again.version("farm", number).root == root_hash
         assert [e.sequence for e in again.events("farm", limit=10_000)] == list(range(1, head.number + 2))
         for version in listed[:2]:
             loaded = again.load(version)
@@ -118,8 +118,8 @@ def temporary(store: Store) -> list[Path]:
 
 def files_in(store: Store) -> list[tuple[Path, int]]:
     """All stored files with their times."""
-    found = sorted(p for p in store.blob_dir.rglob("*") if p.is_file() and not p.name.startswith("."))
-    return [(p, p.stat().st_mtime_ns) for p in found]
+    files = sorted(p for p in store.blob_dir.rglob("*") if p.is_file() and not p.name.startswith("."))
+    return [(p, p.stat().st_mtime_ns) for p in files]
 
 
 def read_all(store: Store, version: Version) -> None:
@@ -134,7 +134,7 @@ def read_all(store: Store, version: Version) -> None:
 
 def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
     store.create_environment("farm", datum=DATUM)
-    made = save(store, "farm", *replaces(everything()))
+    version = save(store, "farm", *replaces(everything()))
     with store._database.read() as connection:
         chunks = connection.exec_driver_sql("SELECT hash, data FROM chunk").all()
     mark = "?" if store.database_url.startswith("sqlite") else "%s"
@@ -150,7 +150,7 @@ def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
                     connection.exec_driver_sql(f"UPDATE chunk SET data = {mark} WHERE hash = {mark}", (wrong, name))
             store._chunks.forget()
             with pytest.raises(Damaged):
-                read_all(store, made)
+                read_all(store, version)
         with store._database.write() as connection:
             if store.database_url.startswith("sqlite"):
                 statement = "INSERT OR REPLACE INTO chunk (hash, data, used) VALUES (?, ?, 0)"
@@ -158,13 +158,13 @@ def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
                 statement = "INSERT INTO chunk (hash, data, used) VALUES (%s, %s, 0)"
             connection.exec_driver_sql(statement, (name, data))
         store._chunks.forget()
-        assert_same_layers(store.load(made), Layers(everything(), DATUM))
+        assert_same_layers(store.load(version), Layers(everything(), DATUM))
 
 
 def test_collecting_stops_at_damage(sqlite_store: Store):
     sqlite_store.create_environment("farm")
-    made = save(sqlite_store, "farm", Replace(GRID, grid()))
-    root = bytes.fromhex(made.parts[0].hash)
+    version = save(sqlite_store, "farm", Replace(GRID, grid()))
+    root = bytes.fromhex(version.parts[0].hash)
     with sqlite_store._database.write() as connection:
         connection.exec_driver_sql("DELETE FROM chunk WHERE hash = ?", (root,))
         before = connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one()

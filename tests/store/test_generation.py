@@ -25,17 +25,17 @@ def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> No
 
 
 def test_another_process_sees_it(tmp_path: Path) -> None:
-    here = Generation(tmp_path)
-    before = here()
+    counter = Generation(tmp_path)
+    before = counter()
     code = "from pathlib import Path; from app.store.generation import Generation; "
     code += f"Generation(Path({str(tmp_path)!r})).change()"
     subprocess.run([sys.executable, "-c", code], check=True)
-    assert here() != before
-    here.close()
+    assert counter() != before
+    counter.close()
 
 
 def test_without_a_folder_it_works_in_this_process(tmp_path: Path) -> None:
-    here = Generation(tmp_path / "absent")
-    before = here()
-    here.change()
-    assert here() != before
+    counter = Generation(tmp_path / "absent")
+    before = counter()
+    counter.change()
+    assert counter() != before

@@ -127,6 +127,6 @@ def test_overlays_are_bounded_and_tidied(farm: Store, monkeypatch: pytest.Monkey
 
 def test_of_very_many_the_newest_are_listed(farm: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(overlays, "MAX_LISTED", 2)
-    made = [farm.add_overlay(blocked(edge=f"e{k}", created=NOW + timedelta(seconds=k)))[0] for k in range(3)]
+    overlay_list = [farm.add_overlay(blocked(edge=f"e{k}", created=NOW + timedelta(seconds=k)))[0] for k in range(3)]
     assert [o.edge for o in farm.overlays("farm")] == ["e1", "e2"]
-    assert made[0].edge == "e0"
+    assert overlay_list[0].edge == "e0"

@@ -60,8 +60,8 @@ def names(store: Store, latitude: float, longitude: float, **more: Any) -> list[
 
 
 def match(store: Store, name: str, latitude: float, longitude: float) -> Match | None:
-    found = {e.name: m for e, m in store.locate(latitude, longitude)[0]}
-    return found.get(name)
+    matches = {e.name: m for e, m in store.locate(latitude, longitude)[0]}
+    return matches.get(name)
 
 
 def stale(store: Store) -> list[str]:
@@ -80,12 +80,12 @@ def test_two_fields_of_one_farm_answer_for_their_own(store: Store):
     assert names(store, 53.2705, -0.5295) == ["north"]
     assert names(store, 53.2685, -0.5295) == ["south"]
     assert names(store, 53.2695, -0.5295) == []
-    found = match(store, "north", 53.2705, -0.5295)
-    assert found is not None
-    assert found.by == "fence"
-    assert found.area == pytest.approx(surface(fields["north"]), abs=0.1)
-    assert found.area == pytest.approx(66.7 * 111.3, rel=0.01)
-    assert found.distance == pytest.approx(math.hypot(33.4, 55.7), rel=0.01)
+    position_match = match(store, "north", 53.2705, -0.5295)
+    assert position_match is not None
+    assert position_match.by == "fence"
+    assert position_match.area == pytest.approx(surface(fields["north"]), abs=0.1)
+    assert position_match.area == pytest.approx(66.7 * 111.3, rel=0.01)
+    assert position_match.distance == pytest.approx(math.hypot(33.4, 55.7), rel=0.01)
     assert {e.name for e in store.environments(bbox=(-0.53, 53.2694, -0.5295, 53.2696))[0]} == {"north", "south"}
     assert stale(store) == []
 
@@ -103,9 +103,9 @@ def test_fences_have_holes_and_several_pieces(store: Store):
     assert names(store, 53.265, -0.515) == []
     for edge in ((53.26, -0.53), (53.27, -0.505), (53.265, -0.526)):
         assert names(store, *edge) == ["yard"], "the edge belongs to it"
-    found = match(store, "yard", 53.265, -0.505)
-    assert found is not None
-    assert found.area == pytest.approx(surface(ring) + surface(island), abs=0.1)
+    position_match = match(store, "yard", 53.265, -0.505)
+    assert position_match is not None
+    assert position_match.area == pytest.approx(surface(ring) + surface(island), abs=0.1)
 
 
 def test_both_databases_agree_with_geometry(store: Store):
@@ -142,12 +142,12 @@ def test_fences_across_the_antimeridian(store: Store, form: str):
     for longitude in (179.98, -179.98, 0.0, 90.0, -90.0, *((-179.9995,) if form == "touching" else ())):
         assert names(store, -17.0, longitude) == [], longitude
     assert names(store, -16.98, 179.9995) == []
-    found = match(store, "fiji", -17.0, 180.0)
-    assert found is not None
+    position_match = match(store, "fiji", -17.0, 180.0)
+    assert position_match is not None
     width = {"crossing": 0.02, "cut": 0.02, "touching": 0.01}.get(form)
     if width is not None:
-        assert found.area == pytest.approx(surface(shapely.box(0, -17.01, width, -16.99)), rel=1e-6)
-    assert found.distance == pytest.approx(106.5, rel=0.01)
+        assert position_match.area == pytest.approx(surface(shapely.box(0, -17.01, width, -16.99)), rel=1e-6)
+    assert position_match.distance == pytest.approx(106.5, rel=0.01)
 
 
 def test_a_fence_without_area_is_none(store: Store):
@@ -165,14 +165,14 @@ def test_a_fence_without_area_is_none(store: Store):
     assert names(store, 53.265, -0.529) == ["bow"]
     assert names(store, 53.265, -0.521) == ["bow"]
     assert names(store, 53.269, -0.525) == [], "between the two triangles"
-    found = store.locate(53.2605, -0.5255)[0]
-    assert {(e.name, m.by) for e, m in found} == {(name, "datum") for name in ("line", "path", "empty")}
+    environments = store.locate(53.2605, -0.5255)[0]
+    assert {(e.name, m.by) for e, m in environments} == {(name, "datum") for name in ("line", "path", "empty")}
 
 
 def test_what_is_called_a_fence_wins_over_other_polygons(store: Store):
     store.create_environment("farm", datum=HERE)
-    own = shapely.box(-0.525, 53.268, -0.524, 53.269)
-    save(store, "farm", Replace(SITE, features([("farm", FARM, {}), ("own", own, {"kind": "fence"})], "wgs84")))
+    boundary = shapely.box(-0.525, 53.268, -0.524, 53.269)
+    save(store, "farm", Replace(SITE, features([("farm", FARM, {}), ("own", boundary, {"kind": "fence"})], "wgs84")))
     assert names(store, 53.2685, -0.5245) == ["farm"]
     assert names(store, 53.26, -0.53) == []
     save(store, "farm", Delete(SITE, ("own",)))
@@ -210,10 +210,10 @@ def test_floor_is_what_grids_networks_and_floors_show(store: Store):
     assert hits(-350, -350) == {"hall": "floor"}
     assert hits(200, -500) == {}, "a building is no floor"
     assert hits(0, 0) == {"mask": "datum", "unknown": "datum"}
-    found = match(store, "hall", *at(turned, -350, -350))
-    assert found is not None
-    assert found.area == pytest.approx(100 * 100 + 4 * 100 * 10 + math.pi * 100, rel=1e-3)
-    assert found.distance == pytest.approx(math.hypot(350, 350), abs=0.1)
+    position_match = match(store, "hall", *at(turned, -350, -350))
+    assert position_match is not None
+    assert position_match.area == pytest.approx(100 * 100 + 4 * 100 * 10 + math.pi * 100, rel=1e-3)
+    assert position_match.distance == pytest.approx(math.hypot(350, 350), abs=0.1)
 
 
 @pytest.mark.parametrize("anchor", ["local", "wgs84"])
@@ -268,8 +268,8 @@ def test_fences_first_then_the_smallest_then_the_nearest_datum(store: Store):
     cursor: str | None = None
     pages = 0
     while pages == 0 or cursor is not None:
-        found, cursor = store.locate(HERE.latitude, HERE.longitude, limit=2, cursor=cursor)
-        seen += [e.name for e, _ in found]
+        environments, cursor = store.locate(HERE.latitude, HERE.longitude, limit=2, cursor=cursor)
+        seen += [e.name for e, _ in environments]
         pages += 1
     assert (seen, pages) == (expected, 3)
     assert names(store, HERE.latitude, HERE.longitude, allowed="*r*") == ["large", "room", "b-near", "a-far"]
@@ -289,32 +289,32 @@ def test_areas_follow_every_change_in_its_transaction(store: Store):
     west, east = (53.265, -0.529), (53.265, -0.521)
     one, other = shapely.box(-0.53, 53.26, -0.525, 53.27), shapely.box(-0.525, 53.26, -0.52, 53.27)
 
-    def where() -> tuple[list[str], list[str]]:
+    def matching_names() -> tuple[list[str], list[str]]:
         assert stale(store) == []
         return names(store, *west), names(store, *east)
 
     store.create_environment("farm", datum=HERE)
     save(store, "farm", Replace(SITE, fence(one)))
-    assert where() == (["farm"], [])
+    assert matching_names() == (["farm"], [])
     save(store, "farm", Put(SITE, fence(other)))
-    assert where() == ([], ["farm"])
+    assert matching_names() == ([], ["farm"])
     save(store, "farm", Replace(TOPOLOGY, network(50, side=300)))
-    assert where() == ([], ["farm"])
+    assert matching_names() == ([], ["farm"])
     store.revert("farm", 2, author="me", message="back")
-    assert where() == (["farm"], [])
+    assert matching_names() == (["farm"], [])
     store.create_environment("copy", clone=store.version("farm", 4))
-    assert where() == (["farm"], ["copy"])
+    assert matching_names() == (["farm"], ["copy"])
     store.update_environment("copy", new_name="second")
-    assert where() == (["farm"], ["second"])
+    assert matching_names() == (["farm"], ["second"])
     store.delete_environment("second")
-    assert where() == (["farm"], [])
+    assert matching_names() == (["farm"], [])
     assert names(store, *east, deleted=True) == ["second"]
     store.restore_environment("second")
-    assert where() == (["farm"], ["second"])
+    assert matching_names() == (["farm"], ["second"])
     save(store, "second", Drop(SITE))
-    assert where() == (["farm"], [])
-    found = match(store, "second", *at(HERE, 150, 150))
-    assert (found.by if found else "none") == "floor"
+    assert matching_names() == (["farm"], [])
+    position_match = match(store, "second", *at(HERE, 150, 150))
+    assert (position_match.by if position_match else "none") == "floor"
     moved = Datum(53.3, -0.6)
     base = store.version("second")
     store.commit("second", store.prepare(base, Changes(datum=moved)), author="me", message="moved")
@@ -360,26 +360,26 @@ def test_several_servers_catch_up_together(store: Store, database_url: str, monk
     compute = position.area_of
 
     def slow(*arguments: Any) -> Any:
-        found = compute(*arguments)
+        result = compute(*arguments)
         if not moved.is_set():  # a commit comes between the computing and the writing
             moved.set()
             save(store, "farm-0", Replace(SITE, fence(shapely.box(-0.5, 53.0, -0.4, 53.1))))
             with store._database.write() as connection:
                 connection.execute(update(table).where(table.c.name == "farm-0").values(area_stale=True))
-        return found
+        return result
 
     monkeypatch.setattr(position, "area_of", slow)
     others = [Store(database_url, store.blob_dir) for _ in range(3)]
     try:
         with ThreadPoolExecutor(3) as threads:
-            found = list(threads.map(lambda s: names(s, 53.26, -0.53), others))
+            answers = list(threads.map(lambda s: names(s, 53.26, -0.53), others))
     finally:
         for other in others:
             other.close()
     assert stale(store) == []
     assert names(store, 53.26, -0.53) == [f"farm-{k}" for k in range(1, 8)]
     assert names(store, 53.05, -0.45) == ["farm-0"]
-    assert all(set(answer) <= {f"farm-{k}" for k in range(8)} and len(answer) >= 7 for answer in found)
+    assert all(set(answer) <= {f"farm-{k}" for k in range(8)} and len(answer) >= 7 for answer in answers)
     with store._database.read() as connection:
         assert len(connection.execute(select(tables.area)).all()) == 8
 
@@ -402,8 +402,8 @@ def test_damaged_content_of_one_environment_keeps_no_other_away(
 
     calls: list[int] = []
     monkeypatch.setattr(position, "area_of", fail)
-    found = names(store, HERE.latitude, HERE.longitude)
-    assert len(found) == 1
+    environment_names = names(store, HERE.latitude, HERE.longitude)
+    assert len(environment_names) == 1
     assert len(stale(store)) == 1
     assert "chunk 4711" in caplog.text
     assert stale(store)[0] in caplog.text
@@ -489,10 +489,10 @@ def test_ten_thousand_environments_cost_an_index_search(store: Store):
     with store._database.engine.connect() as connection:
         if store._database.sqlite:
             plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters).all()
-            told = " | ".join(str(line[-1]) for line in plan)
-            assert "SEARCH area USING INDEX ix_area_box" in told, told
-            assert "SEARCH environment USING INDEX sqlite_autoindex_environment_1" in told, told
-            assert "SCAN" not in told, told
+            query_plan = " | ".join(str(line[-1]) for line in plan)
+            assert "SEARCH area USING INDEX ix_area_box" in query_plan, query_plan
+            assert "SEARCH environment USING INDEX sqlite_autoindex_environment_1" in query_plan, query_plan
+            assert "SCAN" not in query_plan, query_plan
             steps = [0]
             driver: Any = connection.connection.driver_connection
 
@@ -501,9 +501,9 @@ def test_ten_thousand_environments_cost_an_index_search(store: Store):
                 return 0
 
             driver.set_progress_handler(count, 1)
-            found = len(connection.exec_driver_sql(statement, parameters).all())
+            row_count = len(connection.exec_driver_sql(statement, parameters).all())
             driver.set_progress_handler(None, 0)
-            assert found < 5, "what shapely looks at"
+            assert row_count < 5, "what shapely looks at"
             assert steps[0] < 10 * MANY, "instructions of SQLite's machine: a few for each entry of the index"
         else:
             plan_ = connection.exec_driver_sql(f"EXPLAIN (ANALYZE, FORMAT JSON) {statement}", parameters).scalar_one()

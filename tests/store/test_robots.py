@@ -37,7 +37,7 @@ def farm(store: Store) -> Store:
 
 
 def test_held_version_follows_the_statement_of_the_robot(farm: Store):
-    def held() -> Held | None:
+    def active_map() -> Held | None:
         return farm.robots("farm", "r1")[0].held
 
     def say(minute: float, root: str, state: Any, holds: tuple[int, str] | None, **more: Any) -> None:
@@ -45,18 +45,18 @@ def test_held_version_follows_the_statement_of_the_robot(farm: Store):
 
     say(0, A, "active", None, sequence=3)
     say(1, "c" * 64, "failed", (2, B), version=3, sequence=5)
-    assert held() == Held(2, B, 5, NOW + timedelta(minutes=1)), "the status active of B was lost"
+    assert active_map() == Held(2, B, 5, NOW + timedelta(minutes=1)), "the status active of B was lost"
     say(2, "c" * 64, "failed", (2, B), version=3, sequence=5)
-    assert held() == Held(2, B, 5, NOW + timedelta(minutes=1))
+    assert active_map() == Held(2, B, 5, NOW + timedelta(minutes=1))
     assert len(farm.robot_history("farm", "r1")) == 2
     say(3, "c" * 64, "failed", (1, A), version=3, sequence=5)
-    assert held() == Held(1, A, 5, NOW + timedelta(minutes=3)), "the same failure, and it went back"
+    assert active_map() == Held(1, A, 5, NOW + timedelta(minutes=3)), "the same failure, and it went back"
     say(4, "c" * 64, "downloading", None, version=3)
-    assert held() == Held(1, A, 5, NOW + timedelta(minutes=3)), "it does not say"
+    assert active_map() == Held(1, A, 5, NOW + timedelta(minutes=3)), "it does not say"
     say(5, "c" * 64, "active", (1, A), version=3)
-    assert held() == Held(3, "c" * 64, None, NOW + timedelta(minutes=5)), "active is what it runs"
+    assert active_map() == Held(3, "c" * 64, None, NOW + timedelta(minutes=5)), "active is what it runs"
     say(6, A, "downloading", (0, NO_ROOT), version=1)
-    assert held() is None, "its disk is empty"
+    assert active_map() is None, "its disk is empty"
 
 
 def test_authority_of_one_report_lasts(farm: Store):
@@ -64,8 +64,8 @@ def test_authority_of_one_report_lasts(farm: Store):
         return [r.vouched for r in farm.robots("farm")]
 
     open_bus = {"vouched": False}
-    said = NOW
-    first, second = heard("r1", 0, A, said=said), heard("r1", 1, B, "ready", said=said)
+    reported_at = NOW
+    first, second = heard("r1", 0, A, said=reported_at), heard("r1", 1, B, "ready", said=reported_at)
     farm.note_reports([replace(first, **open_bus), replace(second, **open_bus), replace(heard("r2", 0), **open_bus)])
     assert vouched() == [False, False]
     farm.note_reports([replace(first, time=NOW + timedelta(minutes=2))])
@@ -79,10 +79,10 @@ def test_authority_of_one_report_lasts(farm: Store):
 
 
 def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
-    said = NOW - timedelta(hours=5)
-    assert farm.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, said=said)]) == [None]
+    reported_at = NOW - timedelta(hours=5)
+    assert farm.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, said=reported_at)]) == [None]
     (robot,) = farm.robots("farm")
-    assert robot.report == Report("production", 1, A, "active", "ok\ufffd", 4, said)
+    assert robot.report == Report("production", 1, A, "active", "ok\ufffd", 4, reported_at)
     assert (robot.environment, robot.robot, robot.time, robot.since) == ("farm", "r1", NOW, NOW)
     assert robot.held == Held(1, A, 4, NOW)
     assert (robot.there, robot.seen) == (None, None)
@@ -249,8 +249,8 @@ def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
     def lag(*reports: Heard) -> Any:
         farm.note_reports(list(reports))
         (robot,) = farm.robots("farm", reports[0].robot)
-        found = lag_of(robot, channel, moves)
-        return found.events, found.differs, found.since and (found.since - NOW) / timedelta(minutes=1)
+        lag = lag_of(robot, channel, moves)
+        return lag.events, lag.differs, lag.since and (lag.since - NOW) / timedelta(minutes=1)
 
     assert lag(heard("in-step", 0, moves[2].root)) == (0, False, None)
     assert lag(heard("told", 0, moves[1].root, sequence=5)) == (1, True, 7)

@@ -106,9 +106,9 @@ def test_exactly_the_share_is_enough(count: int, share: float, enough: int):
 
     def step(state: Any, version: str, those: int) -> Any:
         rollout = Rollout(2, "b", now, ready=share, failed=share, state=state, moved=now, before=1)
-        said = [(version, "b") if k < those else ("active", "a") for k in range(count)]
+        reports = [(version, "b") if k < those else ("active", "a") for k in range(count)]
         robots = [
-            Robot(f"r{k}", "farm", Report("production", 1, r, s), now, now, None) for k, (s, r) in enumerate(said)
+            Robot(f"r{k}", "farm", Report("production", 1, r, s), now, now, None) for k, (s, r) in enumerate(reports)
         ]
         return decide(rollout, robots, now)
 
@@ -252,12 +252,12 @@ def test_a_first_move_has_nothing_to_go_back_to(fleet: Fleet):
 def test_a_decision_is_taken_again_where_it_is_carried_out(fleet: Fleet):
     fleet.say("a", 2, "ready")
     fleet.roll(ready=1.0)
-    asked = []
+    calls = []
 
     def changes_its_mind(*about: Any) -> Any:
-        asked.append(about)
-        return decide(*about) if len(asked) == 1 else None
+        calls.append(about)
+        return decide(*about) if len(calls) == 1 else None
 
     assert fleet.store.advance_rollouts(fleet.at(2), changes_its_mind) == []
-    assert len(asked) == 2
+    assert len(calls) == 2
     assert fleet.channel().version == 1

@@ -122,9 +122,9 @@ def test_of_servers_that_start_together_one_makes_the_administrator(database_url
             store.close()
 
     with ThreadPoolExecutor(6) as threads:
-        made = list(threads.map(start, range(6)))
-    assert sum(secret is not None for secret in made) == 1
+        tokens = list(threads.map(start, range(6)))
+    assert sum(secret is not None for secret in tokens) == 1
     store = Store(database_url, tmp_path / "blobs")
     assert [token.role for token in store.tokens()] == ["admin"]
-    assert store.find_token(next(filter(None, made))) is not None
+    assert store.find_token(next(filter(None, tokens))) is not None
     store.close()

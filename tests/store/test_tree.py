@@ -106,9 +106,9 @@ def test_paths_reach_every_key_and_select_every_box():
     items = {b"%05d" % i: i for i in range(3000)}
     draft = tree.Draft(memory)
     root = tree.edit(draft, codec, None, items, ())
-    wanted = [b"%05d" % i for i in range(0, 3000, 17)]
-    found = {k for name in tree.paths(draft, root, wanted) for k in codec.decode(draft.read(name))[0]}
-    assert set(wanted) <= found
+    keys = [b"%05d" % i for i in range(0, 3000, 17)]
+    path_keys = {k for name in tree.paths(draft, root, keys) for k in codec.decode(draft.read(name))[0]}
+    assert set(keys) <= path_keys
     leaves = tree.select(draft, root, lambda boxes: (boxes[:, 0] <= 1210) & (boxes[:, 2] >= 1200))
     chosen = {k for name in leaves for k in codec.decode(draft.read(name))[0]}
     assert {b"%05d" % i for i in range(1200, 1211)} <= chosen

@@ -49,10 +49,10 @@ def spoil_chunk(store: Store, name: str, *, lose: bool = False) -> None:
 
 def test_verification_names_what_is_damaged_and_the_versions_it_hits(store: Store) -> None:
     filled(store)
-    found = store.verifier().run()
-    assert found.findings == []
-    assert found.checked["version"] == 3
-    assert found.checked["blob"] >= 3
+    verification = store.verifier().run()
+    assert verification.findings == []
+    assert verification.checked["version"] == 3
+    assert verification.checked["blob"] >= 3
     first, second = store.version("farm", 1), store.version("farm", 2)
     only_first = first.part(GRID)
     both = next(e for e in first.parts if e.key != GRID and e in second.parts)
@@ -65,15 +65,15 @@ def test_verification_names_what_is_damaged_and_the_versions_it_hits(store: Stor
     path.write_bytes(bytes(100_000))
     (pack,) = [p for p in (store.blob_dir / "packs").iterdir() if b"small" in p.read_bytes()]
     pack.write_bytes(pack.read_bytes().replace(b"small", b"smell"))
-    found = store.verifier().run()
-    told = {(f.kind, f.name): (f.problem, f.versions) for f in found.findings}
-    assert told == {
+    verification = store.verifier().run()
+    findings = {(f.kind, f.name): (f.problem, f.versions) for f in verification.findings}
+    assert findings == {
         ("chunk", only_first.hash): ("damaged", (("farm", 1),)),
         ("chunk", both.hash): ("lost", (("farm", 1), ("farm", 2))),
         ("blob", big): ("damaged", (("farm", 1),)),
         ("blob", small): ("damaged", (("farm", 1),)),
     }
-    assert json.dumps([f.as_dict() for f in found.findings])
+    assert json.dumps([f.as_dict() for f in verification.findings])
     path.unlink()
     assert ("blob", big, "lost") in {(f.kind, f.name, f.problem) for f in store.verifier().run().findings}
     store.blobs.put_many([b"b" * 100_000, b"small", b"new"])
@@ -88,10 +88,10 @@ def test_every_node_of_a_tree_counts(sqlite_store: Store) -> None:
     for name in names:
         raw = sqlite_store.chunk(name)
         spoil_chunk(sqlite_store, name, lose=True)
-        found = sqlite_store.verifier().run().findings
-        if found:
-            assert {f.name for f in found} == {name}
-            lost += ("farm", version.number) in found[0].versions
+        findings = sqlite_store.verifier().run().findings
+        if findings:
+            assert {f.name for f in findings} == {name}
+            lost += ("farm", version.number) in findings[0].versions
         sqlite_store.heal_chunks({name: raw})
     assert lost > len(names) // 2
     assert sqlite_store.verifier().run().findings == []
@@ -350,11 +350,11 @@ def test_only_chunks_that_are_still_damaged_and_unused_are_removed(store: Store)
     healed, in_use, unused = raws
     with store._database.write() as connection:
         insert(connection, dict.fromkeys(raws, b"damaged"), now=time.time() - 100)
-    found = store.verifier().run()
-    assert {f.name for f in found.findings} == set(raws)
+    verification = store.verifier().run()
+    assert {f.name for f in verification.findings} == set(raws)
     with store._database.write() as connection:  # uploads of other processes, while the check goes on
         insert(connection, {healed: compress(raws[healed])}, now=time.time() - 50)
         insert(connection, {in_use: b"damaged"})
-    assert store.remove_unused_chunks(found) == {unused}
+    assert store.remove_unused_chunks(verification) == {unused}
     assert store.chunk(healed) == raws[healed]
     assert {f.name for f in store.verifier().run().findings} == {in_use}

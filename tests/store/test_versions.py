@@ -50,23 +50,23 @@ def farm(store: Store) -> Store:
 
 def test_every_kind_of_part_comes_back_whole(farm: Store):
     parts = everything()
-    made = save(farm, "farm", *replaces(parts))
-    assert made.number == 2
-    assert made.parent == 1
-    assert [e.key for e in made.parts] == sorted(parts)
+    version = save(farm, "farm", *replaces(parts))
+    assert version.number == 2
+    assert version.parent == 1
+    assert [e.key for e in version.parts] == sorted(parts)
     assert_same_layers(farm.load(farm.version("farm")), Layers(parts, DATUM))
-    some = farm.load(made, [GRID, OBJECTS])
+    some = farm.load(version, [GRID, OBJECTS])
     assert set(some.parts) == {GRID, OBJECTS}
     with pytest.raises(NotFound, match="occupancy"):
-        farm.load(made, [PartKey("occupancy", "ground", "keepout")])
+        farm.load(version, [PartKey("occupancy", "ground", "keepout")])
 
 
 def test_another_process_reads_the_same(farm: Store, tmp_path: Path):
     parts = everything()
-    made = save(farm, "farm", *replaces(parts))
+    version = save(farm, "farm", *replaces(parts))
     other = Store(farm.database_url, farm.blob_dir, readonly=True)
     assert_same_layers(other.load(other.version("farm")), Layers(parts, DATUM))
-    assert other.prepare(made, Changes((Drop(GRID),))).changed
+    assert other.prepare(version, Changes((Drop(GRID),))).changed
     with pytest.raises((Unavailable, Invalid)):
         other.create_environment("second")
     other.close()
@@ -82,18 +82,18 @@ def test_equal_content_has_equal_roots_on_both_databases(store: Store, sqlite_st
 def test_the_root_depends_on_content_alone(farm: Store):
     farm.create_environment("other", title="t")
     save(farm, "other", *replaces(everything()))
-    there = save(farm, "other", datum=DATUM)
-    here = farm.prepare(
+    other = save(farm, "other", datum=DATUM)
+    prepared = farm.prepare(
         farm.version("farm"), Changes(tuple(Replace(k, p, Provenance("derived")) for k, p in everything().items()))
     )
-    assert here.root == there.root
+    assert prepared.root == other.root
     for changed in (
         Changes((Drop(GRID),)),
         Changes(datum=Datum(53.2, -0.5)),
         Changes(datum=None),
         Changes(levels=(Level(), Level("first", 3.0))),
     ):
-        assert farm.prepare(there, changed).root != there.root
+        assert farm.prepare(other, changed).root != other.root
 
 
 def test_the_same_again_changes_nothing(farm: Store):
@@ -121,7 +121,7 @@ def edits(seed: int) -> Callable[[Store], None]:
     def run(store: Store) -> None:
         random.seed(seed)
         rng = np.random.default_rng(seed)
-        known: dict[str, tuple[Any, dict[str, Any], bool]] = {}
+        items: dict[str, tuple[Any, dict[str, Any], bool]] = {}
         store.create_environment("a")
         store.create_environment("b")
         for round_ in range(14):
@@ -129,23 +129,25 @@ def edits(seed: int) -> Callable[[Store], None]:
                 chosen = [f"n{i}" for i in rng.integers(0, 600, rng.choice([0, 1, 5, 200]))]
                 put = {}
                 for i in dict.fromkeys(chosen):
-                    if i in known and known[i][2] != local and rng.random() < 0.5:
+                    if i in items and items[i][2] != local and rng.random() < 0.5:
                         continue
-                    stays = i in known and known[i][2] == local and rng.random() < 0.5
-                    place = known[i][0] if stays else shapely.Point(*(rng.random(2) * (300 if local else 0.01)))
+                    stays = i in items and items[i][2] == local and rng.random() < 0.5
+                    place = items[i][0] if stays else shapely.Point(*(rng.random(2) * (300 if local else 0.01)))
                     put[i] = (place, {"r": round_, "x": [1, 1.0]}, local)
                 operations: list[Any] = []
                 if put:
                     listed = features([(i, g, p) for i, (g, p, _) in put.items()], "local" if local else "wgs84")
                     operations.append(Put(TOPOLOGY, listed))
-                    known.update(put)
-                gone = random.sample(sorted(known), min(len(known), int(rng.choice([0, 1, 40])))) if known else []
+                    items.update(put)
+                deleted_ids = (
+                    random.sample(sorted(items), min(len(items), int(rng.choice([0, 1, 40])))) if items else []
+                )
                 if round_ == 9 and not local:
-                    gone = sorted(known)
-                if gone:
-                    operations.append(Delete(TOPOLOGY, tuple(gone)))
-                    for i in gone:
-                        del known[i]
+                    deleted_ids = sorted(items)
+                if deleted_ids:
+                    operations.append(Delete(TOPOLOGY, tuple(deleted_ids)))
+                    for i in deleted_ids:
+                        del items[i]
                 if not operations:
                     continue
                 head = save(store, "a", *operations)
@@ -153,7 +155,7 @@ def edits(seed: int) -> Callable[[Store], None]:
 
                 anew = concatenate(
                     [
-                        features([(i, g, p) for i, (g, p, here) in known.items() if here is flag], anchor)
+                        features([(i, g, p) for i, (g, p, is_local) in items.items() if is_local is flag], anchor)
                         for flag, anchor in ((True, "local"), (False, "wgs84"))
                     ]
                 )
@@ -161,11 +163,11 @@ def edits(seed: int) -> Callable[[Store], None]:
                 assert head.root == fresh.root
                 entry = head.part(TOPOLOGY)
                 assert entry is not None
-                assert entry.count == len(known)
+                assert entry.count == len(items)
                 assert entry.bounds == fresh.part(TOPOLOGY).bounds  # type: ignore[union-attr]
         loaded = store.load(store.version("a")).parts[TOPOLOGY]
         assert isinstance(loaded, Features)
-        assert set(loaded.ids) == set(known)
+        assert set(loaded.ids) == set(items)
 
     return run
 
@@ -186,22 +188,22 @@ def test_put_and_delete_say_what_they_changed(farm: Store):
         "local",
         {"tmap2": {"name": "changed"}, "more": 1},
     )
-    made = save(farm, "farm", Put(TOPOLOGY, new), Delete(TOPOLOGY, ("n2", "n3")))
-    assert made.changes == {"topology": {"added": 1, "changed": 1, "deleted": 2, "document": True}}
-    part = farm.load(made).parts[TOPOLOGY]
+    version = save(farm, "farm", Put(TOPOLOGY, new), Delete(TOPOLOGY, ("n2", "n3")))
+    assert version.changes == {"topology": {"added": 1, "changed": 1, "deleted": 2, "document": True}}
+    part = farm.load(version).parts[TOPOLOGY]
     assert isinstance(part, Features)
     assert part.document == {"tmap2": {"name": "changed"}, "more": 1}
     assert len(part) == 199
     with pytest.raises(NotFound, match="'gone'"):
-        farm.prepare(made, Changes((Delete(TOPOLOGY, ("n1", "gone")),)))
+        farm.prepare(version, Changes((Delete(TOPOLOGY, ("n1", "gone")),)))
     with pytest.raises(NotFound):
-        farm.prepare(made, Changes((Delete(OBJECTS, ("n1",)),)))
+        farm.prepare(version, Changes((Delete(OBJECTS, ("n1",)),)))
     with pytest.raises(NotFound):
-        farm.prepare(made, Changes((Drop(OBJECTS),)))
+        farm.prepare(version, Changes((Drop(OBJECTS),)))
     with pytest.raises(Invalid):
-        farm.prepare(made, Changes((Put(GRID, new),)))
+        farm.prepare(version, Changes((Put(GRID, new),)))
     with pytest.raises(Invalid):
-        farm.prepare(made, Changes((Replace(GRID, new),)))
+        farm.prepare(version, Changes((Replace(GRID, new),)))
 
 
 def test_an_integer_that_becomes_a_float_is_a_change(farm: Store):
@@ -215,13 +217,13 @@ def test_an_integer_that_becomes_a_float_is_a_change(farm: Store):
 
 
 def test_features_come_by_id_and_by_document_order(farm: Store):
-    made = save(farm, "farm", Replace(TOPOLOGY, network(300)))
-    part = farm.load(made).parts[TOPOLOGY]
+    version = save(farm, "farm", Replace(TOPOLOGY, network(300)))
+    part = farm.load(version).parts[TOPOLOGY]
     assert isinstance(part, Features)
     assert list(part.ids) == sorted(part.ids)
-    assert farm.has_ids(made, TOPOLOGY, ["n5", "n299", "nope"]) == {"n5", "n299"}
-    assert farm.has_ids(made, OBJECTS, ["n5"]) == set()
-    some = farm.get(made, TOPOLOGY, ["n7", "n250", "nope"])
+    assert farm.has_ids(version, TOPOLOGY, ["n5", "n299", "nope"]) == {"n5", "n299"}
+    assert farm.has_ids(version, OBJECTS, ["n5"]) == set()
+    some = farm.get(version, TOPOLOGY, ["n7", "n250", "nope"])
     assert some.ids == ("n250", "n7")
     index = part.index()
     assert rows(some) == rows(part.take([index["n250"], index["n7"]]))
@@ -264,16 +266,16 @@ def test_a_version_costs_what_it_changes(farm: Store):
 
 
 def grid_of(cells: Any) -> Any:
-    made = grid()
-    return type(made)(
+    source_grid = grid()
+    return type(source_grid)(
         cells,
-        made.resolution,
-        made.origin,
-        made.mode,
-        made.occupied_thresh,
-        made.free_thresh,
-        made.negate,
-        made.properties,
+        source_grid.resolution,
+        source_grid.origin,
+        source_grid.mode,
+        source_grid.occupied_thresh,
+        source_grid.free_thresh,
+        source_grid.negate,
+        source_grid.properties,
     )
 
 
@@ -292,36 +294,36 @@ def test_a_diff_reads_what_differs(farm: Store):
 
 
 def test_a_box_is_found_at_any_version_without_reading_all(farm: Store):
-    whole = network(20_000, side=3000)
-    old = save(farm, "farm", Replace(TOPOLOGY, whole))
+    network_part = network(20_000, side=3000)
+    old = save(farm, "farm", Replace(TOPOLOGY, network_part))
     save(farm, "farm", Drop(TOPOLOGY))
     box = (500.0, 700.0, 800.0, 900.0)
     farm._chunks.forget()
     before = farm._chunks.reads
-    found = farm.features(old, TOPOLOGY, bbox=box)
+    hits = farm.features(old, TOPOLOGY, bbox=box)
     assert farm._chunks.reads - before < 60
-    xy = shapely.get_coordinates(whole.geometry)
+    xy = shapely.get_coordinates(network_part.geometry)
     inside = (xy[:, 0] >= 500) & (xy[:, 0] <= 800) & (xy[:, 1] >= 700) & (xy[:, 1] <= 900)
-    assert set(found.ids) == {whole.ids[k] for k in np.flatnonzero(inside)}
-    assert found.document == whole.document
+    assert set(hits.ids) == {network_part.ids[k] for k in np.flatnonzero(inside)}
+    assert hits.document == network_part.document
     frame = farm.load(old).frame
     assert frame is not None
     corners = frame.to_wgs84(np.array([[500.0, 700.0], [800.0, 900.0]]))
     (west, south), (east, north) = corners.tolist()
     degrees = frame.to_wgs84(xy)
     inside = (degrees[:, 0] >= west) & (degrees[:, 0] <= east) & (degrees[:, 1] >= south) & (degrees[:, 1] <= north)
-    found = farm.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84")
-    assert set(found.ids) == {whole.ids[k] for k in np.flatnonzero(inside)}
-    some = farm.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84", ids=found.ids[:3])
-    assert some.ids == found.ids[:3]
+    hits = farm.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84")
+    assert set(hits.ids) == {network_part.ids[k] for k in np.flatnonzero(inside)}
+    some = farm.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84", ids=hits.ids[:3])
+    assert some.ids == hits.ids[:3]
 
 
 def test_items_on_earth_and_local_ones_are_found_by_either_kind_of_box(farm: Store):
-    made = save(farm, "farm", Replace(OBJECTS, mixed()))
-    assert set(farm.features(made, OBJECTS, bbox=(-100, -100, 100, 100)).ids) == set("pzlaem")
-    assert set(farm.features(made, OBJECTS, bbox=(-100, -100, 100, -1)).ids) == {"p", "m"}
-    assert set(farm.features(made, OBJECTS, bbox=(5, -100, 100, -0.5)).ids) == set()
-    assert set(farm.features(made, OBJECTS, bbox=(-0.512, 53.19, -0.49, 53.22), crs="wgs84").ids) == set("pzlaem")
+    version = save(farm, "farm", Replace(OBJECTS, mixed()))
+    assert set(farm.features(version, OBJECTS, bbox=(-100, -100, 100, 100)).ids) == set("pzlaem")
+    assert set(farm.features(version, OBJECTS, bbox=(-100, -100, 100, -1)).ids) == {"p", "m"}
+    assert set(farm.features(version, OBJECTS, bbox=(5, -100, 100, -0.5)).ids) == set()
+    assert set(farm.features(version, OBJECTS, bbox=(-0.512, 53.19, -0.49, 53.22), crs="wgs84").ids) == set("pzlaem")
     blind = save(farm, "farm", datum=None)
     from app.errors import MissingDatum
 
@@ -367,17 +369,17 @@ def test_a_grid_that_grows_is_laid_over_the_old_one(farm: Store):
     g = grid_of(wider)
     moved = type(g)(wider, g.resolution, (g.origin[0] - 20 * 0.05, g.origin[1] - 10 * 0.05, 0.0), g.mode)
     b = save(farm, "farm", Replace(GRID, moved))
-    told = farm.diff(a, b)["occupancy"]["map"]
-    assert (told["freed"], told["blocked"], told["unknown"], told["other"]) == (0, 1, 0, 0)
-    assert {"height", "origin", "width"} <= set(told["fields"])
+    diff = farm.diff(a, b)["occupancy"]["map"]
+    assert (diff["freed"], diff["blocked"], diff["unknown"], diff["other"]) == (0, 1, 0, 0)
+    assert {"height", "origin", "width"} <= set(diff["fields"])
     assert farm.delta_parts(a, b).grids[0].whole
     c = save(farm, "farm", Replace(GRID, grid_of(cells)))
     turned = type(g)(cells, 0.07, (0.0, 0.0, 0.5), "trinary")
-    told = farm.diff(c, save(farm, "farm", Replace(GRID, turned)))["occupancy"]["map"]
-    assert told["fields"] == ["mode", "origin", "properties", "resolution"]
-    gone = save(farm, "farm", Drop(GRID))
-    assert gone.changes["occupancy"]["map"]["unknown"] == 3000
-    assert farm.delta_parts(c, gone).grids[0].deleted
+    diff = farm.diff(c, save(farm, "farm", Replace(GRID, turned)))["occupancy"]["map"]
+    assert diff["fields"] == ["mode", "origin", "properties", "resolution"]
+    deletion = save(farm, "farm", Drop(GRID))
+    assert deletion.changes["occupancy"]["map"]["unknown"] == 3000
+    assert farm.delta_parts(c, deletion).grids[0].deleted
 
 
 def test_other_layers_tell_counts(farm: Store):
@@ -410,23 +412,23 @@ def test_other_layers_tell_counts(farm: Store):
 
 def test_voxels_tell_which_came_changed_and_went(farm: Store):
     key = PartKey("voxels", "ground", "v")
-    whole = voxels(30_000)
-    assert whole.colour is not None
-    a = save(farm, "farm", Replace(key, whole))
-    assert a.changes["voxels"] == {"v": {"added": len(whole), "changed": 0, "deleted": 0}}
-    odds, colour = whole.log_odds.copy(), whole.colour.copy()
+    original = voxels(30_000)
+    assert original.colour is not None
+    a = save(farm, "farm", Replace(key, original))
+    assert a.changes["voxels"] == {"v": {"added": len(original), "changed": 0, "deleted": 0}}
+    odds, colour = original.log_odds.copy(), original.colour.copy()
     odds[[5, 20_000]] += 0.5
     colour[[5, 7]] ^= 1
-    depth, code = whole.depth.copy(), whole.code.copy()
+    depth, code = original.depth.copy(), original.code.copy()
     depth[100], code[100] = 15, code[100] >> np.uint64(3)  # a larger leaf in the place of one
-    kept = np.arange(len(whole)) >= 3
-    kept[101:110] = whole.code[101:110] >> np.uint64(3) != code[100]
-    columns = (c[kept] for c in (depth, code, odds, colour))
+    remaining = np.arange(len(original)) >= 3
+    remaining[101:110] = original.code[101:110] >> np.uint64(3) != code[100]
+    columns = (c[remaining] for c in (depth, code, odds, colour))
     names = ("depth", "code", "log_odds", "colour")
-    other = dataclasses.replace(whole, **dict(zip(names, columns, strict=True)))
+    other = dataclasses.replace(original, **dict(zip(names, columns, strict=True)))
     b = save(farm, "farm", Replace(key, other))
-    gone = int((~kept).sum())
-    assert b.changes["voxels"] == {"v": {"added": 1, "changed": 3, "deleted": gone + 1}}
+    deleted_count = int((~remaining).sum())
+    assert b.changes["voxels"] == {"v": {"added": 1, "changed": 3, "deleted": deleted_count + 1}}
     assert_same_part(farm.load(b, [key]).parts[key], other)
     plain = save(farm, "farm", Replace(key, dataclasses.replace(other, colour=None)))
     assert plain.changes["voxels"]["v"] == {"added": 0, "changed": len(other), "deleted": 0, "fields": ["colour"]}
@@ -486,13 +488,13 @@ def test_many_writers_make_one_line_of_versions(farm: Store):
 
 
 def test_threads_may_share_a_store(farm: Store):
-    made = save(farm, "farm", *replaces(everything()))
+    version = save(farm, "farm", *replaces(everything()))
     expected = Layers(everything(), DATUM)
 
     def read(k: int) -> None:
         farm._chunks.forget()
-        assert_same_layers(farm.load(made), expected)
-        assert farm.prepare(made, Changes((Replace(TOPOLOGY, network(50 + k)),))).changed
+        assert_same_layers(farm.load(version), expected)
+        assert farm.prepare(version, Changes((Replace(TOPOLOGY, network(50 + k)),))).changed
 
     with ThreadPoolExecutor(6) as pool:
         list(pool.map(read, range(12)))
@@ -502,13 +504,13 @@ def test_a_key_makes_one_version_however_often_it_is_sent(farm: Store):
     head = farm.version("farm")
     prepared = farm.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
     key = Idempotency("abc", "print")
-    made = farm.commit("farm", prepared, author="a", message="m", idempotency=key)
-    assert farm.idempotent("farm", "abc") == ("print", made.number)
+    version = farm.commit("farm", prepared, author="a", message="m", idempotency=key)
+    assert farm.idempotent("farm", "abc") == ("print", version.number)
     assert farm.idempotent("farm", "other") is None
-    assert farm.commit("farm", prepared, author="a", message="m", idempotency=key) == made
+    assert farm.commit("farm", prepared, author="a", message="m", idempotency=key) == version
     with pytest.raises(Conflict, match="abc"):
         farm.commit("farm", prepared, author="a", message="m", idempotency=Idempotency("abc", "else"))
-    assert farm.version("farm").number == made.number
+    assert farm.version("farm").number == version.number
 
 
 def test_revert_copies_a_manifest(farm: Store):
@@ -543,9 +545,9 @@ def test_a_version_says_where_it_comes_from(farm: Store):
     )
     warnings = [Problem("odd\x00 name \ud800", "a.yaml", 3, "nodes[1]")]
     sources = [Source("a.yaml", 7, digest, "tmap2"), Source("b.txt", 7, digest, None, used=False)]
-    made = farm.commit("farm", prepared, author="ann", message="first", sources=sources, warnings=warnings)
-    again = farm.version("farm", made.number)
-    assert again == made
+    version = farm.commit("farm", prepared, author="ann", message="first", sources=sources, warnings=warnings)
+    again = farm.version("farm", version.number)
+    assert again == version
     assert again.sources == tuple(sources)
     assert again.warnings == (Problem("odd\ufffd name ?", "a.yaml", 3, "nodes[1]"),)
     assert again.information == {
@@ -564,7 +566,7 @@ def test_a_version_says_where_it_comes_from(farm: Store):
     edited = save(farm, "farm", Put(TOPOLOGY, features([("q", None, {})], "local"), Provenance("raw", "edit")))
     assert edited.part(TOPOLOGY).provenance.sources == ("a.yaml",)  # type: ignore[union-attr]
     with pytest.raises(Unavailable, match="send it again"):
-        farm.add_sources("farm", made.number, [Source("lost", 1, "0" * 64)])
+        farm.add_sources("farm", version.number, [Source("lost", 1, "0" * 64)])
     with pytest.raises(Invalid, match="NUL"):
         farm.commit("farm", prepared, author="ann", message="a\x00b")
 
@@ -616,8 +618,8 @@ def test_what_nothing_needs_is_gone_after_one_collection(farm: Store):
     assert removed["blobs"] == 20
     assert removed["bytes"] == 19_000 + 200_000
     assert farm.blobs.get(digests[3]) == files[3]
-    kept = [p for p in farm.blob_dir.rglob("*") if p.is_file() and not p.name.startswith(".")]
-    total = sum(p.stat().st_size for p in kept)
+    remaining_files = [p for p in farm.blob_dir.rglob("*") if p.is_file() and not p.name.startswith(".")]
+    total = sum(p.stat().st_size for p in remaining_files)
     assert total == 1000 + sum(len(v) for v in everything()[PartKey("resources", "ground", "gazebo")].files.values())  # type: ignore[union-attr]
     with pytest.raises(NotFound):
         farm.blobs.get(digests[4])
@@ -667,16 +669,16 @@ def say(store: Store, templates: Templates, env: str = "farm") -> Any:
 def test_templates_are_part_of_a_version(farm: Store):
     before = save(farm, "farm", *replaces(everything()))
     assert before.templates == NO_TEMPLATES
-    made = say(farm, OUTDOOR)
-    assert (made.number, made.parts) == (before.number + 1, before.parts)
-    assert made.root != before.root
-    assert made.changes.keys() == {"templates"}
+    version = say(farm, OUTDOOR)
+    assert (version.number, version.parts) == (before.number + 1, before.parts)
+    assert version.root != before.root
+    assert version.changes.keys() == {"templates"}
     assert farm.version("farm").templates == OUTDOOR
     assert farm.version("farm", before.number).templates == NO_TEMPLATES
-    assert farm.diff(before, made) == made.changes
-    assert say(farm, OUTDOOR).number == made.number, "nothing new"
+    assert farm.diff(before, version) == version.changes
+    assert say(farm, OUTDOOR).number == version.number, "nothing new"
     event = farm.events("farm", since=0)[-1]
-    assert (event.body["version"], event.body["layers"]) == (made.number, [])
+    assert (event.body["version"], event.body["layers"]) == (version.number, [])
     later = save(farm, "farm", Drop(GRID))
     assert later.templates == OUTDOOR, "other changes leave them"
     moved = farm.commit("farm", farm.prepare(later, Changes(datum=None)), author="a", message="")
@@ -684,12 +686,12 @@ def test_templates_are_part_of_a_version(farm: Store):
     back = farm.revert("farm", before.number, author="a", message="")
     assert (back.root, back.templates) == (before.root, NO_TEMPLATES)
     assert back.changes["templates"]["set"] == {"from": "outdoor", "to": "default"}
-    farm.create_environment("copy", clone=made)
+    farm.create_environment("copy", clone=version)
     copied = farm.version("copy")
-    assert (copied.root, copied.templates) == (made.root, OUTDOOR)
+    assert (copied.root, copied.templates) == (version.root, OUTDOOR)
     assert copied.changes["templates"]["set"] == {"from": "default", "to": "outdoor"}
     farm.collect(timedelta(0))
-    assert farm.version("farm", made.number).templates == OUTDOOR
+    assert farm.version("farm", version.number).templates == OUTDOOR
 
 
 def test_templates_count_for_roots_alike_on_both_databases(store: Store, sqlite_store: Store):
@@ -722,10 +724,12 @@ def test_what_is_derived_anew_from_other_inputs_is_a_version_though_it_is_the_sa
     assert farm.diff(first, new) == {}
     other = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("b", 2.0)))
     assert other.number == new.number + 1, "by another way"
-    told = save(farm, "farm", Replace(TOPOLOGY, network(3), Provenance(sources=("n.yaml",))))
-    assert (told.number, told.information["topology"]) == (other.number + 1, "raw"), "a source says it now"
+    raw_version = save(farm, "farm", Replace(TOPOLOGY, network(3), Provenance(sources=("n.yaml",))))
+    assert (raw_version.number, raw_version.information["topology"]) == (other.number + 1, "raw"), (
+        "a source says it now"
+    )
     same = save(farm, "farm", Replace(TOPOLOGY, network(3), Provenance(sources=("m.yaml",))))
-    assert same.number == told.number, "of two sources that say the same the first one stays"
+    assert same.number == raw_version.number, "of two sources that say the same the first one stays"
 
 
 def test_an_edit_that_changes_nothing_renews_nothing(farm: Store):

@@ -64,8 +64,8 @@ def execute(
         )
     except OSError as error:
         return Outcome(None, f"cannot be started: {error.strerror}")
-    said = bytearray()
-    reader = threading.Thread(target=_read, args=(process.stdout, said), name="fleetmap-hook", daemon=True)
+    output = bytearray()
+    reader = threading.Thread(target=_read, args=(process.stdout, output), name="fleetmap-hook", daemon=True)
     reader.start()
     end = time.monotonic() + seconds
     status: int | None = None
@@ -79,7 +79,7 @@ def execute(
     if status == 0:
         return Outcome(0, "ended with 0")
     reader.join(LOOK_SECONDS)
-    text = " ".join(bytes(said[-TOLD:]).decode(errors="replace").split())
+    text = " ".join(bytes(output[-TOLD:]).decode(errors="replace").split())
     if status is not None:
         how = f"ended with {status}"
     else:
@@ -87,9 +87,9 @@ def execute(
     return Outcome(status, f"{how}: {text}" if text else how)
 
 
-def _read(stream: IO[bytes], said: bytearray) -> None:
+def _read(stream: IO[bytes], output: bytearray) -> None:
     """Keep the end of what is printed: a hook that prints without end fills neither disk nor memory."""
     with stream:
         while chunk := os.read(stream.fileno(), 1 << 16):
-            said += chunk
-            del said[:-TOLD]
+            output += chunk
+            del output[:-TOLD]

@@ -73,12 +73,12 @@ class Client:
 
         def answer() -> None:
             try:
-                found = service(request)
+                response = service(request)
             except ArithmeticError as error:
                 future.finish(None, error)
             else:
-                if found is not None:
-                    future.finish(found, None)
+                if response is not None:
+                    future.finish(response, None)
 
         threading.Thread(target=answer, daemon=True).start()
         return future
@@ -107,27 +107,27 @@ class LifecycleNode:
     def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
         assert qos.durability == "transient_local"
         topic = topic.replace("~", f"/{self.name}")
-        made = SimpleNamespace(publish=lambda message: self.graph.latched.setdefault(topic, []).append(message))
-        self.entities.append(made)
-        return made
+        publisher = SimpleNamespace(publish=lambda message: self.graph.latched.setdefault(topic, []).append(message))
+        self.entities.append(publisher)
+        return publisher
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any, *, callback_group: Any) -> Any:
-        made = SimpleNamespace(topic=topic)
-        self.entities.append(made)
+        subscription = SimpleNamespace(topic=topic)
+        self.entities.append(subscription)
         for message in self.graph.latched.get(topic, ()):
             threading.Thread(target=callback, args=(message,), daemon=True).start()
-        return made
+        return subscription
 
     def create_client(self, kind: Any, name: str, *, callback_group: Any) -> Any:
-        made = Client(self.graph, name)
-        self.entities.append(made)
-        return made
+        client = Client(self.graph, name)
+        self.entities.append(client)
+        return client
 
     def create_service(self, kind: Any, name: str, callback: Any, *, callback_group: Any) -> Any:
-        made = SimpleNamespace(name=name)
+        service = SimpleNamespace(name=name)
         self.offered[name] = callback
-        self.entities.append(made)
-        return made
+        self.entities.append(service)
+        return service
 
     def destroy(self, entity: Any) -> None:
         self.entities.remove(entity)
@@ -152,9 +152,9 @@ class LifecycleNode:
 
 def modules() -> dict[str, types.ModuleType]:
     def module(name: str, **members: Any) -> tuple[str, types.ModuleType]:
-        made = types.ModuleType(name)
-        made.__dict__.update(members)
-        return name, made
+        new_module = types.ModuleType(name)
+        new_module.__dict__.update(members)
+        return name, new_module
 
     def request(name: str) -> Any:
         return SimpleNamespace(__name__=name, Request=Message)

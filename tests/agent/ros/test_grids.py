@@ -77,13 +77,13 @@ def test_as_the_server_writes_it(tmp_path: Path) -> None:
     from app.convert.files import offline
     from tests.api import samples
 
-    made = offline(samples.grid(), "occupancy_grid", hints=Hints())
-    for name, data in made.files.items():
+    converted = offline(samples.grid(), "occupancy_grid", hints=Hints())
+    for name, data in converted.files.items():
         (tmp_path / name).write_bytes(data)
     (path,) = tmp_path.glob("*.yaml")
     grid = grids.read_map(path)
     cells = np.frombuffer(grid.cells, np.uint8).reshape(grid.height, grid.width)
-    pixels = next(data for name, data in made.files.items() if name.endswith(".pgm"))
+    pixels = next(data for name, data in converted.files.items() if name.endswith(".pgm"))
     rows = np.frombuffer(pixels[-grid.width * grid.height :], np.uint8).reshape(grid.height, grid.width)[::-1]
     assert ((cells == 100) == (rows == 0)).all()
     assert ((cells == 0) == (rows == 254)).all()

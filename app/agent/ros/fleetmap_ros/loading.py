@@ -192,10 +192,10 @@ class Site:
     def recall(self) -> dict[str, Any]:
         """What Nav2 was given last; empty if nothing is known."""
         try:
-            found = json.loads((self.memory / "nav2.json").read_bytes())
+            state = json.loads((self.memory / "nav2.json").read_bytes())
         except (OSError, ValueError):
             return {}
-        return found if isinstance(found, dict) else {}
+        return state if isinstance(state, dict) else {}
 
     def remember(self, **members: Any) -> None:
         """Keep what Nav2 was given."""
@@ -307,8 +307,8 @@ class Nav2:
             if self._changed(path):
                 raise LoadError("the route graph is no longer part of the map; Nav2 keeps the one before")
             return None
-        known = self._site.recall()
-        blocked, remembered = blocked_edges(file), set(known.get("closed_edges") or ())
+        saved_state = self._site.recall()
+        blocked, remembered = blocked_edges(file), set(saved_state.get("closed_edges") or ())
         is_due = self._is_due("route", path)
         if not is_due and blocked == remembered:
             return None
@@ -349,8 +349,8 @@ class Nav2:
 
     def _is_on_another_level(self, kind: str, path: str) -> bool:
         """Whether Nav2 was given a file of another level before."""
-        known = self._site.recall().get(kind)
-        return bool(known) and str(known).rpartition("/")[0] != path.rpartition("/")[0]
+        saved_state = self._site.recall().get(kind)
+        return bool(saved_state) and str(saved_state).rpartition("/")[0] != path.rpartition("/")[0]
 
     def _changed(self, path: str) -> bool:
         """Whether a file, or one that belongs to it, is named as changed."""
@@ -359,8 +359,8 @@ class Nav2:
 
     def _is_due(self, kind: str, path: str) -> bool:
         """Whether a file changed, or another one is loaded."""
-        known = self._site.recall()
-        return self._site.changed is None or self._changed(path) or (kind in known and known[kind] != path)
+        saved_state = self._site.recall()
+        return self._site.changed is None or self._changed(path) or (kind in saved_state and saved_state[kind] != path)
 
     def _load_map(self, server: str, role: str, path: str) -> None:
         url = str(self._site.folder / path)  # an absolute path is accepted, file:// is not
@@ -432,11 +432,11 @@ class Network:
         for word, ours, theirs in (("name", self.name, other.name), ("pointset", self.pointset, other.pointset)):
             if ours != theirs:
                 return f"its {word} is {theirs[:80]!r}, not {ours[:80]!r}"
-        for word, mine, yours in (("nodes", self.nodes, other.nodes), ("edges", self.edges, other.edges)):
-            if mine != yours:
-                one = sorted(mine ^ yours)[0]
-                lack = "lacks" if one in mine else "still has"
-                return f"it has {len(yours)} {word}, not {len(mine)}; for example it {lack} {one[:80]!r}"
+        for word, own_names, other_names in (("nodes", self.nodes, other.nodes), ("edges", self.edges, other.edges)):
+            if own_names != other_names:
+                one = sorted(own_names ^ other_names)[0]
+                lack = "lacks" if one in own_names else "still has"
+                return f"it has {len(other_names)} {word}, not {len(own_names)}; for example it {lack} {one[:80]!r}"
         return None
 
 
@@ -464,12 +464,12 @@ class TopologicalMap:
         if not self._names.manager:
             return None
         path = self._file()
-        known = self._site.recall()
-        elsewhere = "topological_map" in known and known["topological_map"] != path
+        saved_state = self._site.recall()
+        elsewhere = "topological_map" in saved_state and saved_state["topological_map"] != path
         if not self._site.has_changed(path) and not elsewhere:
             return None
         file = self._site.folder / path
-        wanted = read_network(file)
+        network = read_network(file)
         service = f"{self._names.manager}/switch_topological_map"
         if not self._ros.has_service(service, WRITE_TOPOLOGICAL_MAP):
             raise LoadError(
@@ -481,10 +481,10 @@ class TopologicalMap:
             answer = self._ros.call(service, WRITE_TOPOLOGICAL_MAP, {"filename": name, "no_alias": False})
             if answer.get("success") is not True:
                 raise LoadError(f"{service} refused {path}: see the log of the map manager")
-            problem = wanted.difference(network_of(self._ros.last_text(self._names.topic)))
+            problem = network.difference(network_of(self._ros.last_text(self._names.topic)))
             if problem is None:
                 self._site.remember(topological_map=path)
-                return f"{self._names.manager} publishes {path}: {len(wanted.nodes)} nodes, {len(wanted.edges)} edges"
+                return f"{self._names.manager} publishes {path}: {len(network.nodes)} nodes, {len(network.edges)} edges"
         raise LoadError(f"{service} reported success, but {self._names.topic} does not hold {path}: {problem}")
 
 
