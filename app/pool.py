@@ -1,6 +1,6 @@
 """A pool of worker processes for parsing and conversion: limits on memory and time, and a crash costs one job.
 
-Hostile files are read here, never in the server's own process (security, reading 1). Workers are forked from a process
+Hostile files are read here, never in the server's own process. Workers are forked from a process
 that has imported what they need and does nothing else: a worker that dies or overruns is replaced within milliseconds,
 and all share that memory. The server itself is never forked, since it holds native threads. Workers end with it.
 """

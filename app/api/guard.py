@@ -189,7 +189,8 @@ _refusals = _Quota()
 def _log(scope: Scope, status: int, seconds: float, reason: str) -> None:
     """A request: refusals and failures always, changes and slow ones from level info on, the others with debug."""
     changes = scope["method"] not in ("GET", "OPTIONS") and not _REPORT.fullmatch(scope["path"])
-    if status >= 500 or (status in (401, 403, 429) and _refusals.allow(source_of(_address(scope)))):
+    starting = status == 503 and scope["path"] == "/readyz"  # what is wrong later is logged where it goes wrong
+    if (status >= 500 and not starting) or (status in (401, 403, 429) and _refusals.allow(source_of(_address(scope)))):
         level = logging.WARNING
     elif changes or seconds > SLOW_SECONDS:
         level = logging.INFO

@@ -26,7 +26,6 @@ import typer
 from app.cli import local, options, output, variables
 from app.cli.problems import Refused
 from app.errors import FleetMapError, NoRoom, Unavailable
-from app.pool import start_beside
 
 if TYPE_CHECKING:
     from app.config import Settings
@@ -75,6 +74,8 @@ def serve(*, demo: bool = False, **values: Any) -> None:
         settings = with_demo_token(settings)
     listener = listen(settings.host, settings.port)
     if settings.workers == 1:
+        from app.pool import start_beside
+
         start_beside()
     gc.disable()  # until the application is made: what is loaded by then stays
     try:

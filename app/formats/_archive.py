@@ -1,4 +1,4 @@
-"""Safe ZIP reading and deterministic writing (security, reading 8), for KMZ and for uploads of a zipped folder.
+"""Safe ZIP reading and deterministic writing, for KMZ and for uploads of a zipped folder.
 
 Nothing is ever extracted by name: an archive becomes a mapping of names to bytes in memory. The central directory and
 every local header are read here rather than by ``zipfile``, because the two must agree and ``zipfile`` lets them

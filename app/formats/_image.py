@@ -1,4 +1,4 @@
-"""Pictures read safely and PNG written quickly: what grids, overlays and floor plans share (security, reading 7).
+"""Pictures read safely and PNG written quickly: what grids, overlays and floor plans share.
 
 A picture is known by its first bytes, never by its name; its size is checked before a pixel is decoded; a damaged one
 is refused, never half read. Read: PGM (P2, P5) and raw PBM and PPM (P4, P6), PNG, BMP, JPEG.

@@ -1,7 +1,7 @@
 """GeoTIFF read and written by GDAL, from and to memory: what the given bytes hold, and nothing else.
 
-Only the GTiff driver is let at an upload, by bytes in memory: no sidecar, no VRT, no address of it is ever opened
-(security, reading 10). Size and memory are checked by the header, before a pixel is decoded (reading 7).
+Only the GTiff driver is let at an upload, by bytes in memory: no sidecar, no VRT, no address of it is ever opened.
+Size and memory are checked by the header, before a pixel is decoded.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Variables of environment.sh and properties.sh, read and never run (security, reading 9).
+"""Variables of environment.sh and properties.sh, read and never run.
 
 Robots source these files, so what they say is taken as text: only assignments of a literal (``export NAME='value'``,
 ``"value"`` or a bare word) that the shell would come to on every run are read. Whatever needs a shell to be known is

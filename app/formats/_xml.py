@@ -1,4 +1,4 @@
-"""Safe XML for readers: no DOCTYPE, no entities, no network, bounded depth and attributes (security, reading 5)."""
+"""Safe XML for readers: no DOCTYPE, no entities, no network, bounded depth and attributes."""
 
 from __future__ import annotations
 

@@ -155,7 +155,18 @@ def test_the_server_code_is_imported_after_a_check_of_the_python() -> None:
     assert count >= 8
 
 
-AFTER_THE_CHECK = {"_compile", "_store", "_main", "_companions", "_check_names", "_open", "_repair", "_donor", "bundle"}
+AFTER_THE_CHECK = {
+    "_compile",
+    "_store",
+    "_main",
+    "_companions",
+    "_check_names",
+    "_open",
+    "_repair",
+    "_donor",
+    "serve",
+    "bundle",
+}
 """Called by a function that has checked."""
 
 

@@ -466,7 +466,7 @@ def test_properties_that_anybody_edited_do_no_harm() -> None:
 def test_a_large_file_in_time() -> None:
     rows_ = [feature(point(k % 170, k % 80), {"n": k}, id=k) for k in range(50_000)]
     data = orjson.dumps(collection(*rows_))
-    started = time.monotonic()
+    started = time.process_time()
     layers = read(data)
     assert orjson.loads(write(layers)) == orjson.loads(data)
-    assert time.monotonic() - started < 60
+    assert time.process_time() - started < 60

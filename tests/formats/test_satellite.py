@@ -692,9 +692,9 @@ def test_many_pictures_of_one_upload_are_sorted_in_time() -> None:
             f"t{k}.tif": placed_itself,
             f"t{k}.tfw": b"1 0 0 -1 0 0",
         }
-    start = time.monotonic()
+    start = time.process_time()
     groups, rest = formats.group(files)
-    assert time.monotonic() - start < 60
+    assert time.process_time() - start < 60
     assert len(groups) == 4000
     assert rest == []
     assert all(len(g.files) == 2 for g in groups)

@@ -200,10 +200,10 @@ def test_lines_heaped_on_each_other_end_in_time() -> None:
     n = 20_000
     rng = np.random.default_rng(5)
     heap = shapely.linestrings(np.stack([rng.random((n, 2)) * [100, 1e-3], rng.random((n, 2)) * [100, 1e-3]], axis=1))
-    started = time.monotonic()
+    started = time.process_time()
     with pytest.raises(Invalid, match="lie on each other"):
         from_drawing(features([(str(k), g, {}) for k, g in enumerate(heap)], "local"))
-    assert time.monotonic() - started < 20
+    assert time.process_time() - started < 20
     dense = rng.random((20_000, 2)) * 0.05
     assert len(nodes(from_drawing(features([("d", shapely.linestrings(dense), {})], "local")))) == 1
 
