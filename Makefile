@@ -35,7 +35,7 @@ lint: install-dev
 
 # The documentation, into build/docs: warnings are errors, links and anchors are checked.
 docs: install-dev
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs --quiet build --strict --config-file .mkdocs.yml $(ARGS)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file .mkdocs.yml $(ARGS)
 	@echo "build/docs/index.html"
 
 bench: install-dev

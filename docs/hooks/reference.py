@@ -134,7 +134,7 @@ def _definition(found: re.Match[str]) -> str:
 def sentence(text: str) -> str:
     """A text that begins with a capital letter and ends with a full stop."""
     text = text.strip()
-    first = re.match(r"[a-z]+(?=[ ,:;]|$)", text)  # a name such as recovery_behaviours_config stays as it is
+    first = re.match(r"[a-z]+(?=[ ,;]|$)", text)  # a name such as recovery_behaviours_config stays as it is
     text = text[0].upper() + text[1:] if first else text
     return text + ("" if not text or text.endswith((".", "!", "?", ":")) else ".")
 
@@ -174,11 +174,11 @@ def kind_of(hint: Any) -> str:
 
 def bounds(low: float | None, high: float | None, *, above: float | None = None) -> str:
     """Bounds as a range."""
-    if above is not None:
-        return f"above {above:g}" + ("" if high is None else f", to {high:g}")
-    if low is not None and high is not None:
-        return f"{low:g} to {high:g}"
-    return f"from {low:g}" if low is not None else f"up to {high:g}" if high is not None else ""
+    ends = [None if end is None else str(int(end)) if end == int(end) else f"{end:g}" for end in (low, above, high)]
+    start = f"above {ends[1]}" if ends[1] else ends[0]
+    if start and ends[2]:
+        return f"{start}{',' if ends[1] else ''} to {ends[2]}"
+    return start if ends[1] else f"from {start}" if start else f"up to {ends[2]}" if ends[2] else ""
 
 
 def _text(value: object) -> str:
