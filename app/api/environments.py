@@ -157,7 +157,7 @@ def list_environments(
 @router.post(
     "",
     status_code=201,
-    responses=told(EnvironmentOut, 400, 409, 415, ok=201, description="Made"),
+    responses=told(EnvironmentOut, 400, 404, 409, 415, ok=201, description="Made"),
     summary="Make an environment",
 )
 def create_environment(body: EnvironmentBody, services: Here, principal: Admin) -> Response:

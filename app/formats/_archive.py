@@ -40,7 +40,7 @@ _CHUNK = 2**20
 
 _TEXTS = (
     *(".kml", ".xml", ".osm", ".sdf", ".world", ".dae"),
-    *(".yaml", ".yml", ".json", ".geojson", ".ron", ".lif", ".tmap2", ".tmap"),
+    *(".yaml", ".yml", ".json", ".geojson", ".ron", ".lif", ".tmap2", ".tmap", ".csv"),
 )
 _TEXT_COST = 2
 """What parsing a text costs beside keeping other content: it must compress by this factor less. Real ones reach 40."""

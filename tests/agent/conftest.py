@@ -173,7 +173,7 @@ def whole(into: Path) -> dict[str, Any]:
     for file in manifest["files"]:
         data = (version / file["format"] / file["name"]).read_bytes()
         assert (len(data), hashlib.sha256(data).hexdigest()) == (file["size"], file["sha256"]), file
-    files = {str(p.relative_to(version)) for p in version.rglob("*") if p.is_file()}
+    files = {str(p.relative_to(version)) for p in version.rglob("*") if p.is_file() and p.suffix != ".new"}
     expected = {f"{f['format']}/{f['name']}" for f in manifest["files"]}
     assert files == expected | {"manifest.json", "manifest.sig", "environment.sh", "closures.json", "levels.json"}
     return manifest

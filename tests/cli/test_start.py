@@ -55,7 +55,7 @@ def test_workers_are_prepared_beside_the_start(workers: str, tmp_path: Path, mon
         done.append("check")
         raise Unavailable("the database is away")
 
-    monkeypatch.setattr(serving, "start_beside", lambda: done.append("beside"))
+    monkeypatch.setattr("app.pool.start_beside", lambda: done.append("beside"))
     monkeypatch.setattr(serving, "check", check)
     with pytest.raises(Unavailable, match="away"):
         serving.serve(data_dir=str(tmp_path), port="0", workers=workers)
