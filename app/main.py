@@ -56,16 +56,16 @@ from app.api import (
     vda5050,
     versions,
 )
-from app.api.access import Access
-from app.api.answers import API
+from app.api.auth import Access
 from app.api.connections import ConnectionLimits, Connections, fit_open_files
 from app.api.deltas import Deltas
-from app.api.guard import Guard
+from app.api.dependencies import ApiOptions, Services, Writability
 from app.api.jobs import BEAT_SECONDS, Work
 from app.api.maps import Hot, Server
 from app.api.metrics import Metrics
+from app.api.middleware import Guard
 from app.api.protocol import BoundedProtocol, tls_context
-from app.api.services import ApiOptions, Services, Writability
+from app.api.responses import API
 from app.api.signed import SignedLinks
 from app.api.uploads import Intake
 from app.config import Settings
@@ -73,7 +73,7 @@ from app.convert.maps import Maps
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
 from app.events import bus
 from app.events.bus import Bus, BusOptions
-from app.events.login import Login
+from app.events.credentials import Login
 from app.events.relay import Relay
 from app.events.ros2 import Ros2, Ros2Options
 from app.events.ros_names import parse_chosen, parse_keys

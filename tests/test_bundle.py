@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 import shapely
 
-from app.bundle import Bundle, Hints, Known, corner, read, template_folder, unpack
 from app.errors import BadUpload, Invalid, UnreadableFile
 from app.formats import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import PartKey
+from app.upload_reader import Bundle, Hints, Known, corner, read, template_folder, unpack
 
 LIMITS = Limits()
 

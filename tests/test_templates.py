@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from app import formats, parameters, templates
-from app.bundle import Hints
 from app.convert.files import offline
 from app.errors import Invalid
 from app.formats import Group, ReadContext
@@ -13,6 +12,7 @@ from app.model.features import Features
 from app.model.frame import Datum
 from app.model.layers import Layers
 from app.model.templates import NO_TEMPLATES, Own, Templates, template_changes
+from app.upload_reader import Hints
 
 TMAP2 = formats.get_format("tmap2")
 

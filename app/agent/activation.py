@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from app.agent import hooks
-from app.agent.folder import Folder
+from app.agent.http_client import Stopped
 from app.agent.levels import level_problem, level_variables, read_level
+from app.agent.map_directory import Folder
 from app.agent.options import Options
+from app.agent.signed_manifest import Manifest
 from app.agent.state import StateStore, write_whole
-from app.agent.trust import Manifest
-from app.agent.web import Stopped
 
 NOT_NOW = 75
 """Exit status of ``--before-switch`` that delays the switch (EX_TEMPFAIL of sysexits.h)."""

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from urllib.parse import quote, urlencode
 
-from app.agent.folder import Folder
+from app.agent.http_client import Web
+from app.agent.map_directory import Folder
 from app.agent.requests import FormatRequest
-from app.agent.trust import File, Manifest
-from app.agent.web import Web
+from app.agent.signed_manifest import File, Manifest
 
 
 class Downloads:

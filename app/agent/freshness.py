@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from app.agent.trust import CLOCKS_DIFFER, Manifest
+from app.agent.signed_manifest import CLOCKS_DIFFER, Manifest
 
 PLAUSIBLE_SINCE = 1767225600.0
 """2026-01-01: an earlier clock is unset, in seconds since 1970."""

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from app.agent import hooks
-from app.agent.folder import Folder
+from app.agent.map_directory import Folder
+from app.agent.signed_manifest import Manifest
 from app.agent.state import write_whole
-from app.agent.trust import Manifest
 from app.errors import Conflict, Invalid, NotFound, Unavailable
 
 MAX_LEVEL_BYTES = 4096

@@ -6,14 +6,14 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 
-from app.agent import trust
-from app.agent.folder import Folder
+from app.agent import signed_manifest
 from app.agent.freshness import Freshness, SignedClock
+from app.agent.http_client import Web
+from app.agent.map_directory import Folder
 from app.agent.options import Options
 from app.agent.requests import FormatRequest, encode_entries
+from app.agent.signed_manifest import Manifest
 from app.agent.state import Mark, StateStore
-from app.agent.trust import Manifest
-from app.agent.web import Web
 from app.errors import Unavailable, Untrusted
 
 
@@ -73,7 +73,7 @@ class Manifests:
             self._clock.floor = 0.0
         self._clock.observe(manifest)
         if state.key != key:
-            self._log("trusting", key=trust.key_id(key), detail="rotated" if state.key else "first contact")
+            self._log("trusting", key=signed_manifest.key_id(key), detail="rotated" if state.key else "first contact")
         state = dataclasses.replace(state, key=key, newest_time=self._clock.floor)
         self._store.keep(state.marked(channel, manifest.mark))
         self._latest = (request_key, response[2], manifest)
@@ -83,7 +83,11 @@ class Manifests:
         """Fetch the manifest of a version that a channel is planned to move to. Raises Untrusted."""
         closures = "&closures=apply" if self.has_closures else ""
         response = self._web.manifest(self._options.environment, str(version), self._query + closures)
-        if response is not None and not closures and trust.parse(response[0], response[1]).overlays_digest is not None:
+        if (
+            response is not None
+            and not closures
+            and signed_manifest.parse(response[0], response[1]).overlays_digest is not None
+        ):
             response = self._web.manifest(self._options.environment, str(version), f"{self._query}&closures=apply")
         if response is None:
             raise Unavailable(f"the server did not return the manifest of version {version}")
@@ -124,9 +128,9 @@ class Manifests:
     def _verify(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, bytes]:
         """Return a manifest and the key that signed it. Raises Untrusted."""
         state = self._store.value
-        key = trust.signer(data, signature, state.key, state.given, self._web.keys)
-        manifest = trust.parse(data, signature)
-        trust.check(
+        key = signed_manifest.signer(data, signature, state.key, state.given, self._web.keys)
+        manifest = signed_manifest.parse(data, signature)
+        signed_manifest.check(
             manifest,
             environment=self._options.environment,
             channel=channel,

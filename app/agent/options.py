@@ -9,7 +9,7 @@ from pathlib import Path
 
 from app.errors import Invalid
 from app.events import messages
-from app.events.login import Login
+from app.events.credentials import Login
 
 POLL_SECONDS = 60.0
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from app.agent.web import Web
+from app.agent.http_client import Web
 from app.errors import FleetMapError, Unavailable
 from app.events.messages import RobotStatus
 

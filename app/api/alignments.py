@@ -7,10 +7,10 @@ import math
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from app.api.access import Editor
-from app.api.answers import Route, answer
+from app.api.auth import Editor
+from app.api.dependencies import Here
+from app.api.responses import Route, answer
 from app.api.schemas import AlignmentBody, AlignmentOut, EnvironmentPath, IdempotencyKey, IfMatch, OntoBody, told
-from app.api.services import Here
 from app.errors import Invalid, Problem
 from app.ingest import Alignment
 

@@ -7,10 +7,10 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
-from app.api.access import ServerAdmin
-from app.api.answers import Route, page
+from app.api.auth import ServerAdmin
+from app.api.dependencies import Here
+from app.api.responses import Route, page
 from app.api.schemas import AuditOut, Limit, told
-from app.api.services import Here
 from app.errors import Invalid
 from app.store.audit import AuditEntry
 from app.store.values import rfc3339

@@ -12,13 +12,13 @@ from fastapi import APIRouter, Query, Request
 from numpy.typing import NDArray
 from starlette.responses import Response
 
-from app.api.access import Viewer
-from app.api.answers import Route, answer, json_bytes
+from app.api.auth import Viewer
 from app.api.caching import none_match
+from app.api.dependencies import Here, Services
 from app.api.layers import Crs, feature_collection
 from app.api.maps import number_of
+from app.api.responses import Route, answer, json_bytes
 from app.api.schemas import VERSION, DeltaOut, EnvironmentPath, VersionPath, told
-from app.api.services import Here, Services
 from app.errors import MissingDatum
 from app.model.features import Features
 from app.model.frame import Anchor

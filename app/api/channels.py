@@ -12,11 +12,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import fleet
-from app.api.access import Editor, Viewer
-from app.api.answers import Route, answer, json_bytes
+from app.api.auth import Editor, Viewer
 from app.api.caching import none_match
+from app.api.dependencies import Here, Services
+from app.api.responses import Route, answer, json_bytes
 from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, told
-from app.api.services import Here, Services
 from app.errors import Invalid, Problem
 from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
 

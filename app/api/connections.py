@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from app.api.access import is_loopback, source_of
+from app.api.auth import is_loopback, source_of
 
 log = logging.getLogger(__name__)
 

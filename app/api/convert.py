@@ -12,22 +12,22 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats, parameters
-from app.api.access import Editor
-from app.api.answers import Route, answer
+from app.api.auth import Editor
 from app.api.caching import content_disposition
+from app.api.dependencies import Here, Services
 from app.api.environments import datum_of, numbers
 from app.api.problems import UnsupportedMedia
+from app.api.responses import Route, answer
 from app.api.schemas import DatumBody, told
-from app.api.services import Here, Services
 from app.api.uploads import Form
 from app.api.versions import check_names, format_named, truth
-from app.bundle import DRAWN_LAYERS, Hints, drawn_layer
 from app.convert.files import Converted
-from app.convert.make import media_type, zipped
+from app.convert.worker import media_type, zipped
 from app.errors import Invalid, Problem
 from app.ingest.service import check_grid_name
 from app.model.frame import GROUND, Datum, Level
 from app.model.names import did_you_mean
+from app.upload_reader import DRAWN_LAYERS, Hints, drawn_layer
 
 router = APIRouter(tags=["formats"], route_class=Route)
 

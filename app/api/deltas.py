@@ -12,7 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 
-from app.api.together import Together
+from app.api.single_flight import Together
 from app.convert.cache import Cache, MadeFile
 
 if sys.version_info >= (3, 14):

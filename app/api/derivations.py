@@ -8,10 +8,10 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from app import derive, parameters
-from app.api.access import Editor, Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Editor, Viewer
+from app.api.dependencies import Here
+from app.api.responses import Route, answer
 from app.api.schemas import DerivationBody, DerivationOut, EnvironmentPath, IdempotencyKey, IfMatch, VersionOut, told
-from app.api.services import Here
 from app.api.versions import told_as
 from app.catalogue import describe_derivations
 from app.errors import Invalid, NotFound, Problem

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from starlette.responses import Response
 
-from app.api.access import Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Viewer
+from app.api.dependencies import Here, Services
 from app.api.maps import number_of
+from app.api.responses import Route, answer
 from app.api.schemas import VERSION, DiffOut, EnvironmentPath, told
-from app.api.services import Here, Services
 from app.errors import Invalid
 from app.model.features import Features, features
 from app.model.frame import Anchor

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
-from app.api.access import Admin, Editor, Principal, Viewer
-from app.api.answers import Route, answer, page, path_of
+from app.api.auth import Admin, Editor, Principal, Viewer
+from app.api.dependencies import Here, Services
+from app.api.responses import Route, answer, page, path_of
 from app.api.schemas import (
     RESERVED,
     Cursor,
@@ -21,7 +22,6 @@ from app.api.schemas import (
     Limit,
     told,
 )
-from app.api.services import Here, Services
 from app.errors import Conflict, Gone, Invalid, NotFound, Problem
 from app.ingest.service import check_if_match
 from app.model.frame import Datum

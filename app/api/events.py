@@ -18,15 +18,15 @@ from fastapi import APIRouter, Header, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
-from app.api.access import Access, Principal, Viewer
-from app.api.answers import Route
+from app.api.auth import Access, Principal, Viewer
+from app.api.dependencies import Here, Services
 from app.api.environments import as_dict, position_of
 from app.api.maps import closure_mode, number_of
 from app.api.problems import Throttled
 from app.api.protocol import ON_STOP
+from app.api.responses import Route
 from app.api.schemas import told
-from app.api.services import Here, Services
-from app.api.together import Together
+from app.api.single_flight import Together
 from app.convert.cache import MadeFile
 from app.convert.maps import file_of
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable

@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from app.api.access import Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Viewer
+from app.api.responses import Route, answer
 from app.api.schemas import FormatOut, told
 from app.catalogue import describe_formats
 

@@ -6,10 +6,10 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from app import generate
-from app.api.access import Editor, Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Editor, Viewer
+from app.api.dependencies import Here
+from app.api.responses import Route, answer
 from app.api.schemas import EnvironmentPath, GenerationBody, GeneratorOut, IdempotencyKey, IfMatch, VersionOut, told
-from app.api.services import Here
 from app.api.versions import told_as
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import Order

@@ -10,11 +10,11 @@ from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.access import ServerViewer
-from app.api.answers import Route, answer
+from app.api.auth import ServerViewer
+from app.api.dependencies import Here, Services
 from app.api.metrics import CONTENT_TYPE
+from app.api.responses import Route, answer
 from app.api.schemas import told
-from app.api.services import Here, Services
 from app.errors import Unavailable
 from app.events import ros2
 from app.events.relay import state_of

@@ -17,10 +17,10 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app.api import problems
-from app.api.access import Principal, Viewer
-from app.api.answers import Route, answer, path_of
+from app.api.auth import Principal, Viewer
+from app.api.dependencies import Here
+from app.api.responses import Route, answer, path_of
 from app.api.schemas import JobOut, JobPath, Limit, told
-from app.api.services import Here
 from app.convert.cache import Made
 from app.convert.maps import Maps
 from app.convert.recipe import Recipe

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from starlette.responses import Response
 
-from app.api.access import Viewer
-from app.api.answers import Route, answer, json_bytes
+from app.api.auth import Viewer
 from app.api.caching import none_match
+from app.api.dependencies import Here, Services
 from app.api.environments import box_of, numbers
 from app.api.maps import number_of
 from app.api.problems import NotAcceptable
+from app.api.responses import Route, answer, json_bytes
 from app.api.schemas import EnvironmentPath, LayerOut, LayerPath, VersionPath, told
-from app.api.services import Here, Services
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
 from app.model.features import Features
 from app.model.frame import GROUND, MAX_METRES, Anchor

@@ -9,12 +9,12 @@ from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.access import Principal, Viewer
-from app.api.answers import API, Route, answer
+from app.api.auth import Principal, Viewer
+from app.api.dependencies import Here, Services
 from app.api.jobs import Started, started
 from app.api.maps import Wanted, made_at, number_of
+from app.api.responses import API, Route, answer
 from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, told
-from app.api.services import Here, Services
 from app.api.signed import Grant
 from app.convert.cache import MadeFile
 from app.convert.maps import file_of

@@ -16,13 +16,13 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats
-from app.api.access import ServerAdmin, Viewer
-from app.api.answers import Route, answer, json_bytes
+from app.api.auth import ServerAdmin, Viewer
 from app.api.caching import none_match
+from app.api.dependencies import Here, Services
 from app.api.jobs import Started, started
 from app.api.maps import address_of, number_of, options_of
+from app.api.responses import Route, answer, json_bytes
 from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
-from app.api.services import Here, Services
 from app.convert import site
 from app.convert.cache import Made
 from app.convert.recipe import Recipe, own_options

@@ -26,17 +26,17 @@ from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from app.api import deltas
-from app.api.access import Access, Principal, Viewer
-from app.api.answers import API, Route, answer, path_of
+from app.api.auth import Access, Principal, Viewer
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
-from app.api.guard import is_from_here
+from app.api.dependencies import Here, Services
 from app.api.jobs import Started, started
 from app.api.metrics import Metrics
+from app.api.middleware import is_from_here
 from app.api.protocol import PROVE
+from app.api.responses import API, Route, answer, path_of
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
-from app.api.services import Here, Services
 from app.api.signed import LINK
-from app.api.together import Together
+from app.api.single_flight import Together
 from app.convert.cache import LostMap, Made, MadeFile
 from app.convert.maps import file_of
 from app.convert.recipe import Recipe

@@ -13,10 +13,11 @@ from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.access import Editor, Principal, Reporter, Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Editor, Principal, Reporter, Viewer
+from app.api.dependencies import Here, Services
 from app.api.jobs import Started, started
 from app.api.maps import address_of, made_by
+from app.api.responses import Route, answer
 from app.api.schemas import (
     DynamicEdgesOut,
     EnvironmentPath,
@@ -27,7 +28,6 @@ from app.api.schemas import (
     ZoneSetsOut,
     told,
 )
-from app.api.services import Here, Services
 from app.convert.cache import Made
 from app.convert.closures import place_problem
 from app.errors import Conflict, Denied, Invalid, NotFound, Problem

@@ -9,11 +9,11 @@ from xml.sax.saxutils import escape
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
-from app.api.access import Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Viewer
+from app.api.dependencies import Here
 from app.api.maps import number_of
+from app.api.responses import Route, answer
 from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, told
-from app.api.services import Here
 from app.convert.maps import Maps
 from app.store.values import Version
 

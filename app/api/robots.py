@@ -12,10 +12,10 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import fleet
-from app.api.access import Editor, Principal, Reporter, Viewer
-from app.api.answers import Route, answer, page
+from app.api.auth import Editor, Principal, Reporter, Viewer
+from app.api.dependencies import Here, Services
+from app.api.responses import Route, answer, page
 from app.api.schemas import CHANNEL, NAME, Cursor, Limit, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
-from app.api.services import Here, Services
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.audit import about
 from app.store.values import Channel, Heard, Held, Move, Report, Robot, rfc3339

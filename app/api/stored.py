@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path
 from starlette.responses import Response
 
-from app.api.access import ServerAdmin
-from app.api.answers import Route
+from app.api.auth import ServerAdmin
+from app.api.dependencies import Here
 from app.api.maps import IN_MEMORY, streamed
+from app.api.responses import Route
 from app.api.schemas import told
-from app.api.services import Here
 from app.errors import Damaged, NotFound
 
 TYPE = "application/octet-stream"

@@ -8,9 +8,10 @@ from fastapi import APIRouter, Path, Query
 from starlette.responses import Response
 
 from app import formats, templates
-from app.api.access import Editor, Principal, Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Editor, Principal, Viewer
+from app.api.dependencies import Here, Services
 from app.api.maps import number_of
+from app.api.responses import Route, answer
 from app.api.schemas import (
     MAX_TEXT,
     VERSION,
@@ -25,7 +26,6 @@ from app.api.schemas import (
     VersionOut,
     told,
 )
-from app.api.services import Here, Services
 from app.api.versions import told_as
 from app.formats import Format
 from app.ingest import TemplateWish

@@ -8,10 +8,10 @@ from typing import Any
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from app.api.access import ServerAdmin
-from app.api.answers import Route, answer
+from app.api.auth import ServerAdmin
+from app.api.dependencies import Here
+from app.api.responses import Route, answer
 from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, told
-from app.api.services import Here
 from app.errors import Conflict, Invalid, NotFound, Problem
 from app.events.messages import ROBOT_NAME
 from app.store.values import Token, rfc3339

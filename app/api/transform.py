@@ -8,12 +8,12 @@ import numpy as np
 from fastapi import APIRouter, Query
 from starlette.responses import Response
 
-from app.api.access import Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Viewer
+from app.api.dependencies import Here
 from app.api.environments import numbers
 from app.api.maps import number_of
+from app.api.responses import Route, answer
 from app.api.schemas import VERSION, EnvironmentPath, TransformOut, told
-from app.api.services import Here
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES
 from app.model.geodesy import local_frame

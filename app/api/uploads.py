@@ -24,7 +24,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
-from app.api.guard import multipart_boundary
+from app.api.middleware import multipart_boundary
 from app.api.problems import MalformedBody
 from app.errors import NO_ROOM, Invalid, NoRoom, Problem, TooLarge, Unavailable
 from app.formats import Limits

@@ -11,14 +11,14 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats
-from app.api.access import Principal, Reporter, Viewer
-from app.api.answers import Route, answer
+from app.api.auth import Principal, Reporter, Viewer
+from app.api.dependencies import Here, Services
 from app.api.jobs import Started, started
 from app.api.links import LinkedFile, link_to
 from app.api.maps import number_of
+from app.api.responses import Route, answer
 from app.api.robots import may_report, noted
 from app.api.schemas import CHANNEL, NAME, ActionsOut, EnvironmentPath, RobotPath, StateOut, VersionPath, told
-from app.api.services import Here, Services
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
 from app.store.values import Channel, Report, RobotState, Version

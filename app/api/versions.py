@@ -11,11 +11,12 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from app import formats
-from app.api.access import Editor, Principal, Viewer
-from app.api.answers import Route, answer, page, path_of
+from app.api.auth import Editor, Principal, Viewer
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
+from app.api.dependencies import Here, Services
 from app.api.maps import IN_MEMORY, number_of, streamed
 from app.api.problems import UnsupportedMedia
+from app.api.responses import Route, answer, page, path_of
 from app.api.schemas import (
     VERSION,
     Cursor,
@@ -30,14 +31,13 @@ from app.api.schemas import (
     VersionPath,
     told,
 )
-from app.api.services import Here, Services
 from app.api.uploads import Form
-from app.bundle import DRAWN_LAYERS, drawn_layer
 from app.errors import FleetMapError, Invalid, NotFound, Problem
 from app.ingest import Outcome, SpooledFile, Upload
 from app.ingest.service import bad_name
 from app.model.frame import GROUND, Level
 from app.store.values import Source
+from app.upload_reader import DRAWN_LAYERS, drawn_layer
 
 router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=Route)
 

@@ -157,11 +157,11 @@ def agent(
 
     Example: `fleetmap agent -e farm -f occupancy_grid,tmap2 -o /srv/maps --channel production --on-change nav2`
     """
-    from app.agent.core import Agent, Options, robot_name
+    from app.agent.agent import Agent, Options, robot_name
     from app.agent.requests import parse_formats
     from app.cli.client import DEFAULT_SERVER
     from app.errors import Invalid
-    from app.events.login import Login
+    from app.events.credentials import Login
 
     names = parse_formats(formats)
     if not names:

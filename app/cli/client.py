@@ -21,7 +21,7 @@ import httpx
 from app.cli import variables
 from app.cli.output import Bar, progress_bar, say
 from app.cli.problems import Refused
-from app.events.login import trusting
+from app.events.credentials import trusting
 from app.model.names import did_you_mean
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"

@@ -33,16 +33,16 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
     ),
     "Environments and their versions": (
         ("environment", "environments:commands"),
-        ("versions", "history:versions"),
-        ("diff", "history:diff"),
-        ("revert", "history:revert"),
+        ("versions", "versions:versions"),
+        ("diff", "versions:diff"),
+        ("revert", "versions:revert"),
         ("where", "position:locate"),
-        ("derive", "history:derive"),
+        ("derive", "versions:derive"),
         ("align", "align:align"),
         ("generate", "generate:generate"),
     ),
     "Fleet": (
-        ("promote", "history:promote"),
+        ("promote", "versions:promote"),
         ("channels", "channels:commands"),
         ("robots", "robots:commands"),
         ("overlays", "overlays:commands"),
@@ -51,12 +51,12 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("agent-level", "agent:agent_level"),
     ),
     "Server": (
-        ("serve", "serving:serve"),
-        ("demo", "serving:demo"),
+        ("serve", "server:serve"),
+        ("demo", "server:demo"),
         ("token", "tokens:commands"),
         ("keys", "keys:commands"),
         ("jobs", "jobs:commands"),
-        ("migrate", "serving:migrate"),
+        ("migrate", "server:migrate"),
         ("verify", "verify:verify"),
     ),
 }
@@ -138,7 +138,7 @@ def build(only: str | None = None) -> typer.Typer:
             app.add_typer(command, name=name, **shown)
             continue
         if name == "serve":
-            command = sys.modules["app.cli.serving"].with_flags(command) if only == "serve" else _serve_without_flags
+            command = sys.modules["app.cli.server"].with_flags(command) if only == "serve" else _serve_without_flags
         settings = {"ignore_unknown_options": True} if name in NEGATIVE_ARGUMENTS else None
         app.command(name, context_settings=settings, **shown)(command)
     return app

@@ -18,7 +18,7 @@ TIMEOUT_SECONDS = 1.0
 MAX_NAMES = 1000
 
 DRAWN_LAYERS = ("objects", "topology", "location", "zones")
-"""The same as ``app.bundle.DRAWN_LAYERS``, without its imports."""
+"""The same as ``app.upload_reader.DRAWN_LAYERS``, without its imports."""
 
 
 def environments(ctx: typer.Context) -> list[tuple[str, str]]:
@@ -90,7 +90,7 @@ def _rows(ctx: typer.Context, *path: str, **query: Any) -> list[Any]:
     from urllib.request import Request, urlopen
 
     from app.errors import FleetMapError
-    from app.events.login import trusting
+    from app.events.credentials import trusting
 
     given = (ctx.params.get("server"), os.environ.get("FLEETMAP_SERVER"), "http://127.0.0.1:8000")
     server = str(next(filter(None, given))).rstrip("/")

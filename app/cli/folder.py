@@ -19,7 +19,8 @@ from app.errors import Invalid
 
 CONFIG = "config"
 PARTS = ("location", "metric", "topological", "world")
-"""The folders of an environment_template's config; the same as ``app.bundle.TEMPLATE_FOLDERS``, without its imports."""
+"""The folders of an environment_template's config; the same as ``app.upload_reader.TEMPLATE_FOLDERS``, without its
+imports."""
 
 SCRIPTS = ("environment.sh", "properties.sh")
 """Read as literal assignments by the server; never run."""

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli import completion, local, options, output, write
+from app.cli import completion, local, options, output, output_files
 from app.cli.client import Client, path_of
 from app.cli.created import ensured
 from app.cli.folder import check_name, environment_name
-from app.cli.history import show_made
 from app.cli.maps import show_parameters, show_report
+from app.cli.versions import show_made
 from app.errors import Invalid, Problem
 
 if TYPE_CHECKING:
@@ -186,8 +186,10 @@ def _write(
     report["warnings"] = [w.as_dict() for w in notes.warnings] + report["warnings"]
     report["dropped"] = notes.dropped + report["dropped"]
     report["template"] = notes.template + report["template"]
-    as_folder = write.wants_folder(out) or (len(result.files) > 1 and out != "-" and not out.lower().endswith(".zip"))
-    names = write.bundle(result.files, Path(out), folder=as_folder)
+    as_folder = output_files.wants_folder(out) or (
+        len(result.files) > 1 and out != "-" and not out.lower().endswith(".zip")
+    )
+    names = output_files.bundle(result.files, Path(out), folder=as_folder)
     if as_json:
         output.show_json({"files": names, "report": report})
         return

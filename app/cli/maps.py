@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli import completion, local, options, output, write
+from app.cli import completion, local, options, output, output_files
 from app.cli import folder as folders
 from app.cli.client import Client, Download, LocalFile, path_of
 from app.cli.companions import with_companions
 from app.cli.created import ensured
-from app.cli.history import change_line, channel_rows
+from app.cli.versions import change_line, channel_rows
 from app.errors import Invalid, NotFound
 from app.model.frame import GROUND
 
@@ -187,9 +187,9 @@ def convert(
     """
     local.require_server_python("convert")
     from app import formats, parameters
-    from app.bundle import Hints, drawn_layer
     from app.convert.files import offline
     from app.derive import all_derivations, takes
+    from app.upload_reader import Hints, drawn_layer
 
     if out == "-" and as_json:
         raise typer.BadParameter("--json and -o - both want standard output")
@@ -204,10 +204,10 @@ def convert(
     with output.progress_bar(f"converting to {to}"):
         data = {f.name: f.path.read_bytes() for f in files}
         converted = offline(data, to, hints=hints, datum=options.datum(datum), options=format_options, derived=derive)
-    as_folder = write.wants_folder(out) or (
+    as_folder = output_files.wants_folder(out) or (
         len(converted.files) > 1 and out != "-" and not out.lower().endswith(".zip")
     )
-    names = write.bundle(converted.files, Path(out), folder=as_folder)
+    names = output_files.bundle(converted.files, Path(out), folder=as_folder)
     if as_json:
         output.show_json({"files": names, "report": converted.report})
         return
@@ -231,11 +231,11 @@ def check(
     Example: `fleetmap check map.yaml map.pgm`
     """
     local.require_server_python("check")
-    from app import bundle, formats
+    from app import formats, upload_reader
 
     collected, _, notes = _collect(paths)
     collected = with_companions(collected)
-    files = bundle.unpack({f.name: f.path.read_bytes() for f in collected}, formats.Limits())
+    files = upload_reader.unpack({f.name: f.path.read_bytes() for f in collected}, formats.Limits())
     groups, rest = formats.group({name: data for name, data in files.items() if data}, format)
     results: list[dict[str, Any]] = []
     for group in groups:
@@ -475,17 +475,17 @@ def _preferred(client: Client, environment: str) -> str:
 
 def _store(got: Download, to: str | None) -> list[str]:
     """Put a download where the user wants it: the places."""
-    if to is not None and write.wants_folder(to):
+    if to is not None and output_files.wants_folder(to):
         if got.is_zip:
-            return [str(Path(to) / name) for name in write.unpack(got.path, Path(to))]
-        target = write.inside(Path(to), got.name)
+            return [str(Path(to) / name) for name in output_files.unpack(got.path, Path(to))]
+        target = output_files.inside(Path(to), got.name)
     else:
         target = Path(to or got.name)
     with got.path.open("rb") as stream:
         if to == "-":
-            write.to_stdout(stream)
+            output_files.to_stdout(stream)
             return []
-        write.to_file(target, stream)
+        output_files.to_file(target, stream)
     return [str(target)]
 
 

@@ -10,7 +10,7 @@ import typer
 
 from app.cli import completion, local, options, output
 from app.cli.client import Client, path_of
-from app.cli.history import change_line
+from app.cli.versions import change_line
 
 
 def template(

@@ -61,7 +61,7 @@ def verify(
     Example: `fleetmap verify --repair --from /backup/originals --from https://other-server`
     """
     local.require_server_python("verify")
-    from app.cli.serving import load_settings
+    from app.cli.server import load_settings
     from app.convert.cache import Cache
 
     if sources and not repair:

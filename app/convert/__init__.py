@@ -1,5 +1,5 @@
 """READ: a stored version -> a map in the wanted format.
 
-``recipe`` says how a map would be made (cheaply, from the version's manifest), ``make`` makes it, ``cache`` keeps it
+``recipe`` says how a map would be made (cheaply, from the version's manifest), ``worker`` makes it, ``cache`` keeps it
 and lets one of many askers do the work, ``app.pool`` is where the work is done.
 """

@@ -7,17 +7,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from app import bundle, formats
-from app.bundle import Hints, Known
-from app.convert import make as making
+from app import formats, upload_reader
 from app.convert import recipe as recipes
 from app.convert import site
+from app.convert import worker as making
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.formats import Files, Format, Limits
 from app.model.frame import Datum
 from app.model.layers import Layer, Layers
 from app.store.values import PartEntry, Provenance
 from app.templates import REQUEST
+from app.upload_reader import Hints, Known
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ def offline(
 
     options: the wanted format's own, and the parameters of derivations on the way.
 
-    Raises what reading and planning raise; see ``app.bundle.read`` and ``app.convert.recipe.chain``.
+    Raises what reading and planning raise; see ``app.upload_reader.read`` and ``app.convert.recipe.chain``.
     """
     return _offline(lambda: files, to, hints or Hints(), datum, options or {}, limits or Limits(), derived)
 
@@ -70,15 +70,15 @@ def _offline(
     cells = bool(option_values) or not fmt.outlines  # an option may ask for the images, too
     complete = required_layers is None and cells
     knowing = Known(datum, None, required_layers, cells, fmt.drawing or fmt.holds)
-    upload_bundle = bundle.read(bundle.unpack(load(), limits), hints, knowing, limits)
+    upload_bundle = upload_reader.read(upload_reader.unpack(load(), limits), hints, knowing, limits)
     try:
         written = _made(fmt, upload_bundle, datum, option_values, derived=derived and complete)
     except (CannotConvert, Invalid, NotFound):
         if complete:
             raise
         # Nothing is ever derived from layers that were read in part: a world without its meshes has no walls.
-        upload_bundle = bundle.read(
-            bundle.unpack(load(), limits), hints, replace(knowing, wanted=None, cells=True), limits
+        upload_bundle = upload_reader.read(
+            upload_reader.unpack(load(), limits), hints, replace(knowing, wanted=None, cells=True), limits
         )
         written = _made(fmt, upload_bundle, datum, option_values, derived=derived)
     filled = making.labelled(written.report["template"], dict.fromkeys(option_values, REQUEST))
@@ -88,7 +88,12 @@ def _offline(
 
 
 def _made(
-    fmt: Format, upload_bundle: bundle.Bundle, datum: Datum | None, option_values: Mapping[str, Any], *, derived: bool
+    fmt: Format,
+    upload_bundle: upload_reader.Bundle,
+    datum: Datum | None,
+    option_values: Mapping[str, Any],
+    *,
+    derived: bool,
 ) -> making.Written:
     credit = {key: upload_bundle.credit(key) for key in upload_bundle.parts}
     layers = upload_bundle.layers(datum)

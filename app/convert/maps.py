@@ -16,12 +16,11 @@ from typing import Any
 import orjson
 
 from app import __version__, formats, parameters, templates
-from app.bundle import Hints
 from app.convert import closures as applied_closures
 from app.convert import files as direct
-from app.convert import make as making
 from app.convert import recipe as recipes
 from app.convert import site
+from app.convert import worker as making
 from app.convert.cache import Cache, LostMap, Made, MadeFile, Product
 from app.convert.recipe import Hindrance, Recipe
 from app.convert.trials import Trials
@@ -44,6 +43,7 @@ from app.model.names import did_you_mean
 from app.pool import Stop, WorkerDied
 from app.store.store import Store
 from app.store.values import Version
+from app.upload_reader import Hints
 
 Run = Callable[..., Any]
 """``run(function, *args, stop=…)``: call a module-level function somewhere safe, return its result (``Pool.run``)."""

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from app import derive, formats, generate
-from app.convert import files, make
+from app.convert import files, worker
 from app.model.frame import Datum
 from app.model.geodesy import distance, local_frame
 
@@ -19,4 +19,4 @@ Image.preinit()
 local_frame(Datum(0.0, 0.0)).to_local(np.unique(np.zeros((1, 2)), axis=0))
 distance((0.0, 0.0), (0.0, 1.0))
 
-__all__ = ["files", "make"]
+__all__ = ["files", "worker"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.derive._choice import named, one_each
+from app.derive._select import named, one_each
 from app.errors import CannotConvert, Invalid
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame

@@ -10,8 +10,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, derives
+from app.derive._picture_methods import method_of, plan_of, seen
 from app.derive._pictures import Ground, called, chosen, ground
-from app.derive._seen import method_of, plan_of, seen
 from app.derive._segments import Segmentation, Segments
 from app.errors import CannotConvert
 from app.model.features import features

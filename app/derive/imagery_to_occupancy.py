@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.derive import Notes, derives
+from app.derive._picture_methods import method_of, plan_of, seen
 from app.derive._pictures import called, chosen, ground
-from app.derive._seen import method_of, plan_of, seen
 from app.derive._segments import Segmentation
 from app.errors import CannotConvert, MissingDatum
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid

@@ -12,8 +12,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, _raster, derives
-from app.derive._grids import called, chosen, seen
 from app.derive._raster import Frame
+from app.derive._select_grids import called, chosen, seen
 from app.errors import CannotConvert, MissingDatum
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import Picture

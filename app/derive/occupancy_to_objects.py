@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from app.derive import Notes, derives
 from app.derive._figures import MOST, Box, Disc, Found, Sizes, figures
-from app.derive._grids import called, chosen, seen
+from app.derive._select_grids import called, chosen, seen
 from app.errors import CannotConvert, TooLarge
 from app.model.features import features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid

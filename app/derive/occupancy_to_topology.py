@@ -19,7 +19,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, derives
-from app.derive._grids import called, chosen, grey_warning
+from app.derive._select_grids import called, chosen, grey_warning
 from app.errors import CannotConvert, Invalid, Problem, TooLarge
 from app.model.features import Compact, Features, Properties, from_columns, points
 from app.model.grid import OccupancyGrid, as_seen, unknown_grey

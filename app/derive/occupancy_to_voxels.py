@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes, derives
-from app.derive._grids import called, seen
+from app.derive._select_grids import called, seen
 from app.errors import CannotConvert, MissingLayer
 from app.model import masks
 from app.model.grid import UNKNOWN, OccupancyGrid, as_seen

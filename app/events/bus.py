@@ -24,7 +24,7 @@ from zenoh import ext
 
 from app.errors import Invalid, Problem, Unavailable
 from app.events import messages
-from app.events.login import no_router, plain
+from app.events.credentials import no_router, plain
 from app.events.router import Router
 from app.events.security import Security
 

@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from app.events import single
+from app.events import leader
 from app.events.bus import HISTORY, Bus
-from app.events.single import POLL_SECONDS, Single
+from app.events.leader import POLL_SECONDS, Single
 from app.store.store import Store
 from app.store.values import Event
 
@@ -84,4 +84,4 @@ class Relay(Single):
 
 def state_of(data_dir: Path, mode: str) -> dict[str, Any]:
     """What /readyz says of events: ``off``, ``starting``, ``connected`` or ``down`` with the reason."""
-    return {"state": "off"} if mode == "off" else single.state_of(data_dir, NAME)
+    return {"state": "off"} if mode == "off" else leader.state_of(data_dir, NAME)

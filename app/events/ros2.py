@@ -24,10 +24,10 @@ import zenoh
 from zenoh import ext
 
 from app.errors import FleetMapError
-from app.events import cdr, ros_names, single
+from app.events import cdr, leader, ros_names
 from app.events.bus import BusOptions, no_connection, session_configuration
+from app.events.leader import POLL_SECONDS, Single
 from app.events.ros_names import Chosen, Keys, Topic
-from app.events.single import POLL_SECONDS, Single
 from app.store.values import Version
 
 log = logging.getLogger(__name__)
@@ -308,7 +308,7 @@ def update(before: cdr.Grid, after: cdr.Grid, version: Version) -> bytes:
 
 def state_of(data_dir: Path) -> dict[str, Any]:
     """What /readyz says of topics: ``starting``, ``connected`` with their number, or ``down`` with the reason."""
-    return single.state_of(data_dir, NAME)
+    return leader.state_of(data_dir, NAME)
 
 
 def _close(session: Any) -> None:

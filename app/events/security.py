@@ -18,7 +18,7 @@ from typing import Any
 
 from app.errors import Invalid, Problem
 from app.events import messages
-from app.events.login import Login, file_of
+from app.events.credentials import Login, file_of
 
 SERVER = "server"
 """The user that the server itself is on its own router."""

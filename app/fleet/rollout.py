@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from datetime import datetime, timedelta
 from fractions import Fraction
 
-from app.fleet.picture import is_online, is_ready
+from app.fleet.status import is_online, is_ready
 from app.store.values import Robot, Rollout, Step, rfc3339
 
 

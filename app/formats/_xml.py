@@ -10,7 +10,7 @@ from lxml import etree
 from app.errors import Problem, TooLarge, UnreadableFile
 from app.formats import Limits, ReadContext
 from app.model.names import did_you_mean
-from app.model.prolog import check_prolog
+from app.model.xml_prolog import check_prolog
 
 __all__ = ["MAX_ATTRIBUTES", "attributes", "check_bounds", "check_prolog", "parse"]
 

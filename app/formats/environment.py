@@ -14,8 +14,8 @@ that are there; as in the template those of maps that are missing are empty. The
 the very environment, and in one that was edited the maps count. Added files that no format reads (a README,
 ``.DS_Store``) are no edit.
 
-Every map in it is another format's: reading is what an upload of the folder is (``app.bundle``), and writers come from
-``WriteContext.make``.
+Every map in it is another format's: reading is what an upload of the folder is (``app.upload_reader``), and writers
+come from ``WriteContext.make``.
 """
 
 from __future__ import annotations

@@ -5,7 +5,8 @@ in both directions. A line's ends are the points at these very coordinates. Sour
 convertors/ffrnetwork_to_tmap.py, which reads ``topological/network.ffr.yaml`` (it puts each line to both of its ends;
 that the way back then leads from a node to itself is a slip of its).
 
-Canonical: a node's id is its name, an edge's ``<from>-<to>``; see ``_twoway`` for edges of both directions. A point's
+Canonical: a node's id is its name, an edge's ``<from>-<to>``; see ``_undirected`` for edges of both directions. A
+    point's
 ``z`` is its altitude. ``properties.ffr_network`` holds ``more`` (further keys of a point, or of a line and under
 ``start`` and ``end`` of its ends), ``name`` where it is not the id; the document's ``ffr_network`` holds ``top``
 (further keys of the file) and ``dangling`` (lines that end at no point).
@@ -38,7 +39,7 @@ from app.formats._network import (
     without_repeats,
 )
 from app.formats._text import METRES, numbers
-from app.formats._twoway import NODE_CANONICAL, Line, edges, lines, warn_lonely
+from app.formats._undirected import NODE_CANONICAL, Line, edges, lines, warn_lonely
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.frame import MAX_METRES
 from app.model.layers import NETWORK, Layers, PartKey

@@ -45,8 +45,8 @@ from app.formats import (
     _xml,
     register,
 )
-from app.formats._choice import the_one
 from app.formats._sdf_elements import KNOWN
+from app.formats._select import the_one
 from app.formats._text import DEGREES, number
 from app.model import masks, solids, worlds
 from app.model.features import Feature, Features, features, unique_ids

@@ -41,7 +41,7 @@ from app.formats import (
     _yaml,
     register,
 )
-from app.formats._choice import file_stem, the_one
+from app.formats._select import file_stem, the_one
 from app.model.frame import MAX_METRES
 from app.model.grid import (
     FREE,

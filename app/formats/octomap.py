@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from app.errors import NotFound, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Format, Needs, Parts, ReadContext, WriteContext, _octomap_rules, register
-from app.formats._choice import file_stem, the_one
+from app.formats._select import file_stem, the_one
 from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
 from app.model.voxels import DEPTH, LOG_ODDS, UNSET, VoxelMap, coarser, cut, parents_of, pruned

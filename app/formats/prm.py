@@ -10,7 +10,8 @@ environment_template, else beside the roadmap, else the only map.yaml), or optio
 centre of its pixel, metres in the local frame. On writing pixels are those of the stored grid ``map``, else of the
 picture that the roadmap came with, else of a picture that would just hold the network.
 
-Canonical: a node's id is its ``id`` as a text, an edge's ``<from>-<to>``; see ``_twoway`` for edges of both directions.
+Canonical: a node's id is its ``id`` as a text, an edge's ``<from>-<to>``; see ``_undirected`` for edges of both
+    directions.
 ``properties.prm`` holds ``more`` (further keys) and ``id`` where it is no whole number; the document's ``prm`` holds
 ``picture`` ({resolution, origin, height}), ``top`` (further keys of the file) and ``dangling`` (edges to nowhere).
 """
@@ -46,7 +47,7 @@ from app.formats._network import (
     some,
     without_repeats,
 )
-from app.formats._twoway import NODE_CANONICAL, Line, canonical, edges, lines, warn_lonely
+from app.formats._undirected import NODE_CANONICAL, Line, canonical, edges, lines, warn_lonely
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.frame import GROUND, MAX_METRES
 from app.model.grid import OccupancyGrid

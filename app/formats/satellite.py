@@ -25,7 +25,7 @@ from PIL import Image
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Format, Limits, Needs, Parts, ReadContext, WriteContext, _image, _raster, _xml, register
-from app.formats._choice import file_stem, the_one
+from app.formats._select import file_stem, the_one
 from app.formats._text import DEGREES, METRES
 from app.model.frame import MAX_METRES, is_writable
 from app.model.geodesy import WGS84

@@ -19,8 +19,8 @@ import shapely
 from app.derive import Notes
 from app.errors import CannotGenerate
 from app.generate import Source
-from app.generate._place import Place, placed
 from app.generate._site import SLACK, Site, SiteOptions, angle, mm, refused
+from app.generate._site_frame import Place, placed
 from app.model.frame import GROUND, Level
 from app.model.layers import Layers
 

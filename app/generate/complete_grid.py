@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.derive._grids import called, chosen, grey_warning
+from app.derive._select_grids import called, chosen, grey_warning
 from app.errors import CannotGenerate
 from app.generate import MAX_CELLS, Source, _evidence, _wfc, generates
 from app.generate._site import refused

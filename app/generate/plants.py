@@ -10,8 +10,8 @@ import shapely
 from app.derive import Notes
 from app.errors import Invalid, Problem
 from app.generate import Source, _lsystem, _plants, generates
-from app.generate._place import placed
 from app.generate._site import Site, SiteOptions, disc, refused
+from app.generate._site_frame import placed
 from app.model.layers import Layers
 from app.parameters import parameter
 

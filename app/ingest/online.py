@@ -26,8 +26,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app import bundle
-from app.bundle import Hints, Known
+from app import upload_reader
 from app.errors import (
     BadUpload,
     CannotDerive,
@@ -46,6 +45,7 @@ from app.model.layers import Layers, PartKey
 from app.parameters import describe, parameter
 from app.store.changes import Changes, Prepared, Provenance, Replace
 from app.store.values import Version
+from app.upload_reader import Hints, Known
 
 if TYPE_CHECKING:
     import httpx
@@ -512,7 +512,7 @@ def _decoded(block: Block, data: bytes, limits: Limits) -> NDArray[np.uint8]:
     name = f"answer.{end}"
     hints = Hints(format="satellite", options={"metres_per_pixel": "1"})
     try:
-        (part,) = bundle.read({name: data}, hints, Known(), limits).layers(None).parts.values()
+        (part,) = upload_reader.read({name: data}, hints, Known(), limits).layers(None).parts.values()
     except (BadUpload, ValueError) as error:
         raise CannotDerive(f"the imagery provider sends a picture that cannot be read: {error}", step=METHOD) from error
     assert isinstance(part, Picture)

@@ -15,8 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app import bundle, formats
-from app.bundle import Bundle, Hints, Known
+from app import formats, upload_reader
 from app.errors import Damaged, Invalid, Problem
 from app.formats import Limits
 from app.ingest.match import OWN_IDS, match_ids
@@ -28,6 +27,7 @@ from app.model.layers import Part, PartKey, Resources, cloud_name, join_levels
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Put, Replace
 from app.store.store import Store
 from app.store.values import Version
+from app.upload_reader import Bundle, Hints, Known
 
 Mode = Literal["replace", "merge"]
 
@@ -66,11 +66,12 @@ def prepare_upload(
     mode: Mode,
     limits: Limits,
 ) -> Proposal:
-    """Read spooled files against a version: the version they would make. Raises what ``app.bundle.read`` raises."""
+    """Read spooled files against a version: the version they would make. Raises what ``app.upload_reader.read``
+    raises."""
     store = open_store(database_url, blob_dir)
     uploaded = {name: path.read_bytes() for name, path in paths.items()}
-    files = bundle.unpack(uploaded, limits)
-    upload_bundle = bundle.read(files, hints, Known(base.datum, fence_of(store, base)), limits)
+    files = upload_reader.unpack(uploaded, limits)
+    upload_bundle = upload_reader.read(files, hints, Known(base.datum, fence_of(store, base)), limits)
     renamed: dict[str, dict[str, str]] = {}
     # Sorted, so objects come before the topology that was drawn from them.
     operations: list[Operation] = [

@@ -14,8 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from app import bundle
-from app.bundle import Hints, Known
+from app import upload_reader
 from app.errors import Damaged, FleetMapError, NotFound
 from app.formats import Limits
 from app.ingest.prepare import fence_of, open_store, operation_for
@@ -26,6 +25,7 @@ from app.store.store import Store
 from app.store.tree import Draft
 from app.store.values import PartEntry, Version
 from app.store.verify import Finding
+from app.upload_reader import Hints, Known
 
 Run = Callable[..., Any]
 """``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
@@ -176,7 +176,9 @@ def _composed(
 ) -> Iterator[tuple[Draft, Mapping[str, bytes]]]:
     """The chunks and blobs of the parts that files are read as, replaced or merged."""
     start = version if base is None else base
-    upload_bundle = bundle.read(files, hints, Known(start.datum or version.datum, fence_of(store, start)), limits)
+    upload_bundle = upload_reader.read(
+        files, hints, Known(start.datum or version.datum, fence_of(store, start)), limits
+    )
     entries: Mapping[PartKey, PartEntry] = {} if base is None else {e.key: e for e in base.parts}
     for mode in ("replace", "merge"):
         renamed: dict[str, dict[str, str]] = {}

@@ -13,7 +13,6 @@ import orjson
 
 from app import formats, parameters
 from app import generate as generators
-from app.bundle import Hints
 from app.errors import CannotDerive, Conflict, Invalid, Problem, StaleParent, UnreadableFile
 from app.formats import Limits
 from app.ingest import online
@@ -30,6 +29,7 @@ from app.pool import WorkerDied
 from app.store.changes import KEEP, Changes, Prepared
 from app.store.store import Store
 from app.store.values import Idempotency, Source, Version
+from app.upload_reader import Hints
 
 Run = Callable[..., Any]
 """``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from app.errors import FleetMapError, Invalid, Problem, TooLarge
 from app.model.frame import MAX_METRES
-from app.model.prolog import check_prolog
+from app.model.xml_prolog import check_prolog
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]

@@ -11,7 +11,7 @@ from app.model.frame import Anchor
 from app.model.geodesy import local_frame
 from app.model.layers import VECTOR_LAYERS, Layers, PartKey
 from app.model.templates import template_changes
-from app.store import difference, parts
+from app.store import diff, parts
 from app.store.base import Base
 from app.store.parts import PartRoot
 from app.store.prepare import differing_keys, frame_changes, part_names, roots_of
@@ -102,16 +102,16 @@ class Content(Base):
         for key in differing_keys(before, after):
             old, new = roots_of(draft, key, before), roots_of(draft, key, after)
             if key.layer in VECTOR_LAYERS:
-                changed = difference.features(draft, old, new)
+                changed = diff.features(draft, old, new)
                 layer = out.setdefault(key.layer, {"added": [], "changed": [], "deleted": []})
                 for name, listed in changed.as_dict().items():
                     layer[name] += listed
                 if changed.document:
                     layer["document"] = True
             elif key.layer == "occupancy":
-                out.setdefault(key.layer, {})[names[key]] = difference.cells(draft, old, new).as_dict()
+                out.setdefault(key.layer, {})[names[key]] = diff.cells(draft, old, new).as_dict()
             else:
-                out.setdefault(key.layer, {})[names[key]] = difference.others(draft, old, new)
+                out.setdefault(key.layer, {})[names[key]] = diff.others(draft, old, new)
         out |= frame_changes(a.datum, b.datum, a.levels, b.levels)
         return out | template_changes(a.templates, b.templates)
 
@@ -123,7 +123,7 @@ class Content(Base):
         for key in differing_keys(before, after):
             old, new = roots_of(draft, key, before), roots_of(draft, key, after)
             if key.layer in VECTOR_LAYERS:
-                changed = difference.features(draft, old, new)
+                changed = diff.features(draft, old, new)
                 items = {i: changed.after[i] for i in (*changed.added, *changed.changed)}
                 document = parts.read_document(draft, new) if new is not None and changed.document else {}
                 features.append(FeatureDelta(key, parts.features_of(items, document), tuple(changed.deleted)))
@@ -140,7 +140,7 @@ def _grid_delta(draft: Draft, key: PartKey, old: PartRoot | None, new: PartRoot 
         return GridDelta(key, (), deleted=True)
     if old is None or old.header != new.header:
         return GridDelta(key, (), whole=True)
-    return GridDelta(key, difference.rectangles(draft, old, new))
+    return GridDelta(key, diff.rectangles(draft, old, new))
 
 
 def _missing(version: Version, key: PartKey) -> str:

@@ -25,7 +25,7 @@ from sqlalchemy import (
 )
 
 from app.model.layers import VECTOR_LAYERS, Layer, PartKey
-from app.store import difference, tables
+from app.store import diff, tables
 from app.store.base import Base
 from app.store.changes import IndexRows
 from app.store.extent import geometry as to_geometry
@@ -147,7 +147,7 @@ class SpatialIndex(Base):
         for key in differing_keys(old, new):
             if key.layer not in VECTOR_LAYERS:
                 continue
-            changed = difference.features(draft, roots_of(draft, key, old), roots_of(draft, key, new))
+            changed = diff.features(draft, roots_of(draft, key, old), roots_of(draft, key, new))
             apply(connection, row.id, index_rows({key: changed}, head.datum, None) or ())
 
     def rebuild_index(self) -> None:

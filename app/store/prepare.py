@@ -15,10 +15,10 @@ from app.model.geodesy import local_frame
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import LAYERS, PART_TYPES, VECTOR_LAYERS, PartKey
 from app.model.templates import NO_TEMPLATES, Templates, template_changes
-from app.store import difference, parts, tree
+from app.store import diff, parts, tree
 from app.store.area import area_after
 from app.store.changes import KEEP, Changes, Delete, Drop, IndexRows, Operation, Prepared, Replace
-from app.store.difference import CellChanges, FeatureChanges
+from app.store.diff import CellChanges, FeatureChanges
 from app.store.encode import bounds, compress, from_wkb, pack, root_hash, to_wkb
 from app.store.parts import Item, Made, PartRoot
 from app.store.tree import Draft
@@ -232,7 +232,7 @@ def summarise(
                 total["deleted"] += a.count
                 features = None
                 continue
-            changed = difference.features(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+            changed = diff.features(draft, roots_of(draft, key, before), roots_of(draft, key, after))
             for name, count in changed.counts().items():
                 total[name] += count
             if changed.document:
@@ -245,10 +245,10 @@ def summarise(
             if a is None and isinstance(new, OccupancyGrid):
                 cells = cells_added(new)
             else:
-                cells = difference.cells(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+                cells = diff.cells(draft, roots_of(draft, key, before), roots_of(draft, key, after))
             out.setdefault(key.layer, {})[names[key]] = cells.as_dict()
         else:
-            other = difference.others(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+            other = diff.others(draft, roots_of(draft, key, before), roots_of(draft, key, after))
             out.setdefault(key.layer, {})[names[key]] = other
     return out, features
 
@@ -265,9 +265,7 @@ def cells_added(grid: OccupancyGrid) -> CellChanges:
         rows = np.flatnonzero(known_cells.any(axis=1))
         columns = np.flatnonzero(known_cells.any(axis=0))
         header = {"origin": list(grid.origin), "resolution": grid.resolution}
-        out.box = difference.cell_box(
-            header, float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
-        )
+        out.box = diff.cell_box(header, float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
     return out
 
 

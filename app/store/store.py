@@ -14,12 +14,12 @@ from app.store.base import environment_row
 from app.store.blobs import Blobs
 from app.store.channels import Channels
 from app.store.chunks import Chunks, delete, insert, problem, select_rows
-from app.store.collect import Collection
+from app.store.commit_counter import Generation
 from app.store.content import Content
 from app.store.database import Database
 from app.store.encode import compress, digest
 from app.store.environments import Environments
-from app.store.generation import Generation
+from app.store.garbage_collection import Collection
 from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
 from app.store.manifest import read_version

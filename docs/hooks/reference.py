@@ -33,9 +33,9 @@ from typer.main import get_command
 
 from app import derive, generate
 from app.api import problems
-from app.api.access import AtLeast
-from app.api.answers import API
+from app.api.auth import AtLeast
 from app.api.metrics import Metrics, _Heads, _Scrubs
+from app.api.responses import API
 from app.cli import commands
 from app.config import Settings, format_size
 from app.derive import Derivation

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, unquote
 
-from app.agent.core import Agent, Options
+from app.agent.agent import Agent, Options
 from app.signing import Keys
 
 PLACE = "field"

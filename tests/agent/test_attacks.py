@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from backports import zstd
 
-from app.agent import trust
-from app.agent.core import Agent, Options
+from app.agent import signed_manifest
+from app.agent.agent import Agent, Options
 from app.errors import Untrusted
 from app.signing import Keys, key_id
 from tests.agent.conftest import Gate, network, whole
@@ -310,13 +310,13 @@ def test_endorsements_are_followed_back_to_the_trusted_key(tmp_path: Path) -> No
     name, signature = keys.sign(b"data")
     header = f"{name}:{base64.b64encode(signature).decode()}"
     listed = [k.as_dict() for k in keys.public()]
-    key = trust.signer(b"data", header, first.public, None, lambda: listed)
+    key = signed_manifest.signer(b"data", header, first.public, None, lambda: listed)
     assert key_id(key) == name == keys.public()[0].id
-    assert trust.signer(b"data", header, None, first.id, lambda: listed) == key
-    assert trust.signer(b"data", header, None, base64.b64encode(first.public).decode(), lambda: listed) == key
+    assert signed_manifest.signer(b"data", header, None, first.id, lambda: listed) == key
+    assert signed_manifest.signer(b"data", header, None, base64.b64encode(first.public).decode(), lambda: listed) == key
     for left in (0, 1, 6):  # a link of the chain is missing
         with pytest.raises(Untrusted, match=r"vouch|does not tell"):
-            trust.signer(b"data", header, first.public, None, lambda n=left: listed[:n] + listed[n + 1 :])
+            signed_manifest.signer(b"data", header, first.public, None, lambda n=left: listed[:n] + listed[n + 1 :])
     circle = [{**listed[0], "endorsed_by": listed[0]["id"]}]
     with pytest.raises(Untrusted, match="vouch"):
-        trust.signer(b"data", header, first.public, None, lambda: circle)
+        signed_manifest.signer(b"data", header, first.public, None, lambda: circle)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from app.agent.core import Agent, Options
+from app.agent.agent import Agent, Options
 from app.signing import Keys
 from tests.agent.conftest import Gate, network, whole
 from tests.agent.test_attacks import signed

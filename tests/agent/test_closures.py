@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from app.agent import core
+from app.agent import agent
 from app.events.messages import RobotStatus
 from tests.agent.conftest import whole
 from tests.agent.fake import Fake, One, run
@@ -128,7 +128,7 @@ def test_file_that_is_gone_with_its_closure_is_no_error(fake: Fake, robot: Robot
 
 
 def test_closures_that_never_agree_are_an_error(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core, "CLOSURES_SECONDS", 0.001)
+    monkeypatch.setattr(agent, "CLOSURES_SECONDS", 0.001)
     assert robot().once()
     fake.put(B)
     request_count = 0
@@ -144,7 +144,7 @@ def test_closures_that_never_agree_are_an_error(fake: Fake, robot: Robot, monkey
     one = robot()
     assert not one.once()
     assert "other closures than the manifest" in one.detail
-    assert request_count <= 2 * (core.MAX_CLOSURE_CHANGES + 1)
+    assert request_count <= 2 * (agent.MAX_CLOSURE_CHANGES + 1)
     assert whole(one.into)["version"] == 1
     fake.instead = lambda _: False
     assert robot().once()
@@ -363,7 +363,7 @@ def test_closure_that_the_robot_cannot_load_is_tried_again_ever_later(fake: Fake
 def test_closures_that_change_during_a_preload_are_no_failure(
     fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(core, "CLOSURES_SECONDS", 0.01)
+    monkeypatch.setattr(agent, "CLOSURES_SECONDS", 0.01)
     fake.move("production", 1)
     assert robot().once()
     fake.put(B)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from app.agent import activation, core, freshness
+from app.agent import activation, agent, freshness
 from app.cli.agent import _logger
 from tests.agent.conftest import whole
 from tests.agent.fake import Fake, One, run, send
@@ -39,7 +39,7 @@ def robot(fake: Fake, tmp_path: Path) -> Robot:
 
 @pytest.fixture(autouse=True)
 def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.05)
+    monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 0.05)
 
 
 def later(**delta: float) -> str:

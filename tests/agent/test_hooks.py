@@ -360,8 +360,8 @@ def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> 
 
 def test_networks_are_read_as_the_server_writes_them(tmp_path: Path) -> None:
     pytest.importorskip("numpy", reason="the server's packages")
-    from app.bundle import Hints
     from app.convert.files import offline
+    from app.upload_reader import Hints
 
     names = ["a: b", "it's", "'", '"', "1e3", "yes", "- x", "name: y", "\u00e9 \U0001f600", "#", "~"]
     pose = {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "orientation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}

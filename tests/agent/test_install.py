@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from app.agent import trust
+from app.agent import signed_manifest
 from tests.agent.conftest import ROOT
 from tests.agent.conftest import whole as whole_map
 from tests.api.conftest import ADMIN, Api
@@ -174,13 +174,13 @@ AFTER_THE_CHECK = {
 
 @pytest.mark.parametrize("text", ["2026-11-22T10:00:00Z", "2026-11-22T10:00:00.1234567+00:00", "2026-11-22t10:00:00z"])
 def test_times_are_read_on_any_python(text: str) -> None:
-    assert trust.read_time(text).replace(microsecond=0) == datetime(2026, 11, 22, 10, tzinfo=UTC)
+    assert signed_manifest.read_time(text).replace(microsecond=0) == datetime(2026, 11, 22, 10, tzinfo=UTC)
 
 
 @pytest.mark.parametrize("text", ["", "2026-11-22", "2026-11-22T10:00:00", "2026-13-22T10:00:00Z", "20261122T100000Z"])
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(ValueError):
-        trust.read_time(text)
+        signed_manifest.read_time(text)
 
 
 def test_hooks_are_part_of_the_package() -> None:

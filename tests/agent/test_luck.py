@@ -22,8 +22,8 @@ from typing import Any
 
 import pytest
 
-from app.agent import core, folder, web
-from app.agent.ear import Ear
+from app.agent import agent, http_client, map_directory
+from app.agent.zenoh_client import Ear
 from app.errors import Conflict, Invalid
 from app.events import messages
 from tests.agent.conftest import ROOT, whole
@@ -61,7 +61,7 @@ def event(sequence: int, **more: Any) -> messages.Event:
 def test_it_looks_again_where_the_server_knew_less_than_its_event(
     fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.02)
+    monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 0.02)
     one = robot(poll_seconds=3600.0)
     with run(one):
         eventually(lambda: one.saw("active", version=1))
@@ -80,7 +80,7 @@ def test_it_looks_again_where_the_server_knew_less_than_its_event(
 def test_a_version_that_the_channel_does_not_follow_is_not_waited_for(
     fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.001)
+    monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 0.001)
     fake.move("production", 1)
     one = robot(poll_seconds=3600.0)
     one.agent._heard(event(9))  # before it knows which channel it follows
@@ -94,7 +94,7 @@ def test_a_version_that_the_channel_does_not_follow_is_not_waited_for(
 def test_an_event_that_never_comes_true_costs_ever_less(
     fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.001)
+    monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 0.001)
     one = robot(poll_seconds=3600.0)
     with run(one):
         eventually(lambda: one.saw("active", version=1))
@@ -264,7 +264,7 @@ def test_jobs_are_the_servers_own(fake: Fake, robot: Robot, where: str) -> None:
 
 
 def test_a_job_that_is_done_and_never_handed_out(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web, "MAX_JOBS", 5)
+    monkeypatch.setattr(http_client, "MAX_JOBS", 5)
 
     def job(handler: BaseHTTPRequestHandler) -> bool:
         if "/manifest" in handler.path:
@@ -340,8 +340,8 @@ def test_a_line_that_breaks_all_the_time_gets_there(fake: Fake, robot: Robot) ->
 def test_a_server_that_answers_slowly_for_ever_is_given_up(
     fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch, part: str, kind: str
 ) -> None:
-    monkeypatch.setattr(web, "HEAD_SECONDS", 0.2)
-    monkeypatch.setattr(web, "PACE_SECONDS", 0.2)
+    monkeypatch.setattr(http_client, "HEAD_SECONDS", 0.2)
+    monkeypatch.setattr(http_client, "PACE_SECONDS", 0.2)
     stop = threading.Event()
 
     def slow(handler: BaseHTTPRequestHandler) -> bool:
@@ -389,12 +389,12 @@ def test_a_mistake_of_ours_is_told_and_gone_on_from(fake: Fake, robot: Robot, mo
     def wrong(*_: Any) -> None:
         raise KeyError("x")
 
-    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.02)
+    monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 0.02)
     fake.close_edges()  # a server that knows of closures takes `holds`, too
     assert robot().once()
     fake.put(B)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(folder.Folder, "build", wrong)
+        patch.setattr(map_directory.Folder, "build", wrong)
         one = robot(poll_seconds=3600.0)
         with run(one):
             eventually(lambda: one.saw("failed"))
@@ -481,8 +481,8 @@ def test_old_parts_and_versions_make_room(fake: Fake, robot: Robot, monkeypatch:
         inodes |= {p.stat().st_ino: p.stat().st_size for p in (path / "partial").iterdir()}
         return sum(inodes.values())
 
-    monkeypatch.setattr(folder.Folder, "_free", lambda self: room - used(self.path))
-    monkeypatch.setattr(folder, "CHUNK", 0)
+    monkeypatch.setattr(map_directory.Folder, "_free", lambda self: room - used(self.path))
+    monkeypatch.setattr(map_directory, "CHUNK", 0)
     assert robot().once()  # 5000 bytes
     fake.put(B)
     assert robot().once()  # 6000 bytes, and the 5000 of before
@@ -713,9 +713,9 @@ def test_a_server_tells_routers_by_plain_addresses(fake: Fake, robot: Robot, tol
 
 
 def test_it_says_why_it_hears_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    from app.agent import ear
+    from app.agent import zenoh_client
 
-    monkeypatch.setattr(ear, "CONNECT_MS", 100)
+    monkeypatch.setattr(zenoh_client, "CONNECT_MS", 100)
     problems: list[str] = []
     port = free_port()
     one = Ear(PLACE, "robot", heard=lambda _: None, back=lambda: None, lost=problems.append)

@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from app.agent import core, freshness, web
+from app.agent import agent, freshness, http_client
+from app.agent.signed_manifest import MAX_SEQUENCE_AHEAD
 from app.agent.state import Mark, State, load, save
-from app.agent.trust import MAX_SEQUENCE_AHEAD
 from app.errors import Conflict
 from app.signing import Keys
 from tests.agent.conftest import whole
@@ -47,8 +47,8 @@ def robot(fake: Fake, tmp_path: Path) -> Robot:
 
 @pytest.fixture(autouse=True)
 def _short_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.02)
-    monkeypatch.setattr(web, "PACE_SECONDS", 0.5)
+    monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 0.02)
+    monkeypatch.setattr(http_client, "PACE_SECONDS", 0.5)
 
 
 def signs(fake: Fake, keys: Keys, change: Callable[[dict[str, Any]], dict[str, Any]], name: str | None = None) -> None:
@@ -385,7 +385,7 @@ def test_delta_that_cannot_be_decoded_falls_back_to_the_file(fake: Fake, robot: 
     def delta(handler: BaseHTTPRequestHandler) -> bool:
         if "dcz" not in handler.headers.get("accept-encoding", ""):
             return False
-        send(handler, 200, web.DCZ_MAGIC + digest + b"nonsense", **{"content-encoding": "dcz"})
+        send(handler, 200, http_client.DCZ_MAGIC + digest + b"nonsense", **{"content-encoding": "dcz"})
         return True
 
     fake.instead = delta

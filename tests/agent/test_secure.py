@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from app.agent.core import Agent, Options
+from app.agent.agent import Agent, Options
 from app.errors import Invalid
-from app.events.login import Login
+from app.events.credentials import Login
 from tests.agent.conftest import ROOT, Robot, network
 from tests.api.conftest import ADMIN, Api, running, settings_for
 from tests.certificates import Authority

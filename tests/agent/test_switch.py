@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from app.agent import activation, core
+from app.agent import activation, agent
 from tests.agent.conftest import ROOT, whole
 from tests.agent.fake import PLACE, Fake, One, run, send
 from tests.events.conftest import eventually
@@ -41,8 +41,8 @@ def robot(fake: Fake, tmp_path: Path) -> Robot:
 
 @pytest.fixture(autouse=True)
 def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.05)
-    monkeypatch.setattr(core, "BEFORE_SWITCH_SECONDS", 0.05)
+    monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 0.05)
+    monkeypatch.setattr(agent, "BEFORE_SWITCH_SECONDS", 0.05)
 
 
 def exits(path: Path) -> str:
@@ -138,7 +138,7 @@ def test_before_switch_refuses_a_version(
     fake.put(B)
     refuses = f"echo x >> {tmp_path}/log; [ $FLEETMAP_VERSION != 2 ] || {{ {command}; }}"
     one = robot(before_switch=(refuses,), poll_seconds=3600.0)
-    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 600.0)
+    monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 600.0)
     with run(one):
         eventually(lambda: fake.statuses[-1]["state"] == "failed")
         assert word in fake.statuses[-1]["detail"]

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from app.api.access import (
+from app.api.auth import (
     FRESH_SECONDS,
     WINDOW_SECONDS,
     Access,

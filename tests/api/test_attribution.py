@@ -11,9 +11,9 @@ import yaml
 from lxml import etree
 
 from app import formats
-from app.bundle import Hints
 from app.convert.files import offline
 from app.model.frame import Datum
+from app.upload_reader import Hints
 from tests.api.conftest import Api
 
 HERE = Datum(53.2686, -0.5245)

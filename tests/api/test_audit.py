@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from app.api import guard
-from app.api.guard import LOGGED_REFUSALS
+from app.api import middleware
+from app.api.middleware import LOGGED_REFUSALS
 from app.logs import REQUEST_ID, JsonFormatter, TextFormatter
 from app.store.audit import CALLER, Caller
 from app.store.store import Store
@@ -100,7 +100,7 @@ def test_entry_and_change_are_one_transaction(tmp_path: Path) -> None:
 def test_log_names_changes_and_refused_tokens_but_no_token(
     api: Api, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guard, "_refusals", guard._Quota())  # other tests of this process were refused, too
+    monkeypatch.setattr(middleware, "_refusals", middleware._Quota())  # other tests of this process were refused, too
     with caplog.at_level(logging.INFO, logger="app.requests"):
         api.post("environments", {"name": "logged"})
         api.as_("not-a-token-that-anybody-has").problem("GET", "environments/a%0Ab", 401)

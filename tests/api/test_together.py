@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from app.api import channels, maps
-from app.api.access import Access
-from app.api.together import Together
+from app.api.auth import Access
+from app.api.single_flight import Together
 from app.errors import NotFound, Unavailable
 from app.store.database import Database
 from app.store.store import Store

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from app import derive
-from app.bundle import Hints
 from app.convert.files import offline
 from app.derive import Notes, derives
 from app.errors import CannotConvert, CannotDerive, Invalid, MissingLayer
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
+from app.upload_reader import Hints
 from tests.api.conftest import Api
 
 SQUARE = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"name": "bed"},

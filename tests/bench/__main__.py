@@ -15,12 +15,12 @@ import httpx
 from rich.console import Console
 from rich.table import Table
 
-from app import bundle
-from app.bundle import Hints
+from app import upload_reader
 from app.convert.files import offline
 from app.formats import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
+from app.upload_reader import Hints
 from tests.bench import closures, derived, events, floors, generate, http, large, networks
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -206,7 +206,7 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
 def farm_grid() -> OccupancyGrid:
     """The real map of 4000 × 4000 cells."""
     files = {name: (DATA / FARM / "metric/map" / name).read_bytes() for name in ("map.yaml", "map.png")}
-    upload_bundle = bundle.read(files, Hints(), bundle.Known(None, None, None, True, False), Limits())
+    upload_bundle = upload_reader.read(files, Hints(), upload_reader.Known(None, None, None, True, False), Limits())
     (grid,) = upload_bundle.layers(None).grids().values()
     return grid
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from app.agent.core import Agent, Options
+from app.agent.agent import Agent, Options
 
 FARM = "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config"
 

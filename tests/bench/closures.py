@@ -17,7 +17,7 @@ from typing import Any
 
 import httpx
 
-from app.agent.core import Agent
+from app.agent.agent import Agent
 from app.agent.options import Options
 from app.events import messages
 from tests.bench import http

@@ -25,12 +25,12 @@ import httpx
 import zenoh
 from zenoh import ext
 
-from app.agent.core import Agent, Options
+from app.agent.agent import Agent, Options
 from app.derive import _native
 from app.events import messages
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
-from app.store.generation import Generation
+from app.store.commit_counter import Generation
 from tests.bench import changes, http
 
 SESSIONS = 100
@@ -122,8 +122,8 @@ def latency() -> list[dict[str, Any]]:
     """Half of all deliveries of an event at 100 sessions, from its commit, against the same bytes put by a bare session
     to plain subscribers of the same sessions.
 
-    The commit is seen by the number that the store changes right after it (``app.store.generation``): the last change
-    before the event came first.
+    The commit is seen by the number that the store changes right after it (``app.store.commit_counter``): the last
+    change before the event came first.
     """
     port, zenoh_port = http.free_port(), http.free_port()
     with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port) as client:

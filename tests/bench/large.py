@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from app import formats
-from app.bundle import Hints
 from app.convert.files import offline_paths
 from app.formats import Limits
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.model.voxels import LOG_ODDS, VoxelMap, morton
+from app.upload_reader import Hints
 from tests.bench.memory import peak, reset, resident
 
 SEED = 2026

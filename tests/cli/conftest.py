@@ -20,7 +20,7 @@ import httpx
 import pytest
 
 from app.cli import run
-from app.cli.serving import wait_ready
+from app.cli.server import wait_ready
 from app.errors import Unavailable
 
 TOKEN = "administrator-of-the-tests"

@@ -14,8 +14,8 @@ import pytest
 
 from app.cli import client as clients
 from app.cli.client import Client, LocalFile
+from app.cli.output_files import inside, unpack
 from app.cli.problems import Refused
-from app.cli.write import inside, unpack
 from app.errors import Invalid
 
 Answer = tuple[int, dict[str, str], bytes] | None

@@ -95,9 +95,9 @@ def test_a_name_that_cannot_be_used_asks_for_another(text: str) -> None:
 
 
 def test_names_and_folders_are_those_of_the_server() -> None:
-    from app import bundle
+    from app import upload_reader
     from app.store import base
 
-    assert folder.PARTS == bundle.TEMPLATE_FOLDERS
+    assert folder.PARTS == upload_reader.TEMPLATE_FOLDERS
     assert folder.NAME.pattern == base.ENVIRONMENT_NAME.pattern
     assert folder.RESERVED == base.RESERVED

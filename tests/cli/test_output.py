@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from app.cli import output
-from app.cli.history import change_line, counts
+from app.cli.versions import change_line, counts
 
 
 @pytest.mark.parametrize(

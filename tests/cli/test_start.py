@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from app.cli import serving
+from app.cli import server
 from app.errors import Unavailable
 from app.pool import WARM
 
@@ -26,7 +26,7 @@ def loaded(statement: str) -> list[str]:
     return done.stdout.split()
 
 
-@pytest.mark.parametrize("statement", ["import app.cli.serving, app.main", f"import {', '.join(WARM)}"])
+@pytest.mark.parametrize("statement", ["import app.cli.server, app.main", f"import {', '.join(WARM)}"])
 def test_start_loads_nothing_that_only_others_need(statement: str) -> None:
     assert loaded(statement) == []
 
@@ -56,9 +56,9 @@ def test_workers_are_prepared_beside_the_start(workers: str, tmp_path: Path, mon
         raise Unavailable("the database is away")
 
     monkeypatch.setattr("app.pool.start_beside", lambda: done.append("beside"))
-    monkeypatch.setattr(serving, "check", check)
+    monkeypatch.setattr(server, "check", check)
     with pytest.raises(Unavailable, match="away"):
-        serving.serve(data_dir=str(tmp_path), port="0", workers=workers)
+        server.serve(data_dir=str(tmp_path), port="0", workers=workers)
     # Servers of several workers are processes of their own, which have their own conversion workers.
     assert done == (["beside", "check"] if workers == "1" else ["check"])
     assert gc.isenabled()
@@ -68,5 +68,5 @@ def test_workers_are_prepared_beside_the_start(workers: str, tmp_path: Path, mon
 def test_application_collects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEETMAP_DATA_DIR", str(tmp_path))
     gc.disable()
-    serving.application()
+    server.application()
     assert gc.isenabled()

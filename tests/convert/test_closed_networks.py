@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from app import formats
-from app.convert import make
+from app.convert import worker
 from app.formats import Files, ReadContext
 from app.model.closures import Closure, Closures
 from app.model.frame import Datum
@@ -74,8 +74,8 @@ def test_map_of_real_network_loses_the_closed_edge_alone(shared: Path, name: str
     level, edge = sorted(edges(layers))[len(edges(layers)) // 2]
     fmt = formats.get_format(name)
     closures = Closures((Closure("c", "blocked", level, "2030-01-01T00:00:00Z", edge=edge),))
-    closed = make.from_layers(fmt, layers, {}, derived=False, closures=closures)
-    complete = make.from_layers(fmt, layers, {}, derived=False, closures=Closures())
+    closed = worker.from_layers(fmt, layers, {}, derived=False, closures=closures)
+    complete = worker.from_layers(fmt, layers, {}, derived=False, closures=Closures())
     before, after = edges_in(name, complete.files), edges_in(name, closed.files)
     assert before - after == Counter([edges(layers)[level, edge]])
     assert not after - before

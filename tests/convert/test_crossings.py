@@ -13,7 +13,7 @@ import shapely
 import yaml
 
 from app import formats
-from app.convert import make
+from app.convert import worker
 from app.convert.files import offline
 from app.model.closures import Closure, Closures
 from app.model.features import features
@@ -59,12 +59,12 @@ def crossing(report: Mapping[str, Any]) -> list[str]:
 def test_straight_edges_through_a_wall_are_reported_and_bent_ones_go_around(yaw: float) -> None:
     for name in ("tmap2", "geojson"):
         fmt = formats.get_format(name)
-        through = make.from_layers(fmt, site(False, yaw, occupancy=hall(yaw)), {}, derived=False)
+        through = worker.from_layers(fmt, site(False, yaw, occupancy=hall(yaw)), {}, derived=False)
         assert crossing(through.report) == [
             "2 edges cross occupied cells of the occupancy grid 'map': a_b, b_a; a robot that follows the network "
             "meets an obstacle there"
         ]
-        assert crossing(make.from_layers(fmt, site(True, yaw, occupancy=hall(yaw)), {}, derived=False).report) == []
+        assert crossing(worker.from_layers(fmt, site(True, yaw, occupancy=hall(yaw)), {}, derived=False).report) == []
 
 
 def test_buildings_count_where_there_is_no_grid() -> None:
@@ -76,9 +76,9 @@ def test_buildings_count_where_there_is_no_grid() -> None:
     ]
     objects = features(rows, "local")
     fmt = formats.get_format("tmap2")
-    (warning,) = crossing(make.from_layers(fmt, site(False, objects=objects), {}, derived=False).report)
+    (warning,) = crossing(worker.from_layers(fmt, site(False, objects=objects), {}, derived=False).report)
     assert warning.startswith("2 edges cross buildings or walls: a_b, b_a;") or warning.startswith("2 edges cross")
-    assert crossing(make.from_layers(fmt, site(True, objects=objects), {}, derived=False).report) == []
+    assert crossing(worker.from_layers(fmt, site(True, objects=objects), {}, derived=False).report) == []
 
 
 def test_nav2_drives_straight_along_its_own_bent_edges() -> None:
@@ -89,9 +89,9 @@ def test_nav2_drives_straight_along_its_own_bent_edges() -> None:
         {**layers.parts, TOPOLOGY: features(zip(part.ids, part.geometry, owned, strict=True), "local")}
     )
     fmt = formats.get_format("nav2_route")
-    (warning,) = crossing(make.from_layers(fmt, nav2_layers, {}, derived=False).report)
+    (warning,) = crossing(worker.from_layers(fmt, nav2_layers, {}, derived=False).report)
     assert warning.startswith("2 edges cross occupied cells")
-    assert crossing(make.from_layers(fmt, layers, {}, derived=False).report) == []
+    assert crossing(worker.from_layers(fmt, layers, {}, derived=False).report) == []
 
 
 def test_closures_by_id_and_area_close_all_pieces_of_a_bent_edge() -> None:
@@ -101,7 +101,7 @@ def test_closures_by_id_and_area_close_all_pieces_of_a_bent_edge() -> None:
     by_id = Closures((Closure("c", "blocked", GROUND, until, edge="a_b"),))
     by_area = Closures((Closure("c", "blocked", GROUND, until, polygon=area, crs="local"),))
     for closures, closed_ids in ((by_id, {"a_b"}), (by_area, {"a_b", "b_a"})):
-        written_map = make.from_layers(fmt, site(True), {}, derived=False, closures=closures)
+        written_map = worker.from_layers(fmt, site(True), {}, derived=False, closures=closures)
         nodes = yaml.safe_load(written_map.files["network.tmap2.yaml"])["nodes"]
         left = {e["edge_id"].partition("~")[0] for n in nodes for e in n["node"]["edges"]}
         assert left == {"a_b", "b_a", "a_c"} - closed_ids
@@ -114,7 +114,7 @@ def test_reports_of_stored_maps_name_edges_through_obstacles(api: Api, fresh: An
     api.post("environments", {"name": env})
     layers = site(False, occupancy=hall())
     for name in ("tmap2", "occupancy_grid"):
-        api.upload(env, make.from_layers(formats.get_format(name), layers, {}, derived=False).files)
+        api.upload(env, worker.from_layers(formats.get_format(name), layers, {}, derived=False).files)
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
     assert len(crossing(report)) == 1
     assert "a_b, b_a" in crossing(report)[0]
@@ -147,10 +147,10 @@ def test_bends_inside_a_building_do_not_hide_that_an_edge_leads_through_it(name:
         "in, out and in": detour((5, 1), (5, 6), (4.5, 6), (4.5, 2), (2, 2), inside=True),
     }
     for called, layers in crossed.items():
-        (warning,) = crossing(make.from_layers(fmt, layers, {}, derived=False).report)
+        (warning,) = crossing(worker.from_layers(fmt, layers, {}, derived=False).report)
         assert warning.startswith("1 edge crosses buildings or walls: e;"), called
     clear = [detour(inside=True), detour((4.5, 1), inside=True), detour((3, 6), (8, 6))]
-    assert all(crossing(make.from_layers(fmt, layers, {}, derived=False).report) == [] for layers in clear)
+    assert all(crossing(worker.from_layers(fmt, layers, {}, derived=False).report) == [] for layers in clear)
 
 
 def test_buildings_count_where_a_grid_knows_nothing() -> None:
@@ -160,13 +160,13 @@ def test_buildings_count_where_a_grid_knows_nothing() -> None:
     beyond = OccupancyGrid(np.full((20, 20), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     grey = replace(free, free_thresh=0.25, properties={UNKNOWN_GREY: packed_cells(np.ones((20, 40), bool))})
     for grid, count in ((free, 0), (unknown, 1), (beyond, 1), (grey, 1)):
-        warnings = crossing(make.from_layers(fmt, detour((5, 1), occupancy=grid), {}, derived=False).report)
+        warnings = crossing(worker.from_layers(fmt, detour((5, 1), occupancy=grid), {}, derived=False).report)
         assert len(warnings) == count
 
 
 def test_an_environment_package_warns_of_edges_through_obstacles() -> None:
     fmt = formats.get_format("environment")
-    warnings = crossing(make.from_layers(fmt, detour((5, 1)), {}, derived=False).report)
+    warnings = crossing(worker.from_layers(fmt, detour((5, 1)), {}, derived=False).report)
     assert len(warnings) == 1
     assert "1 edge crosses buildings or walls: e;" in warnings[0]
 
@@ -176,7 +176,7 @@ def test_files_of_a_network_and_a_grid_are_checked_without_a_server(name: str) -
     layers = site(False, occupancy=hall())
     files: dict[str, bytes] = {}
     for source in ("nav2_route", "occupancy_grid"):
-        files |= make.from_layers(formats.get_format(source), layers, {}, derived=False).files
+        files |= worker.from_layers(formats.get_format(source), layers, {}, derived=False).files
     warnings = crossing(offline(files, name, datum=Datum(48.0, 9.0)).report)
     assert len(warnings) == 1
     assert "occupied cells of the occupancy grid" in warnings[0]

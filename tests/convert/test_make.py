@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from app import formats
-from app.convert import make
+from app.convert import worker
 from app.formats import ReadContext
 from app.model.closures import ClosureMode, Closures
 from app.model.features import features
@@ -32,9 +32,9 @@ def network(**edge_properties: object) -> Layers:
     return Layers({PartKey("topology", "ground", NETWORK): features(rows, "local")}, Datum(53.2, -0.5))
 
 
-def write_map(name: str, layers: Layers, mode: ClosureMode = "apply") -> make.Written:
+def write_map(name: str, layers: Layers, mode: ClosureMode = "apply") -> worker.Written:
     closures = Closures(mode=mode)
-    return make.from_layers(formats.get_format(name), layers, {}, derived=False, closures=closures)
+    return worker.from_layers(formats.get_format(name), layers, {}, derived=False, closures=closures)
 
 
 def edges_in(name: str, files: Mapping[str, bytes]) -> set[tuple[str, str]]:

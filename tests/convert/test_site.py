@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from app import formats
-from app.convert import make, site
+from app.convert import site, worker
 from app.convert.cache import Cache, LostMap, Product
 from app.convert.maps import file_of, joined
 from app.convert.recipe import Chain, Member, Recipe, Spread
@@ -21,7 +21,7 @@ from app.model.frame import Level
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
 
-EMPTY = make.empty_report(formats.get_format("satellite"))
+EMPTY = worker.empty_report(formats.get_format("satellite"))
 
 
 def recipe(key: str, **more: Any) -> Recipe:
@@ -130,7 +130,7 @@ def tower(*kinds: str) -> Layers:
     ],
 )
 def test_layers_in_memory_give_the_whole_site(asked: dict[str, str], derived: bool, expected: set[str]) -> None:
-    written_map = make.from_layers(
+    written_map = worker.from_layers(
         formats.get_format("occupancy_grid"), tower("keepout", "priority"), asked, derived=derived
     )
     assert {name.removesuffix(".pgm") for name in written_map.files if name.endswith(".pgm")} == expected
@@ -141,19 +141,19 @@ def test_layers_in_memory_give_the_whole_site(asked: dict[str, str], derived: bo
 def test_masks_need_no_map() -> None:
     fmt, layers = formats.get_format("occupancy_grid"), tower("keepout")
     zones = Layers({k: p for k, p in layers.parts.items() if k.layer == "zones"}, None, layers.levels)
-    written_map = make.from_layers(fmt, zones, {"level": "*", "grid": "keepout"}, derived=True)
+    written_map = worker.from_layers(fmt, zones, {"level": "*", "grid": "keepout"}, derived=True)
     assert "keepout.pgm" in written_map.files, "the lowest level with zones is at the top"
     with pytest.raises(MissingLayer):
-        make.from_layers(fmt, zones, {"level": "*", "grid": "*"}, derived=True)
+        worker.from_layers(fmt, zones, {"level": "*", "grid": "*"}, derived=True)
 
 
 def test_whole_site_without_a_part_that_fits_is_not_found() -> None:
     fmt = formats.get_format("occupancy_grid")
     for options in ({"level": "*", "grid": "keepout"}, {"level": "L9", "grid": "*"}):
         with pytest.raises(NotFound):
-            make.from_layers(fmt, tower(), options, derived=True)
+            worker.from_layers(fmt, tower(), options, derived=True)
     with pytest.raises(NotFound, match="none of them can be derived"):
-        make.from_layers(fmt, tower("speed"), {"level": "*", "grid": "keepout"}, derived=True)
+        worker.from_layers(fmt, tower("speed"), {"level": "*", "grid": "keepout"}, derived=True)
 
 
 def test_formats_with_parts_declare_their_own_options() -> None:

@@ -12,8 +12,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app import bundle, derive, parameters
-from app.bundle import Hints, Known
+from app import derive, parameters, upload_reader
 from app.derive import Notes
 from app.derive.location_to_occupancy import Parameters as BlankParameters
 from app.derive.location_to_occupancy import location_to_occupancy
@@ -30,6 +29,7 @@ from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, SITE, Layers, Part, PartKey, Resources
 from app.model.obstacles import OF_OSM
 from app.model.solids import TYPES
+from app.upload_reader import Hints, Known
 from tests.model.test_meshes import stl
 
 BOX = {"type": "box", "size": [1, 2, 3], "pose": [0, 0, 1.5, 0, 0, 0]}
@@ -630,7 +630,9 @@ def test_it_is_planned_with_what_it_may_also_read() -> None:
 
 def read(*paths: Path) -> Layers:
     files = {p.name: p.read_bytes() for p in paths}
-    upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
+    upload_bundle = upload_reader.read(
+        upload_reader.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits()
+    )
     return upload_bundle.layers(None)
 
 

@@ -11,8 +11,8 @@ import pytest
 import shapely
 
 from app import derive
-from app.convert.make import from_layers
 from app.convert.recipe import recipe
+from app.convert.worker import from_layers
 from app.derive import Notes
 from app.derive import occupancy_to_imagery as plan
 from app.errors import Ambiguous, CannotConvert, MissingLayer

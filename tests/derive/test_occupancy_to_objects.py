@@ -13,8 +13,7 @@ from lxml import etree
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from app import bundle, derive, formats, parameters
-from app.bundle import Hints, Known
+from app import derive, formats, parameters, upload_reader
 from app.convert import recipe
 from app.derive import Notes
 from app.derive import _figures as known_figures
@@ -28,6 +27,7 @@ from app.model.features import Features
 from app.model.frame import Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
+from app.upload_reader import Hints, Known
 
 CELL = 0.05
 Array = NDArray[np.float64]
@@ -340,7 +340,9 @@ def test_parameters_are_checked_and_the_planner_prefers_all_other_ways() -> None
 
 def load(folder: Path) -> Layers:
     files = {p.name: p.read_bytes() for p in sorted(folder.iterdir()) if p.is_file()}
-    upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
+    upload_bundle = upload_reader.read(
+        upload_reader.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits()
+    )
     return upload_bundle.layers(None)
 
 

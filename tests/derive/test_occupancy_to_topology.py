@@ -17,7 +17,6 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from app import derive, formats, parameters
-from app.bundle import Hints, Known, read
 from app.derive import Notes, occupancy_to_imagery, occupancy_to_voxels, voxels_to_occupancy
 from app.derive.occupancy_to_topology import Parameters, network, occupancy_to_topology
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound
@@ -37,6 +36,7 @@ from app.model.grid import (
 )
 from app.model.imagery import Picture
 from app.model.layers import MAP, NETWORK, Layers, PartKey
+from app.upload_reader import Hints, Known, read
 
 METHODS = ("skeleton", "roadmap", "voronoi")
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config"

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
-from app import bundle
-from app.bundle import Hints, Known
+from app import upload_reader
 from app.derive import Notes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.derive.objects_to_voxels import Parameters as VoxelParameters
@@ -26,6 +25,7 @@ from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
 from app.model.solids import Solids
 from app.model.voxels import VoxelMap
+from app.upload_reader import Hints, Known
 
 PAIRS = {
     # world: folder, file, map, shift of the map (metres), the share of its occupied cells within 10 cm
@@ -43,7 +43,9 @@ PAIRS = {
 
 
 def read(files: dict[str, bytes]) -> Layers:
-    upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
+    upload_bundle = upload_reader.read(
+        upload_reader.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits()
+    )
     return upload_bundle.layers(None)
 
 

@@ -14,7 +14,6 @@ import shapely
 import yaml
 
 from app import derive
-from app.bundle import Hints
 from app.convert.files import offline
 from app.derive import Notes
 from app.derive.zones_to_occupancy import Parameters, zones_to_occupancy
@@ -23,6 +22,7 @@ from app.model.features import features
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
+from app.upload_reader import Hints
 from tests.api.conftest import Api, running, settings_for
 
 KEEPOUT, SPEED = PartKey("occupancy", "ground", "keepout"), PartKey("occupancy", "ground", "speed")

@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 import yaml
 
-from app.cli.serving import wait_ready
+from app.cli.server import wait_ready
 from tests.cli.conftest import Fleetmap
 
 TOP = Path(__file__).resolve().parents[2]

@@ -133,7 +133,7 @@ def test_reports_wait_for_a_database_that_is_away(api: Api, monkeypatch: pytest.
 def test_what_comes_too_fast_is_told(
     api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("app.fleet.intake.WAITING", 2)
+    monkeypatch.setattr("app.fleet.report_queue.WAITING", 2)
     store: Store = api.app.state.services.store
     store.create_environment("farm")
     intake = Intake(store)
@@ -148,8 +148,8 @@ def test_what_comes_too_fast_is_told(
 def test_who_says_too_much_displaces_nobody(
     api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("app.fleet.intake.SHARE", 3)
-    monkeypatch.setattr("app.fleet.intake.WAITING", 20)
+    monkeypatch.setattr("app.fleet.report_queue.SHARE", 3)
+    monkeypatch.setattr("app.fleet.report_queue.WAITING", 20)
     store: Store = api.app.state.services.store
     store.create_environment("farm")
     intake = Intake(store)
@@ -173,7 +173,7 @@ def test_nonsense_keeps_nothing_from_being_renewed(
     api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Who was there stays there while somebody else never stops."""
-    monkeypatch.setattr("app.fleet.intake.RENEW_SECONDS", 0.2)
+    monkeypatch.setattr("app.fleet.report_queue.RENEW_SECONDS", 0.2)
     store: Store = api.app.state.services.store
     intake, renewed, stop = Intake(store), [], threading.Event()
     monkeypatch.setattr(store, "note_presence", lambda on_bus, absent, now: renewed.append(on_bus))

@@ -200,7 +200,7 @@ class Deaf:
 def test_a_database_that_is_away_is_told_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("app.events.single.POLL_SECONDS", 0.01)
+    monkeypatch.setattr("app.events.leader.POLL_SECONDS", 0.01)
     store = Store(f"sqlite:///{tmp_path / 'store.sqlite'}", tmp_path / "blobs")
     store.migrate()
     store.create_environment("farm")

@@ -15,12 +15,12 @@ import pytest
 import zenoh
 from zenoh import ext
 
-from app.agent.ear import Ear
-from app.cli.serving import check
+from app.agent.zenoh_client import Ear
+from app.cli.server import check
 from app.errors import Invalid, Unavailable
 from app.events.bus import Bus, BusOptions, router_configuration, session_configuration
 from app.events.bus import check as check_bus
-from app.events.login import Login, no_router
+from app.events.credentials import Login, no_router
 from app.events.router import Router
 from app.events.security import Security, access_control, read_users
 from app.main import check_bus as check_settings
@@ -320,7 +320,7 @@ def test_why_a_certificate_is_not_trusted_is_told(
         assert bus.state["detail"] == f"no router at {endpoint}: its certificate is not to be trusted: {told}"
         refused(port, Login(authority.pem))
         ear = Ear("farm", "r1", heard=nothing, back=nothing, login=Login(authority.pem))
-        monkeypatch.setattr("app.agent.ear.CONNECT_MS", int(REFUSED_SECONDS * 1000))
+        monkeypatch.setattr("app.agent.zenoh_client.CONNECT_MS", int(REFUSED_SECONDS * 1000))
         ear.aim(endpoint, "fleetmap")
         try:
             eventually(lambda: ear.problem and told in ear.problem)

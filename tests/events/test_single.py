@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from app.errors import Unavailable
-from app.events.single import Single, state_of
+from app.events.leader import Single, state_of
 from tests.events.conftest import eventually
 
 
@@ -39,7 +39,7 @@ class Rounds(Single):
 
 
 def test_what_a_killed_process_said_no_longer_holds(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "app.events.single")
+    caplog.set_level(logging.INFO, "app.events.leader")
     (tmp_path / "some.json").write_text('{"state": "connected"}')
     slow = threading.Event()
     one = Rounds(tmp_path, slow.wait)
@@ -59,7 +59,7 @@ def test_what_a_killed_process_said_no_longer_holds(tmp_path: Path, caplog: pyte
 
 
 def test_the_next_one_goes_on_where_one_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.events.single.POLL_SECONDS", 0.05)
+    monkeypatch.setattr("app.events.leader.POLL_SECONDS", 0.05)
     hold = "import fcntl, sys; f = open(sys.argv[1], 'a'); fcntl.flock(f, fcntl.LOCK_EX); print('held', flush=True)"
     other = subprocess.Popen(
         [sys.executable, "-c", hold + "; input()", str(tmp_path / "some.lock")],
@@ -92,7 +92,7 @@ def test_trouble_is_told_once_and_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr("app.events.single.POLL_SECONDS", 0.01)
+    monkeypatch.setattr("app.events.leader.POLL_SECONDS", 0.01)
     errors: list[Exception] = [Unavailable("the database is away")] * 3 + [ValueError("a mistake")]
 
     def work() -> None:

@@ -17,10 +17,9 @@ import orjson
 import pytest
 import shapely
 
-from app import bundle, formats
-from app.bundle import Bundle, Hints, Known
-from app.convert import make as making
+from app import formats, upload_reader
 from app.convert import recipe
+from app.convert import worker as making
 from app.convert.files import offline
 from app.errors import BadUpload, CannotConvert, MissingLayer
 from app.formats import Limits, WriteContext, _archive, _shell, get_format
@@ -34,6 +33,7 @@ from app.model.templates import NO_TEMPLATES
 from app.model.voxels import VoxelMap
 from app.store import parts as store_parts
 from app.store.tree import Draft
+from app.upload_reader import Bundle, Hints, Known
 
 FORMAT = get_format("environment")
 SAMPLE = (Path(__file__).resolve().parents[1] / "samples/environment/yard.zip").read_bytes()
@@ -64,7 +64,7 @@ def folder(shared: Path, name: str) -> dict[str, bytes]:
 
 
 def read_upload(files: dict[str, bytes], name: str | None = None) -> Bundle:
-    return bundle.read(bundle.unpack(files, Limits()), Hints(name), Known(), Limits())
+    return upload_reader.read(upload_reader.unpack(files, Limits()), Hints(name), Known(), Limits())
 
 
 def written(layers: Layers, **options: Any) -> tuple[dict[str, bytes], dict[str, Any]]:

@@ -10,9 +10,8 @@ import pytest
 import shapely
 
 from app import formats
-from app.bundle import Hints, Known, read, unpack
 from app.convert.files import offline
-from app.convert.make import from_layers
+from app.convert.worker import from_layers
 from app.errors import BadUpload, CannotConvert, Invalid, MissingLayer
 from app.formats import Limits
 from app.model.features import features
@@ -20,6 +19,7 @@ from app.model.frame import Datum
 from app.model.layers import LAYERS, Layers, PartKey
 from app.store import parts
 from app.store.tree import Draft
+from app.upload_reader import Hints, Known, read, unpack
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 HERE = Datum(53.2686, -0.5245, heading=12.5)

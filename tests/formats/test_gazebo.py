@@ -21,8 +21,6 @@ import shapely
 from lxml import etree
 
 from app import formats
-from app.bundle import Bundle, Hints, Known, unpack
-from app.bundle import read as read_bundle
 from app.convert.files import offline
 from app.errors import Ambiguous, BadUpload, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
 from app.formats import Limits, WriteContext, _sdf, _sdf_bodies, gazebo, get_format
@@ -33,6 +31,8 @@ from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey, Resources
 from app.model.meshes import read_mesh
+from app.upload_reader import Bundle, Hints, Known, unpack
+from app.upload_reader import read as read_bundle
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "gazebo"
 LIMITS = Limits()

@@ -18,8 +18,6 @@ import shapely
 from lxml import etree
 
 from app import formats
-from app.bundle import Hints, Known
-from app.bundle import read as read_bundle
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, _osm, get_format
@@ -27,6 +25,8 @@ from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, speed_of
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
+from app.upload_reader import Hints, Known
+from app.upload_reader import read as read_bundle
 
 FORMAT = get_format("lanelet2")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "lanelet2"

@@ -16,8 +16,6 @@ import pytest
 from pyproj import CRS, Transformer
 
 from app import formats
-from app.bundle import Hints, Known
-from app.bundle import read as read_bundle
 from app.convert.files import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, get_format
@@ -25,6 +23,8 @@ from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, PartKey
 from app.model.voxels import VoxelMap
+from app.upload_reader import Hints, Known
+from app.upload_reader import read as read_bundle
 from tests.formats import clouds
 
 FORMAT = get_format("las")

@@ -13,7 +13,6 @@ import pytest
 import shapely
 
 from app import formats
-from app.bundle import Hints
 from app.convert.files import offline
 from app.errors import CannotConvert, MissingDatum, TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, get_format
@@ -21,6 +20,7 @@ from app.formats.lif import WriteOptions
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey
+from app.upload_reader import Hints
 
 FORMAT = get_format("lif")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "lif"

@@ -15,7 +15,6 @@ import shapely
 import yaml
 
 from app import formats
-from app.bundle import Hints
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, UnreadableFile
 from app.formats import Group, ReadContext, WriteContext, get_format
@@ -23,6 +22,7 @@ from app.formats._yaml import Tagged, load
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey
+from app.upload_reader import Hints
 
 FORMAT = get_format("navgraph")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "navgraph"

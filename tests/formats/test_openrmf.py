@@ -14,7 +14,6 @@ import shapely
 import yaml
 
 from app import formats
-from app.bundle import Hints
 from app.convert.files import offline
 from app.errors import BadUpload, MissingLayer, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, get_format
@@ -22,6 +21,7 @@ from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, Part, PartKey, Resources
+from app.upload_reader import Hints
 
 FORMAT = get_format("openrmf")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "openrmf"

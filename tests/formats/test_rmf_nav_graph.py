@@ -14,12 +14,12 @@ import shapely
 import yaml
 
 from app import formats
-from app.bundle import Hints
 from app.convert.files import offline
 from app.errors import MissingLayer, UnreadableFile
 from app.formats import Group, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.layers import Layers, PartKey
+from app.upload_reader import Hints
 
 FORMAT = get_format("rmf_nav_graph")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"

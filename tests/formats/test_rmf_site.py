@@ -15,7 +15,6 @@ import shapely
 import yaml
 
 from app import formats
-from app.bundle import Hints
 from app.convert.files import offline
 from app.errors import MissingLayer, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, _ron, get_format
@@ -23,6 +22,7 @@ from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, Part, PartKey
+from app.upload_reader import Hints
 
 FORMAT = get_format("rmf_site")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "rmf_site"

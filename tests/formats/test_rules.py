@@ -20,14 +20,14 @@ import pytest
 import yaml
 
 from app import formats
-from app.bundle import Hints, unpack
-from app.convert import make
+from app.convert import worker
 from app.convert.files import offline
 from app.convert.recipe import Chain
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Limits, Needs, WriteContext
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
+from app.upload_reader import Hints, unpack
 from tests.formats.test_every_format import CASES, HERE, mutations
 
 ERROR, WARNING = "error", "warning"
@@ -209,7 +209,7 @@ def test_a_wide_grid_is_told_in_its_report() -> None:
     cells = np.zeros((1, 32768), np.uint8)
     layers = Layers({PartKey("occupancy", "ground", "map"): OccupancyGrid(cells, 0.05, (0.0, 0.0, 0.5))})
     chain = Chain((), tuple(layers.parts))
-    report = make.write(formats.get_format("occupancy_grid"), layers, {}, chain).report
+    report = worker.write(formats.get_format("occupancy_grid"), layers, {}, chain).report
     warnings = {(w["level"], w["file"], w.get("where")) for w in report["warnings"]}
     assert warnings == {(ERROR, "map.pgm", None), (WARNING, "map.yaml", "origin")}
     assert any("normalize=true" in w["problem"] for w in report["warnings"]), "the writer's own words stay"

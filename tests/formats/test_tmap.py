@@ -13,13 +13,13 @@ import shapely
 import yaml
 
 from app import formats
-from app.bundle import Hints, Known
-from app.bundle import read as read_bundle
 from app.convert.files import offline
 from app.errors import UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.layers import Layers, PartKey
+from app.upload_reader import Hints, Known
+from app.upload_reader import read as read_bundle
 
 FORMAT = get_format("tmap")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"

@@ -12,9 +12,8 @@ import pytest
 import shapely
 from lxml import etree
 
-from app import bundle, formats
-from app.bundle import Hints, Known
-from app.convert import make
+from app import formats, upload_reader
+from app.convert import worker
 from app.derive import Notes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotConvert
@@ -23,6 +22,7 @@ from app.model import osm_areas
 from app.model.frame import Datum
 from app.model.grid import OCCUPIED, OccupancyGrid
 from app.model.layers import Layers
+from app.upload_reader import Hints, Known
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 DATUM = Datum(53.2, -0.5)
@@ -62,12 +62,12 @@ def courtyard(without: int | None = None) -> bytes:
     return "".join([*out, f'<relation id="7" version="1">{members}{tags}</relation></osm>']).encode()
 
 
-def read(files: dict[str, bytes], datum: Datum | None = DATUM) -> bundle.Bundle:
-    return bundle.read(bundle.unpack(files, Limits()), Hints(), Known(datum), Limits())
+def read(files: dict[str, bytes], datum: Datum | None = DATUM) -> upload_reader.Bundle:
+    return upload_reader.read(upload_reader.unpack(files, Limits()), Hints(), Known(datum), Limits())
 
 
 def written(layers: Layers, to: str, **options: Any) -> dict[str, bytes]:
-    return make.from_layers(formats.get_format(to), layers, options, derived=False).files
+    return worker.from_layers(formats.get_format(to), layers, options, derived=False).files
 
 
 def cut(layers: Layers, **options: Any) -> dict[str, OccupancyGrid]:

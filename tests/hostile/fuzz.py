@@ -22,11 +22,11 @@ from pathlib import Path
 
 import orjson
 
-from app import bundle, formats
-from app.bundle import Hints, Known
+from app import formats, upload_reader
 from app.errors import BadUpload, FleetMapError, Invalid
 from app.formats import Limits, WriteContext
 from app.model.frame import Datum
+from app.upload_reader import Hints, Known
 from tests.hostile.corpus import sample_maps
 
 CPU_SECONDS = 10.0
@@ -126,7 +126,7 @@ def outcome(name: str | None, files: Files) -> str:
 
 def _outcome(name: str | None, files: Files) -> str:
     try:
-        upload_bundle = bundle.read(bundle.unpack(files, LIMITS), Hints(name), Known(HERE), LIMITS)
+        upload_bundle = upload_reader.read(upload_reader.unpack(files, LIMITS), Hints(name), Known(HERE), LIMITS)
     except (BadUpload, Invalid) as error:
         assert error.detail, "refused without a reason"
         if isinstance(error, BadUpload):
@@ -141,7 +141,7 @@ def _outcome(name: str | None, files: Files) -> str:
     return result
 
 
-def _again(upload_bundle: bundle.Bundle) -> str:
+def _again(upload_bundle: upload_reader.Bundle) -> str:
     layers = upload_bundle.layers(HERE)
     for name in sorted({use.format for use in upload_bundle.files.values() if use.used and use.format}):
         fmt = formats.all_formats().get(name)
@@ -152,7 +152,7 @@ def _again(upload_bundle: bundle.Bundle) -> str:
         except FleetMapError as error:  # what was read lacks what the format needs: a network without an edge
             assert error.detail
             continue
-        bundle.read(written, Hints(name), Known(HERE), LIMITS)
+        upload_reader.read(written, Hints(name), Known(HERE), LIMITS)
     return "read"
 
 

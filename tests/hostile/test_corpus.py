@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import orjson
 import pytest
 
-from app import bundle
-from app.bundle import Hints, Known
+from app import upload_reader
 from app.errors import BadUpload, Invalid, TooLarge
 from app.formats import Limits
 from app.formats._text import numbers
+from app.upload_reader import Hints, Known
 from tests.hostile.corpus import ACCORDING_TO_KIND, Case, cases, damaged, sample_maps, zipped
 
 SECONDS = 15.0
@@ -38,7 +38,9 @@ def outcome(case: Case) -> str:
     """``read`` or ``refused``; anything else fails here."""
     start = time.monotonic()
     try:
-        upload_bundle = bundle.read(bundle.unpack(case.files, LIMITS), Hints(case.format), Known(), LIMITS)
+        upload_bundle = upload_reader.read(
+            upload_reader.unpack(case.files, LIMITS), Hints(case.format), Known(), LIMITS
+        )
     except (BadUpload, Invalid) as error:
         result = "refused"
         assert error.detail
@@ -85,9 +87,9 @@ def test_damaged_samples(name: str, files: dict[str, bytes]) -> None:
 def test_archives_of_one_upload_share_the_limit() -> None:
     limits = Limits(unpacked_bytes=3000)
     files = {f"{k}.zip": zipped({f"{k}/z": bytes(1000)}) for k in range(3)}
-    assert len(bundle.unpack(files, limits)) == 3
+    assert len(upload_reader.unpack(files, limits)) == 3
     with pytest.raises(TooLarge) as caught:
-        bundle.unpack({**files, "one more.zip": zipped({"a": b"1"})}, limits)
+        upload_reader.unpack({**files, "one more.zip": zipped({"a": b"1"})}, limits)
     assert [p.file for p in caught.value.problems] == ["one more.zip"]
 
 

@@ -14,11 +14,11 @@ from typing import Any
 
 import pytest
 
-from app import bundle
-from app.bundle import Hints, Known
+from app import upload_reader
 from app.errors import BadUpload, TooLarge
 from app.formats import UNPACKED_FREE_BYTES, Limits, ReadContext, get_format
 from app.pool import Pool
+from app.upload_reader import Hints, Known
 from tests.hostile.corpus import KML, ROOM, SAMPLES, zipped
 
 MEMORY_BYTES = 400 * 2**20
@@ -31,7 +31,7 @@ def measured_upload(path: str) -> tuple[str, int, float]:
     before, start = _peak_bytes(), time.process_time()
     data = Path(path).read_bytes()
     try:
-        bundle.read(bundle.unpack({Path(path).name: data}, Limits()), Hints(), Known(), Limits())
+        upload_reader.read(upload_reader.unpack({Path(path).name: data}, Limits()), Hints(), Known(), Limits())
     except BadUpload as error:
         result = type(error).__name__
         assert all(p.problem and p.file for p in error.problems), error.problems
@@ -77,7 +77,7 @@ def uploads() -> Iterator[tuple[str, bytes]]:
 
 @pytest.fixture(scope="module")
 def worker() -> Iterator[Pool]:
-    pool = Pool(1, warm=("app.bundle", "tests.hostile.test_unfolding"))
+    pool = Pool(1, warm=("app.upload_reader", "tests.hostile.test_unfolding"))
     yield pool
     pool.close()
 
@@ -94,23 +94,23 @@ def test_bombs_are_refused_with_little_memory(worker: Pool, tmp_path: Path) -> N
 
 def test_small_archives_may_compress_well() -> None:
     body = b"0" * (UNPACKED_FREE_BYTES - len(DOCUMENT))
-    assert len(bundle.unpack({"a.zip": zipped({"doc.kml": DOCUMENT, "a.txt": body})}, Limits())) == 2
+    assert len(upload_reader.unpack({"a.zip": zipped({"doc.kml": DOCUMENT, "a.txt": body})}, Limits())) == 2
 
 
 def test_a_blank_image_may_compress_better_than_a_text() -> None:
     blank = bytes(2 * UNPACKED_FREE_BYTES)
     limits = Limits(pixels=len(blank))
-    assert bundle.unpack({"a.zip": zipped({"blank.pgm": blank})}, limits)["blank.pgm"] == blank
+    assert upload_reader.unpack({"a.zip": zipped({"blank.pgm": blank})}, limits)["blank.pgm"] == blank
     for files in ({"blank.txt": blank}, {"a.pgm": blank, "b.pgm": b"0"}):
         with pytest.raises(TooLarge):
-            bundle.unpack({"a.zip": zipped(files)}, limits)
+            upload_reader.unpack({"a.zip": zipped(files)}, limits)
 
 
 def test_a_text_in_an_archive_has_the_limit_of_a_text() -> None:
     with pytest.raises(
         TooLarge, match=r"doc\.kml: declares \d+ bytes; the limit for a text of \d+ compressed bytes is 50"
     ) as caught:
-        bundle.unpack({"a.zip": zipped({"doc.kml": DOCUMENT})}, Limits(text_bytes=50))
+        upload_reader.unpack({"a.zip": zipped({"doc.kml": DOCUMENT})}, Limits(text_bytes=50))
     assert [(p.file, p.where) for p in caught.value.problems] == [("a.zip", "doc.kml")]
 
 

@@ -18,15 +18,15 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
-from app import bundle, formats
-from app.bundle import Hints, Known
-from app.convert.make import write
+from app import formats, upload_reader
 from app.convert.recipe import Stock, chain
+from app.convert.worker import write
 from app.errors import FleetMapError
 from app.formats import Limits
 from app.model.features import NO_GEOMETRY, Features
 from app.model.frame import Datum
 from app.model.layers import Layers
+from app.upload_reader import Hints, Known
 from tests.hostile.corpus import sample_maps
 
 HERE = Datum(50.0, 7.0, heading=30.0)
@@ -100,7 +100,9 @@ def bases() -> Iterator[tuple[str, Layers]]:
         for layer in (None, "topology"):
             if layer and not formats.get_format(name).drawing:
                 continue
-            upload_bundle = bundle.read(bundle.unpack(files, Limits()), Hints(name, layer=layer), Known(HERE), Limits())
+            upload_bundle = upload_reader.read(
+                upload_reader.unpack(files, Limits()), Hints(name, layer=layer), Known(HERE), Limits()
+            )
             layers = upload_bundle.layers(HERE)
             parts = {key: smaller(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
             yield f"{name}/{min(files)}{f' as {layer}' if layer else ''}", Layers(parts, layers.datum, layers.levels)

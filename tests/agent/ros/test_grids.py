@@ -73,8 +73,8 @@ def test_a_yaml_that_is_none(tmp_path: Path, text: str) -> None:
 def test_as_the_server_writes_it(tmp_path: Path) -> None:
     """A grid that the server has read and written, against the server's own cells."""
     np = pytest.importorskip("numpy", reason="the server's packages")
-    from app.bundle import Hints
     from app.convert.files import offline
+    from app.upload_reader import Hints
     from tests.api import samples
 
     converted = offline(samples.grid(), "occupancy_grid", hints=Hints())

@@ -18,10 +18,10 @@ from urllib.parse import quote, urljoin
 
 import httpx
 
+from app.agent.signed_manifest import File
 from app.agent.state import digest
-from app.agent.trust import File
 from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
-from app.events.login import trusting
+from app.events.credentials import trusting
 
 if sys.version_info >= (3, 14):
     from compression import zstd

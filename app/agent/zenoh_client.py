@@ -18,7 +18,7 @@ from zenoh import ext
 
 from app.errors import FleetMapError
 from app.events import messages
-from app.events.login import Login, no_router
+from app.events.credentials import Login, no_router
 
 LOOK_SECONDS = 0.5
 """Between two looks whether the router is there."""

@@ -18,13 +18,13 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api import problems
-from app.api.access import MAX_SOURCES, Principal, environment_of, is_open, source_of
-from app.api.answers import API
+from app.api.auth import MAX_SOURCES, Principal, environment_of, is_open, source_of
+from app.api.dependencies import Services
 from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
 from app.api.protocol import PROVE
-from app.api.services import Services
+from app.api.responses import API
 from app.api.signed import LINK, signed_address
-from app.api.together import Together
+from app.api.single_flight import Together
 from app.errors import Denied, FleetMapError, TooLarge
 from app.logs import REQUEST_ID, log_request
 from app.store.audit import CALLER, Caller

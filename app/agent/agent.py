@@ -14,20 +14,20 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from app.agent import trust
+from app.agent import signed_manifest
 from app.agent.activation import ACTIVE, BEFORE_SWITCH_SECONDS, Activation, LogEvent, Outcome, Retries, changed_files
 from app.agent.download import Downloads
-from app.agent.ear import Ear
-from app.agent.folder import Folder
 from app.agent.freshness import Freshness, SignedClock
+from app.agent.http_client import Busy, ClosuresChanged, Stopped, Web, plain
 from app.agent.levels import write_hooks
 from app.agent.manifests import Manifests
+from app.agent.map_directory import Folder
 from app.agent.options import Options, robot_name
 from app.agent.requests import parse_requests
+from app.agent.signed_manifest import File, Manifest
 from app.agent.state import State, StateStore
 from app.agent.status import StatusReporter
-from app.agent.trust import File, Manifest
-from app.agent.web import Busy, ClosuresChanged, Stopped, Web, plain
+from app.agent.zenoh_client import Ear
 from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events import messages
 from app.events.messages import RobotState, RobotStatus
@@ -75,7 +75,7 @@ class Agent:
 
     def __init__(self, options: Options, tell: LogEvent, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
-            options = dataclasses.replace(options, key=trust.check_given(options.key))
+            options = dataclasses.replace(options, key=signed_manifest.check_given(options.key))
         self.options, self._tell, self._clock = options, tell, clock
         self._robot = robot_name(options.robot)
         self._login = options.zenoh_login
@@ -137,7 +137,7 @@ class Agent:
         given = self.options.key
         state = self._state
         if given is not None and given != state.given:
-            if state.key is not None and given not in (trust.key_id(state.key), _text(state.key)):
+            if state.key is not None and given not in (signed_manifest.key_id(state.key), _text(state.key)):
                 self._tell("trusting", key=given, detail="the key that was pinned before is forgotten")
                 state = dataclasses.replace(state, key=None, marks={})
             state = dataclasses.replace(state, given=given)
@@ -261,7 +261,7 @@ class Agent:
         if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
-        if not 0 < event.sequence - self._mark <= trust.MAX_SEQUENCE_AHEAD + 1:
+        if not 0 < event.sequence - self._mark <= signed_manifest.MAX_SEQUENCE_AHEAD + 1:
             return
         ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
         if event.type == "version.created":
@@ -585,7 +585,7 @@ class Agent:
         """Report why a planned version is not here. What may end by itself is no failure of the version."""
         detail = f"planned version {version}: {error.detail}"
         subject: Subject | None = self._fetched
-        if subject is None and isinstance(root, str) and trust.is_hash(root):
+        if subject is None and isinstance(root, str) and signed_manifest.is_hash(root):
             subject = (version, root)
         if isinstance(error, Busy):
             self._after = error.seconds

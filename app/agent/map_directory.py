@@ -29,9 +29,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from app.agent.http_client import Stopped
+from app.agent.signed_manifest import File, Manifest, parse
 from app.agent.state import digest, sync_folder, write_new
-from app.agent.trust import File, Manifest, parse
-from app.agent.web import Stopped
 from app.errors import Conflict, Invalid, Unavailable, Untrusted
 
 KEPT = 2

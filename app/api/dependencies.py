@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Depends, Request
 
-from app.api.access import Access
+from app.api.auth import Access
 from app.api.signed import SignedLinks
 from app.convert.maps import Maps
 from app.errors import Unavailable

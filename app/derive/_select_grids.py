@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.derive._choice import named, one_each
+from app.derive._select import named, one_each
 from app.errors import MissingLayer
 from app.model import masks
 from app.model.grid import OccupancyGrid, as_seen, unknown_grey

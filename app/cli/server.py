@@ -352,7 +352,7 @@ def _run(settings: Settings, listener: socket.socket) -> None:
     import uvicorn
     from uvicorn.supervisors import Multiprocess
 
-    config = _main().server_config(settings, "app.cli.serving:application")
+    config = _main().server_config(settings, "app.cli.server:application")
     # Uvicorn raises the signal again once it has shut down; after a clean stop the exit status shall be 0.
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: None)
