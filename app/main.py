@@ -56,18 +56,18 @@ from app.api import (
     vda5050,
     versions,
 )
-from app.api.auth import Access
+from app.api.auth import Authenticator
 from app.api.connections import ConnectionLimits, Connections, fit_open_files
 from app.api.deltas import Deltas
 from app.api.dependencies import ApiOptions, Services, Writability
-from app.api.jobs import BEAT_SECONDS, Work
-from app.api.maps import Hot, Server
+from app.api.jobs import BEAT_SECONDS, ConversionJobs
+from app.api.maps import FleetMapApp, ResponseCache
 from app.api.metrics import Metrics
 from app.api.middleware import Guard
 from app.api.protocol import BoundedProtocol, tls_context
 from app.api.responses import API
 from app.api.signed import SignedLinks
-from app.api.uploads import Intake
+from app.api.uploads import UploadSpool
 from app.config import Settings
 from app.convert.maps import Maps
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
@@ -104,14 +104,14 @@ CACHE_SHARE = 0.1
 """Of the cached maps a scrub hashes so many: each is hashed anyway when a process first meets it."""
 
 
-def create_app(settings: Settings) -> Server:
+def create_app(settings: Settings) -> FleetMapApp:
     """The application. Its lifespan opens the store and starts the workers, and closes both."""
 
     @contextlib.asynccontextmanager
-    async def lifespan(app: Server) -> AsyncIterator[None]:
+    async def lifespan(app: FleetMapApp) -> AsyncIterator[None]:
         services = await run_in_threadpool(open_services, settings)
         app.state.services = services
-        app.state.feed = events.Feed(services)
+        app.state.feed = events.EventFeed(services)
         services.fleet.start()
         threading.Thread(target=_prepare, args=(services,), daemon=True).start()
         publishing = [p for p in (ros2_of(settings, services), relay_of(settings, services)) if p is not None]
@@ -131,7 +131,7 @@ def create_app(settings: Settings) -> Server:
                 await run_in_threadpool(one.close)
             await run_in_threadpool(close_services, services)
 
-    app = Server(
+    app = FleetMapApp(
         title="Fleet Map Server",
         version=__version__,
         lifespan=lifespan,
@@ -180,7 +180,7 @@ def create_app(settings: Settings) -> Server:
     return app
 
 
-def from_environment() -> Server:
+def from_environment() -> FleetMapApp:
     """For ``uvicorn --factory app.main:from_environment`` and for worker processes."""
     return create_app(Settings())
 
@@ -259,7 +259,7 @@ def open_services(settings: Settings) -> Services:
                 log.error("%s", error.detail)  # noqa: TRY400  a trace shows paths
             if not settings.insecure_no_auth:
                 _first_token(store, settings)
-            intake = Intake(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
+            intake = UploadSpool(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
         if settings.models_dir is not None:
             os.environ["FLEETMAP_MODELS_DIR"] = str(settings.models_dir.resolve())  # where derivations look for it
             os.environ["FLEETMAP_MODELS_MAX_BYTES"] = str(settings.models_max_bytes)
@@ -293,7 +293,7 @@ def allowed(settings: Settings) -> Allowed:
     return Allowed(ports=(make_url(settings.database).port or 5432,))
 
 
-def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake: Intake) -> Services:
+def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake: UploadSpool) -> Services:
     def run(function: Callable[..., Any], *args: Any, by: Pool = pool, **more: Any) -> Any:
         try:
             return by.run(function, *args, **more)
@@ -309,7 +309,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         store, run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes, run_trial=run_trial
     )
     service.cache.on_damage = metrics.cache_damaged.inc
-    access = Access(store.find_token, failures=settings.token_failures, insecure=settings.insecure_no_auth)
+    access = Authenticator(store.find_token, failures=settings.token_failures, insecure=settings.insecure_no_auth)
 
     keys, secrets = Keys(settings.data_dir / "keys"), LinkSecrets(settings.data_dir / "keys")
     with contextlib.suppress(OSError):  # created now, since later the disk may be full
@@ -341,8 +341,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         ingest=Ingest(store, run, settings.limits, provider_of(settings)),
         maps=service,
         access=access,
-        work=Work(store, service, settings.job_seconds, count),
-        hot=Hot(settings.memory_cache_bytes, access, metrics, store.generation),
+        work=ConversionJobs(store, service, settings.job_seconds, count),
+        hot=ResponseCache(settings.memory_cache_bytes, access, metrics, store.generation),
         intake=intake,
         metrics=metrics,
         keys=keys,

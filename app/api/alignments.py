@@ -8,13 +8,13 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from app.api.auth import Editor
-from app.api.dependencies import Here
-from app.api.responses import Route, answer
+from app.api.dependencies import ServicesDep
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import AlignmentBody, AlignmentOut, EnvironmentPath, IdempotencyKey, IfMatch, OntoBody, told
 from app.errors import Invalid, Problem
 from app.ingest import Alignment
 
-router = APIRouter(tags=["alignments"], route_class=Route)
+router = APIRouter(tags=["alignments"], route_class=StrictRoute)
 
 
 @router.post(
@@ -29,7 +29,7 @@ router = APIRouter(tags=["alignments"], route_class=Route)
 def create_alignment(
     env: EnvironmentPath,
     body: AlignmentBody,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,

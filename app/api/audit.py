@@ -8,20 +8,20 @@ from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from app.api.auth import ServerAdmin
-from app.api.dependencies import Here
-from app.api.responses import Route, page
+from app.api.dependencies import ServicesDep
+from app.api.responses import StrictRoute, page
 from app.api.schemas import AuditOut, Limit, told
 from app.errors import Invalid
 from app.store.audit import AuditEntry
 from app.store.values import rfc3339
 
-router = APIRouter(prefix="/audit", tags=["audit"], route_class=Route)
+router = APIRouter(prefix="/audit", tags=["audit"], route_class=StrictRoute)
 
 
 @router.get("", responses=told(list[AuditOut]), summary="Who changed what, from where")
 def list_audit(
     request: Request,
-    services: Here,
+    services: ServicesDep,
     _: ServerAdmin,
     environment: Annotated[str | None, Query(max_length=63, description="Only changes of this environment.")] = None,
     token_id: Annotated[str | None, Query(max_length=32, description="Only changes made with this token.")] = None,

@@ -24,9 +24,9 @@ from app.api.problems import Throttled
 from app.errors import Denied, Unauthenticated
 from app.store.values import Role, Token
 
-Need = Literal["viewer", "robot", "editor", "admin"]
+RequiredRole = Literal["viewer", "robot", "editor", "admin"]
 
-_CAN: dict[Need, frozenset[Role]] = {
+_CAN: dict[RequiredRole, frozenset[Role]] = {
     "viewer": frozenset({"viewer", "robot", "editor", "admin"}),
     "robot": frozenset({"robot", "editor", "admin"}),
     "editor": frozenset({"editor", "admin"}),
@@ -63,7 +63,7 @@ class Principal:
         """Who holds this token."""
         return cls(token.id, token.name, token.role, token.environments, token.robot, token.expires)
 
-    def can(self, need: Need) -> bool:
+    def can(self, need: RequiredRole) -> bool:
         """Whether the role allows it."""
         return self.role in _CAN[need]
 
@@ -71,7 +71,7 @@ class Principal:
         """Whether the token reaches this environment."""
         return self.environments is None or fnmatchcase(environment, self.environments)
 
-    def demand(self, need: Need) -> None:
+    def demand(self, need: RequiredRole) -> None:
         """Denied unless the role allows it."""
         if not self.can(need):
             takes = " or ".join(sorted(_CAN[need]))
@@ -88,7 +88,7 @@ class Principal:
             raise Denied(f"this call takes a token for all environments; yours is limited to {self.environments}")
 
 
-NOBODY = Principal("", "anonymous", "admin")
+ANONYMOUS_ADMIN = Principal("", "anonymous", "admin")
 """Everybody, where access control is switched off."""
 
 
@@ -103,7 +103,7 @@ def environment_of(path: str) -> str | None:
     return match[1] if match else None
 
 
-class Access:
+class Authenticator:
     """Tokens, looked up in the store and believed for a second. forgotten: how often one was revoked here."""
 
     def __init__(
@@ -124,7 +124,7 @@ class Access:
     def known(self, header: bytes | None) -> Principal | None:
         """Who sent this Authorization header, if it was checked less than a second ago. Never blocks."""
         if self.insecure:
-            return NOBODY
+            return ANONYMOUS_ADMIN
         if header is None:
             return None
         entry = self._known.get(hashlib.sha256(header).digest())
@@ -212,10 +212,10 @@ def is_loopback(source: str) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class AtLeast:
+class RequireRole:
     """A route's dependency: the caller, who must have at least this role; everywhere: in all environments."""
 
-    need: Need
+    need: RequiredRole
     everywhere: bool = False
 
     async def __call__(self, request: Request) -> Principal:
@@ -229,12 +229,12 @@ class AtLeast:
         return principal
 
 
-viewer, robot, editor, admin = AtLeast("viewer"), AtLeast("robot"), AtLeast("editor"), AtLeast("admin")
+viewer, robot, editor, admin = RequireRole("viewer"), RequireRole("robot"), RequireRole("editor"), RequireRole("admin")
 
 Viewer = Annotated[Principal, Depends(viewer)]
-Reporter = Annotated[Principal, Depends(robot)]
+RobotRole = Annotated[Principal, Depends(robot)]
 Editor = Annotated[Principal, Depends(editor)]
 Admin = Annotated[Principal, Depends(admin)]
-ServerViewer = Annotated[Principal, Depends(AtLeast("viewer", everywhere=True))]
-ServerAdmin = Annotated[Principal, Depends(AtLeast("admin", everywhere=True))]
+ServerViewer = Annotated[Principal, Depends(RequireRole("viewer", everywhere=True))]
+ServerAdmin = Annotated[Principal, Depends(RequireRole("admin", everywhere=True))]
 """For what concerns the server itself or all environments: tokens, keys, metrics."""

@@ -14,10 +14,10 @@ from starlette.responses import Response
 
 from app.api.auth import Viewer
 from app.api.caching import none_match
-from app.api.dependencies import Here, Services
+from app.api.dependencies import Services, ServicesDep
 from app.api.layers import Crs, feature_collection
 from app.api.maps import number_of
-from app.api.responses import Route, answer, json_bytes
+from app.api.responses import StrictRoute, answer, json_bytes
 from app.api.schemas import VERSION, DeltaOut, EnvironmentPath, VersionPath, told
 from app.errors import MissingDatum
 from app.model.features import Features
@@ -30,7 +30,7 @@ from app.store.values import Delta, FeatureDelta, GridDelta, Rectangle, Version
 MAX_CELLS = 4 * 2**20
 """Where more cells of a grid changed, fetching the grid is less work than reading them as JSON."""
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=StrictRoute)
 
 
 @router.get(
@@ -42,7 +42,7 @@ def get_delta(
     env: EnvironmentPath,
     v: VersionPath,
     request: Request,
-    services: Here,
+    services: ServicesDep,
     _: Viewer,
     since: Annotated[
         str, Query(pattern=VERSION, description="What the client has: number, channel, or `latest`.", examples=["0"])

@@ -14,8 +14,8 @@ from starlette.responses import Response
 from app import fleet
 from app.api.auth import Editor, Viewer
 from app.api.caching import none_match
-from app.api.dependencies import Here, Services
-from app.api.responses import Route, answer, json_bytes
+from app.api.dependencies import Services, ServicesDep
+from app.api.responses import StrictRoute, answer, json_bytes
 from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, told
 from app.errors import Invalid, Problem
 from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
@@ -23,7 +23,7 @@ from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
 CLOCKS_DIFFER = timedelta(seconds=60)
 """A time that is past by less may lie ahead by the clock of whoever asks: the channel moves at once."""
 
-router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=StrictRoute)
 
 
 def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> dict[str, Any]:
@@ -66,7 +66,7 @@ def _one(services: Services, env: str, channel: Channel) -> dict[str, Any]:
 async def list_channels(
     env: EnvironmentPath,
     request: Request,
-    services: Here,
+    services: ServicesDep,
     _: Viewer,
     robots: Annotated[
         bool, Query(description="`false`: without how their robots stand, which costs a look at all.")
@@ -98,7 +98,7 @@ def _listed(services: Services, env: str, request: Request, robots: bool) -> tup
 
 @router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")
 def move_channel(
-    env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, services: Here, principal: Editor
+    env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, services: ServicesDep, principal: Editor
 ) -> Response:
     """To a newer version or back to an older one, now or at a time to come. `latest` moves by itself.
 
@@ -151,7 +151,7 @@ def _refused(detail: str, location: str = "body.activate_at") -> Invalid:
 
 
 @router.delete("/{channel}/planned", status_code=204, responses=told(None, 404), summary="Cancel what is planned")
-def cancel_planned(env: EnvironmentPath, channel: ChannelPath, services: Here, principal: Editor) -> Response:
+def cancel_planned(env: EnvironmentPath, channel: ChannelPath, services: ServicesDep, principal: Editor) -> Response:
     """The channel stays where it is."""
     services.store.cancel_planned(env, channel, principal.name)
     return Response(status_code=204)

@@ -14,12 +14,12 @@ from starlette.responses import Response
 from app import formats, parameters
 from app.api.auth import Editor
 from app.api.caching import content_disposition
-from app.api.dependencies import Here, Services
+from app.api.dependencies import Services, ServicesDep
 from app.api.environments import datum_of, numbers
 from app.api.problems import UnsupportedMedia
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import DatumBody, told
-from app.api.uploads import Form
+from app.api.uploads import UploadForm
 from app.api.versions import check_names, format_named, truth
 from app.convert.files import Converted
 from app.convert.worker import media_type, zipped
@@ -29,7 +29,7 @@ from app.model.frame import GROUND, Datum, Level
 from app.model.names import did_you_mean
 from app.upload_reader import DRAWN_LAYERS, Hints, drawn_layer
 
-router = APIRouter(tags=["formats"], route_class=Route)
+router = APIRouter(tags=["formats"], route_class=StrictRoute)
 
 _BODY: dict[str, Any] = {
     "requestBody": {
@@ -78,7 +78,7 @@ _BODY: dict[str, Any] = {
     summary="Convert files without storing them",
     openapi_extra=_BODY,
 )
-async def convert(request: Request, services: Here, _: Editor) -> Response:
+async def convert(request: Request, services: ServicesDep, _: Editor) -> Response:
     """The wanted format made of the files in the request. `Fleetmap-Warnings` counts what was doubtful."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media != "multipart/form-data":
@@ -87,7 +87,7 @@ async def convert(request: Request, services: Here, _: Editor) -> Response:
         return await run_in_threadpool(_convert, services, form)
 
 
-def _convert(services: Services, form: Form) -> Response:
+def _convert(services: Services, form: UploadForm) -> Response:
     fields = dict(form.fields)
     to = format_named(fields.pop("to", ""), "to")
     if to is None:

@@ -12,7 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 
-from app.api.single_flight import Together
+from app.api.single_flight import SingleFlight
 from app.convert.cache import Cache, MadeFile
 
 if sys.version_info >= (3, 14):
@@ -36,7 +36,7 @@ class Deltas:
     def __init__(self, cache: Cache, room: int = 64 * 2**20) -> None:
         self._cache, self._room, self._size = cache, room, 0
         self._known: OrderedDict[tuple[str, str], bytes | None] = OrderedDict()
-        self._running: Together[tuple[str, str], bytes | None] = Together()
+        self._running: SingleFlight[tuple[str, str], bytes | None] = SingleFlight()
         self._lock = threading.Lock()
 
     async def between(self, old: str, new: str, body: bytes | MadeFile) -> bytes | None:

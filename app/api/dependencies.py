@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Depends, Request
 
-from app.api.auth import Access
+from app.api.auth import Authenticator
 from app.api.signed import SignedLinks
 from app.convert.maps import Maps
 from app.errors import Unavailable
@@ -24,10 +24,10 @@ from app.store.store import Store
 
 if TYPE_CHECKING:
     from app.api.deltas import Deltas
-    from app.api.jobs import Work
-    from app.api.maps import Hot
+    from app.api.jobs import ConversionJobs
+    from app.api.maps import ResponseCache
     from app.api.metrics import Metrics
-    from app.api.uploads import Intake
+    from app.api.uploads import UploadSpool
 
 WRITABLE_SECONDS = 2.0
 """How long it is remembered whether something can be stored."""
@@ -100,10 +100,10 @@ class Services:
     spare: Pool
     ingest: Ingest
     maps: Maps
-    access: Access
-    work: Work
-    hot: Hot
-    intake: Intake
+    access: Authenticator
+    work: ConversionJobs
+    hot: ResponseCache
+    intake: UploadSpool
     metrics: Metrics
     keys: Keys
     links: SignedLinks
@@ -120,4 +120,4 @@ async def services(request: Request) -> Services:
     return instance
 
 
-Here = Annotated[Services, Depends(services)]
+ServicesDep = Annotated[Services, Depends(services)]

@@ -9,15 +9,15 @@ from starlette.responses import Response
 
 from app import derive, parameters
 from app.api.auth import Editor, Viewer
-from app.api.dependencies import Here
-from app.api.responses import Route, answer
+from app.api.dependencies import ServicesDep
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import DerivationBody, DerivationOut, EnvironmentPath, IdempotencyKey, IfMatch, VersionOut, told
 from app.api.versions import told_as
 from app.catalogue import describe_derivations
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import Wish, online
 
-router = APIRouter(tags=["derivations"], route_class=Route)
+router = APIRouter(tags=["derivations"], route_class=StrictRoute)
 
 
 def as_online() -> dict[str, Any]:
@@ -34,7 +34,7 @@ def as_online() -> dict[str, Any]:
 
 
 @router.get("/derivations", responses=told(list[DerivationOut]), summary="All derivations")
-def list_derivations(services: Here, _: Viewer) -> Response:
+def list_derivations(services: ServicesDep, _: Viewer) -> Response:
     """What can be computed from what. Maps use them by themselves; their parameters go into a map's query."""
     return answer(describe_derivations() + ([as_online()] if services.ingest.provider is not None else []))
 
@@ -51,7 +51,7 @@ def list_derivations(services: Here, _: Viewer) -> Response:
 def create_derivation(
     env: EnvironmentPath,
     body: DerivationBody,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,

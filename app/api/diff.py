@@ -14,9 +14,9 @@ from PIL import Image, ImageDraw
 from starlette.responses import Response
 
 from app.api.auth import Viewer
-from app.api.dependencies import Here, Services
+from app.api.dependencies import Services, ServicesDep
 from app.api.maps import number_of
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import VERSION, DiffOut, EnvironmentPath, told
 from app.errors import Invalid
 from app.model.features import Features, features
@@ -26,7 +26,7 @@ from app.model.grid import OccupancyGrid
 from app.model.layers import PartKey
 from app.store.values import Version
 
-router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=StrictRoute)
 
 Ref = Annotated[
     str | None,
@@ -49,7 +49,7 @@ FREED, BLOCKED, OTHER = (120, 200, 140), (225, 120, 120), (240, 205, 120)
 )
 def diff(
     env: EnvironmentPath,
-    services: Here,
+    services: ServicesDep,
     _: Viewer,
     from_: Annotated[
         str | None,
@@ -104,7 +104,7 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
         image = Image.new("RGB", (256, 64), "white")
         ImageDraw.Draw(image).text((12, 24), "nothing to be drawn differs", fill=(60, 60, 60))
         return _png(image)
-    view = _View(np.array(boxes), degrees)
+    view = _Viewport(np.array(boxes), degrees)
     image = Image.new("RGB", (view.width, view.height), "white")
     for _, a, b in grids:
         view.paint(image, a, b)
@@ -178,7 +178,7 @@ def _cells_to_local(grid: OccupancyGrid, cells: NDArray[np.float64]) -> NDArray[
     return np.stack([x + c * u - s * v, y + s * u + c * v], axis=1)
 
 
-class _View:
+class _Viewport:
     """Where the picture looks: local metres (or degrees) to pixels."""
 
     def __init__(self, boxes: NDArray[np.float64], degrees: bool) -> None:

@@ -8,8 +8,8 @@ from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from app.api.auth import Admin, Editor, Principal, Viewer
-from app.api.dependencies import Here, Services
-from app.api.responses import Route, answer, page, path_of
+from app.api.dependencies import Services, ServicesDep
+from app.api.responses import StrictRoute, answer, page, path_of
 from app.api.schemas import (
     RESERVED,
     Cursor,
@@ -40,7 +40,7 @@ CONTAINS: Final = f"""\
 A datum at exactly 0, 0 counts as none. Fences come first, then the smallest area, then the nearest datum. `match` says
 why: `by`, `area_m2`, and `distance_m` from the position to the datum."""
 
-router = APIRouter(prefix="/environments", tags=["environments"], route_class=Route)
+router = APIRouter(prefix="/environments", tags=["environments"], route_class=StrictRoute)
 
 
 def as_dict(environment: Environment, match: Match | None = None) -> dict[str, Any]:
@@ -109,7 +109,7 @@ def _headers(environment: Environment) -> dict[str, str]:
 @router.get("", responses=told(list[EnvironmentOut]), summary="List environments")
 def list_environments(
     request: Request,
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     q: Annotated[
         str | None,
@@ -160,7 +160,7 @@ def list_environments(
     responses=told(EnvironmentOut, 400, 404, 409, 415, ok=201, description="Made"),
     summary="Make an environment",
 )
-def create_environment(body: EnvironmentBody, services: Here, principal: Admin) -> Response:
+def create_environment(body: EnvironmentBody, services: ServicesDep, principal: Admin) -> Response:
     """Empty (version 0), with a datum (version 1), or with the content of another one (version 1)."""
     principal.enter(body.name)
     _check_name(body.name)
@@ -186,7 +186,7 @@ def create_environment(body: EnvironmentBody, services: Here, principal: Admin) 
 
 
 @router.get("/{env}", responses=told(EnvironmentOut, 404), summary="One environment")
-def get_environment(env: EnvironmentPath, services: Here, _: Viewer) -> Response:
+def get_environment(env: EnvironmentPath, services: ServicesDep, _: Viewer) -> Response:
     """The environment as it is now; its `ETag` is the head's number, for `If-Match`."""
     environment = services.store.environment(env)
     return answer(as_dict(environment), headers=_headers(environment))
@@ -196,7 +196,7 @@ def get_environment(env: EnvironmentPath, services: Here, _: Viewer) -> Response
     "/{env}", responses=told(EnvironmentOut, 400, 404, 409, 412, 415), summary="Describe, rename, or set the datum"
 )
 def update_environment(
-    env: EnvironmentPath, body: EnvironmentPatch, services: Here, principal: Editor, if_match: IfMatch = None
+    env: EnvironmentPath, body: EnvironmentPatch, services: ServicesDep, principal: Editor, if_match: IfMatch = None
 ) -> Response:
     """What is left out stays. A new datum makes a version and takes an editor; all else takes an administrator."""
     given = body.model_dump(exclude_none=True)
@@ -228,21 +228,21 @@ def update_environment(
 
 
 @router.delete("/{env}", status_code=204, responses=told(None, 404), summary="Delete an environment")
-def delete_environment(env: EnvironmentPath, services: Here, principal: Admin) -> Response:
+def delete_environment(env: EnvironmentPath, services: ServicesDep, principal: Admin) -> Response:
     """It can be restored until it is purged; its name stays taken until then."""
     services.store.delete_environment(env, principal.name)
     return Response(status_code=204)
 
 
 @router.post("/{env}/restore", responses=told(EnvironmentOut, 404, 409), summary="Undo a deletion")
-def restore_environment(env: EnvironmentPath, services: Here, principal: Admin) -> Response:
+def restore_environment(env: EnvironmentPath, services: ServicesDep, principal: Admin) -> Response:
     """A deleted environment comes back with all its versions and channels."""
     environment = services.store.restore_environment(env, principal.name)
     return answer(as_dict(environment), headers=_headers(environment))
 
 
 @router.post("/{env}/purge", status_code=204, responses=told(None, 404, 409), summary="Remove for good")
-def purge_environment(env: EnvironmentPath, services: Here, _: Admin) -> Response:
+def purge_environment(env: EnvironmentPath, services: ServicesDep, _: Admin) -> Response:
     """Removes a deleted environment with all its versions for good; only then its name is free again."""
     services.store.purge_environment(env)
     return Response(status_code=204)

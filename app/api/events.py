@@ -18,15 +18,15 @@ from fastapi import APIRouter, Header, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
-from app.api.auth import Access, Principal, Viewer
-from app.api.dependencies import Here, Services
+from app.api.auth import Authenticator, Principal, Viewer
+from app.api.dependencies import Services, ServicesDep
 from app.api.environments import as_dict, position_of
 from app.api.maps import closure_mode, number_of
 from app.api.problems import Throttled
 from app.api.protocol import ON_STOP
-from app.api.responses import Route
+from app.api.responses import StrictRoute
 from app.api.schemas import told
-from app.api.single_flight import Together
+from app.api.single_flight import SingleFlight
 from app.convert.cache import MadeFile
 from app.convert.maps import file_of
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable
@@ -49,11 +49,11 @@ MAX_ENVIRONMENTS = 100
 STREAMS = 1000
 """So many streams at once for each worker."""
 
-router = APIRouter(tags=["events"], route_class=Route)
+router = APIRouter(tags=["events"], route_class=StrictRoute)
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class StreamEvent:
     """An event as it goes out. number: its id in the stream."""
 
     number: int
@@ -61,13 +61,13 @@ class Told:
     line: bytes
 
 
-class Feed:
+class EventFeed:
     """Who listens at this moment: all wait for one look at the store."""
 
     def __init__(self, services: Services) -> None:
         self._here = services
-        self._looks: Together[tuple[str | None, int, int], list[Told]] = Together()
-        self._checks: Together[tuple[bytes | None, str | None, int], Principal] = Together()
+        self._looks: SingleFlight[tuple[str | None, int, int], list[StreamEvent]] = SingleFlight()
+        self._checks: SingleFlight[tuple[bytes | None, str | None, int], Principal] = SingleFlight()
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self.streams = 0
@@ -84,16 +84,16 @@ class Feed:
         except TimeoutError:
             return
 
-    async def events(self, environment: str | None, start: int) -> list[Told]:
+    async def events(self, environment: str | None, start: int) -> list[StreamEvent]:
         """The next events after a place; all who stand there share a look. NotFound, Unavailable."""
         key = (environment, start, self._here.store.generation())
         return await self._looks.run(key, self._read, environment, start)
 
-    def _read(self, environment: str | None, start: int) -> list[Told]:
+    def _read(self, environment: str | None, start: int) -> list[StreamEvent]:
         out = []
         for event in self._here.store.events(environment, start, PAGE):
             number = event.sequence if environment is not None else event.position
-            out.append(Told(number, event.environment, _line(event, number)))
+            out.append(StreamEvent(number, event.environment, _line(event, number)))
         return out
 
     async def check(self, header: bytes | None, client: str | None) -> None:
@@ -130,7 +130,7 @@ class Feed:
 )
 async def stream_events(
     request: Request,
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     environment: Annotated[
         str | None, Query(description="Only of this environment; else of all that the token reaches.")
@@ -152,7 +152,7 @@ async def stream_events(
             raise Invalid("Last-Event-ID is a number from an event's id", [Problem("not a number", where="id")])
         start = int(text)
     start = await run_in_threadpool(_begin, services, environment, start)  # NotFound comes before the stream
-    feed: Feed = request.app.state.feed
+    feed: EventFeed = request.app.state.feed
     if feed.streams >= STREAMS:
         raise Unavailable("too many streams of events are open: close some, or poll with follow=false")
     headers = {"cache-control": "no-store", "x-accel-buffering": "no", "x-content-type-options": "nosniff"}
@@ -161,7 +161,7 @@ async def stream_events(
         return StreamingResponse(_nothing(), media_type="text/event-stream", headers=headers)
     state[ON_STOP] = feed.end
     client = request.client.host if request.client else None
-    bearer = _Bearer(services.access, feed, principal, request.headers.get("authorization"), client)
+    bearer = _StreamAuth(services.access, feed, principal, request.headers.get("authorization"), client)
     stream = _stream(feed, bearer, environment, start, follow=follow)
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
@@ -192,11 +192,11 @@ async def _nothing() -> AsyncIterator[bytes]:
         yield line
 
 
-class _Bearer:
+class _StreamAuth:
     """Whether a stream's token is still one."""
 
     def __init__(
-        self, access: Access, feed: Feed, principal: Principal, header: str | None, client: str | None
+        self, access: Authenticator, feed: EventFeed, principal: Principal, header: str | None, client: str | None
     ) -> None:
         self.who = principal
         self._access, self._feed, self._client = access, feed, client
@@ -221,7 +221,7 @@ class _Bearer:
 
 
 async def _stream(
-    feed: Feed, bearer: _Bearer, environment: str | None, start: int, *, follow: bool
+    feed: EventFeed, bearer: _StreamAuth, environment: str | None, start: int, *, follow: bool
 ) -> AsyncIterator[bytes]:
     feed.streams += 1
     try:

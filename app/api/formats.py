@@ -6,11 +6,11 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from app.api.auth import Viewer
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import FormatOut, told
 from app.catalogue import describe_formats
 
-router = APIRouter(prefix="/formats", tags=["formats"], route_class=Route)
+router = APIRouter(prefix="/formats", tags=["formats"], route_class=StrictRoute)
 
 
 @router.get("", responses=told(list[FormatOut]), summary="All formats")

@@ -7,14 +7,14 @@ from starlette.responses import Response
 
 from app import generate
 from app.api.auth import Editor, Viewer
-from app.api.dependencies import Here
-from app.api.responses import Route, answer
+from app.api.dependencies import ServicesDep
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import EnvironmentPath, GenerationBody, GeneratorOut, IdempotencyKey, IfMatch, VersionOut, told
 from app.api.versions import told_as
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import Order
 
-router = APIRouter(tags=["generations"], route_class=Route)
+router = APIRouter(tags=["generations"], route_class=StrictRoute)
 
 
 @router.get("/generators", responses=told(list[GeneratorOut]), summary="All generators")
@@ -35,7 +35,7 @@ def list_generators(_: Viewer) -> Response:
 def create_generation(
     env: EnvironmentPath,
     body: GenerationBody,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,

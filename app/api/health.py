@@ -11,9 +11,9 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app.api.auth import ServerViewer
-from app.api.dependencies import Here, Services
+from app.api.dependencies import Services, ServicesDep
 from app.api.metrics import CONTENT_TYPE
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import told
 from app.errors import Unavailable
 from app.events import ros2
@@ -21,7 +21,7 @@ from app.events.relay import state_of
 
 READY_SECONDS = 5.0
 
-router = APIRouter(tags=["health"], route_class=Route)
+router = APIRouter(tags=["health"], route_class=StrictRoute)
 
 
 _ENDPOINT = re.compile(r"([a-z]+)/(.+):(\d+)(.*)")
@@ -108,7 +108,7 @@ async def readyz(
     response_class=Response,
     responses={200: {"description": "Prometheus text format", "content": {"text/plain": {}}}},
 )
-async def metrics(services: Here, _: ServerViewer) -> Response:
+async def metrics(services: ServicesDep, _: ServerViewer) -> Response:
     """Requests, conversions, cache hits, heads. Takes a token for all environments."""
     services.hot.count()
     response = Response(await run_in_threadpool(services.metrics.render, services.store))

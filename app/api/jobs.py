@@ -18,8 +18,8 @@ from starlette.responses import Response
 
 from app.api import problems
 from app.api.auth import Principal, Viewer
-from app.api.dependencies import Here
-from app.api.responses import Route, answer, path_of
+from app.api.dependencies import ServicesDep
+from app.api.responses import StrictRoute, answer, path_of
 from app.api.schemas import JobOut, JobPath, Limit, told
 from app.convert.cache import Made
 from app.convert.maps import Maps
@@ -39,14 +39,14 @@ LOST_AFTER = timedelta(seconds=60)
 
 
 @dataclass(frozen=True, slots=True)
-class Started:
+class JobStarted:
     """The map takes longer than an answer may: follow this job."""
 
     job: Job
 
 
 @dataclass(slots=True)
-class _Running:
+class _RunningConversion:
     """A map in the making. asking: requests that wait for it. jobs: principal's id -> job id."""
 
     future: asyncio.Future[Made]
@@ -55,17 +55,17 @@ class _Running:
     jobs: dict[str, str] = field(default_factory=dict)
 
 
-class Work:
+class ConversionJobs:
     """Maps being made in this process, by recipe."""
 
     def __init__(self, store: Store, maps: Maps, seconds: float, count: Callable[[str, str], None]) -> None:
         self._store, self._maps, self._seconds, self._count = store, maps, seconds, count
-        self._running: dict[str, _Running] = {}
+        self._running: dict[str, _RunningConversion] = {}
         self._lock = threading.Lock()
         self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fleetmap-make")
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def make(self, recipe: Recipe, principal: Principal, address: str) -> Made | Started:
+    async def make(self, recipe: Recipe, principal: Principal, address: str) -> Made | JobStarted:
         """The map, or after ``seconds`` the job that will end with it. address: where the finished map is had.
 
         Raises what making raises; Unavailable where too much is being made.
@@ -83,9 +83,9 @@ class Work:
                 return running.future.result()
             job_id = running.jobs.get(principal.id)
             if job_id is not None:
-                return Started(await run_in_threadpool(self._store.job, job_id))
+                return JobStarted(await run_in_threadpool(self._store.job, job_id))
             try:
-                return Started(await self._as_job(recipe, running, principal, address))
+                return JobStarted(await self._as_job(recipe, running, principal, address))
             except NoRoom:  # nowhere to note a job: the answer waits for the map
                 return await asyncio.shield(running.future)
         finally:
@@ -106,10 +106,10 @@ class Work:
                 return True
         return False
 
-    def _begin(self, recipe: Recipe) -> _Running:
+    def _begin(self, recipe: Recipe) -> _RunningConversion:
         stop = Stop()
         future = asyncio.get_running_loop().run_in_executor(self._threads, self._maps.make, recipe, stop)
-        running = self._running[recipe.key] = _Running(future, stop)
+        running = self._running[recipe.key] = _RunningConversion(future, stop)
         future.add_done_callback(lambda _: self._finished(recipe, running))
         return running
 
@@ -124,7 +124,7 @@ class Work:
         """Let threads end; what is being made ends with the pool."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    async def _as_job(self, recipe: Recipe, running: _Running, principal: Principal, address: str) -> Job:
+    async def _as_job(self, recipe: Recipe, running: _RunningConversion, principal: Principal, address: str) -> Job:
         label = f"{recipe.format.name} of {recipe.version.environment}, version {recipe.version.number}"
 
         def begin() -> Job:
@@ -166,7 +166,7 @@ class Work:
         except FleetMapError as error:
             log.warning("a job could not be kept alive: %s", error.detail)
 
-    def _finished(self, recipe: Recipe, running: _Running) -> None:
+    def _finished(self, recipe: Recipe, running: _RunningConversion) -> None:
         with self._lock:
             if self._running.get(recipe.key) is running:
                 del self._running[recipe.key]
@@ -205,10 +205,10 @@ def started(job: Job) -> Response:
     return answer(as_dict(job), 202, {"location": path_of("jobs", job.id), "retry-after": "2"})
 
 
-router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=Route)
+router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=StrictRoute)
 
 
-def _mine(services: Here, principal: Principal, id: str) -> Job:
+def _mine(services: ServicesDep, principal: Principal, id: str) -> Job:
     """A job that the caller may see; NotFound for all others, as if there were none."""
     job = services.store.job(id)
     if job.owner != principal.id and not (principal.can("admin") and principal.environments is None):
@@ -218,7 +218,7 @@ def _mine(services: Here, principal: Principal, id: str) -> Job:
 
 @router.get("", responses=told(list[JobOut]), summary="List jobs")
 def list_jobs(
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
     limit: Limit = 100,
@@ -231,7 +231,7 @@ def list_jobs(
 
 
 @router.get("/{id}", responses=told(JobOut, 404), summary="How far a job is")
-def get_job(id: JobPath, services: Here, principal: Viewer) -> Response:
+def get_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
     """A job of the own token; an administrator of all environments sees all. ``result.location`` is where a
     finished map is had.
     """
@@ -239,7 +239,7 @@ def get_job(id: JobPath, services: Here, principal: Viewer) -> Response:
 
 
 @router.delete("/{id}", status_code=204, responses=told(None, 404), summary="Cancel or forget a job")
-def delete_job(id: JobPath, services: Here, principal: Viewer) -> Response:
+def delete_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
     """Cancels a job that runs: the work is stopped, unless somebody else waits for it too. Forgets one that has
     ended.
     """

@@ -19,11 +19,11 @@ from starlette.responses import Response
 
 from app.api.auth import Viewer
 from app.api.caching import none_match
-from app.api.dependencies import Here, Services
+from app.api.dependencies import Services, ServicesDep
 from app.api.environments import box_of, numbers
 from app.api.maps import number_of
 from app.api.problems import NotAcceptable
-from app.api.responses import Route, answer, json_bytes
+from app.api.responses import StrictRoute, answer, json_bytes
 from app.api.schemas import EnvironmentPath, LayerOut, LayerPath, VersionPath, told
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
 from app.model.features import Features
@@ -36,7 +36,7 @@ from app.model.voxels import DEPTH, Box3, VoxelMap
 from app.model.voxels import cut as cut_voxels
 from app.store.values import Box, PartEntry, Version
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}/layers", tags=["layers"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}/versions/{v}/layers", tags=["layers"], route_class=StrictRoute)
 
 LOCAL_CRS = "urn:fleetmap:crs:local"
 """The local frame's name in JSON-FG's ``coordRefSys``; where it lies stands in the member ``datum``."""
@@ -69,7 +69,7 @@ def entry_dict(entry: PartEntry) -> dict[str, Any]:
 
 
 @router.get("", responses=told(list[LayerOut], 404), summary="What a version holds")
-def list_layers(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer) -> Response:
+def list_layers(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """Every part: layer, level and name, how much it holds, where, and where it comes from."""
     version = services.store.version(env, number_of(v))
     return answer([entry_dict(entry) for entry in version.parts if entry.key.layer != "resources"])
@@ -98,7 +98,7 @@ def get_layer(
     v: VersionPath,
     layer: LayerPath,
     request: Request,
-    services: Here,
+    services: ServicesDep,
     _: Viewer,
     level: Annotated[str | None, Query(max_length=256, description="Of this storey only.")] = None,
     name: Annotated[str | None, Query(max_length=256, description="The part's name: a grid's, a network's …")] = None,

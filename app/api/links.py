@@ -10,10 +10,10 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app.api.auth import Principal, Viewer
-from app.api.dependencies import Here, Services
-from app.api.jobs import Started, started
-from app.api.maps import Wanted, made_at, number_of
-from app.api.responses import API, Route, answer
+from app.api.dependencies import Services, ServicesDep
+from app.api.jobs import JobStarted, started
+from app.api.maps import MapRequest, made_at, number_of
+from app.api.responses import API, StrictRoute, answer
 from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, told
 from app.api.signed import Grant
 from app.convert.cache import MadeFile
@@ -21,7 +21,7 @@ from app.convert.maps import file_of
 from app.store.audit import about
 from app.store.values import Version, rfc3339
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
 
 
 @router.post(
@@ -34,7 +34,7 @@ router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], rou
     summary="Create a signed link to a map",
 )
 async def create_link(
-    env: EnvironmentPath, v: VersionPath, body: LinkBody, request: Request, services: Here, principal: Viewer
+    env: EnvironmentPath, v: VersionPath, body: LinkBody, request: Request, services: ServicesDep, principal: Viewer
 ) -> Response:
     """The `url` needs no token until it `expires`, for `GET` and `HEAD` alone.
 
@@ -46,7 +46,7 @@ async def create_link(
     version = await run_in_threadpool(services.store.version, env, number_of(v))
     values = {name: _text(value) for name, value in body.parameters.items()}
     linked = await link_to(services, request, principal, version, body.format, body.file, values, body.seconds)
-    if isinstance(linked, Started):
+    if isinstance(linked, JobStarted):
         return started(linked.job)
     about(target=f"link to {body.format} of version {version.number}, until {linked.expires}")
     await run_in_threadpool(services.store.record_change)
@@ -82,7 +82,7 @@ async def link_to(
     seconds: int | None = None,
     *,
     signed: bool = True,
-) -> LinkedFile | Started:
+) -> LinkedFile | JobStarted:
     """Convert a version's map, and link to it or to one of its files; the job where converting takes long.
 
     Args:
@@ -92,9 +92,9 @@ async def link_to(
 
     Raises what converting raises; NotFound for a file that the map does not have.
     """
-    map_request = Wanted(version.environment, str(version.number), format, file)
+    map_request = MapRequest(version.environment, str(version.number), format, file)
     outcome = await made_at(services, map_request, urlencode(sorted(values.items())).encode(), principal)
-    if isinstance(outcome, Started):
+    if isinstance(outcome, JobStarted):
         return outcome
     map_file = file_of(*outcome, file)
     path = f"{API}/environments/{version.environment}/versions/{version.number}/maps/{format}"

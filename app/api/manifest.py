@@ -18,10 +18,10 @@ from starlette.responses import Response
 from app import formats
 from app.api.auth import ServerAdmin, Viewer
 from app.api.caching import none_match
-from app.api.dependencies import Here, Services
-from app.api.jobs import Started, started
+from app.api.dependencies import Services, ServicesDep
+from app.api.jobs import JobStarted, started
 from app.api.maps import address_of, number_of, options_of
-from app.api.responses import Route, answer, json_bytes
+from app.api.responses import StrictRoute, answer, json_bytes
 from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
 from app.convert import site
 from app.convert.cache import Made
@@ -43,11 +43,11 @@ UNAVAILABLE = (CannotConvert, NotFound, Invalid)
 
 LAYER_DIGITS = 16
 
-router = APIRouter(tags=["manifest"], route_class=Route)
+router = APIRouter(tags=["manifest"], route_class=StrictRoute)
 
 
 @router.get("/keys", responses=told(list[KeyOut]), summary="Keys that sign manifests")
-def list_keys(services: Here, _: Viewer) -> Response:
+def list_keys(services: ServicesDep, _: Viewer) -> Response:
     """The newest first: it signs. `endorsement` is the signature of the key before it over the raw public key."""
     return answer([key.as_dict() for key in services.keys.public()])
 
@@ -55,7 +55,7 @@ def list_keys(services: Here, _: Viewer) -> Response:
 @router.post(
     "/keys", status_code=201, responses=told(KeyOut, ok=201, description="The new key"), summary="Rotate the key"
 )
-def rotate_key(services: Here, _: ServerAdmin) -> Response:
+def rotate_key(services: ServicesDep, _: ServerAdmin) -> Response:
     """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one. Takes a
     token for all environments.
 
@@ -79,7 +79,7 @@ async def get_manifest(
     env: EnvironmentPath,
     v: VersionPath,
     request: Request,
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     formats: Annotated[
         str,
@@ -113,10 +113,10 @@ async def get_manifest(
     while True:
         outcome = await services.hot.shared(request, _signed, services, env, v, entries, closures, request, {})
         if (
-            isinstance(outcome, _Unmade) and outcome.recipe.key in cached_maps
+            isinstance(outcome, _PendingConversion) and outcome.recipe.key in cached_maps
         ):  # the cache has no room for all of them at once
             outcome = await run_in_threadpool(_signed, services, env, v, entries, closures, request, cached_maps)
-        if not isinstance(outcome, _Unmade):
+        if not isinstance(outcome, _PendingConversion):
             break
         try:
             conversion = await _made(services, outcome.recipe, request, principal)
@@ -124,7 +124,7 @@ async def get_manifest(
             if outcome.entry.required:
                 raise _named(error, outcome.entry) from error
             continue  # it is remembered: the next look lists it as missing
-        if isinstance(conversion, Started):
+        if isinstance(conversion, JobStarted):
             return started(conversion.job)
         if conversion is not None:
             cached_maps[outcome.recipe.key] = conversion
@@ -147,7 +147,7 @@ class _Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class _Unmade:
+class _PendingConversion:
     """A map that is to be made before the manifest can be written."""
 
     entry: _Entry
@@ -162,7 +162,7 @@ def _signed(
     mode: ClosureMode | None,
     request: Request,
     cached_maps: Mapping[str, Made],
-) -> tuple[dict[str, str], bytes] | _Unmade:
+) -> tuple[dict[str, str], bytes] | _PendingConversion:
     """The headers and the signed bytes; the first map that is to be made before that can be said.
 
     cached_maps: maps that were made for this answer, by their recipes' keys: they may have left the cache again.
@@ -172,7 +172,7 @@ def _signed(
     version, sequence = services.store.standing(env, number_of(v), mode)
     closures = version.closures or NO_CLOSURES
     listed = _listed(services, version, entries, cached_maps)
-    if isinstance(listed, _Unmade):
+    if isinstance(listed, _PendingConversion):
         return listed
     files, missing = listed
     now = datetime.now(UTC).timestamp()
@@ -218,7 +218,7 @@ def _seconds(moment: float) -> str:
 
 def _listed(
     services: Services, version: Version, entries: list[_Entry], cached_maps: Mapping[str, Made]
-) -> tuple[list[dict[str, Any]], list[dict[str, str]]] | _Unmade:
+) -> tuple[list[dict[str, Any]], list[dict[str, str]]] | _PendingConversion:
     """The files of all formats, and the optional formats that cannot be given; or a map that is to be made first."""
     files: list[dict[str, Any]] = []
     missing: list[dict[str, str]] = []
@@ -235,7 +235,7 @@ def _listed(
             missing.append({"format": entry.format, "detail": error.detail})
             continue
         if cached_map is None:
-            return _Unmade(entry, recipe)
+            return _PendingConversion(entry, recipe)
         for file in cached_map.files:
             line = {"format": entry.format, "name": file.name, "size": file.size, "sha256": file.sha256}
             files.append(line | ({"level": file.place[0]} if file.place is not None else {}))
@@ -307,7 +307,7 @@ def _entry(text: str, location: str, *, required: bool) -> _Entry:
     return _Entry(name, values, derive, closures, required, dict(parse_qsl(query, keep_blank_values=True)))
 
 
-async def _made(services: Services, recipe: Recipe, request: Request, principal: Any) -> Made | Started | None:
+async def _made(services: Services, recipe: Recipe, request: Request, principal: Any) -> Made | JobStarted | None:
     """A map that is not ready, or the job that makes it. None where it cannot be derived so: the next recipe goes
     another way, or says that there is none.
     """

@@ -1,6 +1,6 @@
 """Maps as robots fetch them: plain routes over an LRU of answers, so that a fleet that asks again costs microseconds.
 
-``Server`` first answers what it has in memory: an answer is believed while
+``FleetMapApp`` first answers what it has in memory: an answer is believed while
 ``Store.generation()`` stays the same and for a second at most, the caller's token likewise. All else goes the long
 way: guard, route, recipe (the ETag), cache on disk, conversion.
 """
@@ -26,17 +26,17 @@ from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from app.api import deltas
-from app.api.auth import Access, Principal, Viewer
+from app.api.auth import Authenticator, Principal, Viewer
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
-from app.api.dependencies import Here, Services
-from app.api.jobs import Started, started
+from app.api.dependencies import Services, ServicesDep
+from app.api.jobs import JobStarted, started
 from app.api.metrics import Metrics
 from app.api.middleware import is_from_here
 from app.api.protocol import PROVE
-from app.api.responses import API, Route, answer, path_of
+from app.api.responses import API, StrictRoute, answer, path_of
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
 from app.api.signed import LINK
-from app.api.single_flight import Together
+from app.api.single_flight import SingleFlight
 from app.convert.cache import LostMap, Made, MadeFile
 from app.convert.maps import file_of
 from app.convert.recipe import Recipe
@@ -65,7 +65,7 @@ Key = tuple[bytes, bytes]
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class MapRequest:
     """What an address asks for. version: None on a short address. file: None for the whole map. closures: None for the
     default of the address.
     """
@@ -78,13 +78,13 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Resource:
+class CachedResponse:
     """What stands at an address. recipe: None where it is no map. body: None while it is not made, or too large for
     memory; file: then the one on disk. link_expires: seconds since 1970, of a signed link; None where a token is
     needed.
     """
 
-    wanted: Wanted
+    wanted: MapRequest
     recipe: Recipe | None
     etag: str
     raw_etag: bytes
@@ -100,25 +100,25 @@ class Resource:
     link_expires: int | None = None
 
 
-class Hot:
+class ResponseCache:
     """Answers in memory, and the long way to an answer."""
 
-    def __init__(self, here_bytes: int, access: Access, metrics: Metrics, generation: Any) -> None:
+    def __init__(self, here_bytes: int, access: Authenticator, metrics: Metrics, generation: Any) -> None:
         self._limit, self._size = here_bytes, 0
         self.access, self._metrics, self.generation = access, metrics, generation
-        self._entries: OrderedDict[Key, Resource] = OrderedDict()
-        self._looks: Together[tuple[Any, ...], Any] = Together()
+        self._entries: OrderedDict[Key, CachedResponse] = OrderedDict()
+        self._looks: SingleFlight[tuple[Any, ...], Any] = SingleFlight()
         self._lock = threading.Lock()
         self._tallies: dict[str, list[int]] = {}
 
-    def get(self, key: Key) -> Resource | None:
+    def get(self, key: Key) -> CachedResponse | None:
         """What is known to stand there at this moment."""
         entry = self._entries.get(key)
         if entry is None or entry.fresh_until < time.monotonic() or entry.generation != self.generation():
             return None
         return entry
 
-    async def find(self, request: Request, services: Services, principal: Principal) -> Resource | Started:
+    async def find(self, request: Request, services: Services, principal: Principal) -> CachedResponse | JobStarted:
         """What stands at the request's address; made where need be, or the job that makes it."""
         key = _key(request)
         fresh = self.get(key)
@@ -144,13 +144,13 @@ class Hot:
                 return empty
             # From here on the recipe says what is meant: who was told of a later commit has another one.
             try:
-                entry: Resource | None = await self._looks.run(
+                entry: CachedResponse | None = await self._looks.run(
                     (key, _meant(recipe), "ready"), self._ready, services, key, empty
                 )
                 if entry is not None:
                     return entry
                 outcome = await services.work.make(recipe, principal, address_of(request))
-                if isinstance(outcome, Started):
+                if isinstance(outcome, JobStarted):
                     return outcome
                 entry = await self._looks.run((key, _meant(recipe), "fill"), self._fill, key, empty, outcome)
             except CannotDerive:
@@ -162,7 +162,7 @@ class Hot:
             return entry
         raise AssertionError("unreachable")
 
-    def _ready(self, services: Services, key: Key, empty: Resource) -> Resource | None:
+    def _ready(self, services: Services, key: Key, empty: CachedResponse) -> CachedResponse | None:
         assert empty.recipe is not None
         cached_map = services.maps.ready(empty.recipe)
         if cached_map is None:
@@ -170,7 +170,7 @@ class Hot:
         self._metrics.disk_hits.inc()
         return self._fill(key, empty, cached_map)
 
-    def _fill(self, key: Key, empty: Resource, cached_map: Made) -> Resource:
+    def _fill(self, key: Key, empty: CachedResponse, cached_map: Made) -> CachedResponse:
         full = _filled(empty, cached_map)
         self._put(key, full)
         return full
@@ -186,14 +186,14 @@ class Hot:
 
     def _resource(
         self,
-        map_request: Wanted,
+        map_request: MapRequest,
         recipe: Recipe,
         values: Mapping[str, str],
         derive: bool,
         generation: int,
         until: float,
         route: str,
-    ) -> Resource:
+    ) -> CachedResponse:
         version = recipe.version
         etag = recipe.etag if map_request.file is None else _file_etag(recipe, map_request.file)
         closures = version.closures
@@ -211,7 +211,7 @@ class Hot:
         link = f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()
         headers = [*bare, (b"link", link), (b"x-content-type-options", b"nosniff")]
         tally = self._tallies.setdefault(route, [0, 0])
-        return Resource(
+        return CachedResponse(
             map_request, recipe, etag, etag.encode(), headers, bare, 0, None, None, "", generation, until, tally
         )
 
@@ -228,13 +228,13 @@ class Hot:
         full.append((b"x-content-type-options", b"nosniff"))
         tally = self._tallies.setdefault(request.scope["route"].path, [0, 0])
         map_request, until, etag = (
-            Wanted(environment, None, "", None),
+            MapRequest(environment, None, "", None),
             time.monotonic() + FRESH_SECONDS,
             headers["etag"],
         )
         self._put(
             key,
-            Resource(
+            CachedResponse(
                 map_request, None, etag, etag.encode(), full, bare, len(body), body, None, "", generation, until, tally
             ),
         )
@@ -254,7 +254,7 @@ class Hot:
                     self._metrics.requests.labels("GET", route, status).inc(new)
                     self._metrics.memory_hits.inc(new)
 
-    def _put(self, key: Key, resource: Resource) -> None:
+    def _put(self, key: Key, resource: CachedResponse) -> None:
         with self._lock:
             old = self._entries.pop(key, None)
             self._size += _weight(resource) - (_weight(old) if old else 0)
@@ -269,7 +269,7 @@ def link_of(request: Request) -> SignedAddress | None:
     return link
 
 
-def _by_link(resource: Resource, link: SignedAddress) -> Resource:
+def _by_link(resource: CachedResponse, link: SignedAddress) -> CachedResponse:
     """The same for a link: only its holder may cache it, and no page learns the link as a referrer."""
 
     def private(headers: Headers) -> Headers:
@@ -284,7 +284,7 @@ def _key(request: Request) -> Key:
     return (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
 
 
-def _weight(resource: Resource) -> int:
+def _weight(resource: CachedResponse) -> int:
     return 2048 + len(resource.body or b"")
 
 
@@ -308,13 +308,13 @@ def _matches(request: Request, etag: str) -> bool:
     return header is not None and header.strip() != "*" and none_match(header, etag)
 
 
-def _resolve(services: Services, map_request: Wanted, values: Mapping[str, str], derive: bool) -> Recipe:
+def _resolve(services: Services, map_request: MapRequest, values: Mapping[str, str], derive: bool) -> Recipe:
     return services.maps.recipe(
         version_of(services, map_request), map_request.format, values, derive=derive, file=map_request.file
     )
 
 
-def version_of(services: Services, map_request: Wanted) -> Version:
+def version_of(services: Services, map_request: MapRequest) -> Version:
     """The version that an address means, with the closures that its maps show: on a short one production where there is
     one, else the head.
     """
@@ -331,7 +331,7 @@ def number_of(ref: str) -> str | int:
     return int(ref) if ref.isascii() and ref.isdigit() and len(ref) <= 18 else ref
 
 
-def _filled(empty: Resource, cached_map: Made) -> Resource:
+def _filled(empty: CachedResponse, cached_map: Made) -> CachedResponse:
     """With headers and content of the made map. NotFound where it has no such file."""
     assert empty.recipe is not None
     file = file_of(empty.recipe, cached_map, empty.wanted.file)
@@ -349,7 +349,7 @@ def _filled(empty: Resource, cached_map: Made) -> Resource:
     return replace(empty, headers=headers, size=len(body), body=body, sha256=file.sha256)
 
 
-def _dictionary(map_request: Wanted) -> str:
+def _dictionary(map_request: MapRequest) -> str:
     """For which addresses this file is a dictionary: the same file of any version (RFC 9842, URL pattern)."""
     env, name = quote(map_request.environment, safe=""), quote(map_request.format, safe="")
     file = "/" + quote(map_request.file, safe="/") if map_request.file else ""
@@ -369,14 +369,14 @@ _SHORT = re.compile(r"/maps/([^/]+)/([^/]+)(?:/(.+))?", re.DOTALL)
 _LONG = re.compile(rf"{API}/environments/([^/]+)/versions/([^/]+)/maps/([^/]+)(?:/(.+))?", re.DOTALL)
 
 
-def wanted_of(request: Request) -> Wanted:
+def wanted_of(request: Request) -> MapRequest:
     """What the address of a map asks for."""
     path = request.scope["path"]
     short, long = _SHORT.fullmatch(path), _LONG.fullmatch(path)
     if short:
-        return Wanted(short[1], None, short[2], short[3])
+        return MapRequest(short[1], None, short[2], short[3])
     if long:
-        return Wanted(long[1], long[2], long[3], long[4])
+        return MapRequest(long[1], long[2], long[3], long[4])
     raise NotFound("there is no map at this address")
 
 
@@ -430,13 +430,13 @@ def closure_mode(text: str | None) -> ClosureMode | None:
     raise Invalid(f"closures must be one of {accepted}, got {text[:80]!r}", [Problem(accepted, where="closures")])
 
 
-class Server(FastAPI):
+class FleetMapApp(FastAPI):
     """The application, with the answers it has in memory in front of everything else.
 
     ``hot`` is None until the services are open.
     """
 
-    hot: Hot | None = None
+    hot: ResponseCache | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a repeated request for a map from memory, or go the long way."""
@@ -458,7 +458,7 @@ _EMPTY = {"type": "http.response.body", "body": b""}
 
 
 def _reply(
-    hot: Hot, entry: Resource, headers: list[tuple[bytes, bytes]], head_only: bool
+    hot: ResponseCache, entry: CachedResponse, headers: list[tuple[bytes, bytes]], head_only: bool
 ) -> tuple[dict[str, Any], dict[str, Any]] | None:
     """The two messages of an answer, or None where it takes the long way."""
     authorization = condition = None
@@ -504,8 +504,8 @@ async def download(template: str, request: Request) -> Response:
     raise Unavailable("the map is removed from the cache faster than it is sent: try again in a few seconds")
 
 
-async def _answer(request: Request, services: Services, outcome: Resource | Started) -> Response:
-    if isinstance(outcome, Started):
+async def _answer(request: Request, services: Services, outcome: CachedResponse | JobStarted) -> Response:
+    if isinstance(outcome, JobStarted):
         if link_of(request) is not None:  # its holder has no token to follow a job with
             raise Unavailable("the map is still being converted: try again in a few seconds")
         return started(outcome.job)
@@ -525,7 +525,7 @@ async def _answer(request: Request, services: Services, outcome: Resource | Star
     return _response(206, _partial_headers(outcome, part), body[part[0] : part[1]])
 
 
-async def _delta(request: Request, services: Services, entry: Resource) -> Response | None:
+async def _delta(request: Request, services: Services, entry: CachedResponse) -> Response | None:
     """The file as a delta to the one that the client has, if it has one that is known here."""
     old = deltas.wanted(request.headers)
     if old is None or "range" in request.headers or entry.size > deltas.MAX_BYTES:
@@ -554,7 +554,7 @@ def _unsatisfiable(size: int) -> HTTPException:
     return HTTPException(416, f"the file has {size} bytes", {"content-range": f"bytes */{size}"})
 
 
-def _partial_headers(entry: Resource, part: tuple[int, int]) -> Headers:
+def _partial_headers(entry: CachedResponse, part: tuple[int, int]) -> Headers:
     other_headers = [(n, v) for n, v in entry.headers if n != b"content-length"]
     start, end = part
     return [
@@ -564,7 +564,7 @@ def _partial_headers(entry: Resource, part: tuple[int, int]) -> Headers:
     ]
 
 
-async def _from_disk(request: Request, entry: Resource) -> Response:
+async def _from_disk(request: Request, entry: CachedResponse) -> Response:
     """A large file, in chunks. It is opened before the answer starts, so the cache may drop it meanwhile."""
     assert entry.file is not None
     assert entry.file.path is not None
@@ -628,8 +628,8 @@ def add_routes(app: FastAPI) -> None:
 
 
 async def made_at(
-    services: Services, map_request: Wanted, query: bytes, principal: Principal
-) -> tuple[Recipe, Made] | Started:
+    services: Services, map_request: MapRequest, query: bytes, principal: Principal
+) -> tuple[Recipe, Made] | JobStarted:
     """The map that an address of a version's number gives, made where need be; the job that makes it if it takes long.
 
     query: the map's parameters, percent-encoded.
@@ -643,7 +643,7 @@ async def made_at(
 
 async def made_by(
     services: Services, plan: Callable[[], Recipe], address: str, principal: Principal
-) -> tuple[Recipe, Made] | Started:
+) -> tuple[Recipe, Made] | JobStarted:
     """The map of a recipe, made where need be; the job that makes it for ``address`` if it takes long.
 
     plan: called again if a derivation finds nothing to use; the next recipe goes another way, or says there is none.
@@ -657,14 +657,14 @@ async def made_by(
             outcome = await services.work.make(recipe, principal, address)
         except CannotDerive:
             continue
-        return outcome if isinstance(outcome, Started) else (recipe, outcome)
+        return outcome if isinstance(outcome, JobStarted) else (recipe, outcome)
 
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
 
 
 @router.get("/maps", responses=told(list[CoverageOut], 404), summary="Which formats can be had")
-def coverage(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer) -> Response:
+def coverage(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """For every format: whether it can be written as it is, by deriving what lacks, or what to supply."""
     return answer(services.maps.coverage(services.store.version(env, number_of(v))))
 
@@ -680,14 +680,14 @@ async def report(
     v: VersionPath,
     format: FormatPath,
     request: Request,
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     derive: bool = Query(True, description="Whether derived information is allowed."),
 ) -> Response:
     """Raw, derived and filled-in information of a map, what was dropped and why. Takes the map's own parameters."""
     values, allowed, mode = _options(request.scope["query_string"])
-    plan = partial(_resolve, services, Wanted(env, v, format, None, mode), values, allowed and derive)
+    plan = partial(_resolve, services, MapRequest(env, v, format, None, mode), values, allowed and derive)
     outcome = await made_by(services, plan, address_of(request), principal)
-    if isinstance(outcome, Started):
+    if isinstance(outcome, JobStarted):
         return started(outcome.job)
     return answer(await run_in_threadpool(services.maps.report, outcome[0]))

@@ -64,12 +64,12 @@ class Metrics:
             registry = CollectorRegistry()
             multiprocess.MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
         heads = CollectorRegistry()
-        heads.register(_Heads(store))
+        heads.register(_HeadVersionCollector(store))
         heads.register(_Scrubs(store))
         return generate_latest(registry) + generate_latest(heads)
 
 
-class _Heads(Collector):
+class _HeadVersionCollector(Collector):
     """Every environment's newest version, and how many environments there are."""
 
     def __init__(self, store: Store) -> None:

@@ -24,7 +24,7 @@ from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
 from app.api.protocol import PROVE
 from app.api.responses import API
 from app.api.signed import LINK, signed_address
-from app.api.single_flight import Together
+from app.api.single_flight import SingleFlight
 from app.errors import Denied, FleetMapError, TooLarge
 from app.logs import REQUEST_ID, log_request
 from app.store.audit import CALLER, Caller
@@ -63,7 +63,7 @@ class Guard:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._checks: Together[tuple[bytes | None, str | None, int], Principal] = Together()
+        self._checks: SingleFlight[tuple[bytes | None, str | None, int], Principal] = SingleFlight()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or pass it on."""
@@ -80,9 +80,9 @@ class Guard:
         given = _headers(scope).get(b"x-request-id", b"")
         request_id = given.decode() if _REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
         REQUEST_ID.set(request_id)
-        answer = _Answer(send, head_only, request_id)
+        answer = _ResponseSender(send, head_only, request_id)
         reason = ""
-        body = _Body(receive, services)
+        body = _RequestBody(receive, services)
         try:
             await self._pass(scope, body, answer, services)
         except _Disconnected:
@@ -105,7 +105,7 @@ class Guard:
             services.metrics.seconds.labels(route).observe(seconds)
             _log(scope, answer.status, seconds, reason)
 
-    async def _pass(self, scope: Scope, body: _Body, answer: _Answer, services: Services) -> None:
+    async def _pass(self, scope: Scope, body: _RequestBody, answer: _ResponseSender, services: Services) -> None:
         headers = _headers(scope)
         if services.options.insecure_no_auth:
             _only_from_here(headers)
@@ -139,7 +139,7 @@ class Guard:
             principal = await self._checks.run(key, services.access.check, authorization, client)
         return principal
 
-    async def _refuse(self, response: Response, scope: Scope, body: _Body, answer: _Answer) -> None:
+    async def _refuse(self, response: Response, scope: Scope, body: _RequestBody, answer: _ResponseSender) -> None:
         if answer.started:
             # Half an answer is out: the only honest end is a broken connection.
             raise ConnectionAbortedError("the answer could not be finished")
@@ -241,7 +241,7 @@ def is_from_here(headers: dict[bytes, bytes]) -> bool:
     return host in _LOOPBACK and (origin is None or urlsplit(origin.decode("latin-1")).hostname in _LOOPBACK)
 
 
-class _Answer:
+class _ResponseSender:
     """Sends, and remembers the status; adds ``nosniff``; leaves out the body of a HEAD."""
 
     __slots__ = ("_head_only", "_request_id", "_send", "started", "status")
@@ -268,7 +268,7 @@ class _Answer:
         await self._send(message)
 
 
-class _Body:
+class _RequestBody:
     """Receives, counts, and keeps the time."""
 
     __slots__ = (

@@ -13,11 +13,11 @@ from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.auth import Editor, Principal, Reporter, Viewer
-from app.api.dependencies import Here, Services
-from app.api.jobs import Started, started
+from app.api.auth import Editor, Principal, RobotRole, Viewer
+from app.api.dependencies import Services, ServicesDep
+from app.api.jobs import JobStarted, started
 from app.api.maps import address_of, made_by
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import (
     DynamicEdgesOut,
     EnvironmentPath,
@@ -43,7 +43,7 @@ MAX_POINTS = 1000
 DEFAULT_SECONDS = 3600.0
 MAX_SECONDS = 2_592_000.0
 
-router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=StrictRoute)
 
 Ref = Annotated[
     str | None,
@@ -58,7 +58,7 @@ Ref = Annotated[
 @router.get("", responses=told(list[OverlayOut], 404), summary="List overlays")
 def list_overlays(
     env: EnvironmentPath,
-    services: Here,
+    services: ServicesDep,
     _: Viewer,
     state: Annotated[
         Literal["pending", "accepted", "rejected", "expired", "ended"] | None,
@@ -80,7 +80,7 @@ def list_overlays(
     },
     summary="Report what is blocked",
 )
-def report_overlay(env: EnvironmentPath, body: OverlayBody, services: Here, principal: Reporter) -> Response:
+def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDep, principal: RobotRole) -> Response:
     """Report that a polygon or an edge cannot be used until a time. With `state: "accepted"` (editors) it is in force
     at once, on every channel; otherwise an editor decides.
     """
@@ -169,7 +169,7 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @router.post("/{id}/accept", responses=told(OverlayOut, 404, 409, 422, 503), summary="Accept an overlay")
-def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal: Editor) -> Response:
+def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """Put it in force on every channel until its end: areas become keepout, edges are closed. No version changes."""
     now = datetime.now(UTC)
     overlay = services.store.overlay(env, id)
@@ -184,14 +184,14 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, princi
 
 
 @router.post("/{id}/reject", responses=told(OverlayOut, 404, 409), summary="Reject an overlay")
-def reject_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal: Editor) -> Response:
+def reject_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """It stays in the list, and nothing changes."""
     decided = services.store.decide_overlay(env, id, "pending", "rejected", principal.name, datetime.now(UTC))
     return answer(decided.as_dict())
 
 
 @router.post("/{id}/end", responses=told(OverlayOut, 404, 409), summary="End an accepted overlay now")
-def end_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal: Editor) -> Response:
+def end_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """Open the area or edge again, on every channel at once."""
     return answer(
         services.store.decide_overlay(env, id, "accepted", "ended", principal.name, datetime.now(UTC)).as_dict()
@@ -199,7 +199,7 @@ def end_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal
 
 
 @router.post("/{id}/keep", responses=told(OverlayOut, 404, 409, 422, 503), summary="Make an accepted overlay permanent")
-def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principal: Editor) -> Response:
+def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """A new version holds it: an area as a keepout zone, an edge with `blocked: true`. The overlay stays in force until
     its end; promote the version before that to keep robots out for good.
     """
@@ -222,13 +222,13 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: Here, principa
 
 @router.get("/nav2", responses=told(DynamicEdgesOut, 404, 409, 422), summary="Closures for Nav2's route server")
 async def nav2_edges(
-    env: EnvironmentPath, request: Request, services: Here, principal: Viewer, version: Ref = None
+    env: EnvironmentPath, request: Request, services: ServicesDep, principal: Viewer, version: Ref = None
 ) -> Response:
     """A request of `nav2_msgs/srv/DynamicEdges`: the numbers of closed edges, and of those that were closed and are
     open again, in the graph that `maps/nav2_route?closures=mark` gives.
     """
     maps = await _marked(services, env, version, "nav2_route", request, principal)
-    if isinstance(maps, Started):
+    if isinstance(maps, JobStarted):
         return started(maps.job)
     now, before = (live.closed_edges(files) for files in maps)
     return answer({"closed_edges": now, "opened_edges": sorted(set(before) - set(now))})
@@ -238,7 +238,7 @@ async def nav2_edges(
 async def rmf_lanes(
     env: EnvironmentPath,
     request: Request,
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     version: Ref = None,
     fleet: Annotated[str, Query(max_length=256, description="`fleet_name` of the messages.")] = "",
@@ -247,7 +247,7 @@ async def rmf_lanes(
     are open again, by their indexes in the graphs that `maps/rmf_nav_graph?closures=mark` gives.
     """
     maps = await _marked(services, env, version, "rmf_nav_graph", request, principal)
-    if isinstance(maps, Started):
+    if isinstance(maps, JobStarted):
         return started(maps.job)
     now, before = (live.closed_lanes(files) for files in maps)
     messages = [
@@ -267,7 +267,7 @@ async def rmf_lanes(
 @router.get("/vda5050", responses=told(ZoneSetsOut, 404, 409, 422), summary="Closures for VDA 5050 fleet managers")
 def vda5050_zones(
     env: EnvironmentPath,
-    services: Here,
+    services: ServicesDep,
     _: Viewer,
     version: Ref = None,
     map_id: Annotated[
@@ -301,7 +301,7 @@ def _shown(services: Services, env: str, ref: str | None) -> Version:
 
 async def _marked(
     services: Services, env: str, ref: str | None, name: str, request: Request, principal: Principal
-) -> list[dict[str, bytes]] | Started:
+) -> list[dict[str, bytes]] | JobStarted:
     """A map's files twice, with marks: of the closures in force, and of those that ended."""
     shown = await run_in_threadpool(_shown, services, env, ref)
     ended = [o for o in await run_in_threadpool(services.store.overlays, env) if o.state == "ended"]
@@ -309,7 +309,7 @@ async def _marked(
     for closures in (shown.closures, Closures(tuple(o.closure for o in ended), "mark")):
         plan = partial(services.maps.recipe, live.with_closures(shown, closures), name)
         outcome = await made_by(services, plan, address_of(request), principal)
-        if isinstance(outcome, Started):
+        if isinstance(outcome, JobStarted):
             return outcome
         out.append(await run_in_threadpool(_files, outcome[1]))
     return out

@@ -10,14 +10,14 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from app.api.auth import Viewer
-from app.api.dependencies import Here
+from app.api.dependencies import ServicesDep
 from app.api.maps import number_of
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, told
 from app.convert.maps import Maps
 from app.store.values import Version
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=StrictRoute)
 
 ROW, WIDTH, GAP, TOP = 34, 250, 130, 60
 COLOURS = {
@@ -166,7 +166,7 @@ def _short(text: str, limit: int) -> str:
     responses={**told(ProvenanceOut, 404), 200: {"model": ProvenanceOut, "content": {"image/svg+xml": {}}}},
     summary="Which file made which map",
 )
-def provenance(env: EnvironmentPath, v: VersionPath, request: Request, services: Here, _: Viewer) -> Response:
+def provenance(env: EnvironmentPath, v: VersionPath, request: Request, services: ServicesDep, _: Viewer) -> Response:
     """An SVG picture, or the same as JSON with `Accept: application/json`. What is stale is marked."""
     version = services.store.version(env, number_of(v))
     lineage = graph(services.maps, version)

@@ -44,7 +44,7 @@ def page(request: Request, items: list[Any], cursor: str | None) -> Response:
     return answer(items, headers=headers)
 
 
-class _Request(Request):
+class _StrictRequest(Request):
     async def json(self) -> Any:
         """The body as JSON: no NaN, no infinity, no lone surrogates, no integer beyond 64 bits, bounded nesting."""
         data = await self.body()
@@ -63,7 +63,7 @@ def _int64(text: str) -> int:
     return int(text)
 
 
-class Route(APIRoute):
+class StrictRoute(APIRoute):
     """A route that reads exact JSON and refuses query parameters it does not know: a misspelt one is told."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
@@ -82,7 +82,7 @@ class Route(APIRoute):
                         f"unknown query parameter {unknown[0][:80]!r}{near}; accepted: {accepted}",
                         [Problem(f"unknown; accepted: {accepted}", where=name[:80]) for name in unknown[:20]],
                     )
-            return await handler(_Request(request.scope, request.receive))
+            return await handler(_StrictRequest(request.scope, request.receive))
 
         return exact
 

@@ -12,15 +12,15 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import fleet
-from app.api.auth import Editor, Principal, Reporter, Viewer
-from app.api.dependencies import Here, Services
-from app.api.responses import Route, answer, page
+from app.api.auth import Editor, Principal, RobotRole, Viewer
+from app.api.dependencies import Services, ServicesDep
+from app.api.responses import StrictRoute, answer, page
 from app.api.schemas import CHANNEL, NAME, Cursor, Limit, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.audit import about
 from app.store.values import Channel, Heard, Held, Move, Report, Robot, rfc3339
 
-router = APIRouter(prefix="/robots", tags=["robots"], route_class=Route)
+router = APIRouter(prefix="/robots", tags=["robots"], route_class=StrictRoute)
 
 EnvironmentQuery = Annotated[
     str | None, Query(pattern=NAME, description="Only in this environment; else in all that the token reaches.")
@@ -30,7 +30,7 @@ EnvironmentQuery = Annotated[
 @router.get("", responses=told(list[RobotOut], 404), summary="All robots")
 def list_robots(
     request: Request,
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     environment: EnvironmentQuery = None,
     channel: Annotated[str | None, Query(pattern=CHANNEL, description="Only on this channel.")] = None,
@@ -51,7 +51,7 @@ def list_robots(
 @router.get("/{robot}", responses=told(RobotDetailOut, 404), summary="One robot, with what it said before")
 def get_robot(
     robot: RobotPath,
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     environment: EnvironmentQuery = None,
     limit: Annotated[int, Query(ge=1, le=200, description="Reports in `history`.")] = 50,
@@ -82,8 +82,8 @@ def get_robot(
 async def put_status(
     robot: RobotPath,
     body: StatusBody,
-    services: Here,
-    principal: Reporter,
+    services: ServicesDep,
+    principal: RobotRole,
     prefer: Annotated[str | None, Header(description="`return=minimal` (RFC 7240): 204 instead of the robot.")] = None,
 ) -> Response:
     """The same as over Zenoh. A robot's token may tell of the robot that it names; editors may tell of any."""
@@ -106,7 +106,7 @@ async def put_status(
 @router.delete("/{robot}", status_code=204, responses=told(None, 404), summary="Forget a robot that is gone for good")
 def forget_robot(
     robot: RobotPath,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     environment: Annotated[str, Query(pattern=NAME, description="Where it is to be forgotten.", examples=["orchard"])],
 ) -> Response:

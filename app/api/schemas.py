@@ -24,7 +24,7 @@ MAX_TEXT = 20_000
 RESERVED = frozenset({"robots", "server"})
 
 
-class In(BaseModel):
+class RequestModel(BaseModel):
     """A request body: unknown members and numbers that are not finite are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -39,10 +39,10 @@ def _representable(moment: datetime) -> datetime:
     return moment
 
 
-Moment = Annotated[datetime, AfterValidator(_representable)]
+ApiTime = Annotated[datetime, AfterValidator(_representable)]
 
 
-class DatumBody(In):
+class DatumBody(RequestModel):
     """Where the local frame's origin is (WGS 84), and where its +y axis points."""
 
     latitude: float = Field(ge=-MAX_DATUM_LATITUDE, le=MAX_DATUM_LATITUDE, description="Degrees north.")
@@ -51,14 +51,14 @@ class DatumBody(In):
     heading: float = Field(0.0, ge=-360, le=360, description="Degrees clockwise from true north to the local +y axis.")
 
 
-class CloneBody(In):
+class CloneBody(RequestModel):
     """Whose content a new environment starts with."""
 
     environment: str = Field(examples=["orchard"])
     version: int | str = Field("latest", description="Number, channel or `latest`.", examples=["latest"])
 
 
-class EnvironmentBody(In):
+class EnvironmentBody(RequestModel):
     """A new environment."""
 
     model_config = ConfigDict(
@@ -84,7 +84,7 @@ class EnvironmentBody(In):
     clone: CloneBody | None = Field(None, description="Start with the content of another one (gives version 1).")
 
 
-class EnvironmentPatch(In):
+class EnvironmentPatch(RequestModel):
     """What is to change; what is left out stays."""
 
     model_config = ConfigDict(
@@ -104,14 +104,14 @@ class EnvironmentPatch(In):
     )
 
 
-class RevertBody(In):
+class RevertBody(RequestModel):
     """A new version with the content of an old one."""
 
     revert_to: int = Field(ge=0, description="The old version's number.")
     message: str = Field("", max_length=MAX_TEXT)
 
 
-class PutChange(In):
+class PutChange(RequestModel):
     """Add or replace one feature, by id.
 
     A feature may be put back as `GET …/layers/{layer}` shows it: what was not edited stays exactly as it is stored. A
@@ -133,7 +133,7 @@ class PutChange(In):
     )
 
 
-class DeleteChange(In):
+class DeleteChange(RequestModel):
     """Remove one feature, by id."""
 
     op: Literal["delete"]
@@ -143,7 +143,7 @@ class DeleteChange(In):
     name: str | None = Field(None, max_length=256)
 
 
-class CellsChange(In):
+class CellsChange(RequestModel):
     """Set the cells of a grid whose centres lie in a polygon."""
 
     op: Literal["cells"]
@@ -159,7 +159,7 @@ class CellsChange(In):
 Change = Annotated[PutChange | DeleteChange | CellsChange, Field(discriminator="op")]
 
 
-class EditsBody(In):
+class EditsBody(RequestModel):
     """Changes that make one version together, or none."""
 
     model_config = ConfigDict(
@@ -200,7 +200,7 @@ class EditsBody(In):
     changes: list[Change] = Field(min_length=1, max_length=100_000)
 
 
-class DerivationBody(In):
+class DerivationBody(RequestModel):
     """A layer to be computed from others."""
 
     model_config = ConfigDict(
@@ -219,7 +219,7 @@ class DerivationBody(In):
     replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
 
 
-class GenerationBody(In):
+class GenerationBody(RequestModel):
     """A site to be made up."""
 
     model_config = ConfigDict(
@@ -237,7 +237,7 @@ class GenerationBody(In):
     replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
 
 
-class FormatTemplatesBody(In):
+class FormatTemplatesBody(RequestModel):
     """What is filled in where the format asks for more than the layers have."""
 
     model_config = ConfigDict(
@@ -254,14 +254,14 @@ class FormatTemplatesBody(In):
     dry_run: bool = Field(False, description="Only say what would be.")
 
 
-class OwnTemplatesBody(In):
+class OwnTemplatesBody(RequestModel):
     """One format's templates among others."""
 
     set: str | None = Field(None, max_length=100)
     values: dict[str, Any] = Field(default_factory=dict, max_length=100)
 
 
-class TemplatesBody(In):
+class TemplatesBody(RequestModel):
     """The set of an environment, and values for several formats at once."""
 
     model_config = ConfigDict(
@@ -280,7 +280,7 @@ class TemplatesBody(In):
     dry_run: bool = Field(False, description="Only say what would be.")
 
 
-class RolloutBody(In):
+class RolloutBody(RequestModel):
     """A move in two stages. At least one of ``ready`` and ``failed``."""
 
     ready: float | None = Field(
@@ -289,11 +289,11 @@ class RolloutBody(In):
     failed: float | None = Field(
         None, gt=0, le=1, description="It does not move, or moves back, when this share of its robots reports `failed`."
     )
-    deadline: Moment | None = Field(None, description="RFC 3339 time with zone: without enough robots it stays then.")
+    deadline: ApiTime | None = Field(None, description="RFC 3339 time with zone: without enough robots it stays then.")
     window: float = Field(600.0, ge=1, le=604_800, description="Seconds for which robots are watched after the move.")
 
 
-class OntoBody(In):
+class OntoBody(RequestModel):
     """The map that a grid is laid onto."""
 
     layer: Literal["occupancy", "objects", "voxels"] = Field(
@@ -309,7 +309,7 @@ class OntoBody(In):
 Place = tuple[float, float]
 
 
-class AlignmentBody(In):
+class AlignmentBody(RequestModel):
     """A stored grid that does not lie where it should, and what says where that is: another map, or pairs of points."""
 
     model_config = ConfigDict(
@@ -339,7 +339,7 @@ class AlignmentBody(In):
     message: str = Field("", max_length=MAX_TEXT)
 
 
-class ChannelBody(In):
+class ChannelBody(RequestModel):
     """Where a channel is to stand, and since when."""
 
     model_config = ConfigDict(
@@ -349,7 +349,7 @@ class ChannelBody(In):
     )
 
     version: int | str = Field(description="Number, channel or `latest`; kept as the number.")
-    activate_at: Moment | None = Field(
+    activate_at: ApiTime | None = Field(
         None, description="RFC 3339 time with zone at which the channel moves; left out: now."
     )
     rollout: RolloutBody | None = Field(None, description="Let robots fetch it first, and watch them afterwards.")
@@ -363,14 +363,14 @@ class ChannelBody(In):
         return value
 
 
-class StatusHoldsBody(In):
+class StatusHoldsBody(RequestModel):
     """A version that a robot has loaded."""
 
     version: int = Field(ge=0, lt=2**63)
     root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Root hash of the version; 64 zeros: no map is loaded.")
 
 
-class StatusBody(In):
+class StatusBody(RequestModel):
     """What a robot says of itself."""
 
     model_config = ConfigDict(
@@ -391,7 +391,7 @@ class StatusBody(In):
         description="`ready`: it has the version and does not drive on it yet; `active`: it does."
     )
     detail: str | None = Field(None, max_length=2000)
-    time: Moment | None = Field(None, description="RFC 3339 time with zone, by the robot's clock.")
+    time: ApiTime | None = Field(None, description="RFC 3339 time with zone, by the robot's clock.")
     sequence: int | None = Field(None, ge=0, lt=2**63, description="Of the last event that it has processed.")
     overlays: str | None = Field(
         None, pattern=r"^[0-9a-f]{64}$", description="Digest of the closures in the map that it has loaded."
@@ -401,7 +401,7 @@ class StatusBody(In):
     )
 
 
-class OverlayBody(In):
+class OverlayBody(RequestModel):
     """What is blocked: a polygon or an edge."""
 
     model_config = ConfigDict(
@@ -436,14 +436,14 @@ class OverlayBody(In):
         le=2_592_000,
         description="How long it is blocked from now on; default: 3600 unless `expires` is given.",
     )
-    expires: Moment | None = Field(None, description="End, instead of `ttl_seconds`: RFC 3339 time with zone.")
+    expires: ApiTime | None = Field(None, description="End, instead of `ttl_seconds`: RFC 3339 time with zone.")
     state: Literal["pending", "accepted"] = Field(
         "pending", description="`accepted` (editors only): in force at once, on every channel."
     )
     detail: str | None = Field(None, max_length=2000)
 
 
-class LinkBody(In):
+class LinkBody(RequestModel):
     """The map, or one file of it, that a signed link gives."""
 
     model_config = ConfigDict(
@@ -464,7 +464,7 @@ class LinkBody(In):
     )
 
 
-class TokenBody(In):
+class TokenBody(RequestModel):
     """A new token."""
 
     model_config = ConfigDict(
@@ -486,7 +486,7 @@ class TokenBody(In):
         max_length=200,
         description="Role `robot`: the robot whose status it may set. Default: `name`.",
     )
-    expires: Moment | None = Field(None, description="RFC 3339 time with zone; left out: never.")
+    expires: ApiTime | None = Field(None, description="RFC 3339 time with zone; left out: never.")
 
 
 # --- answers ---

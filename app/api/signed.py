@@ -12,7 +12,7 @@ from urllib.parse import quote
 from starlette.types import Scope
 
 from app import links
-from app.api.auth import Access, Principal
+from app.api.auth import Authenticator, Principal
 from app.api.responses import API
 from app.errors import Invalid, InvalidLink, NotFound, Problem
 from app.links import LinkSecrets, SignedAddress
@@ -54,7 +54,7 @@ class SignedLinks:
     def __init__(
         self,
         secrets: LinkSecrets,
-        access: Access,
+        access: Authenticator,
         find: Callable[[str], Environment],
         max_seconds: int,
         clock: Callable[[], float] = time.time,

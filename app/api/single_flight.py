@@ -13,7 +13,7 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 
-class Together(Generic[K, T]):
+class SingleFlight(Generic[K, T]):
     """Calls under way, by key, on one event loop.
 
     What a key stands for must not change while its call runs: where a commit changes the answer, the store's generation

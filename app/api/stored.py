@@ -8,15 +8,15 @@ from fastapi import APIRouter, Path
 from starlette.responses import Response
 
 from app.api.auth import ServerAdmin
-from app.api.dependencies import Here
+from app.api.dependencies import ServicesDep
 from app.api.maps import IN_MEMORY, streamed
-from app.api.responses import Route
+from app.api.responses import StrictRoute
 from app.api.schemas import told
 from app.errors import Damaged, NotFound
 
 TYPE = "application/octet-stream"
 
-router = APIRouter(prefix="/stored", tags=["stored data"], route_class=Route)
+router = APIRouter(prefix="/stored", tags=["stored data"], route_class=StrictRoute)
 
 
 @router.get(
@@ -34,7 +34,7 @@ def stored(
         Path(description="Uploaded files, or chunks of versions' content.", examples=["blobs"]),
     ],
     sha256: Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the bytes, in hex.")],
-    services: Here,
+    services: ServicesDep,
     _: ServerAdmin,
 ) -> Response:
     """What another server of the same data heals with. Takes an administrator's token for all environments."""

@@ -9,9 +9,9 @@ from starlette.responses import Response
 
 from app import formats, templates
 from app.api.auth import Editor, Principal, Viewer
-from app.api.dependencies import Here, Services
+from app.api.dependencies import Services, ServicesDep
 from app.api.maps import number_of
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import (
     MAX_TEXT,
     VERSION,
@@ -32,7 +32,7 @@ from app.ingest import TemplateWish
 from app.model.templates import Own, Templates
 from app.store.values import Version
 
-router = APIRouter(tags=["templates"], route_class=Route)
+router = APIRouter(tags=["templates"], route_class=StrictRoute)
 
 FormatPath = Annotated[
     str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["tmap2"])
@@ -61,7 +61,7 @@ def sets() -> list[dict[str, Any]]:
 
 
 @router.get("/environments/{env}/templates", responses=told(TemplatesOut, 404), summary="An environment's templates")
-def get_templates(env: EnvironmentPath, services: Here, _: Viewer, version: Which = "latest") -> Response:
+def get_templates(env: EnvironmentPath, services: ServicesDep, _: Viewer, version: Which = "latest") -> Response:
     """The chosen set, and for each format with parameters the values of its own, what holds, and from where.
 
     A parameter of a request goes before the environment's values, these before the set's, these before the format's
@@ -83,7 +83,7 @@ def get_templates(env: EnvironmentPath, services: Here, _: Viewer, version: Whic
 def put_templates(
     env: EnvironmentPath,
     body: TemplatesBody,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
@@ -97,7 +97,7 @@ def put_templates(
 @router.delete("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Take all templates back")
 def delete_templates(
     env: EnvironmentPath,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     message: Message = "",
     dry_run: DryRun = False,
@@ -115,7 +115,7 @@ def delete_templates(
     summary="An environment's templates for a format",
 )
 def get_format_templates(
-    env: EnvironmentPath, format: FormatPath, services: Here, _: Viewer, version: Which = "latest"
+    env: EnvironmentPath, format: FormatPath, services: ServicesDep, _: Viewer, version: Which = "latest"
 ) -> Response:
     """`values`: the environment's own. `effective`: each parameter's value, and `from`: `environment`, `set NAME` or
     `default`."""
@@ -135,7 +135,7 @@ def put_format_templates(
     env: EnvironmentPath,
     format: FormatPath,
     body: FormatTemplatesBody,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
@@ -157,7 +157,7 @@ def put_format_templates(
 def delete_format_templates(
     env: EnvironmentPath,
     format: FormatPath,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     message: Message = "",
     dry_run: DryRun = False,

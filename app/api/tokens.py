@@ -9,14 +9,14 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from app.api.auth import ServerAdmin
-from app.api.dependencies import Here
-from app.api.responses import Route, answer
+from app.api.dependencies import ServicesDep
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, told
 from app.errors import Conflict, Invalid, NotFound, Problem
 from app.events.messages import ROBOT_NAME
 from app.store.values import Token, rfc3339
 
-router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=Route)
+router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=StrictRoute)
 
 
 def as_dict(token: Token) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def as_dict(token: Token) -> dict[str, Any]:
 
 
 @router.get("", responses=told(list[TokenOut]), summary="All tokens, without their secrets")
-def list_tokens(services: Here, _: ServerAdmin) -> Response:
+def list_tokens(services: ServicesDep, _: ServerAdmin) -> Response:
     """Oldest first."""
     return answer([as_dict(token) for token in services.store.tokens()])
 
@@ -45,7 +45,7 @@ def list_tokens(services: Here, _: ServerAdmin) -> Response:
     responses=told(NewTokenOut, 400, 415, ok=201, description="Made"),
     summary="Make a token",
 )
-def create_token(body: TokenBody, services: Here, _: ServerAdmin) -> Response:
+def create_token(body: TokenBody, services: ServicesDep, _: ServerAdmin) -> Response:
     """Its secret stands in this answer and nowhere else: only its hash is stored.
 
     A token with the role `robot` names its robot: `robot`, by default its own `name`.
@@ -78,7 +78,7 @@ def _robot_of(body: TokenBody) -> str | None:
 
 
 @router.delete("/{id}", status_code=204, responses=told(None, 404, 409), summary="Revoke a token")
-def delete_token(id: TokenPath, services: Here, _: ServerAdmin) -> Response:
+def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Response:
     """It is refused from now on (within a second by other worker processes). The last administrator's stays."""
     tokens = {token.id: token for token in services.store.tokens()}
     if id not in tokens:

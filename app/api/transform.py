@@ -9,16 +9,16 @@ from fastapi import APIRouter, Query
 from starlette.responses import Response
 
 from app.api.auth import Viewer
-from app.api.dependencies import Here
+from app.api.dependencies import ServicesDep
 from app.api.environments import numbers
 from app.api.maps import number_of
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.schemas import VERSION, EnvironmentPath, TransformOut, told
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES
 from app.model.geodesy import local_frame
 
-router = APIRouter(prefix="/environments/{env}", tags=["transform"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}", tags=["transform"], route_class=StrictRoute)
 
 
 FAR = "the place is too far from the datum for the local frame"
@@ -31,7 +31,7 @@ def _refused(location: str, detail: str) -> Invalid:
 @router.get("/transform", responses=told(TransformOut, 404), summary="Between earth and local frame")
 def transform(
     env: EnvironmentPath,
-    services: Here,
+    services: ServicesDep,
     _: Viewer,
     latlon: Annotated[
         str | None, Query(description="`LAT,LON` in degrees (WGS 84).", examples=["52.4206,5.6134"])

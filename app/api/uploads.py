@@ -2,7 +2,7 @@
 
 A file's name may be a relative path and is kept as it was given; on disk it never names anything. Files lie in a
 folder of their own below the spool, which goes with the request; what a killed server left is removed at the next
-start (``Intake``).
+start (``UploadSpool``).
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ FILES = "files"
 
 
 @dataclass(slots=True)
-class Form:
+class UploadForm:
     """What was sent: files in order, and the other fields."""
 
     files: list[SpooledFile] = field(default_factory=list)
     fields: dict[str, str] = field(default_factory=dict)
 
 
-class Intake:
+class UploadSpool:
     """Where uploads arrive: so many at once, and nothing of a dead process stays."""
 
     def __init__(self, spool: Path, limits: Limits, *, at_once: int) -> None:
@@ -90,7 +90,7 @@ class Intake:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     @contextlib.asynccontextmanager
-    async def take(self, request: Request) -> AsyncIterator[Form]:
+    async def take(self, request: Request) -> AsyncIterator[UploadForm]:
         """The form of a multipart request; its files last as long as the block.
 
         Raises Unavailable (too many uploads at once), MalformedBody, Invalid, TooLarge.
@@ -104,7 +104,7 @@ class Intake:
             boundary = multipart_boundary(request.headers.get("content-type", ""))
             self._open()
             folder.mkdir()
-            receiver = _Receiver(boundary, folder, self._limits)
+            receiver = _MultipartReceiver(boundary, folder, self._limits)
             try:
                 await _feed(request, receiver)
             finally:
@@ -116,7 +116,7 @@ class Intake:
             await run_in_threadpool(shutil.rmtree, folder, True)
 
 
-async def _feed(request: Request, receiver: _Receiver) -> None:
+async def _feed(request: Request, receiver: _MultipartReceiver) -> None:
     batch: list[bytes] = []
     size = 0
     async for chunk in request.stream():
@@ -144,11 +144,11 @@ def _remove_left(spool: Path) -> None:
                     folder.rmdir()
 
 
-class _Receiver:
+class _MultipartReceiver:
     """The parts of one body: files to disk, fields to memory."""
 
     def __init__(self, boundary: bytes, folder: Path, limits: Limits) -> None:
-        self.form = Form()
+        self.form = UploadForm()
         self._folder, self._limits = folder, limits
         self._total = 0
         self._ended = False

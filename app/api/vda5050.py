@@ -11,19 +11,19 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats
-from app.api.auth import Principal, Reporter, Viewer
-from app.api.dependencies import Here, Services
-from app.api.jobs import Started, started
+from app.api.auth import Principal, RobotRole, Viewer
+from app.api.dependencies import Services, ServicesDep
+from app.api.jobs import JobStarted, started
 from app.api.links import LinkedFile, link_to
 from app.api.maps import number_of
-from app.api.responses import Route, answer
+from app.api.responses import StrictRoute, answer
 from app.api.robots import may_report, noted
 from app.api.schemas import CHANNEL, NAME, ActionsOut, EnvironmentPath, RobotPath, StateOut, VersionPath, told
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
 from app.store.values import Channel, Report, RobotState, Version
 
-router = APIRouter(tags=["vda5050"], route_class=Route)
+router = APIRouter(tags=["vda5050"], route_class=StrictRoute)
 
 STATE: dict[str, Any] = {
     "timestamp": "2026-05-01T14:03:07Z",
@@ -45,7 +45,7 @@ async def get_actions(
     env: EnvironmentPath,
     v: VersionPath,
     request: Request,
-    services: Here,
+    services: ServicesDep,
     principal: Viewer,
     map_id: Annotated[
         str | None,
@@ -104,7 +104,7 @@ async def get_actions(
                 raise
             missing.append({"level": name, "detail": error.detail})
             continue
-        if isinstance(outcome, Started):
+        if isinstance(outcome, JobStarted):
             return started(outcome.job)
         floor = map_id if map_id is not None and level != "*" else vda5050.map_id_of(site, _other(version, name))
         maps.append(_actions(version, floor, name if level is not None else None, outcome))
@@ -176,8 +176,8 @@ def _actions(version: Version, map_id: str, level: str | None, link: LinkedFile)
 def post_state(
     robot: RobotPath,
     message: Annotated[dict[str, Any], Body(openapi_examples={"state": {"value": STATE}})],
-    services: Here,
-    principal: Reporter,
+    services: ServicesDep,
+    principal: RobotRole,
     environment: Annotated[
         str | None, Query(pattern=NAME, description="Environment of the maps. Default: the `mapId` before `/`.")
     ] = None,

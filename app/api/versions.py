@@ -13,10 +13,10 @@ from starlette.responses import Response
 from app import formats
 from app.api.auth import Editor, Principal, Viewer
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
-from app.api.dependencies import Here, Services
+from app.api.dependencies import Services, ServicesDep
 from app.api.maps import IN_MEMORY, number_of, streamed
 from app.api.problems import UnsupportedMedia
-from app.api.responses import Route, answer, page, path_of
+from app.api.responses import StrictRoute, answer, page, path_of
 from app.api.schemas import (
     VERSION,
     Cursor,
@@ -31,7 +31,7 @@ from app.api.schemas import (
     VersionPath,
     told,
 )
-from app.api.uploads import Form
+from app.api.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
 from app.ingest import Outcome, SpooledFile, Upload
 from app.ingest.service import bad_name
@@ -39,7 +39,7 @@ from app.model.frame import GROUND, Level
 from app.store.values import Source
 from app.upload_reader import DRAWN_LAYERS, drawn_layer
 
-router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=Route)
+router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=StrictRoute)
 
 UPLOAD_BODY: dict[str, Any] = {
     "x-free-query": True,
@@ -92,7 +92,7 @@ UPLOAD_BODY: dict[str, Any] = {
 
 @router.get("/versions", responses=told(list[VersionOut], 404), summary="History, newest first")
 def list_versions(
-    env: EnvironmentPath, request: Request, services: Here, _: Viewer, limit: Limit = 100, cursor: Cursor = None
+    env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer, limit: Limit = 100, cursor: Cursor = None
 ) -> Response:
     """All versions of an environment."""
     if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) <= 18):
@@ -116,7 +116,7 @@ def list_versions(
 async def create_version(
     env: EnvironmentPath,
     request: Request,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
@@ -151,7 +151,7 @@ async def create_version(
 def create_edit(
     env: EnvironmentPath,
     body: EditsBody,
-    services: Here,
+    services: ServicesDep,
     principal: Editor,
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
@@ -171,7 +171,7 @@ def create_edit(
 
 
 @router.get("/versions/{v}", responses=told(VersionOut, 404), summary="One version")
-def get_version(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer) -> Response:
+def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """A version by number, by channel, or the newest."""
     version = services.store.version(env, number_of(v))
     headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
@@ -179,7 +179,7 @@ def get_version(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer)
 
 
 @router.get("/versions/{v}/sources", tags=["sources"], responses=told(list[SourceOut], 404), summary="Uploaded files")
-def list_sources(env: EnvironmentPath, v: VersionPath, services: Here, _: Viewer) -> Response:
+def list_sources(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """The files that made a version, also those that were not used."""
     return answer([source.as_dict() for source in services.store.version(env, number_of(v)).sources])
 
@@ -203,7 +203,7 @@ def get_source(
         str, Path(max_length=1024, description="The file's name, with its folders.", examples=["datum.yaml"])
     ],
     request: Request,
-    services: Here,
+    services: ServicesDep,
     _: Viewer,
     sha256: Annotated[
         str | None, Query(pattern=r"^[0-9a-f]{64}$", description="Which one, where several have this name.")
@@ -261,7 +261,7 @@ def told_as(outcome: Outcome) -> Response:
     return answer(outcome.body, 201, {**headers, "location": location})
 
 
-def _upload(form: Form, request: Request) -> Upload:
+def _upload(form: UploadForm, request: Request) -> Upload:
     """What the form and the query say, checked."""
     fields = dict(form.fields)
     for name, value in request.query_params.multi_items():

@@ -33,8 +33,8 @@ from typer.main import get_command
 
 from app import derive, generate
 from app.api import problems
-from app.api.auth import AtLeast
-from app.api.metrics import Metrics, _Heads, _Scrubs
+from app.api.auth import RequireRole
+from app.api.metrics import Metrics, _HeadVersionCollector, _Scrubs
 from app.api.responses import API
 from app.cli import commands
 from app.config import Settings, format_size
@@ -389,7 +389,7 @@ def metrics() -> str:
     rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
     with tempfile.TemporaryDirectory() as folder:
         empty: Any = SimpleNamespace(environments=lambda **_: ([], None), blob_dir=Path(folder))
-        for collector in (_Heads(empty), _Scrubs(empty)):
+        for collector in (_HeadVersionCollector(empty), _Scrubs(empty)):
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())
                 rows.append((code(family.name), family.type, codes(labels), family.documentation))
@@ -462,7 +462,7 @@ def _roles() -> dict[tuple[str, str], str]:
                 routers.append(route.original_router)
                 continue
             for dependency in route.dependant.dependencies:
-                if isinstance(dependency.call, AtLeast):
+                if isinstance(dependency.call, RequireRole):
                     least = code(dependency.call.need)
                     role = f"{least}, in all environments" if dependency.call.everywhere else least
                     for method, prefix in itertools.product(route.methods, ("", API)):

@@ -9,7 +9,7 @@ import pytest
 from app.api.auth import (
     FRESH_SECONDS,
     WINDOW_SECONDS,
-    Access,
+    Authenticator,
     Principal,
     environment_of,
     is_loopback,
@@ -48,7 +48,7 @@ def token(role: Role = "viewer", environments: str | None = None, expires: datet
 
 def test_a_token_is_asked_for_once_a_second() -> None:
     clock, book = Clock(), Book(good=token())
-    access = Access(book, failures=3, clock=clock)
+    access = Authenticator(book, failures=3, clock=clock)
     header = b"Bearer good"
     assert access.known(header) is None
     assert access.check(header, "10.0.0.1").name == "somebody"
@@ -64,7 +64,7 @@ def test_a_token_is_asked_for_once_a_second() -> None:
 
 def test_a_revoked_token_is_forgotten_at_once() -> None:
     book = Book(good=token())
-    access = Access(book, failures=3, clock=Clock())
+    access = Authenticator(book, failures=3, clock=Clock())
     access.check(b"Bearer good", None)
     access.forget()
     assert access.known(b"Bearer good") is None
@@ -76,23 +76,23 @@ def test_a_revoked_token_is_forgotten_at_once() -> None:
 def test_without_a_usable_token(header: bytes | None) -> None:
     book = Book(good=token())
     with pytest.raises(Unauthenticated):
-        Access(book, failures=3, clock=Clock()).check(header, None)
+        Authenticator(book, failures=3, clock=Clock()).check(header, None)
     assert book.asked == 0
 
 
 def test_the_scheme_is_not_case_sensitive() -> None:
-    assert Access(Book(good=token()), failures=3).check(b"bearer good", None).id == "t1"
+    assert Authenticator(Book(good=token()), failures=3).check(b"bearer good", None).id == "t1"
 
 
 def test_expired() -> None:
-    access = Access(Book(old=token(expires=NOW - timedelta(seconds=1))), failures=3)
+    access = Authenticator(Book(old=token(expires=NOW - timedelta(seconds=1))), failures=3)
     with pytest.raises(Unauthenticated):
         access.check(b"Bearer old", None)
 
 
 def test_guessing_is_slowed_for_its_source_alone() -> None:
     clock, book = Clock(), Book(good=token())
-    access = Access(book, failures=3, clock=clock)
+    access = Authenticator(book, failures=3, clock=clock)
     access.check(b"Bearer good", "10.0.0.1")
     for _ in range(3):
         with pytest.raises(Unauthenticated):
@@ -115,7 +115,7 @@ def test_guessing_is_slowed_for_its_source_alone() -> None:
 
 
 def test_asking_without_a_token_is_no_failure() -> None:
-    access = Access(Book(good=token()), failures=1, clock=Clock())
+    access = Authenticator(Book(good=token()), failures=1, clock=Clock())
     for _ in range(5):
         with pytest.raises(Unauthenticated):
             access.check(None, "10.0.0.1")

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from app.api import channels, maps
-from app.api.auth import Access
-from app.api.single_flight import Together
+from app.api.auth import Authenticator
+from app.api.single_flight import SingleFlight
 from app.errors import NotFound, Unavailable
 from app.store.database import Database
 from app.store.store import Store
@@ -51,7 +51,7 @@ def at_once(count: int) -> Iterator[Callable[..., Any]]:
 
 def test_one_call_for_all() -> None:
     async def run() -> None:
-        together: Together[str, int] = Together()
+        together: SingleFlight[str, int] = SingleFlight()
         gate = Gate()
 
         def look(number: int) -> int:
@@ -72,7 +72,7 @@ def test_one_call_for_all() -> None:
 
 def test_who_goes_away_harms_nobody() -> None:
     async def run() -> None:
-        together: Together[str, int] = Together()
+        together: SingleFlight[str, int] = SingleFlight()
         gate = Gate()
 
         def look() -> int:
@@ -95,7 +95,7 @@ def test_who_goes_away_harms_nobody() -> None:
 @pytest.mark.filterwarnings("error")
 def test_an_error_is_everybodys_and_is_not_kept(caplog: pytest.LogCaptureFixture) -> None:
     async def run() -> None:
-        together: Together[str, int] = Together()
+        together: SingleFlight[str, int] = SingleFlight()
         gate = Gate()
 
         def fail() -> int:
@@ -267,7 +267,7 @@ def test_a_token_revoked_while_it_is_looked_up_is_not_believed_again() -> None:
         gate()
         return entry
 
-    access = Access(find, failures=10)
+    access = Authenticator(find, failures=10)
     with at_once(1) as ask:
         looking = ask(access.check, b"Bearer t", "1.2.3.4")
         assert gate.reached.wait(20)
