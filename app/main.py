@@ -73,12 +73,12 @@ from app.convert.maps import Maps
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
 from app.events import bus
 from app.events.bus import Bus, BusOptions
-from app.events.credentials import Login
+from app.events.credentials import ZenohCredentials
 from app.events.relay import Relay
-from app.events.ros2 import Ros2, Ros2Options
+from app.events.ros2 import Ros2Options, Ros2Publisher
 from app.events.ros_names import parse_chosen, parse_keys
-from app.events.security import Security
-from app.fleet import Intake as FleetIntake
+from app.events.security import RouterSecurity
+from app.fleet import ReportQueue as FleetIntake
 from app.fleet import decide
 from app.ingest import Ingest, Provider
 from app.links import LinkSecrets
@@ -410,12 +410,12 @@ def relay_of(settings: Settings, services: Services) -> Relay | None:
     return relay
 
 
-def ros2_of(settings: Settings, services: Services) -> Ros2 | None:
+def ros2_of(settings: Settings, services: Services) -> Ros2Publisher | None:
     """Topics for ROS 2, begun; None where no environment is chosen."""
     chosen = parse_chosen(settings.ros2_environments)
     if not chosen or settings.zenoh_mode == "off":
         return None
-    publishing = Ros2(
+    publishing = Ros2Publisher(
         Ros2Options(chosen, parse_keys(settings.ros2_keys), settings.ros2_domain_id),
         _bus_options(settings),
         settings.data_dir,
@@ -441,8 +441,8 @@ def _bus_options(settings: Settings) -> BusOptions:
         prefix=settings.zenoh_prefix,
         config=settings.zenoh_config,
         max_reply_bytes=settings.zenoh_max_reply_bytes,
-        security=Security(
-            Login(
+        security=RouterSecurity(
+            ZenohCredentials(
                 settings.zenoh_ca,
                 settings.zenoh_certificate,
                 settings.zenoh_key,

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from app.agent import hooks
-from app.agent.http_client import Stopped
+from app.agent.http_client import AgentStopped
 from app.agent.levels import level_problem, level_variables, read_level
-from app.agent.map_directory import Folder
-from app.agent.options import Options
+from app.agent.map_directory import MapDirectory
+from app.agent.options import AgentOptions
 from app.agent.signed_manifest import Manifest
 from app.agent.state import StateStore, write_whole
 
@@ -103,9 +103,9 @@ class Activation:
 
     def __init__(
         self,
-        folder: Folder,
+        folder: MapDirectory,
         store: StateStore,
-        options: Options,
+        options: AgentOptions,
         robot: str,
         *,
         log: LogEvent,
@@ -188,7 +188,7 @@ class Activation:
             if ended.status == 0:
                 continue
             if self._stopping.is_set():
-                raise Stopped
+                raise AgentStopped
             if ended.status == NOT_NOW:
                 detail = (
                     f"version {manifest.version} is ready since {since}: --before-switch {command} delays the switch"
@@ -256,7 +256,7 @@ class Activation:
             problem = hooks.run(command, variables, stopping=self._stopping)
             if problem is not None:
                 if self._stopping.is_set():
-                    raise Stopped
+                    raise AgentStopped
                 return problem
             self._log("hook", command=command, version=manifest.version)
         self._store.set(activated=name, working=name)
@@ -275,7 +275,7 @@ class Activation:
 
 
 def hook_variables(
-    folder: Folder, manifest: Manifest, files: Sequence[str], layers: Sequence[str], level: str | None, robot: str
+    folder: MapDirectory, manifest: Manifest, files: Sequence[str], layers: Sequence[str], level: str | None, robot: str
 ) -> dict[str, str]:
     """Return the environment variables of a command.
 

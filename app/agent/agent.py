@@ -18,21 +18,21 @@ from app.agent import signed_manifest
 from app.agent.activation import ACTIVE, BEFORE_SWITCH_SECONDS, Activation, LogEvent, Outcome, Retries, changed_files
 from app.agent.download import Downloads
 from app.agent.freshness import Freshness, SignedClock
-from app.agent.http_client import Busy, ClosuresChanged, Stopped, Web, plain
+from app.agent.http_client import AgentStopped, ClosuresChanged, RetryLater, ServerClient, plain
 from app.agent.levels import write_hooks
 from app.agent.manifests import Manifests
-from app.agent.map_directory import Folder
-from app.agent.options import Options, robot_name
+from app.agent.map_directory import MapDirectory
+from app.agent.options import AgentOptions, robot_name
 from app.agent.requests import parse_requests
-from app.agent.signed_manifest import File, Manifest
-from app.agent.state import State, StateStore
+from app.agent.signed_manifest import Manifest, ManifestFile
+from app.agent.state import AgentState, StateStore
 from app.agent.status import StatusReporter
-from app.agent.zenoh_client import Ear
+from app.agent.zenoh_client import ZenohClient
 from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events import messages
 from app.events.messages import RobotState, RobotStatus
 
-__all__ = ["Agent", "Options", "robot_name"]
+__all__ = ["Agent", "AgentOptions", "robot_name"]
 
 LATEST = "latest"
 PRODUCTION = "production"
@@ -73,7 +73,7 @@ CLOSURES_SECONDS = 0.1
 class Agent:
     """One environment's map in one folder. clock: seconds since 1970; it may be a minute off."""
 
-    def __init__(self, options: Options, tell: LogEvent, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, options: AgentOptions, tell: LogEvent, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
             options = dataclasses.replace(options, key=signed_manifest.check_given(options.key))
         self.options, self._tell, self._clock = options, tell, clock
@@ -84,9 +84,9 @@ class Agent:
         self._login.values()  # Invalid comes now, not in the session's thread
         self._stopping = threading.Event()
         self._wake = threading.Event()
-        self._folder = Folder(options.into)
-        self._web = Web(options.server, options.token, self._stopping, options.ca)
-        self._ear: Ear | None = None
+        self._folder = MapDirectory(options.into)
+        self._web = ServerClient(options.server, options.token, self._stopping, options.ca)
+        self._ear: ZenohClient | None = None
         self._store = StateStore(self._folder.state, options.environment, self._folder.spare)
         self._retries = Retries(options.poll_seconds, lambda: FIRST_PAUSE_SECONDS)
         self._activation = Activation(
@@ -125,7 +125,7 @@ class Agent:
         self._behind = 0
 
     @property
-    def _state(self) -> State:
+    def _state(self) -> AgentState:
         return self._store.value
 
     # --- outside ---
@@ -170,12 +170,12 @@ class Agent:
         self._retries.keep_only()
         try:
             return self._attempt(self._sync)
-        except Stopped:
+        except AgentStopped:
             return False
 
     def run(self) -> None:
         """Keep the folder up to date until ``stop``."""
-        self._ear = Ear(
+        self._ear = ZenohClient(
             self.options.environment,
             self._robot,
             heard=self._heard,
@@ -213,7 +213,7 @@ class Agent:
                 if (due := self._retries.next_due) is not None:
                     pause = min(pause, max(0.0, due - time.monotonic()))
                 woken = self._rest_or_switch(max(self._after, pause))
-            except Stopped:
+            except AgentStopped:
                 break
 
     def _rest_or_switch(self, seconds: float) -> bool:
@@ -334,7 +334,7 @@ class Agent:
         except OSError as error:
             self._fail("failed", f"{error.filename or self._folder.path}: {error.strerror or error}")
             good = False
-        except Stopped:
+        except AgentStopped:
             raise
         except Exception as error:  # noqa: BLE001  a mistake of ours; who ends here is of no use to a robot
             frame = traceback.extract_tb(error.__traceback__)[-1]
@@ -424,7 +424,7 @@ class Agent:
         if outcome.state == "failed":
             self._tell("failed", detail=outcome.detail)
 
-    def _fetch_version(self, version: int, keep: Sequence[File]) -> tuple[Manifest, dict[str, Path]]:
+    def _fetch_version(self, version: int, keep: Sequence[ManifestFile]) -> tuple[Manifest, dict[str, Path]]:
         """Fetch a version by its number, again if closures change meanwhile: its manifest, path -> verified file."""
         for attempt in range(MAX_CLOSURE_CHANGES):
             manifest = self._manifests.planned(version)
@@ -437,7 +437,7 @@ class Agent:
                     raise
                 problem = error.detail
             if self._stopping.wait(CLOSURES_SECONDS * 2**attempt):
-                raise Stopped
+                raise AgentStopped
         raise ClosuresChanged(problem)
 
     def _switch_pending(self) -> bool:
@@ -480,7 +480,7 @@ class Agent:
                 if newer is None or (newer.map_key == manifest.map_key and not isinstance(error, ClosuresChanged)):
                     raise
                 if newer.map_key == manifest.map_key and self._stopping.wait(CLOSURES_SECONDS * 2**attempt):
-                    raise Stopped from None  # the server's manifest is older than its files for a moment
+                    raise AgentStopped from None  # the server's manifest is older than its files for a moment
                 manifest = newer
         return self._install(manifest)
 
@@ -587,7 +587,7 @@ class Agent:
         subject: Subject | None = self._fetched
         if subject is None and isinstance(root, str) and signed_manifest.is_hash(root):
             subject = (version, root)
-        if isinstance(error, Busy):
+        if isinstance(error, RetryLater):
             self._after = error.seconds
         if isinstance(error, Unavailable):
             if subject is not None:
@@ -629,7 +629,7 @@ class Agent:
         return "; ".join(remark for remark in remarks if remark) or None
 
     def _report_error(self, error: FleetMapError, *, is_planned: bool = False) -> None:
-        if isinstance(error, Busy):
+        if isinstance(error, RetryLater):
             self._after = error.seconds
         report_key = ("failed", error.detail, self._folder.standing, self._mark)
         if is_planned and report_key == self._reported:

@@ -6,16 +6,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from urllib.parse import quote, urlencode
 
-from app.agent.http_client import Web
-from app.agent.map_directory import Folder
+from app.agent.http_client import ServerClient
+from app.agent.map_directory import MapDirectory
 from app.agent.requests import FormatRequest
-from app.agent.signed_manifest import File, Manifest
+from app.agent.signed_manifest import Manifest, ManifestFile
 
 
 class Downloads:
     """Fetch files into a map directory."""
 
-    def __init__(self, folder: Folder, web: Web, requests: Sequence[FormatRequest]) -> None:
+    def __init__(self, folder: MapDirectory, web: ServerClient, requests: Sequence[FormatRequest]) -> None:
         self._folder, self._web = folder, web
         self._parameters = {request.name: request.parameters for request in requests}
 
@@ -23,7 +23,7 @@ class Downloads:
         self,
         manifest: Manifest,
         installed: Manifest | None,
-        keep: Sequence[File],
+        keep: Sequence[ManifestFile],
         begin: Callable[[], object] = lambda: None,
     ) -> dict[str, Path]:
         """Fetch what is missing: path -> verified local copy.
@@ -61,7 +61,7 @@ class Downloads:
             sources[file.path] = ready
         return sources
 
-    def _query(self, file: File, manifest: Manifest) -> str:
+    def _query(self, file: ManifestFile, manifest: Manifest) -> str:
         """Return the parameters of a file's address: those of its format, and that closures are applied."""
         parameters = dict(self._parameters.get(file.format, ()))
         if manifest.overlays_digest is not None:

@@ -18,7 +18,7 @@ from urllib.parse import quote, urljoin
 
 import httpx
 
-from app.agent.signed_manifest import File
+from app.agent.signed_manifest import ManifestFile
 from app.agent.state import digest
 from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events.credentials import trusting
@@ -66,7 +66,7 @@ MAX_JOBS = 1000
 """One for each map of a manifest, and then the server loses what it makes."""
 
 
-class Stopped(Exception):
+class AgentStopped(Exception):
     """The agent was told to end."""
 
 
@@ -78,7 +78,7 @@ class UnreadableDelta(Untrusted):
     """A delta that does not give a file: the complete file is to be fetched."""
 
 
-class Busy(Unavailable):
+class RetryLater(Unavailable):
     """The server asks to come again after so many seconds."""
 
     def __init__(self, detail: str, seconds: float = 0.0) -> None:
@@ -86,7 +86,7 @@ class Busy(Unavailable):
         self.seconds = seconds
 
 
-class _Watch:
+class _RequestWatchdog:
     """One thread for all requests of the process: a timer for each would cost more than the request."""
 
     def __init__(self) -> None:
@@ -117,10 +117,10 @@ class _Watch:
                     late()
 
 
-_watch = _Watch()
+_watch = _RequestWatchdog()
 
 
-class Web:
+class ServerClient:
     """A server, with one token. Methods raise FleetMapError where it says no, or nothing.
 
     ca: who signs the server's certificate (PEM); without it, public certification authorities.
@@ -212,7 +212,7 @@ class Web:
         self,
         environment: str,
         version: int,
-        file: File,
+        file: ManifestFile,
         target: Path,
         old: tuple[Path, str] | None,
         *,
@@ -259,7 +259,7 @@ class Web:
 
     # --- inside ---
 
-    def _receive(self, path: str, part: Path, file: File, old: tuple[Path, str] | None) -> bool:
+    def _receive(self, path: str, part: Path, file: ManifestFile, old: tuple[Path, str] | None) -> bool:
         """Write or go on writing ``part``: whether the server sent the whole file."""
         start = part.stat().st_size if part.exists() else 0
         if start == file.size and start:
@@ -273,7 +273,7 @@ class Web:
             if answer.status_code == 416:
                 return False
             if answer.status_code == 202:
-                raise Busy(f"the server is still making {file.path}", 2.0)
+                raise RetryLater(f"the server is still making {file.path}", 2.0)
             if answer.status_code not in (200, 206):
                 raise self._refused(answer)
             coding = answer.headers.get("content-encoding", "identity").lower()
@@ -289,7 +289,7 @@ class Web:
             return not going_on
 
     @staticmethod
-    def _write(part: Path, mode: str, start: int, chunks: Iterable[bytes], file: File, *, keep: bool) -> None:
+    def _write(part: Path, mode: str, start: int, chunks: Iterable[bytes], file: ManifestFile, *, keep: bool) -> None:
         written = start
         if not start:
             part.unlink(missing_ok=True)  # a link that somebody has put here is not followed
@@ -315,7 +315,7 @@ class Web:
         total = since = 0
         for chunk in answer.iter_raw():
             if self._stopping.is_set():
-                raise Stopped
+                raise AgentStopped
             self.received += len(chunk)
             total, since, now = total + len(chunk), since + len(chunk), time.monotonic()
             if now - window > PACE_SECONDS:
@@ -369,7 +369,7 @@ class Web:
             if waited > JOB_SECONDS:
                 raise Unavailable(f"the server has not made the maps within {JOB_SECONDS:g} seconds")
             if self._stopping.wait(pause):
-                raise Stopped
+                raise AgentStopped
             waited += pause
             pause = min(5.0, pause * 1.5)
 
@@ -396,12 +396,12 @@ class Web:
     @contextlib.contextmanager
     def _reach(self) -> Iterator[None]:
         if self._stopping.is_set():
-            raise Stopped
+            raise AgentStopped
         try:
             yield
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             if self._stopping.is_set():
-                raise Stopped from None
+                raise AgentStopped from None
             raise Unavailable(f"no answer from {self.server}: {error or type(error).__name__}") from None
 
     def _refused(self, answer: httpx.Response) -> FleetMapError:
@@ -420,7 +420,7 @@ class Web:
                 seconds = float(answer.headers.get("retry-after", "0"))
             except ValueError:
                 seconds = 0.0
-            return Busy(detail, min(300.0, max(0.0, seconds)))
+            return RetryLater(detail, min(300.0, max(0.0, seconds)))
         if status in (401, 403):
             return Denied(f"{detail} (token: FLEETMAP_TOKEN)")
         if status == 404:
@@ -433,7 +433,7 @@ def plain(text: str) -> str:
     return text.encode("utf-8", "replace").decode()
 
 
-def _complete(part: Path, file: File) -> bool:
+def _complete(part: Path, file: ManifestFile) -> bool:
     try:
         if part.stat().st_size != file.size:
             return False
@@ -447,7 +447,7 @@ def _fits(old: int, new: int) -> bool:
     return old >= MIN_DICTIONARY_BYTES and max(old, new) <= MAX_DICTIONARY_BYTES
 
 
-def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterator[bytes]:
+def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: ManifestFile) -> Iterator[bytes]:
     """The new file of a ``dcz`` body, in pieces; never much more than the manifest's size."""
     old_path, sha256 = old
     want = DCZ_MAGIC + bytes.fromhex(sha256)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from app.agent import hooks
-from app.agent.map_directory import Folder
+from app.agent.map_directory import MapDirectory
 from app.agent.signed_manifest import Manifest
 from app.agent.state import write_whole
 from app.errors import Conflict, Invalid, NotFound, Unavailable
@@ -27,7 +27,7 @@ def level_files(manifest: Manifest, level: str) -> list[str]:
     return sorted(file.path for file in manifest.files if file.level == level)
 
 
-def read_level(folder: Folder) -> str | None:
+def read_level(folder: MapDirectory) -> str | None:
     """Return the level that the robot is on, None if none was ever chosen."""
     try:
         return (folder.path / "level").read_bytes()[:MAX_LEVEL_BYTES].decode(errors="replace").strip("\n") or None
@@ -62,7 +62,7 @@ def level_variables(manifest: Manifest, level: str | None) -> dict[str, str]:
     }
 
 
-def write_hooks(folder: Folder, on_change: Sequence[str], robot: str) -> None:
+def write_hooks(folder: MapDirectory, on_change: Sequence[str], robot: str) -> None:
     """Store the agent's hooks for ``agent-level``."""
     body = {"on_change": list(on_change), "robot": robot}
     data = json.dumps(body, indent=1).encode() + b"\n"
@@ -74,7 +74,7 @@ def write_hooks(folder: Folder, on_change: Sequence[str], robot: str) -> None:
 def load_level(
     directory: Path,
     level: str,
-    variables: Callable[[Folder, Manifest, Sequence[str], Sequence[str], str | None, str], Mapping[str, str]],
+    variables: Callable[[MapDirectory, Manifest, Sequence[str], Sequence[str], str | None, str], Mapping[str, str]],
     log: Callable[..., None],
 ) -> None:
     """Run the agent's hooks for one level of the current map, and remember the level.
@@ -89,7 +89,7 @@ def load_level(
         Conflict: no agent has run in the directory, or it belongs to another user.
         Unavailable: a hook failed; the level stays as it was.
     """
-    folder = Folder(directory)
+    folder = MapDirectory(directory)
     commands, robot = _read_hooks(folder.path / "hooks.json")
     with folder.hooks_lock():
         manifest = folder.manifest(folder.standing)

@@ -8,9 +8,9 @@ from datetime import datetime, timezone
 
 from app.agent import signed_manifest
 from app.agent.freshness import Freshness, SignedClock
-from app.agent.http_client import Web
-from app.agent.map_directory import Folder
-from app.agent.options import Options
+from app.agent.http_client import ServerClient
+from app.agent.map_directory import MapDirectory
+from app.agent.options import AgentOptions
 from app.agent.requests import FormatRequest, encode_entries
 from app.agent.signed_manifest import Manifest
 from app.agent.state import Mark, StateStore
@@ -22,10 +22,10 @@ class Manifests:
 
     def __init__(
         self,
-        options: Options,
+        options: AgentOptions,
         requests: Sequence[FormatRequest],
-        web: Web,
-        folder: Folder,
+        web: ServerClient,
+        folder: MapDirectory,
         store: StateStore,
         *,
         clock: SignedClock,

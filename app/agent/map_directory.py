@@ -29,8 +29,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from app.agent.http_client import Stopped
-from app.agent.signed_manifest import File, Manifest, parse
+from app.agent.http_client import AgentStopped
+from app.agent.signed_manifest import Manifest, ManifestFile, parse
 from app.agent.state import digest, sync_folder, write_new
 from app.errors import Conflict, Invalid, Unavailable, Untrusted
 
@@ -44,7 +44,7 @@ READ_ONLY = 0o444
 CHUNK = 1 << 20
 
 
-class Folder:
+class MapDirectory:
     """One robot's folder of one environment. Only one agent has it at a time."""
 
     def __init__(self, path: Path) -> None:
@@ -89,7 +89,7 @@ class Folder:
                     if stopping is None:
                         time.sleep(HOOKS_LOCK_SECONDS)
                     elif stopping.wait(HOOKS_LOCK_SECONDS):
-                        raise Stopped from None
+                        raise AgentStopped from None
             yield
 
     def close(self) -> None:
@@ -123,7 +123,7 @@ class Folder:
         """Files of a version that are absent or have other bytes than their manifest says."""
         return [file.path for file in manifest.files if not _holds(self.versions / name / file.path, file)]
 
-    def ready(self, file: File) -> Path:
+    def ready(self, file: ManifestFile) -> Path:
         """Where a fetched file lies once it is whole and verified."""
         return self.partial / file.sha256
 
@@ -136,7 +136,7 @@ class Folder:
                 paths.setdefault(file.sha256, []).append(self.versions / name / file.path)
         return paths
 
-    def known(self, file: File, index: Mapping[str, Sequence[Path]]) -> Path | None:
+    def known(self, file: ManifestFile, index: Mapping[str, Sequence[Path]]) -> Path | None:
         """A file with these bytes, fetched or of a version that is there; its hash is verified now."""
         fetched = self.ready(file)
         if _holds(fetched, file):
@@ -144,7 +144,7 @@ class Folder:
         fetched.unlink(missing_ok=True)  # damaged while it lay here
         return next((path for path in index.get(file.sha256, ()) if _holds(path, file)), None)
 
-    def before(self, file: File, installed: Mapping[str, File]) -> tuple[Path, str] | None:
+    def before(self, file: ManifestFile, installed: Mapping[str, ManifestFile]) -> tuple[Path, str] | None:
         """The file of this name that is installed, with its hash: a dictionary for a delta."""
         old = installed.get(file.path)
         standing = self.standing
@@ -153,7 +153,7 @@ class Folder:
         path = self.versions / standing / old.path
         return (path, old.sha256) if _holds(path, old) else None
 
-    def make_room(self, manifest: Manifest, sources: Mapping[str, Path], keep: Sequence[File] = ()) -> None:
+    def make_room(self, manifest: Manifest, sources: Mapping[str, Path], keep: Sequence[ManifestFile] = ()) -> None:
         """See that those of a manifest's files fit that are not among ``sources``, less what was fetched of them.
 
         Where they do not: without parts of other maps, then without old versions, then without what lies ready for a
@@ -175,7 +175,7 @@ class Folder:
     def _free(self) -> int:
         return shutil.disk_usage(self.path).free
 
-    def _fetched(self, file: File) -> int:
+    def _fetched(self, file: ManifestFile) -> int:
         try:
             return self.ready(file).with_suffix(".part").stat().st_size
         except OSError:
@@ -248,7 +248,7 @@ class Folder:
         link.replace(self.current)
         sync_folder(self.path)
 
-    def tidy(self, keep: Iterable[File] = ()) -> None:
+    def tidy(self, keep: Iterable[ManifestFile] = ()) -> None:
         """Remove versions beyond the kept ones, and fetched files but those to keep."""
         self._drop(KEPT)
         self._forget(keep)
@@ -283,7 +283,7 @@ class Folder:
             (self.versions / name).rename(trash)
             shutil.rmtree(trash, ignore_errors=True)
 
-    def _forget(self, keep: Iterable[File]) -> None:
+    def _forget(self, keep: Iterable[ManifestFile]) -> None:
         """Remove fetched files, and parts, but those to keep."""
         hashes = {file.sha256 for file in keep}
         for path in self.partial.iterdir():
@@ -316,7 +316,7 @@ def _root_name(name: str) -> str:
     return "-".join(name.partition(".")[0].split("-")[:2])
 
 
-def _holds(path: Path, file: File) -> bool:
+def _holds(path: Path, file: ManifestFile) -> bool:
     try:
         return path.stat().st_size == file.size and digest(path) == file.sha256
     except OSError:

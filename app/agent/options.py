@@ -9,13 +9,13 @@ from pathlib import Path
 
 from app.errors import Invalid
 from app.events import messages
-from app.events.credentials import Login
+from app.events.credentials import ZenohCredentials
 
 POLL_SECONDS = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class AgentOptions:
     """How to run.
 
     Attributes:
@@ -41,7 +41,7 @@ class Options:
     zenoh_connect: str | None = None
     zenoh_prefix: str | None = None
     zenoh_config: Path | None = None
-    zenoh_login: Login = field(default_factory=Login)
+    zenoh_login: ZenohCredentials = field(default_factory=ZenohCredentials)
     ca: Path | None = None
     before_switch: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()

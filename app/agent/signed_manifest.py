@@ -54,7 +54,7 @@ _FORBIDDEN = re.compile(
 
 
 @dataclass(frozen=True, slots=True)
-class File:
+class ManifestFile:
     """A file of a map. name: relative, with ``/`` between folders. level: name of the level that it belongs to."""
 
     format: str
@@ -93,7 +93,7 @@ class Manifest:
     version: int
     root: str
     expires: datetime
-    files: tuple[File, ...]
+    files: tuple[ManifestFile, ...]
     data: bytes
     signature: str
     variables: Mapping[str, str] = field(default_factory=dict)
@@ -132,7 +132,9 @@ def parse(data: bytes, signature: str) -> Manifest:
     """The members of a manifest, each checked; Untrusted where they are not what a manifest has."""
     try:
         body = json.loads(data)
-        files = tuple(File(f["format"], f["name"], f["size"], f["sha256"], f.get("level")) for f in body["files"])
+        files = tuple(
+            ManifestFile(f["format"], f["name"], f["size"], f["sha256"], f.get("level")) for f in body["files"]
+        )
         signed_at = body.get("time")
         expires = read_time(body["expires"])
         manifest = Manifest(
@@ -246,7 +248,7 @@ def _check_variables(variables: Mapping[str, str]) -> None:
             raise Untrusted(f"the manifest has a variable that is not handed on to a robot: {name[:80]!r}")
 
 
-def _check_paths(files: Sequence[File]) -> None:
+def _check_paths(files: Sequence[ManifestFile]) -> None:
     """No file leaves its folder, none is told twice, none is also a folder."""
     seen: set[str] = set()
     folders: set[str] = set()

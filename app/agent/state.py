@@ -37,7 +37,7 @@ class Mark(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class AgentState:
     """Persistent state.
 
     Attributes:
@@ -60,18 +60,18 @@ class State:
     working: str | None = None
     newest_time: float = 0.0
 
-    def marked(self, channel: str, mark: Mark) -> State:
+    def marked(self, channel: str, mark: Mark) -> AgentState:
         """Return the state after a manifest of this channel was accepted."""
         return dataclasses.replace(self, marks={**self.marks, channel: mark}, channel=channel)
 
 
-def load(path: Path, environment: str) -> State:
+def load(path: Path, environment: str) -> AgentState:
     """What stands there, or a fresh one; Invalid where it is of another environment or not to be read."""
     try:
         body = json.loads(path.read_bytes())
         if body["form"] not in (1, FORM):
             raise ValueError(f"it has the form {body['form']}, and this agent reads forms 1 and {FORM}")
-        state = State(
+        state = AgentState(
             environment=str(body["environment"]),
             key=base64.b64decode(body["key"]) if body.get("key") else None,
             given=body.get("given"),
@@ -92,7 +92,7 @@ def load(path: Path, environment: str) -> State:
         if not 0 <= state.newest_time <= MAX_TIME:
             raise ValueError("newest_time is not a time")
     except FileNotFoundError:
-        return State(environment)
+        return AgentState(environment)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Invalid(
             f"{path} cannot be read ({error}). Remove it to start afresh; the key is then pinned anew at first contact"
@@ -102,7 +102,7 @@ def load(path: Path, environment: str) -> State:
     return state
 
 
-def save(path: Path, state: State) -> None:
+def save(path: Path, state: AgentState) -> None:
     """Whole or not at all, also where the power goes."""
     body = {
         "form": FORM,
@@ -138,14 +138,14 @@ class StateStore:
     def __init__(self, path: Path, environment: str, free_space: Callable[[], None]) -> None:
         """Create a store. free_space: called if the disk is full, before the state is written once more."""
         self._path, self._free_space = path, free_space
-        self.value = State(environment)
+        self.value = AgentState(environment)
         self._unsaved = False
 
     def load(self) -> None:
         """Read the state from the disk. Raises Invalid."""
         self.value = load(self._path, self.value.environment)
 
-    def stage(self, state: State) -> None:
+    def stage(self, state: AgentState) -> None:
         """Replace the state; it is saved with the next call of ``keep``."""
         if state != self.value:
             self.value, self._unsaved = state, True
@@ -154,7 +154,7 @@ class StateStore:
         """Replace some attributes and save."""
         self.keep(dataclasses.replace(self.value, **changes))
 
-    def keep(self, state: State) -> None:
+    def keep(self, state: AgentState) -> None:
         """Save a state if it is new, or if the last one could not be saved."""
         self.stage(state)
         if self._unsaved:

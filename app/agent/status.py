@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from app.agent.http_client import Web
+from app.agent.http_client import ServerClient
 from app.errors import FleetMapError, Unavailable
 from app.events.messages import RobotStatus
 
@@ -40,7 +40,7 @@ class StatusReporter:
     """The newest status of the robot and where it was sent."""
 
     def __init__(
-        self, environment: str, robot: str, web: Web, stopping: threading.Event, refused: Callable[[str], None]
+        self, environment: str, robot: str, web: ServerClient, stopping: threading.Event, refused: Callable[[str], None]
     ) -> None:
         """Create a reporter. refused: called with the reason when the server does not accept a status."""
         self._environment, self._robot, self._web = environment, robot, web

@@ -18,7 +18,7 @@ from zenoh import ext
 
 from app.errors import FleetMapError
 from app.events import messages
-from app.events.credentials import Login, no_router
+from app.events.credentials import ZenohCredentials, no_router
 
 LOOK_SECONDS = 0.5
 """Between two looks whether the router is there."""
@@ -31,7 +31,7 @@ MAX_PAUSE_SECONDS = 30.0
 MAX_EVENT_BYTES = 2**18
 
 
-class Ear:
+class ZenohClient:
     """A session that is opened as soon as it can be, in a thread of its own. Methods are thread-safe.
 
     heard: called with each event of the environment. back: called when the router is there (again). lost: called with
@@ -47,10 +47,10 @@ class Ear:
         back: Callable[[], None],
         lost: Callable[[str], None] = lambda _: None,
         config: Path | None = None,
-        login: Login | None = None,
+        login: ZenohCredentials | None = None,
     ) -> None:
         self._environment, self._robot, self._heard, self._back, self._lost = environment, robot, heard, back, lost
-        self._config, self._login = config, login or Login()
+        self._config, self._login = config, login or ZenohCredentials()
         self._where: tuple[str, str] | None = None
         self._session: zenoh.Session | None = None
         self._held: list[Any] = []
@@ -189,7 +189,7 @@ class Ear:
                 _close(session)
 
 
-def configuration(connect: str, file: Path | None = None, login: Login | None = None) -> zenoh.Config:
+def configuration(connect: str, file: Path | None = None, login: ZenohCredentials | None = None) -> zenoh.Config:
     """A client of the routers at ``connect`` (separated by commas). file: Zenoh's own JSON5, for all else.
 
     Raises Invalid where a file of the login is missing.
@@ -204,7 +204,7 @@ def configuration(connect: str, file: Path | None = None, login: Login | None = 
         "listen/endpoints": [],
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
-        **(login or Login()).values(),
+        **(login or ZenohCredentials()).values(),
     }
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))

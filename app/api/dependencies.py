@@ -15,7 +15,7 @@ from app.api.auth import Authenticator
 from app.api.signed import SignedLinks
 from app.convert.maps import Maps
 from app.errors import Unavailable
-from app.fleet import Intake as FleetIntake
+from app.fleet import ReportQueue as FleetIntake
 from app.formats import Limits
 from app.ingest import Ingest
 from app.pool import Pool

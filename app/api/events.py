@@ -31,7 +31,7 @@ from app.convert.cache import MadeFile
 from app.convert.maps import file_of
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable
 from app.events import messages
-from app.events.bus import Answer, Make
+from app.events.bus import DeferredReply, Reply
 from app.store.values import Event
 
 LOOK_SECONDS = 0.02
@@ -266,7 +266,7 @@ def _line(event: Event, number: int) -> bytes:
 
 def ask(
     services: Services, max_bytes: int, environment: str, rest: str, parameters: Mapping[str, str]
-) -> Answer | Make:
+) -> Reply | DeferredReply:
     """What HTTP answers at ``/environments/{environment}/versions/{rest}``: ``{v}/version``, ``{v}/maps/{format}/…``;
     for a map that is not there, what makes it. ``server/where``: what ``/environments?contains=`` answers.
 
@@ -278,7 +278,7 @@ def ask(
     if pieces[1:] == ["version"]:
         version = services.store.version(environment, number_of(pieces[0]))
         _no_parameters(parameters)
-        return Answer(orjson.dumps(version.as_dict()), "application/json")
+        return Reply(orjson.dumps(version.as_dict()), "application/json")
     if len(pieces) < 3 or pieces[1] != "maps":
         raise NotFound("there is a version and its maps: {v}/version, {v}/maps/{format}, {v}/maps/{format}/{file}")
     values = dict(parameters)
@@ -295,7 +295,7 @@ def ask(
     return lambda: _answer_of(services.maps.fetch(version, name, values, derive=derive == "true", file=file), max_bytes)
 
 
-def _locate(services: Services, parameters: Mapping[str, str]) -> Answer:
+def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
     """The environments that a position is in, best match first, as over HTTP."""
     given = dict(parameters)
     latitude, longitude = given.pop("lat", None), given.pop("lon", None)
@@ -305,13 +305,13 @@ def _locate(services: Services, parameters: Mapping[str, str]) -> Answer:
             [Problem("lat and lon", where="parameters")],
         )
     hits, _ = services.store.locate(*position_of(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
-    return Answer(orjson.dumps([as_dict(environment, match) for environment, match in hits]), "application/json")
+    return Reply(orjson.dumps([as_dict(environment, match) for environment, match in hits]), "application/json")
 
 
-def _answer_of(file: MadeFile, max_bytes: int) -> Answer:
+def _answer_of(file: MadeFile, max_bytes: int) -> Reply:
     if file.size > max_bytes:
         raise TooLarge(f"the map has {file.size} bytes, more than is sent over Zenoh ({max_bytes}): fetch it over HTTP")
-    return Answer(file.read(), file.media_type)
+    return Reply(file.read(), file.media_type)
 
 
 def _no_parameters(parameters: Mapping[str, Any]) -> None:

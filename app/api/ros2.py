@@ -9,8 +9,8 @@ from app import formats
 from app.api.dependencies import Services
 from app.errors import CannotConvert, NotFound
 from app.events import cdr
-from app.events.ros2 import Content
-from app.events.ros_names import Chosen, namespace_of
+from app.events.ros2 import TopicContent
+from app.events.ros_names import EnvironmentSelector, namespace_of
 from app.formats import ReadContext, _yaml
 from app.model.frame import GROUND
 from app.model.grid import OccupancyGrid
@@ -21,7 +21,7 @@ PRODUCTION = "production"
 PAGE = 1000
 
 
-def standing(services: Services, chosen: tuple[Chosen, ...], channel: str) -> dict[str, Version]:
+def standing(services: Services, chosen: tuple[EnvironmentSelector, ...], channel: str) -> dict[str, Version]:
     """The chosen environments that there are, each with the version and closures that the channel shows.
 
     channel: empty for production where there is one, else the latest. Where it stands nowhere, nothing goes out.
@@ -50,7 +50,7 @@ def _all_names(services: Services) -> list[str]:
             return names
 
 
-def content(services: Services, derive: bool, version: Version) -> Content:
+def content(services: Services, derive: bool, version: Version) -> TopicContent:
     """Each level's grid, and the network. derive: also what is not stored but can be computed."""
     absent: list[str] = []
     grids: dict[str, cdr.Grid] = {}
@@ -68,7 +68,7 @@ def content(services: Services, derive: bool, version: Version) -> Content:
         except (CannotConvert, NotFound) as error:
             absent.append(f"no network: {error.detail}")
     by_level = {None if level == lowest else level: grid for level, grid in sorted(grids.items())}
-    return Content(by_level, network, tuple(absent))
+    return TopicContent(by_level, network, tuple(absent))
 
 
 def _grids(version: Version, derive: bool) -> list[dict[str, str]]:

@@ -201,7 +201,7 @@ def post_state(
     """
     may_report(principal, robot)
     out: dict[str, list[dict[str, Any]]] = {"robots": [], "ignored": []}
-    sites: dict[str, list[vda5050.Maps]] = {}
+    sites: dict[str, list[vda5050.VehicleMaps]] = {}
     for maps in vda5050.read_state(message):
         if map_id in (None, maps.map_id, vda5050.site_of(maps.map_id)):
             sites.setdefault(vda5050.site_of(maps.map_id), []).append(maps)
@@ -217,7 +217,7 @@ def _take(
     services: Services,
     principal: Principal,
     robot: str,
-    floors: list[vda5050.Maps],
+    floors: list[vda5050.VehicleMaps],
     env: str,
     channel: str | None,
     out: dict[str, list[dict[str, Any]]],
@@ -249,7 +249,7 @@ def _take(
         out["robots"].append(body)
 
 
-def _states(maps: vda5050.Maps, channel: Channel | None) -> list[tuple[RobotState, str, str | None]]:
+def _states(maps: vda5050.VehicleMaps, channel: Channel | None) -> list[tuple[RobotState, str, str | None]]:
     """What a vehicle is told to have said: (state, version, detail), what it drives on first."""
     planned = None if channel is None or channel.planned is None else str(channel.planned.version)
     targets = {planned, None if channel is None or channel.version is None else str(channel.version)} - {None}

@@ -157,11 +157,11 @@ def agent(
 
     Example: `fleetmap agent -e farm -f occupancy_grid,tmap2 -o /srv/maps --channel production --on-change nav2`
     """
-    from app.agent.agent import Agent, Options, robot_name
+    from app.agent.agent import Agent, AgentOptions, robot_name
     from app.agent.requests import parse_formats
     from app.cli.client import DEFAULT_SERVER
     from app.errors import Invalid
-    from app.events.credentials import Login
+    from app.events.credentials import ZenohCredentials
 
     names = parse_formats(formats)
     if not names:
@@ -169,7 +169,7 @@ def agent(
 
     tell = _logger(as_json=as_json)
     agent = Agent(
-        Options(
+        AgentOptions(
             server=server or DEFAULT_SERVER,
             environment=environment,
             formats=names,
@@ -185,7 +185,7 @@ def agent(
             zenoh_connect=zenoh_connect or None,
             zenoh_prefix=zenoh_prefix or None,
             zenoh_config=zenoh_config,
-            zenoh_login=Login(
+            zenoh_login=ZenohCredentials(
                 zenoh_ca,
                 zenoh_certificate,
                 zenoh_key,

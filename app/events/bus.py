@@ -26,7 +26,7 @@ from app.errors import Invalid, Problem, Unavailable
 from app.events import messages
 from app.events.credentials import no_router, plain
 from app.events.router import Router
-from app.events.security import Security
+from app.events.security import RouterSecurity
 
 log = logging.getLogger(__name__)
 
@@ -65,29 +65,29 @@ class BusOptions:
     prefix: str = messages.PREFIX
     config: Path | None = None
     max_reply_bytes: int = 64 * 2**20
-    security: Security = field(default_factory=Security)
+    security: RouterSecurity = field(default_factory=RouterSecurity)
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Reply:
     """What a query is answered with."""
 
     payload: bytes
     encoding: str
 
 
-Make = Callable[[], Answer]
+DeferredReply = Callable[[], Reply]
 
-Ask = Callable[[str, str, Mapping[str, str]], Answer | Make]
+QueryHandler = Callable[[str, str, Mapping[str, str]], Reply | DeferredReply]
 """(environment, the key after it, parameters) -> the answer, or what takes long and then gives it. Either may raise."""
 
-Explain = Callable[[Exception], bytes]
+ErrorEncoder = Callable[[Exception], bytes]
 """What went wrong -> the problem's JSON, as it is told over HTTP."""
 
 OnStatus = Callable[[str, str, bytes], None]
 """(environment, robot, payload). It must return at once."""
 
-OnAlive = Callable[[str, bool], None]
+OnLiveliness = Callable[[str, bool], None]
 """(robot, whether its session is there). It must return at once."""
 
 
@@ -169,7 +169,13 @@ class Bus:
     """One session, opened again where it breaks. All methods are thread-safe."""
 
     def __init__(
-        self, options: BusOptions, *, ask: Ask, explain: Explain, on_status: OnStatus, on_alive: OnAlive
+        self,
+        options: BusOptions,
+        *,
+        ask: QueryHandler,
+        explain: ErrorEncoder,
+        on_status: OnStatus,
+        on_alive: OnLiveliness,
     ) -> None:
         self.options = options
         self._ask, self._explain, self._on_status, self._on_alive = ask, explain, on_status, on_alive
@@ -343,18 +349,18 @@ class Bus:
         except Exception:
             log.exception("a message over Zenoh could not be taken")
 
-    def _look(self, query: zenoh.Query) -> Answer | Make:
+    def _look(self, query: zenoh.Query) -> Reply | DeferredReply:
         key = str(query.key_expr)
         if "*" in key:
             raise Invalid("query one key at a time: a key without wildcards")
         environment, _, rest = key.removeprefix(self.options.prefix + "/").partition("/")
         return self._ask(environment, rest, _parameters(query))
 
-    def _answer(self, query: zenoh.Query, find: Callable[[zenoh.Query], Answer | Make]) -> None:
+    def _answer(self, query: zenoh.Query, find: Callable[[zenoh.Query], Reply | DeferredReply]) -> None:
         """In a thread of ours: what ``find`` finds is the answer, or is left to the makers."""
         try:
             reply = find(query)
-            if not isinstance(reply, Answer):
+            if not isinstance(reply, Reply):
                 make = reply
                 self._submit(self._makers, query, lambda _: make())
                 return

@@ -16,7 +16,7 @@ PROBE_SECONDS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Login:
+class ZenohCredentials:
     """ca: whom to trust, PEM; without it, public certification authorities. certificate and key: shown where the router
     asks for them, PEM. user and password: as the router knows them."""
 
@@ -71,7 +71,7 @@ def _show(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
         raise Invalid(f"{certificate} and {key} are no certificate and its unencrypted key (PEM): {error}") from error
 
 
-def no_router(hosts: str, error: Exception, login: Login, *, names: bool = True) -> str:
+def no_router(hosts: str, error: Exception, login: ZenohCredentials, *, names: bool = True) -> str:
     """Why nobody was reached at ``hosts``: what TLS has against it, of which Zenoh does not tell, else what Zenoh says.
 
     hosts: endpoints, separated by commas; the first is asked. names: whether its certificate has to name it.
@@ -84,7 +84,7 @@ def plain(text: str) -> str:
     return re.sub(r",? at /\S+", "", text.splitlines()[0] if text else "")[:300]
 
 
-def _objection(endpoints: str, login: Login, *, names: bool) -> str | None:
+def _objection(endpoints: str, login: ZenohCredentials, *, names: bool) -> str | None:
     match = re.fullmatch(r"tls/\[?([^#?]+?)\]?:(\d+)(?:[#?].*)?", endpoints.split(",", maxsplit=1)[0].strip())
     if match is None:
         return None

@@ -20,7 +20,7 @@ POLL_SECONDS = 1.0
 """How often the others look whether they are needed, and how long a pause is after something went wrong."""
 
 
-class Single(ABC):
+class LeaderThread(ABC):
     """It does rounds while it holds the lock ``NAME.lock``, and says in ``NAME.json`` how it stands, for all processes.
 
     well, trouble: what the log says when it is connected, and when it is down.

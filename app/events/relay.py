@@ -13,7 +13,7 @@ from typing import Any
 
 from app.events import leader
 from app.events.bus import HISTORY, Bus
-from app.events.leader import POLL_SECONDS, Single
+from app.events.leader import POLL_SECONDS, LeaderThread
 from app.store.store import Store
 from app.store.values import Event
 
@@ -27,7 +27,7 @@ REPLAYED = 20_000
 NAME = "events"
 
 
-class Relay(Single):
+class Relay(LeaderThread):
     """A thread that publishes what the outbox holds."""
 
     def __init__(self, store: Store, bus: Bus, data_dir: Path) -> None:

@@ -26,8 +26,8 @@ from zenoh import ext
 from app.errors import FleetMapError
 from app.events import cdr, leader, ros_names
 from app.events.bus import BusOptions, no_connection, session_configuration
-from app.events.leader import POLL_SECONDS, Single
-from app.events.ros_names import Chosen, Keys, Topic
+from app.events.leader import POLL_SECONDS, LeaderThread
+from app.events.ros_names import EnvironmentSelector, Keys, Topic
 from app.store.values import Version
 
 log = logging.getLogger(__name__)
@@ -50,13 +50,13 @@ NAME = "ros2"
 class Ros2Options:
     """What goes out, and on whose keys."""
 
-    chosen: tuple[Chosen, ...]
+    chosen: tuple[EnvironmentSelector, ...]
     keys: tuple[Keys, ...] = ("rmw_zenoh", "ros2dds")
     domain: int = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Content:
+class TopicContent:
     """What an environment has to say. grids: by level, None for the lowest. network: the tmap2 as JSON. absent: why
     something is not there, for the log."""
 
@@ -65,14 +65,14 @@ class Content:
     absent: tuple[str, ...] = ()
 
 
-Look = Callable[[], Mapping[str, Version]]
+LookUpVersions = Callable[[], Mapping[str, Version]]
 """The chosen environments, each with the version that its channel stands on."""
 
-Fetch = Callable[[Version], Content]
+Fetch = Callable[[Version], TopicContent]
 """What is in a version. Raises FleetMapError where it cannot be had now."""
 
 
-class Publisher:
+class TopicPublisher:
     """A topic on one kind of keys. It is detected and keeps its last message as long as it is held."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, style: Keys, domain: int, entity: int) -> None:
@@ -115,10 +115,10 @@ class Publisher:
 
 
 @dataclass(slots=True)
-class _Out:
+class _Topic:
     """A topic on all its keys, and what was said last."""
 
-    publishers: Sequence[Publisher]
+    publishers: Sequence[TopicPublisher]
     last: cdr.Grid | str | None = None
 
     def put(self, payload: bytes) -> None:
@@ -132,17 +132,17 @@ class _Out:
 
 
 @dataclass(slots=True)
-class _Place:
+class _PublishedEnvironment:
     """An environment: root and closures' digest that were published, and its topics by name. retry: when it is
     published again after a failure.
     """
 
     shown: tuple[str, str] = ("", "")
-    topics: dict[str, _Out] = field(default_factory=dict)
+    topics: dict[str, _Topic] = field(default_factory=dict)
     retry: float | None = None
 
 
-class Ros2(Single):
+class Ros2Publisher(LeaderThread):
     """The thread. One process of a data folder publishes (it holds a file lock); where it dies, another takes over."""
 
     def __init__(
@@ -152,7 +152,7 @@ class Ros2(Single):
         data_dir: Path,
         *,
         generation: Callable[[], int],
-        look: Look,
+        look: LookUpVersions,
         fetch: Fetch,
     ) -> None:
         super().__init__(data_dir, NAME, well="maps go out to ROS 2", trouble="NOTHING GOES OUT TO ROS 2")
@@ -161,7 +161,7 @@ class Ros2(Single):
         self._session: zenoh.Session | None = None
         self._node: Any = None
         self._entities = 0
-        self._places: dict[str, _Place] = {}
+        self._places: dict[str, _PublishedEnvironment] = {}
         self._owners: dict[str, str] = {}
 
     def _round(self) -> None:
@@ -214,7 +214,7 @@ class Ros2(Single):
         for name, version in standing.items():
             if self._ending.is_set():
                 return
-            place = self._places.setdefault(name, _Place())
+            place = self._places.setdefault(name, _PublishedEnvironment())
             waits = place.retry is not None and time.monotonic() < place.retry
             shown = (version.root, version.closures.digest if version.closures else "")
             if place.shown == shown and (place.retry is None or waits):
@@ -233,7 +233,7 @@ class Ros2(Single):
                 log.warning("ROS 2: %s, version %d: %s", name, version.number, reason)
             self._publish(name, place, version, content)
 
-    def _publish(self, name: str, place: _Place, version: Version, content: Content) -> None:
+    def _publish(self, name: str, place: _PublishedEnvironment, version: Version, content: TopicContent) -> None:
         namespace = ros_names.namespace_of(name, self._options.chosen)
         assert namespace is not None
         topic_names: set[str] = set()
@@ -269,7 +269,7 @@ class Ros2(Single):
                     log.info("ROS 2: %s is version %d of %s", topic.name, version.number, name)
         self._retire(name, topic_names)
 
-    def _out(self, name: str, place: _Place, topic: Topic) -> _Out | None:
+    def _out(self, name: str, place: _PublishedEnvironment, topic: Topic) -> _Topic | None:
         """The topic, declared; None where another environment has it."""
         existing_topic = place.topics.get(topic.name)
         if existing_topic is not None:
@@ -282,8 +282,8 @@ class Ros2(Single):
         publishers = []
         for style in self._options.keys:
             self._entities += 1
-            publishers.append(Publisher(self._session, topic, style, self._options.domain, self._entities))
-        new_topic = _Out(publishers)
+            publishers.append(TopicPublisher(self._session, topic, style, self._options.domain, self._entities))
+        new_topic = _Topic(publishers)
         place.topics[topic.name] = new_topic
         self._owners[topic.name] = name
         return new_topic

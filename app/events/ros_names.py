@@ -122,7 +122,7 @@ def token(text: str, before: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class EnvironmentSelector:
     """Environments that go out: a name or a pattern, and their namespace (None: ``/`` and the environment's name)."""
 
     pattern: str
@@ -134,12 +134,12 @@ class Chosen:
         return not any(c in self.pattern for c in "*?")
 
 
-def parse_chosen(text: str) -> tuple[Chosen, ...]:
+def parse_chosen(text: str) -> tuple[EnvironmentSelector, ...]:
     """``farm, hall=/site/hall, north-*`` as a setting says it. ValueError says what is wrong."""
     out = []
     for piece in filter(None, (part.strip() for part in text.split(","))):
         name, equals, namespace = (part.strip() for part in piece.partition("="))
-        chosen = Chosen(name, namespace if equals else None)
+        chosen = EnvironmentSelector(name, namespace if equals else None)
         if not _PATTERN.fullmatch(name):
             raise ValueError(f"{name!r} is neither an environment's name nor a pattern of such")
         if chosen.namespace is not None:
@@ -165,7 +165,7 @@ def parse_keys(text: str) -> tuple[Keys, ...]:
     return tuple(key for key in KEYS if key in names)
 
 
-def namespace_of(environment: str, chosen: Iterable[Chosen]) -> str | None:
+def namespace_of(environment: str, chosen: Iterable[EnvironmentSelector]) -> str | None:
     """The namespace of an environment: that of the first entry that names or matches it; None where none does."""
     for entry in chosen:
         if fnmatchcase(environment, entry.pattern):

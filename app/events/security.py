@@ -18,7 +18,7 @@ from typing import Any
 
 from app.errors import Invalid, Problem
 from app.events import messages
-from app.events.credentials import Login, file_of
+from app.events.credentials import ZenohCredentials, file_of
 
 SERVER = "server"
 """The user that the server itself is on its own router."""
@@ -33,14 +33,14 @@ SAID = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
 
 
 @dataclass(frozen=True, slots=True)
-class Security:
+class RouterSecurity:
     """What an operator sets. login: of the server at somebody else's router, and of its own router at others.
 
     certificate and key of the login are what a router of our own shows, too. mutual: robots must show a certificate
     that the login's ca has signed. users: a file of ``name:password`` lines. folder: for what is kept between starts.
     """
 
-    login: Login = field(default_factory=Login)
+    login: ZenohCredentials = field(default_factory=ZenohCredentials)
     mutual: bool = False
     users: Path | None = None
     folder: Path = Path()

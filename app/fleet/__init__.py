@@ -4,15 +4,15 @@
 comes over the bus, in order, into the store.
 """
 
-from app.fleet.report_queue import NOTE_SECONDS, Intake, report_of, settle
+from app.fleet.report_queue import NOTE_SECONDS, ReportQueue, report_of, settle
 from app.fleet.rollout import decide
-from app.fleet.status import Holding, Lag, holding, is_online, lag_of
+from app.fleet.status import ChannelConvergence, Lag, holding, is_online, lag_of
 
 __all__ = [
     "NOTE_SECONDS",
-    "Holding",
-    "Intake",
+    "ChannelConvergence",
     "Lag",
+    "ReportQueue",
     "decide",
     "holding",
     "is_online",

@@ -50,14 +50,14 @@ def report_of(status: RobotStatus) -> Report:
 
 
 @dataclass(frozen=True, slots=True)
-class _Said:
+class _QueuedReport:
     """A report that waits. told: who waits to be told whether it was taken, None for what came over the bus."""
 
     heard: Heard
     told: Future[FleetMapError | None] | None = None
 
 
-class Intake:
+class ReportQueue:
     """Reports and liveliness. ``heard`` and ``alive`` return at once, ``note`` when it is stored; a thread writes.
 
     bus_vouches: whether reports over the bus come with authority, because its router lets nobody in but its users.
@@ -67,7 +67,7 @@ class Intake:
         self, store: Store, clock: Callable[[], datetime] = lambda: datetime.now(UTC), *, bus_vouches: bool = False
     ) -> None:
         self._store, self._clock, self._bus_vouches = store, clock, bus_vouches
-        self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _Said | None] = queue.Queue(WAITING)
+        self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _QueuedReport | None] = queue.Queue(WAITING)
         self._shares: Counter[str] = Counter()
         self._there: set[str] = set()
         self._gone: set[str] = set()
@@ -115,7 +115,7 @@ class Intake:
         if self._thread is None or self._ending.is_set():
             raise Unavailable("the server is starting or stopping: try again in a few seconds")
         try:
-            self._queue.put_nowait(_Said(heard, result))
+            self._queue.put_nowait(_QueuedReport(heard, result))
         except queue.Full:
             raise Unavailable("too many reports of robots wait: try again in a few seconds") from None
         return result
@@ -138,7 +138,7 @@ class Intake:
 
     def _run(self) -> None:
         renewed = time.monotonic()
-        batch: list[_Said] = []
+        batch: list[_QueuedReport] = []
         while True:
             batch += self._take(RENEW_SECONDS / 3 if not batch else 0.0, BATCH - len(batch))
             renew = time.monotonic() - renewed > RENEW_SECONDS
@@ -160,8 +160,8 @@ class Intake:
             if self._ending.is_set() and self._queue.empty():
                 return
 
-    def _take(self, seconds: float, limit: int) -> list[_Said]:
-        out: list[_Said] = []
+    def _take(self, seconds: float, limit: int) -> list[_QueuedReport]:
+        out: list[_QueuedReport] = []
         refused: list[str] = []
         deadline = time.monotonic() + seconds
         for _ in range(limit):
@@ -172,7 +172,7 @@ class Intake:
                 break
             if item is None:
                 break
-            if isinstance(item, _Said):
+            if isinstance(item, _QueuedReport):
                 out.append(item)
                 continue
             environment, robot, payload, came = item
@@ -181,7 +181,7 @@ class Intake:
                 if not self._shares[robot]:
                     del self._shares[robot]
             try:
-                out.append(_Said(_read(environment, robot, payload, came, vouched=self._bus_vouches)))
+                out.append(_QueuedReport(_read(environment, robot, payload, came, vouched=self._bus_vouches)))
             except FleetMapError as error:
                 refused.append(f"a report of {robot!r:.128} in {environment!r:.64} was left out: {error.detail}")
         _warn(refused)
@@ -190,7 +190,7 @@ class Intake:
             self._lost = 0
         return out
 
-    def _write(self, batch: list[_Said]) -> None:
+    def _write(self, batch: list[_QueuedReport]) -> None:
         if not batch:
             return
         unheard: list[str] = []
@@ -200,7 +200,7 @@ class Intake:
             _tell(queued, refused)
         _warn(unheard)
 
-    def _write_each(self, batch: list[_Said]) -> list[_Said]:
+    def _write_each(self, batch: list[_QueuedReport]) -> list[_QueuedReport]:
         """Each on its own, so that one that cannot be taken harms no other; those for which the database is away."""
         left = []
         for queued in batch:
@@ -236,7 +236,7 @@ def settle(result: Future[FleetMapError | None], seconds: float = 0.0) -> None:
         raise refused
 
 
-def _tell(queued: _Said, refused: FleetMapError | None) -> None:
+def _tell(queued: _QueuedReport, refused: FleetMapError | None) -> None:
     if queued.told is not None and not queued.told.done():
         queued.told.set_result(refused)
 

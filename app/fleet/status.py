@@ -68,7 +68,7 @@ def lag_of(robot: Robot, channel: Channel, moves: Sequence[Move]) -> Lag:
 
 
 @dataclass(frozen=True, slots=True)
-class Holding:
+class ChannelConvergence:
     """How a channel's robots stand: each is one of holding, failed and lagging.
 
     holding: drive on the channel's root with the closures in force. failed: do not, and say that they failed. ready:
@@ -103,7 +103,7 @@ def is_ready(robot: Robot, root: str) -> bool:
     return loaded or (robot.held is not None and robot.held.root == root)
 
 
-def holding(robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None) -> Holding:
+def holding(robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None) -> ChannelConvergence:
     """The proof of convergence of one channel. robots: of its environment; planned: root of what comes next."""
     channel_robots = [robot for robot in robots if robot.report.channel == channel.name]
     overlays = channel.closures.digest
@@ -114,7 +114,7 @@ def holding(robots: Iterable[Robot], channel: Channel, now: datetime, planned: s
         else:
             behind.append(robot)
     failed = sum(robot.report.state == "failed" for robot in behind)
-    return Holding(
+    return ChannelConvergence(
         total=len(channel_robots),
         online=sum(is_online(robot, now) for robot in channel_robots),
         holding=len(hold),

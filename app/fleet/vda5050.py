@@ -42,7 +42,7 @@ def action(kind: Action, map_id: str, version: int, unique: str, **more: str) ->
 
 
 @dataclass(frozen=True, slots=True)
-class Maps:
+class VehicleMaps:
     """What a state says of one map: versions by what they are. failed: of actions of ours that failed, and why."""
 
     map_id: str
@@ -69,7 +69,7 @@ def site_of(map_id: str) -> str:
     return map_id.partition("/")[0]
 
 
-def whole_site(floors: Sequence[Maps]) -> Maps:
+def whole_site(floors: Sequence[VehicleMaps]) -> VehicleMaps:
     """What a vehicle holds of a site, from what its state says of each floor.
 
     It runs the oldest version that is enabled on a floor, has those that it has of every floor that it reports, and
@@ -81,7 +81,7 @@ def whole_site(floors: Sequence[Maps]) -> Maps:
     enabled = sorted({v for floor in floors for v in floor.enabled}, key=_age)[:1]
     loaded = [v for v in (*first.enabled, *first.disabled) if all(v in (*o.enabled, *o.disabled) for o in others)]
     failed = dict(pair for floor in floors for pair in floor.failed)
-    return Maps(
+    return VehicleMaps(
         site_of(first.map_id), tuple(enabled), tuple(v for v in loaded if v not in enabled), tuple(failed.items())
     )
 
@@ -92,7 +92,7 @@ def _age(version: str) -> tuple[bool, int, str]:
     return not number, int(version) if number else 0, version
 
 
-def read_state(message: Any) -> tuple[Maps, ...]:
+def read_state(message: Any) -> tuple[VehicleMaps, ...]:
     """The maps of a state message, by id; what it does not speak of is not there. Invalid says what is wrong with it.
 
     A download that failed and whose map is there all the same was followed by one that did not fail.
@@ -118,7 +118,8 @@ def read_state(message: Any) -> tuple[Maps, ...]:
         failed.setdefault(map_id, []).append((version, why))
     names = sorted(enabled.keys() | disabled.keys() | failed.keys())
     return tuple(
-        Maps(n, tuple(enabled.get(n, ())[:1]), tuple(disabled.get(n, ())), tuple(failed.get(n, ()))) for n in names
+        VehicleMaps(n, tuple(enabled.get(n, ())[:1]), tuple(disabled.get(n, ())), tuple(failed.get(n, ())))
+        for n in names
     )
 
 

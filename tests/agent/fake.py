@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, unquote
 
-from app.agent.agent import Agent, Options
+from app.agent.agent import Agent, AgentOptions
 from app.signing import Keys
 
 PLACE = "field"
@@ -220,7 +220,7 @@ class One:
     ) -> None:
         self.into = into
         self.lines: list[dict[str, Any]] = []
-        options = Options(fake.url, PLACE, formats, into, robot="robot", on_change=on_change, **more)
+        options = AgentOptions(fake.url, PLACE, formats, into, robot="robot", on_change=on_change, **more)
         self.agent = Agent(options, lambda event, **members: self.lines.append({"event": event, **members}), clock)
 
     def once(self) -> bool:

@@ -13,7 +13,7 @@ import pytest
 from backports import zstd
 
 from app.agent import signed_manifest
-from app.agent.agent import Agent, Options
+from app.agent.agent import Agent, AgentOptions
 from app.errors import Untrusted
 from app.signing import Keys, key_id
 from tests.agent.conftest import Gate, network, whole
@@ -31,7 +31,7 @@ class Once:
         self.into = into
         self.lines: list[dict[str, Any]] = []
         agent = Agent(
-            Options(
+            AgentOptions(
                 server=server, environment=env, formats=("tmap2",), into=into, robot=into.name, token=ADMIN, key=key
             ),
             lambda event, **members: self.lines.append({"event": event, **members}),

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from app.agent.agent import Agent, Options
+from app.agent.agent import Agent, AgentOptions
 from app.signing import Keys
 from tests.agent.conftest import Gate, network, whole
 from tests.agent.test_attacks import signed
@@ -26,7 +26,7 @@ def agent(place: str, gate: Gate, tmp_path: Path) -> Iterator[Make]:
     agents: list[Agent] = []
 
     def make(fast: float) -> Agent:
-        options = Options(gate.url, place, ("tmap2",), tmp_path / "robot", token=ADMIN, robot="robot")
+        options = AgentOptions(gate.url, place, ("tmap2",), tmp_path / "robot", token=ADMIN, robot="robot")
         one = Agent(options, lambda *_, **__: None, clock=lambda: time.time() + fast)
         one.open()
         agents.append(one)

@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 
 from app.agent import agent, http_client, map_directory
-from app.agent.zenoh_client import Ear
+from app.agent.zenoh_client import ZenohClient
 from app.errors import Conflict, Invalid
 from app.events import messages
 from tests.agent.conftest import ROOT, whole
@@ -394,7 +394,7 @@ def test_a_mistake_of_ours_is_told_and_gone_on_from(fake: Fake, robot: Robot, mo
     assert robot().once()
     fake.put(B)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(map_directory.Folder, "build", wrong)
+        patch.setattr(map_directory.MapDirectory, "build", wrong)
         one = robot(poll_seconds=3600.0)
         with run(one):
             eventually(lambda: one.saw("failed"))
@@ -481,7 +481,7 @@ def test_old_parts_and_versions_make_room(fake: Fake, robot: Robot, monkeypatch:
         inodes |= {p.stat().st_ino: p.stat().st_size for p in (path / "partial").iterdir()}
         return sum(inodes.values())
 
-    monkeypatch.setattr(map_directory.Folder, "_free", lambda self: room - used(self.path))
+    monkeypatch.setattr(map_directory.MapDirectory, "_free", lambda self: room - used(self.path))
     monkeypatch.setattr(map_directory, "CHUNK", 0)
     assert robot().once()  # 5000 bytes
     fake.put(B)
@@ -718,7 +718,7 @@ def test_it_says_why_it_hears_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zenoh_client, "CONNECT_MS", 100)
     problems: list[str] = []
     port = free_port()
-    one = Ear(PLACE, "robot", heard=lambda _: None, back=lambda: None, lost=problems.append)
+    one = ZenohClient(PLACE, "robot", heard=lambda _: None, back=lambda: None, lost=problems.append)
     try:
         one.aim(f"tcp/127.0.0.1:{port}", "fleetmap")
         eventually(lambda: problems)

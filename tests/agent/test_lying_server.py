@@ -18,7 +18,7 @@ import pytest
 
 from app.agent import agent, freshness, http_client
 from app.agent.signed_manifest import MAX_SEQUENCE_AHEAD
-from app.agent.state import Mark, State, load, save
+from app.agent.state import AgentState, Mark, load, save
 from app.errors import Conflict
 from app.signing import Keys
 from tests.agent.conftest import whole
@@ -369,7 +369,7 @@ def test_endorsed_key_resets_the_marks(fake: Fake, robot: Robot) -> None:
 
 
 def test_state_survives(tmp_path: Path) -> None:
-    state = State("field", marks={"latest": Mark(2, 7, "0" * 64)}, working="1-abc", newest_time=12.5)
+    state = AgentState("field", marks={"latest": Mark(2, 7, "0" * 64)}, working="1-abc", newest_time=12.5)
     save(tmp_path / "state.json", state)
     assert load(tmp_path / "state.json", "field") == state
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from app.agent.agent import Agent, Options
+from app.agent.agent import Agent, AgentOptions
 from app.errors import Invalid
-from app.events.credentials import Login
+from app.events.credentials import ZenohCredentials
 from tests.agent.conftest import ROOT, Robot, network
 from tests.api.conftest import ADMIN, Api, running, settings_for
 from tests.certificates import Authority
@@ -120,13 +120,16 @@ def test_what_an_agent_is_given_is_looked_at_first(authority: Authority, tmp_pat
     cases: list[tuple[dict[str, Any], str]] = [
         ({"ca": missing_file}, "gone.pem"),
         ({"ca": key}, "no certificate of a certification authority"),
-        ({"zenoh_login": Login(ca=missing_file)}, "gone.pem cannot be read"),
-        ({"zenoh_login": Login(certificate=authority.pem)}, "needs its key"),
-        ({"zenoh_login": Login(user="tractor")}, "needs a password"),
+        ({"zenoh_login": ZenohCredentials(ca=missing_file)}, "gone.pem cannot be read"),
+        ({"zenoh_login": ZenohCredentials(certificate=authority.pem)}, "needs its key"),
+        ({"zenoh_login": ZenohCredentials(user="tractor")}, "needs a password"),
     ]
     for more, reason in cases:
         with pytest.raises(Invalid, match=reason):
-            Agent(Options("https://127.0.0.1:1", "farm", ("tmap2",), tmp_path / "robot", **more), lambda *_, **__: None)
+            Agent(
+                AgentOptions("https://127.0.0.1:1", "farm", ("tmap2",), tmp_path / "robot", **more),
+                lambda *_, **__: None,
+            )
 
 
 def test_the_command_line_over_https(secure: Api, authority: Authority) -> None:

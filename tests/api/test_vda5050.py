@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from app.errors import Invalid
-from app.fleet.vda5050 import Maps, read_state, whole_site
+from app.fleet.vda5050 import VehicleMaps, read_state, whole_site
 from tests.api import samples
 from tests.api.conftest import Api
 
@@ -139,10 +139,10 @@ def test_floors_count_together(api: Api, tower: str) -> None:
 
 
 def test_whole_site_of_floors() -> None:
-    floors = (Maps("a", ("9",), ("10",), ()), Maps("a/L2", ("10",), ("9", "x"), (("11", "no room"),)))
-    assert whole_site(floors) == Maps("a", ("9",), ("10",), (("11", "no room"),))
+    floors = (VehicleMaps("a", ("9",), ("10",), ()), VehicleMaps("a/L2", ("10",), ("9", "x"), (("11", "no room"),)))
+    assert whole_site(floors) == VehicleMaps("a", ("9",), ("10",), (("11", "no room"),))
     assert whole_site(floors[1:]) == floors[1]
-    assert whole_site((Maps("a", ("x",), (), ()), Maps("a/b", ("2",), (), ()))).enabled == ("2",)
+    assert whole_site((VehicleMaps("a", ("x",), (), ()), VehicleMaps("a/b", ("2",), (), ()))).enabled == ("2",)
 
 
 def test_a_state_is_a_status(api: Api, farm: str) -> None:
@@ -212,8 +212,8 @@ def test_a_state_with_nulls() -> None:
         {"actionId": "downloadMap:a:1:9", "actionStatus": "FAILED", "resultDescription": "a first try"},
     ]
     assert read_state({**maps("a", ("1", "DISABLED")), "actionStates": states}) == (
-        Maps("a", (), ("1",), ()),
-        Maps("x:y", (), (), (("7", "the vehicle does not say why"),)),
+        VehicleMaps("a", (), ("1",), ()),
+        VehicleMaps("x:y", (), (), (("7", "the vehicle does not say why"),)),
     )
 
 
@@ -236,8 +236,8 @@ def test_a_state_of_3_0() -> None:
     ]
     message = maps("a", ("1", "ENABLED"), instantActionStates=states, errors=errors, zoneActionStates=None)
     assert read_state(message) == (
-        Maps("a", ("1",), (), (("3", "404"), ("4", "no room"))),
-        Maps("b", (), (), (("6", "the vehicle does not say why"), ("7", "UNKNOWN_MAP_ID"))),
+        VehicleMaps("a", ("1",), (), (("3", "404"), ("4", "no room"))),
+        VehicleMaps("b", (), (), (("6", "the vehicle does not say why"), ("7", "UNKNOWN_MAP_ID"))),
     )
 
 
@@ -247,4 +247,4 @@ def test_real_states(path: Path) -> None:
     message = json.loads(path.read_text())
     assert read_state(message) == ()
     message["maps"] = maps("a", ("1", "ENABLED"))["maps"]
-    assert read_state(message) == (Maps("a", ("1",), (), ()),)
+    assert read_state(message) == (VehicleMaps("a", ("1",), (), ()),)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from app.agent.agent import Agent, Options
+from app.agent.agent import Agent, AgentOptions
 
 FARM = "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config"
 
@@ -50,7 +50,9 @@ def _cost(
 ) -> int:
     events: list[tuple[str, dict[str, Any]]] = []
     with tempfile.TemporaryDirectory() as folder:
-        options = Options(server=server, environment=env, formats=(kind,), into=Path(folder) / "robot", token=token)
+        options = AgentOptions(
+            server=server, environment=env, formats=(kind,), into=Path(folder) / "robot", token=token
+        )
         upload(env, before)
         agent = Agent(options, lambda event, **more: events.append((event, more)))
         agent.open()

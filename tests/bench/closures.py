@@ -18,7 +18,7 @@ from typing import Any
 import httpx
 
 from app.agent.agent import Agent
-from app.agent.options import Options
+from app.agent.options import AgentOptions
 from app.events import messages
 from tests.bench import http
 from tests.bench.events import ENVIRONMENT, TOKEN, served
@@ -147,7 +147,7 @@ def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> 
         robot = f"robot-{k}"
         into = Path(folder) / robot
         into.mkdir(parents=True, exist_ok=True)
-        options = Options(
+        options = AgentOptions(
             server=server,
             environment=ENVIRONMENT,
             formats=("tmap2",),

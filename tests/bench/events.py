@@ -25,7 +25,7 @@ import httpx
 import zenoh
 from zenoh import ext
 
-from app.agent.agent import Agent, Options
+from app.agent.agent import Agent, AgentOptions
 from app.derive import _native
 from app.events import messages
 from app.events.bus import BusOptions, router_configuration
@@ -210,7 +210,7 @@ def put(port: int, count: int, size: int) -> None:
 class Light(Agent):
     """An agent that notes the sequences that it hears."""
 
-    def __init__(self, options: Options, say: Any) -> None:
+    def __init__(self, options: AgentOptions, say: Any) -> None:
         self.heard: list[int] = []
         super().__init__(options, say)
 
@@ -237,7 +237,7 @@ def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> 
     agents, threads = [], []
     for k in range(first, first + count):
         robot = f"robot-{k}"
-        options = Options(
+        options = AgentOptions(
             server=server,
             environment=ENVIRONMENT,
             formats=("tmap2",),

@@ -13,7 +13,7 @@ import pytest
 import zenoh
 
 from app.errors import Unavailable
-from app.fleet import Intake
+from app.fleet import ReportQueue
 from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api
@@ -119,7 +119,7 @@ def test_reports_wait_for_a_database_that_is_away(api: Api, monkeypatch: pytest.
         return note(batch)
 
     monkeypatch.setattr(store, "note_reports", away)
-    intake = Intake(store)
+    intake = ReportQueue(store)
     intake.start()
     intake.heard("farm", "r1", said(1))
     intake.heard("farm", "r1", said(2))
@@ -136,7 +136,7 @@ def test_what_comes_too_fast_is_told(
     monkeypatch.setattr("app.fleet.report_queue.WAITING", 2)
     store: Store = api.app.state.services.store
     store.create_environment("farm")
-    intake = Intake(store)
+    intake = ReportQueue(store)
     for n in range(5):
         intake.heard("farm", "r1", said(n))
     intake.start()
@@ -152,7 +152,7 @@ def test_who_says_too_much_displaces_nobody(
     monkeypatch.setattr("app.fleet.report_queue.WAITING", 20)
     store: Store = api.app.state.services.store
     store.create_environment("farm")
-    intake = Intake(store)
+    intake = ReportQueue(store)
     for n in range(100):
         intake.heard("farm", "loud", said(n))
         intake.heard("nowhere", "lost", said(n))
@@ -175,7 +175,7 @@ def test_nonsense_keeps_nothing_from_being_renewed(
     """Who was there stays there while somebody else never stops."""
     monkeypatch.setattr("app.fleet.report_queue.RENEW_SECONDS", 0.2)
     store: Store = api.app.state.services.store
-    intake, renewed, stop = Intake(store), [], threading.Event()
+    intake, renewed, stop = ReportQueue(store), [], threading.Event()
     monkeypatch.setattr(store, "note_presence", lambda on_bus, absent, now: renewed.append(on_bus))
     intake.alive("calm", on_bus=True)
 

@@ -26,8 +26,8 @@ from zenoh import ext
 from app.errors import Unavailable
 from app.events import cdr, ros_names
 from app.events.bus import BusOptions, router_configuration
-from app.events.ros2 import Content, Ros2, Ros2Options, state_of
-from app.events.ros_names import Chosen
+from app.events.ros2 import Ros2Options, Ros2Publisher, TopicContent, state_of
+from app.events.ros_names import EnvironmentSelector
 from app.events.router import Router
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
@@ -471,15 +471,15 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
     state = {"root": "a", "fails": 0, "calls": 0}
     (tmp_path / "ros2.json").write_text('{"state": "connected", "topics": 99}')  # of a process that was killed
 
-    def fetch(request: Any) -> Content:
+    def fetch(request: Any) -> TopicContent:
         state["calls"] += 1
         if state["fails"]:
             state["fails"] -= 1
             raise Unavailable("the pool is busy")
-        return Content({None: replace(SMALL, cells=SMALL.cells[:5] + request.root.encode())}, None)
+        return TopicContent({None: replace(SMALL, cells=SMALL.cells[:5] + request.root.encode())}, None)
 
-    publishing = Ros2(
-        Ros2Options((Chosen("farm", "/"),), ("ros2dds",)),
+    publishing = Ros2Publisher(
+        Ros2Options((EnvironmentSelector("farm", "/"),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
@@ -508,13 +508,13 @@ def test_a_mistake_with_one_environment_is_not_the_others(
     monkeypatch.setattr("app.events.ros2.ASK_SECONDS", 0.1)
     endpoint, port = router
 
-    def fetch(request: Any) -> Content:
+    def fetch(request: Any) -> TopicContent:
         if request.environment == "bad":
             raise KeyError("nobody thought of this")
-        return Content({None: SMALL}, None)
+        return TopicContent({None: SMALL}, None)
 
-    publishing = Ros2(
-        Ros2Options((Chosen("*", None),), ("ros2dds",)),
+    publishing = Ros2Publisher(
+        Ros2Options((EnvironmentSelector("*", None),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
@@ -538,13 +538,13 @@ def test_without_a_router_it_is_told_and_found_later(tmp_path: Path, monkeypatch
     monkeypatch.setattr("app.events.bus.CONNECT_SECONDS", 0.3)
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
-    publishing = Ros2(
-        Ros2Options((Chosen("farm", "/"),), ("ros2dds",)),
+    publishing = Ros2Publisher(
+        Ros2Options((EnvironmentSelector("farm", "/"),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
         look=lambda: {"farm": version("farm", "r")},
-        fetch=lambda _: Content({None: SMALL}, None),
+        fetch=lambda _: TopicContent({None: SMALL}, None),
     )
     publishing.start()
     try:
@@ -566,24 +566,24 @@ def test_one_topic_belongs_to_one_level_of_one_environment(
     endpoint, port = router
     caplog.set_level(logging.ERROR)
     content = {
-        "a-b": Content({None: SMALL, "L 1": SMALL, "L-1": replace(SMALL, resolution=1.0)}, None),
-        "a_b": Content({None: replace(SMALL, resolution=2.0)}, None),
+        "a-b": TopicContent({None: SMALL, "L 1": SMALL, "L-1": replace(SMALL, resolution=1.0)}, None),
+        "a_b": TopicContent({None: replace(SMALL, resolution=2.0)}, None),
     }
-    publishing = Ros2(
-        Ros2Options((Chosen("a?b", None),), ("ros2dds",)),
+    publishing = Ros2Publisher(
+        Ros2Options((EnvironmentSelector("a?b", None),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
         look=lambda: {name: version(name, "r") for name in content},
         fetch=lambda request: content[request.environment],
     )
-    other = Ros2(
-        Ros2Options((Chosen("a?b", None),), ("ros2dds",)),
+    other = Ros2Publisher(
+        Ros2Options((EnvironmentSelector("a?b", None),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         generation=lambda: 0,
         look=lambda: {"a-b": version("a-b", "r")},
-        fetch=lambda _: Content({None: replace(SMALL, resolution=3.0)}, None),
+        fetch=lambda _: TopicContent({None: replace(SMALL, resolution=3.0)}, None),
     )
     publishing.start()
     try:

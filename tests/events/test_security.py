@@ -15,14 +15,14 @@ import pytest
 import zenoh
 from zenoh import ext
 
-from app.agent.zenoh_client import Ear
+from app.agent.zenoh_client import ZenohClient
 from app.cli.server import check
 from app.errors import Invalid, Unavailable
 from app.events.bus import Bus, BusOptions, router_configuration, session_configuration
 from app.events.bus import check as check_bus
-from app.events.credentials import Login, no_router
+from app.events.credentials import ZenohCredentials, no_router
 from app.events.router import Router
-from app.events.security import Security, access_control, read_users
+from app.events.security import RouterSecurity, access_control, read_users
 from app.main import check_bus as check_settings
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
@@ -36,7 +36,7 @@ REFUSED_SECONDS = 1.0
 
 
 # --- who comes in ---------------------------------------------------------------------------------------------------
-def session_to(port: int, login: Login, *, scheme: str = "tls", patience: float = 10.0) -> zenoh.Session:
+def session_to(port: int, login: ZenohCredentials, *, scheme: str = "tls", patience: float = 10.0) -> zenoh.Session:
     """A robot's session; ZError where it is not let in."""
     more = {
         "connect/endpoints": [f"{scheme}/127.0.0.1:{port}"],
@@ -48,7 +48,7 @@ def session_to(port: int, login: Login, *, scheme: str = "tls", patience: float 
     return zenoh.open(client_config(port, **more))
 
 
-def refused(port: int, login: Login, scheme: str = "tls") -> None:
+def refused(port: int, login: ZenohCredentials, scheme: str = "tls") -> None:
     with pytest.raises(zenoh.ZError), session_to(port, login, scheme=scheme, patience=REFUSED_SECONDS):
         pass
 
@@ -92,13 +92,13 @@ def api(tmp_path_factory: pytest.TempPathFactory, authority: Authority, port: in
 
 @pytest.fixture
 def r1(api: Api, port: int, authority: Authority) -> Iterator[zenoh.Session]:
-    with session_to(port, Login(authority.pem, user="r1", password="word one")) as session:
+    with session_to(port, ZenohCredentials(authority.pem, user="r1", password="word one")) as session:
         yield session
 
 
 @pytest.fixture
 def r2(api: Api, port: int, authority: Authority) -> Iterator[zenoh.Session]:
-    with session_to(port, Login(authority.pem, user="r2", password="word:two")) as session:
+    with session_to(port, ZenohCredentials(authority.pem, user="r2", password="word:two")) as session:
         yield session
 
 
@@ -180,12 +180,14 @@ def test_a_robot_says_nothing_else(api: Api, r1: zenoh.Session, r2: zenoh.Sessio
 
 def test_others_are_not_let_in(api: Api, port: int, authority: Authority, tmp_path: Path) -> None:
     ca = authority.pem
-    refused(port, Login(ca, user="r1", password="word two"))
-    refused(port, Login(ca, user="stranger", password="word one"))
-    refused(port, Login(ca, user="server", password="server"))
-    refused(port, Login(ca))
-    refused(port, Login(Authority(tmp_path).pem, user="r1", password="word one"))  # the robot does not believe it
-    refused(port, Login(user="r1", password="word one"), "tcp")
+    refused(port, ZenohCredentials(ca, user="r1", password="word two"))
+    refused(port, ZenohCredentials(ca, user="stranger", password="word one"))
+    refused(port, ZenohCredentials(ca, user="server", password="server"))
+    refused(port, ZenohCredentials(ca))
+    refused(
+        port, ZenohCredentials(Authority(tmp_path).pem, user="r1", password="word one")
+    )  # the robot does not believe it
+    refused(port, ZenohCredentials(user="r1", password="word one"), "tcp")
 
 
 def test_what_is_kept_is_for_the_server_alone(api: Api) -> None:
@@ -240,7 +242,7 @@ class Wire:
 def test_who_listens_on_the_wire_hears_nothing(api: Api, port: int, authority: Authority) -> None:
     wire = Wire(port)
     try:
-        with session_to(wire.port, Login(authority.pem, user="r1", password="word one")) as session:
+        with session_to(wire.port, ZenohCredentials(authority.pem, user="r1", password="word one")) as session:
             ear = Listener(session, "fleetmap/farm/events")
             ear.wait(lambda e: 2 in e.sequences())
             session.put("fleetmap/farm/robots/r1/status", said(3))
@@ -268,9 +270,9 @@ def test_robots_that_must_show_a_certificate(authority: Authority, tmp_path: Pat
     with running(settings) as api:
         eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
         api.post("environments", {"name": "farm"})
-        refused(port, Login(authority.pem))
-        refused(port, Login(authority.pem, *Authority(tmp_path / "others", "ca").sign("robot")))
-        with session_to(port, Login(authority.pem, *authority.sign("robot"))) as session:
+        refused(port, ZenohCredentials(authority.pem))
+        refused(port, ZenohCredentials(authority.pem, *Authority(tmp_path / "others", "ca").sign("robot")))
+        with session_to(port, ZenohCredentials(authority.pem, *authority.sign("robot"))) as session:
             Listener(session, "fleetmap/farm/events").wait(lambda e: e.sequences() == [1])
 
 
@@ -279,7 +281,9 @@ def test_the_server_is_a_user_of_somebody_elses_router(authority: Authority, tmp
     endpoint = f"tls/127.0.0.1:{port}"
     certificate, key = authority.sign("router")
     (tmp_path / "users").write_text("maps:of all\nr1:one\n")
-    theirs = Security(Login(authority.pem, certificate, key), users=tmp_path / "users", folder=tmp_path)
+    theirs = RouterSecurity(
+        ZenohCredentials(authority.pem, certificate, key), users=tmp_path / "users", folder=tmp_path
+    )
     config = json.loads(router_configuration(BusOptions(listen=endpoint, security=theirs)))
     config["access_control"]["enabled"] = False  # their rules know their users
     router = Router(json.dumps(config))
@@ -289,10 +293,12 @@ def test_the_server_is_a_user_of_somebody_elses_router(authority: Authority, tmp
         with running(settings_for(tmp_path / "a", **settings, zenoh_user="maps", zenoh_password="of all")) as api:
             eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
             api.post("environments", {"name": "farm"})
-            with session_to(port, Login(authority.pem, user="r1", password="one")) as session:
+            with session_to(port, ZenohCredentials(authority.pem, user="r1", password="one")) as session:
                 Listener(session, "fleetmap/farm/events").wait(lambda e: e.sequences() == [1])
         wrong = BusOptions(
-            mode="client", connect=endpoint, security=Security(Login(authority.pem, user="maps", password="of none"))
+            mode="client",
+            connect=endpoint,
+            security=RouterSecurity(ZenohCredentials(authority.pem, user="maps", password="of none")),
         )
         quick = json.loads(session_configuration(wrong))
         quick["connect"]["timeout_ms"] = int(REFUSED_SECONDS * 1000)
@@ -313,13 +319,13 @@ def test_why_a_certificate_is_not_trusted_is_told(
     port = free_port()
     endpoint = f"tls/127.0.0.1:{port}"
     certificate, key = (Authority(tmp_path, "others") if foreign else authority).sign("own", days)
-    options = BusOptions(listen=endpoint, security=Security(Login(authority.pem, certificate, key)))
+    options = BusOptions(listen=endpoint, security=RouterSecurity(ZenohCredentials(authority.pem, certificate, key)))
     bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
     try:
         assert not bus.tend()
         assert bus.state["detail"] == f"no router at {endpoint}: its certificate is not to be trusted: {told}"
-        refused(port, Login(authority.pem))
-        ear = Ear("farm", "r1", heard=nothing, back=nothing, login=Login(authority.pem))
+        refused(port, ZenohCredentials(authority.pem))
+        ear = ZenohClient("farm", "r1", heard=nothing, back=nothing, login=ZenohCredentials(authority.pem))
         monkeypatch.setattr("app.agent.zenoh_client.CONNECT_MS", int(REFUSED_SECONDS * 1000))
         ear.aim(endpoint, "fleetmap")
         try:
@@ -332,16 +338,19 @@ def test_why_a_certificate_is_not_trusted_is_told(
 
 def test_why_a_robot_is_not_let_in_is_told(authority: Authority, tmp_path: Path) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"
-    mutual = Security(Login(authority.pem, *authority.sign("strict")), mutual=True)
+    mutual = RouterSecurity(ZenohCredentials(authority.pem, *authority.sign("strict")), mutual=True)
     router = Router(router_configuration(BusOptions(listen=endpoint, security=mutual)))
     assert router.problem is None
     error = zenoh.ZError("Unable to connect! at /somewhere/else.rs:1")
     try:
         for login, reason in (
-            (Login(authority.pem), "it refuses: tlsv13 alert certificate required"),
-            (Login(authority.pem, *authority.sign("late", -1)), "it refuses: sslv3 alert certificate expired"),
-            (Login(authority.pem, *Authority(tmp_path, "x").sign("r")), "it refuses: "),
-            (Login(authority.pem, *authority.sign("r1")), "Unable to connect!"),
+            (ZenohCredentials(authority.pem), "it refuses: tlsv13 alert certificate required"),
+            (
+                ZenohCredentials(authority.pem, *authority.sign("late", -1)),
+                "it refuses: sslv3 alert certificate expired",
+            ),
+            (ZenohCredentials(authority.pem, *Authority(tmp_path, "x").sign("r")), "it refuses: "),
+            (ZenohCredentials(authority.pem, *authority.sign("r1")), "Unable to connect!"),
         ):
             assert no_router(f"{endpoint}, tcp/x:1", error, login).startswith(
                 f"no router at {endpoint}, tcp/x:1: {reason}"
@@ -350,7 +359,7 @@ def test_why_a_robot_is_not_let_in_is_told(authority: Authority, tmp_path: Path)
         router.close()
     for other_endpoint in (endpoint, "tcp/127.0.0.1:1", "tls/[::1]:1", "what is this"):
         assert (
-            no_router(other_endpoint, error, Login(authority.pem))
+            no_router(other_endpoint, error, ZenohCredentials(authority.pem))
             == f"no router at {other_endpoint}: Unable to connect!"
         )
 
@@ -381,26 +390,31 @@ def test_a_missing_file_is_told_before_the_start(tmp_path: Path) -> None:
     existing_file = tmp_path / "here.pem"
     existing_file.touch()
     for security in (
-        Security(Login(ca=missing_file)),
-        Security(Login(certificate=missing_file, key=existing_file)),
-        Security(Login(certificate=existing_file, key=missing_file)),
-        Security(users=missing_file, folder=tmp_path),
+        RouterSecurity(ZenohCredentials(ca=missing_file)),
+        RouterSecurity(ZenohCredentials(certificate=missing_file, key=existing_file)),
+        RouterSecurity(ZenohCredentials(certificate=existing_file, key=missing_file)),
+        RouterSecurity(users=missing_file, folder=tmp_path),
     ):
         with pytest.raises(Invalid, match=r"gone\.pem cannot be read"):
             check_bus(BusOptions(security=security))
-    for login in (Login(certificate=existing_file), Login(key=existing_file), Login(user="a"), Login(password="a")):
+    for login in (
+        ZenohCredentials(certificate=existing_file),
+        ZenohCredentials(key=existing_file),
+        ZenohCredentials(user="a"),
+        ZenohCredentials(password="a"),
+    ):
         with pytest.raises(Invalid, match="the other way round"):
-            check_bus(BusOptions(mode="client", connect="tcp/x:1", security=Security(login)))
+            check_bus(BusOptions(mode="client", connect="tcp/x:1", security=RouterSecurity(login)))
     with pytest.raises(Unavailable, match="FLEETMAP_ZENOH_CONFIG"):
         check_bus(BusOptions(config=missing_file))
     existing_file.write_text("no PEM")
     with pytest.raises(Invalid, match="holds no certificate of a certification authority"):
-        check_bus(BusOptions(security=Security(Login(ca=existing_file))))
+        check_bus(BusOptions(security=RouterSecurity(ZenohCredentials(ca=existing_file))))
     one, other = Authority(tmp_path / "ca").sign("one"), Authority(tmp_path / "ca").sign("other")
     for certificate, key in ((one[0], other[1]), (existing_file, one[1]), (one[0], existing_file)):
         with pytest.raises(Invalid, match="are no certificate and its unencrypted key"):
-            check_bus(BusOptions(security=Security(Login(certificate=certificate, key=key))))
-    assert "secret" not in repr(Login(user="a", password="secret"))
+            check_bus(BusOptions(security=RouterSecurity(ZenohCredentials(certificate=certificate, key=key))))
+    assert "secret" not in repr(ZenohCredentials(user="a", password="secret"))
 
 
 @pytest.mark.parametrize(
@@ -422,7 +436,7 @@ def test_settings_that_do_not_fit(more: dict[str, Any], told: str, tmp_path: Pat
 def test_access_control_of_the_operators_wins(tmp_path: Path) -> None:
     users = tmp_path / "users"
     users.write_text("r1:one\n")
-    security = Security(users=users, folder=tmp_path)
+    security = RouterSecurity(users=users, folder=tmp_path)
     ours = json.loads(router_configuration(BusOptions(prefix="a/b", security=security)))["access_control"]
     assert ours["default_permission"] == "deny"
     assert [key for rule in ours["rules"][3:] for key in rule["key_exprs"]] == [
@@ -440,7 +454,7 @@ def test_access_control_of_the_operators_wins(tmp_path: Path) -> None:
 def test_processes_that_start_at_once_have_one_password(tmp_path: Path) -> None:
     users = tmp_path / "users"
     users.write_text("r1:one\n")
-    options = BusOptions(security=Security(users=users, folder=tmp_path))
+    options = BusOptions(security=RouterSecurity(users=users, folder=tmp_path))
     passwords: list[str] = []
     barrier = threading.Barrier(8)
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from app.errors import Unavailable
-from app.events.leader import Single, state_of
+from app.events.leader import LeaderThread, state_of
 from tests.events.conftest import eventually
 
 
-class Rounds(Single):
+class Rounds(LeaderThread):
     """Each round calls ``work``, then says that all is well."""
 
     def __init__(self, folder: Path, work: Callable[[], object]) -> None:
