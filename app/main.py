@@ -83,7 +83,7 @@ from app.fleet import decide
 from app.ingest import Ingest, Provider
 from app.links import LinkSecrets
 from app.pool import WARM, Pool
-from app.sandbox import Allowed
+from app.sandbox import SandboxPolicy
 from app.signing import Keys
 from app.store.scrub import Scrub
 from app.store.store import Store
@@ -284,13 +284,13 @@ def _pool_of(settings: Settings, workers: int) -> Pool:
     )
 
 
-def allowed(settings: Settings) -> Allowed:
+def allowed(settings: Settings) -> SandboxPolicy:
     """What worker processes may do: read the database, and nothing else that anybody would notice."""
     if settings.database.startswith("sqlite"):
         file = make_url(settings.database).database
         # Readers of a write-ahead log share memory through a file beside the database.
-        return Allowed(overwrite=(Path(file).resolve().parent,) if file else ())
-    return Allowed(ports=(make_url(settings.database).port or 5432,))
+        return SandboxPolicy(overwrite=(Path(file).resolve().parent,) if file else ())
+    return SandboxPolicy(ports=(make_url(settings.database).port or 5432,))
 
 
 def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake: UploadSpool) -> Services:

@@ -24,7 +24,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from app.errors import FleetMapError, TooLarge, Unavailable
-from app.sandbox import Allowed, confine
+from app.sandbox import SandboxPolicy, confine
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ class _Worker:
     pipe: Connection
 
 
-class Stop:
+class CancelHandle:
     """Stops one job from another thread, wherever it is: its process is killed, or it never gets one."""
 
     def __init__(self) -> None:
@@ -99,7 +99,7 @@ class Pool:
         seconds: float = 300.0,
         waiting: int = 64,
         warm: tuple[str, ...] = (),
-        allowed: Allowed | None = None,
+        allowed: SandboxPolicy | None = None,
     ) -> None:
         self._memory_bytes, self._seconds, self._warm, self._allowed = memory_bytes, seconds, warm, allowed
         self._slots = threading.BoundedSemaphore(workers + waiting)
@@ -133,7 +133,7 @@ class Pool:
                 self._idle.put(worker)
 
     def run(
-        self, function: Callable[..., Any], *args: Any, seconds: float | None = None, stop: Stop | None = None
+        self, function: Callable[..., Any], *args: Any, seconds: float | None = None, stop: CancelHandle | None = None
     ) -> Any:
         """Call a module-level function in a worker and return its result; blocks, so call it from a thread.
 
@@ -167,7 +167,7 @@ class Pool:
             raise value
         return value
 
-    def _turn(self, stop: Stop | None) -> _Worker | None:
+    def _turn(self, stop: CancelHandle | None) -> _Worker | None:
         """Wait in line for a worker; None: one is to be started."""
         if stop is None:
             return self._idle.get()
@@ -248,7 +248,11 @@ def _ask(worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], s
 
 
 def _work(
-    pipe: Connection, environment: dict[str, str], memory_bytes: int, warm: tuple[str, ...], allowed: Allowed | None
+    pipe: Connection,
+    environment: dict[str, str],
+    memory_bytes: int,
+    warm: tuple[str, ...],
+    allowed: SandboxPolicy | None,
 ) -> None:
     """A worker's life: take a job, answer, until the parent closes the pipe or dies."""
     os.environ.clear()  # what it was forked from may have been started under other settings

@@ -23,7 +23,7 @@ _BIND, _CONNECT = 1 << 0, 1 << 1
 
 
 @dataclass(frozen=True, slots=True)
-class Allowed:
+class SandboxPolicy:
     """What a confined process may do besides computing and reading.
 
     scratch: folders in which it may do everything. overwrite: folders in which it may write to existing files (SQLite's
@@ -41,7 +41,7 @@ def supported() -> int:
     return max(0, abi_version)
 
 
-def confine(allowed: Allowed) -> bool:
+def confine(allowed: SandboxPolicy) -> bool:
     """Confine the calling thread and all that it starts, for good. False where the kernel cannot."""
     version = supported()
     if version < 1:

@@ -16,7 +16,7 @@ from app import formats, parameters
 from app.errors import Invalid, NotFound, Problem
 from app.formats import Format
 from app.model.names import did_you_mean
-from app.model.templates import DEFAULT_SET, Own, Templates
+from app.model.templates import DEFAULT_SET, FormatTemplate, Templates
 
 REQUEST, ENVIRONMENT, DEFAULT = "request", "environment", "default"
 """Where a value may come from, besides a set."""
@@ -26,7 +26,7 @@ LONGEST_TEXT: Final = 2000
 
 
 @dataclass(frozen=True, slots=True)
-class Set:
+class TemplateSet:
     """A named set. values: by format, by parameter of its writer."""
 
     title: str
@@ -40,9 +40,9 @@ class Set:
 
 _GOALS = {"action": "NavigateToPose", "action_type": "geometry_msgs/PoseStamped"}
 
-SETS: Final[Mapping[str, Set]] = {
-    DEFAULT_SET: Set("Each format's own defaults", {}),
-    "outdoor": Set(
+SETS: Final[Mapping[str, TemplateSet]] = {
+    DEFAULT_SET: TemplateSet("Each format's own defaults", {}),
+    "outdoor": TemplateSet(
         "Fields, orchards and yards: wide goals, grass underfoot, low walls",
         {
             "tmap2": {"verts_radius": 1.5, "xy_goal_tolerance": 0.5, "yaw_goal_tolerance": 0.3},
@@ -52,7 +52,7 @@ SETS: Final[Mapping[str, Set]] = {
             "datum": {"half_size": 250.0},
         },
     ),
-    "indoor": Set(
+    "indoor": TemplateSet(
         "Offices and wards: narrow goals, slow robots, rooms as high as usual",
         {
             "tmap2": {"verts_radius": 0.5, "xy_goal_tolerance": 0.2},
@@ -61,7 +61,7 @@ SETS: Final[Mapping[str, Set]] = {
             "lanelet2": {"width": 1.2, "subtype": "walkway"},
         },
     ),
-    "warehouse": Set(
+    "warehouse": TemplateSet(
         "Halls with shelves and docks: exact goals, high walls",
         {
             "tmap2": {"xy_goal_tolerance": 0.1, "yaw_goal_tolerance": 0.05},
@@ -74,7 +74,7 @@ SETS: Final[Mapping[str, Set]] = {
             "rmf_site": {"speed_limit": 1.5},
         },
     ),
-    "ros2": Set(
+    "ros2": TemplateSet(
         "Robots whose topological_navigation and route server run on ROS 2",
         {"tmap2": dict(_GOALS), "tmap": {"action": _GOALS["action"]}},
     ),
@@ -83,7 +83,7 @@ SETS: Final[Mapping[str, Set]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Resolved:
+class ResolvedTemplate:
     """What holds for one format of an environment. values: of the set and the environment. origin: where each came
     from: ``environment`` or ``set NAME``. ignored: what was kept once and cannot be used any more."""
 
@@ -92,7 +92,7 @@ class Resolved:
     ignored: tuple[str, ...] = ()
 
 
-NOTHING: Final = Resolved()
+NOTHING: Final = ResolvedTemplate()
 
 
 def check_set(name: str, location: str = "set") -> str:
@@ -129,7 +129,7 @@ def check_values(fmt: Format, values: Mapping[str, Any], location: str = "values
     return out
 
 
-def resolve(templates: Templates, fmt: Format) -> Resolved:
+def resolve(templates: Templates, fmt: Format) -> ResolvedTemplate:
     """The values that an environment's templates give to a format.
 
     What an older or newer release has kept and this one does not know is left out, and told in ``ignored``: a robot
@@ -150,7 +150,7 @@ def resolve(templates: Templates, fmt: Format) -> Resolved:
                 ignored.append(f"{fmt.name}: {error.detail}")
                 continue
             values[name], origin[name] = value, source
-    return Resolved(values, origin, tuple(ignored))
+    return ResolvedTemplate(values, origin, tuple(ignored))
 
 
 def effective(templates: Templates, fmt: Format) -> dict[str, dict[str, Any]]:
@@ -170,7 +170,7 @@ def has_parameters(fmt: Format) -> bool:
     return bool(dataclasses.fields(fmt.write_options))
 
 
-def with_own(templates: Templates, name: str, format_template: Own) -> Templates:
+def with_own(templates: Templates, name: str, format_template: FormatTemplate) -> Templates:
     """The same with something else said of one format; nothing is said of it where ``format_template`` is empty."""
     others = {format_name: template for format_name, template in templates.formats.items() if format_name != name}
     return Templates(templates.set, {**others, name: format_template} if format_template.as_dict() else others)

@@ -63,7 +63,7 @@ def drawn_layer(name: str | None) -> Layer | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Hints:
+class UploadHints:
     """What the sender said of the files; everything else is found out from their content."""
 
     format: str | None = None
@@ -74,7 +74,7 @@ class Hints:
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class EnvironmentContext:
     """What the environment knows already, and what will be used of the files (see ``ReadContext``)."""
 
     datum: Datum | None = None
@@ -85,7 +85,7 @@ class Known:
 
 
 @dataclass(frozen=True, slots=True)
-class Read:
+class ParsedPart:
     """One part as one file told it."""
 
     key: PartKey
@@ -94,7 +94,7 @@ class Read:
 
 
 @dataclass(slots=True)
-class Use:
+class FileUse:
     """What became of a file."""
 
     format: str | None = None
@@ -109,7 +109,7 @@ class Bundle:
     origin: dict[PartKey, tuple[tuple[str, ...], str]] = field(default_factory=dict)
     datum: Datum | None = None
     levels: tuple[Level, ...] = ()
-    files: dict[str, Use] = field(default_factory=dict)
+    files: dict[str, FileUse] = field(default_factory=dict)
     warnings: list[Problem] = field(default_factory=list)
     fence: shapely.Polygon | None = None
     notices: dict[str, str] = field(default_factory=dict)
@@ -167,7 +167,9 @@ def _blamed_on(name: str) -> Iterator[None]:
         raise type(error)(f"{name}: {error.detail}", places) from error
 
 
-def read(files: Files, hints: Hints, context: Known, limits: Limits, *, inner: bool = False) -> Bundle:
+def read(
+    files: Files, hints: UploadHints, context: EnvironmentContext, limits: Limits, *, inner: bool = False
+) -> Bundle:
     """All files of an upload (already unpacked) -> what they say together. inner: they are from one file of it.
 
     Raises BadUpload with every place that is wrong; Invalid for hints that cannot be used.
@@ -175,7 +177,7 @@ def read(files: Files, hints: Hints, context: Known, limits: Limits, *, inner: b
     drawn_layer(hints.layer)
     if not files:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
-    bundle = Bundle(files={name: Use() for name in files}, inner=inner)
+    bundle = Bundle(files={name: FileUse() for name in files}, inner=inner)
     if (content := _content.find(files)) is not None:
         if _take_content(files, content, hints, limits, bundle):
             return bundle
@@ -190,7 +192,7 @@ def read(files: Files, hints: Hints, context: Known, limits: Limits, *, inner: b
     groups, rest = _group(others, hints) if any(others.values()) or not variables else ([], sorted(others))
     taken = _set_aside(groups, bundle)
     _check_options(groups, hints)
-    parsed_parts: list[Read] = []
+    parsed_parts: list[ParsedPart] = []
     problems: list[Problem] = []
     details: list[str] = []
     errors: list[type[BadUpload]] = []
@@ -235,9 +237,9 @@ def _unread(files: Files) -> set[str]:
     return empty | set(formats.group(others)[1] if others else ())
 
 
-def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle: Bundle) -> bool:
+def _take_content(files: Files, main: str, hints: UploadHints, limits: Limits, bundle: Bundle) -> bool:
     """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
-    if dataclasses.replace(hints, format=None) != Hints() or hints.format not in (None, "environment"):
+    if dataclasses.replace(hints, format=None) != UploadHints() or hints.format not in (None, "environment"):
         content: _content.Content | str = "the upload says how its maps are to be read"
     else:
         try:
@@ -250,10 +252,10 @@ def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle:
             raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)]) from error
     if isinstance(content, str):
         for name in _content.owned(files, main):
-            bundle.files[name] = Use("environment", used=False)
+            bundle.files[name] = FileUse("environment", used=False)
         bundle.warnings.append(Problem(f"not used, the maps of the package count: {content}", main))
         return False
-    bundle.files |= {name: Use("environment", used=True) for name in files if name not in content.added}
+    bundle.files |= {name: FileUse("environment", used=True) for name in files if name not in content.added}
     _keep_unread({name: files[name] for name in sorted(content.added)}, bundle)
     bundle.parts, bundle.datum, bundle.levels = dict(content.layers.parts), content.layers.datum, content.layers.levels
     bundle.origin = dict.fromkeys(bundle.parts, ((main,), "environment"))
@@ -323,7 +325,7 @@ def _notice(name: str, data: bytes) -> str | None:
     return f"{', '.join([*title_lines, *filter(None, [holder])])} ({name})"
 
 
-def _group(files: Files, hints: Hints) -> tuple[list[Group], list[str]]:
+def _group(files: Files, hints: UploadHints) -> tuple[list[Group], list[str]]:
     present = {name: data for name, data in files.items() if data}
     if not present:
         raise UnreadableFile("all files are empty", [Problem("the file is empty", name) for name in sorted(files)])
@@ -370,7 +372,7 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
         with _blamed_on(name):
             assigned, doubts = _shell.assignments(files[name])
         variables.update({n: v for n, v in assigned.items() if v or n not in _shell.OF_FILES})
-        bundle.files[name] = Use("environment", used=True)
+        bundle.files[name] = FileUse("environment", used=True)
         # Where the package's files lie is told anew whenever it is served: no loss worth a word.
         bundle.warnings += [Problem(doubt, name) for doubt in doubts if not _OF_FILES.search(doubt)]
     if names:
@@ -408,17 +410,17 @@ def _set_aside(groups: list[Group], bundle: Bundle) -> list[Group]:
             out.append(group)
             continue
         for file in group.files:
-            bundle.files[file] = Use(group.format.name, used=False)
+            bundle.files[file] = FileUse(group.format.name, used=False)
         bundle.warnings.append(Problem(f"not used, kept as a source: {reason}", name))
     return out
 
 
-def _known_options(group: Group, hints: Hints) -> dict[str, str]:
+def _known_options(group: Group, hints: UploadHints) -> dict[str, str]:
     names = {f.name for f in dataclasses.fields(group.format.read_options)}
     return {name: value for name, value in hints.options.items() if name in names}
 
 
-def _check_options(groups: list[Group], hints: Hints) -> None:
+def _check_options(groups: list[Group], hints: UploadHints) -> None:
     """An option that no format of the upload knows is refused, not ignored."""
     option_names = {f.name for g in groups for f in dataclasses.fields(g.format.read_options)}
     for name in hints.options:
@@ -432,7 +434,9 @@ def _is_regions(name: str) -> bool:
     return "region" in PurePosixPath(name).name.lower()
 
 
-def _read_group(group: Group, hints: Hints, upload_context: Known, limits: Limits, bundle: Bundle) -> list[Read]:
+def _read_group(
+    group: Group, hints: UploadHints, upload_context: EnvironmentContext, limits: Limits, bundle: Bundle
+) -> list[ParsedPart]:
     folder = template_folder(group.main)
     layer = hints.layer
     grid = hints.grid
@@ -456,7 +460,7 @@ def _read_group(group: Group, hints: Hints, upload_context: Known, limits: Limit
     )
     layers = formats.read(group, context)
     for file in group.files:
-        bundle.files[file] = Use(group.format.name, used=True)
+        bundle.files[file] = FileUse(group.format.name, used=True)
     bundle.warnings += context.warnings
     for site in layers.vector("location").values():
         bundle.fence = bundle.fence or (site.geometry[0] if len(site) else None)
@@ -469,10 +473,12 @@ def _read_group(group: Group, hints: Hints, upload_context: Known, limits: Limit
         elif bundle.datum != layers.datum:
             bundle.warnings.append(Problem("its datum differs from the one that is used", group.main))
     bundle.levels = join_levels(bundle.levels, [lv for lv in layers.levels if lv != Level()])
-    return [Read(key, part, group) for key, part in parts.items() if not is_empty(part)]
+    return [ParsedPart(key, part, group) for key, part in parts.items() if not is_empty(part)]
 
 
-def _folder_reader(hints: Hints, context: Known, limits: Limits, bundle: Bundle) -> Callable[[Files], Layers] | None:
+def _folder_reader(
+    hints: UploadHints, context: EnvironmentContext, limits: Limits, bundle: Bundle
+) -> Callable[[Files], Layers] | None:
     """What reads a folder inside one file of the upload (an archive that is no ``.zip``); one deep."""
     if bundle.inner:
         return None
@@ -489,7 +495,7 @@ def _assign(
     parts: dict[PartKey, Part],
     layer: Layer | None,
     level: str,
-    context: Known,
+    context: EnvironmentContext,
     datum: Datum | None,
     file: str,
     bundle: Bundle,
@@ -532,7 +538,7 @@ def _move(
 
 
 def _own_fence(
-    part: Features, areas: NDArray[np.bool_], context: Known, bundle: Bundle, file: str
+    part: Features, areas: NDArray[np.bool_], context: EnvironmentContext, bundle: Bundle, file: str
 ) -> NDArray[np.bool_]:
     """Which of the polygons is the environment's own fence: a mask with at most one True."""
     indices = np.flatnonzero(areas & ~part.local)
@@ -552,9 +558,9 @@ def _own_fence(
     return chosen
 
 
-def _compete(parsed_parts: list[Read], bundle: Bundle) -> None:
+def _compete(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
     """Join what belongs together; where two files tell the same network, site or grid, believe one of them."""
-    by_key: dict[PartKey, list[Read]] = {}
+    by_key: dict[PartKey, list[ParsedPart]] = {}
     for one in parsed_parts:
         by_key.setdefault(one.key, []).append(one)
     useful: set[str] = set()
@@ -591,7 +597,7 @@ _ONE_TELLER: Mapping[str, str] = {
 """Layers of which one file's word is enough, as a user calls them."""
 
 
-def _take_drawing(winners: list[Read], loser: Read) -> bool:
+def _take_drawing(winners: list[ParsedPart], loser: ParsedPart) -> bool:
     """A drawn fence in the same place as the believed one: its name and style go along, and nothing is lost."""
     site, drawn = winners[0].part, loser.part
     if not (isinstance(site, Features) and isinstance(drawn, Features) and len(site) == len(drawn) == 1):
@@ -602,16 +608,16 @@ def _take_drawing(winners: list[Read], loser: Read) -> bool:
         return False
     properties = ({**drawn.properties[0], **site.properties[0]},)
     part = Features(site.ids, site.geometry, properties, site.local, {**drawn.document, **site.document})
-    winners[0] = Read(winners[0].key, part, winners[0].group)
+    winners[0] = ParsedPart(winners[0].key, part, winners[0].group)
     return True
 
 
-def _trust(one: Read) -> tuple[object, ...]:
+def _trust(one: ParsedPart) -> tuple[object, ...]:
     name = PurePosixPath(one.group.main).name
     return (-one.group.format.rank, name.startswith("."), "_autogen" in name, len(name), one.group.main)
 
 
-def _join(candidates: list[Read], renamed: dict[str, dict[str, str]]) -> Part:
+def _join(candidates: list[ParsedPart], renamed: dict[str, dict[str, str]]) -> Part:
     """Several files' parts of one key as one; ids that repeat are made distinct, and ``renamed`` remembers how."""
     if len(candidates) == 1:
         part = candidates[0].part
@@ -642,7 +648,7 @@ def _join(candidates: list[Read], renamed: dict[str, dict[str, str]]) -> Part:
     return concatenate(collections)
 
 
-def _choose_datum(bundle: Bundle, context: Known) -> None:
+def _choose_datum(bundle: Bundle, context: EnvironmentContext) -> None:
     if bundle.datum is not None or context.datum is not None:
         return
     chosen = corner(bundle.parts)

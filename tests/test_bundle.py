@@ -16,7 +16,7 @@ from app.formats import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import PartKey
-from app.upload_reader import Bundle, Hints, Known, corner, read, template_folder, unpack
+from app.upload_reader import Bundle, EnvironmentContext, UploadHints, corner, read, template_folder, unpack
 
 LIMITS = Limits()
 
@@ -57,8 +57,8 @@ def tmap2(name: str) -> bytes:
     return f"{head}nodes:\n{nodes}".encode()
 
 
-def read_upload(files: dict[str, bytes], *, context: Known | None = None, **hints: Any) -> Bundle:
-    return read(unpack(files, LIMITS), Hints(**hints), context or Known(), LIMITS)
+def read_upload(files: dict[str, bytes], *, context: EnvironmentContext | None = None, **hints: Any) -> Bundle:
+    return read(unpack(files, LIMITS), UploadHints(**hints), context or EnvironmentContext(), LIMITS)
 
 
 def part(bundle: Bundle, layer: str, name: str) -> Features:
@@ -165,11 +165,16 @@ def test_without_a_datum_the_south_west_corner_is_taken_with_a_warning() -> None
 @pytest.mark.parametrize("latitude", [88.0, -88.0])
 def test_data_nearer_to_a_pole_than_a_datum_may_be_is_warned_of(latitude: float) -> None:
     point = b'{"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [10, %g]}}' % latitude
-    bundle = read({"a.geojson": point}, Hints(), Known(), Limits())
+    bundle = read({"a.geojson": point}, UploadHints(), EnvironmentContext(), Limits())
     assert bundle.datum == Datum(math.copysign(85.0, latitude), 10.0)
     assert any("no datum lies nearer to a pole" in w.problem for w in bundle.warnings)
     with pytest.raises(BadUpload, match="must be between -85 and 85"):
-        read({"datum.yaml": b"datum_latitude: %g\ndatum_longitude: 10\n" % latitude}, Hints(), Known(), Limits())
+        read(
+            {"datum.yaml": b"datum_latitude: %g\ndatum_longitude: 10\n" % latitude},
+            UploadHints(),
+            EnvironmentContext(),
+            Limits(),
+        )
 
 
 def test_the_corner_across_the_antimeridian_is_the_western_end() -> None:
@@ -273,7 +278,7 @@ def test_real_template_folders(shared: Path, facts_json: dict[str, Any], environ
 )
 def test_what_nobody_knows_and_does_not_parse_is_told_with_its_line(name: str, data: bytes, line: int | None) -> None:
     with pytest.raises(UnreadableFile) as caught:
-        read({name: data}, Hints(), Known(), LIMITS)
+        read({name: data}, UploadHints(), EnvironmentContext(), LIMITS)
     (problem,) = caught.value.problems
     assert (problem.file, problem.line) == (name, line)
     assert (problem.problem == "no known map format") == (line is None)

@@ -16,8 +16,8 @@ import pytest
 
 from app import sandbox
 from app.errors import NotFound, Problem, TooLarge, Unavailable
-from app.pool import Cancelled, Pool, Stop, WorkerDied
-from app.sandbox import Allowed
+from app.pool import CancelHandle, Cancelled, Pool, WorkerDied
+from app.sandbox import SandboxPolicy
 
 
 def work_double(x: int) -> int:
@@ -104,7 +104,7 @@ def test_a_worker_that_ended_is_not_killed(pool: Pool, monkeypatch: pytest.Monke
     killed: list[int | None] = []
     (worker,) = pool._workers.values()
     monkeypatch.setattr(type(worker.process), "kill", lambda process: killed.append(process.pid))
-    stop = Stop()
+    stop = CancelHandle()
     stop.hold(worker.process)
     assert worker.process.pid is not None
     os.kill(worker.process.pid, signal.SIGKILL)
@@ -126,10 +126,10 @@ def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
 
 def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
     pool.run(work_double, 1)
-    stops = Stop(), Stop()
+    stops = CancelHandle(), CancelHandle()
     errors: list[BaseException] = []
 
-    def run(stop: Stop) -> None:
+    def run(stop: CancelHandle) -> None:
         try:
             pool.run(work_sleep, 60.0, stop=stop)
         except Cancelled as error:
@@ -146,7 +146,7 @@ def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
     assert len(errors) == 2
     with pytest.raises(Cancelled):
         pool.run(work_double, 1, stop=stops[0])
-    late = Stop()
+    late = CancelHandle()
     assert pool.run(work_double, 21, stop=late) == 42
     late()  # its worker belongs to others by now
     assert pool.run(work_double, 1) == 2
@@ -241,7 +241,7 @@ def confined(tmp_path: Path) -> Iterator[Pool]:
     (tmp_path / "scratch").mkdir()
     (tmp_path / "database").mkdir()
     (tmp_path / "database" / "a-shm").write_text("old")
-    new_pool = Pool(1, allowed=Allowed((tmp_path / "scratch",), (tmp_path / "database",), ()))
+    new_pool = Pool(1, allowed=SandboxPolicy((tmp_path / "scratch",), (tmp_path / "database",), ()))
     yield new_pool
     new_pool.close()
 
@@ -265,7 +265,7 @@ def test_a_confined_worker_has_no_network_and_starts_no_program(confined: Pool) 
         port = server.getsockname()[1]
         with pytest.raises(RuntimeError, match="PermissionError"):
             confined.run(work_call, port)
-        free = Pool(1, allowed=Allowed(ports=(port,)))
+        free = Pool(1, allowed=SandboxPolicy(ports=(port,)))
         assert free.run(work_call, port) == str(port)
         free.close()
     with pytest.raises(RuntimeError, match="PermissionError"):

@@ -11,8 +11,8 @@ from app.formats import Group, ReadContext
 from app.model.features import Features
 from app.model.frame import Datum
 from app.model.layers import Layers
-from app.model.templates import NO_TEMPLATES, Own, Templates, template_changes
-from app.upload_reader import Hints
+from app.model.templates import NO_TEMPLATES, FormatTemplate, Templates, template_changes
+from app.upload_reader import UploadHints
 
 TMAP2 = formats.get_format("tmap2")
 
@@ -40,7 +40,8 @@ def test_no_name_stands_for_two_things() -> None:
 def test_what_holds() -> None:
     assert templates.resolve(NO_TEMPLATES, TMAP2) is templates.NOTHING
     environment_templates = Templates(
-        "outdoor", {"tmap2": Own(None, {"xy_goal_tolerance": 0.4}), "lif": Own(None, {"creator": "x"})}
+        "outdoor",
+        {"tmap2": FormatTemplate(None, {"xy_goal_tolerance": 0.4}), "lif": FormatTemplate(None, {"creator": "x"})},
     )
     resolved_template = templates.resolve(environment_templates, TMAP2)
     assert resolved_template.values["xy_goal_tolerance"] == 0.4
@@ -48,19 +49,25 @@ def test_what_holds() -> None:
     assert resolved_template.origin["verts_radius"] == "set outdoor"
     assert "action" not in resolved_template.values
     assert resolved_template.ignored == ()
-    updated_templates = templates.with_own(environment_templates, "tmap2", Own("default"))
+    updated_templates = templates.with_own(environment_templates, "tmap2", FormatTemplate("default"))
     assert templates.resolve(updated_templates, TMAP2).values == {}, "the default set on purpose"
-    assert templates.with_own(updated_templates, "tmap2", Own()).formats.keys() == {"lif"}
+    assert templates.with_own(updated_templates, "tmap2", FormatTemplate()).formats.keys() == {"lif"}
     assert Templates.from_dict(environment_templates.as_dict()) == environment_templates
     assert Templates.from_dict({}) == NO_TEMPLATES
-    assert Templates("default", {"tmap2": Own()}) == NO_TEMPLATES
-    assert hash(Templates("default", {"tmap2": Own()})) == hash(NO_TEMPLATES)
+    assert Templates("default", {"tmap2": FormatTemplate()}) == NO_TEMPLATES
+    assert hash(Templates("default", {"tmap2": FormatTemplate()})) == hash(NO_TEMPLATES)
     assert Templates("indoor") != NO_TEMPLATES
 
 
 def test_what_differs() -> None:
-    a = Templates("default", {"tmap2": Own(None, {"action": "go", "osm": False})})
-    b = Templates("indoor", {"tmap2": Own("ros2", {"action": "run", "osm": False}), "lif": Own(None, {"creator": "x"})})
+    a = Templates("default", {"tmap2": FormatTemplate(None, {"action": "go", "osm": False})})
+    b = Templates(
+        "indoor",
+        {
+            "tmap2": FormatTemplate("ros2", {"action": "run", "osm": False}),
+            "lif": FormatTemplate(None, {"creator": "x"}),
+        },
+    )
     assert template_changes(a, a) == {}
     assert template_changes(a, b) == {
         "templates": {
@@ -69,7 +76,7 @@ def test_what_differs() -> None:
             "tmap2": {"set": {"from": None, "to": "ros2"}, "action": {"from": "go", "to": "run"}},
         }
     }
-    none = Templates("default", {"tmap2": Own(None, {"action": "go", "osm": False, "pointset": None})})
+    none = Templates("default", {"tmap2": FormatTemplate(None, {"action": "go", "osm": False, "pointset": None})})
     assert template_changes(a, none) == {"templates": {"tmap2": {"pointset": {"from": None, "to": None}}}}
 
 
@@ -105,7 +112,7 @@ SAYING = [known.name for known in formats.all_formats().values() if texts(known)
 def test_no_text_breaks_out_of_a_file(name: str) -> None:
     fmt = formats.get_format(name)
     options = templates.check_values(fmt, texts(fmt))
-    hints, datum = Hints(layer="topology"), Datum(53.2686, -0.5245)
+    hints, datum = UploadHints(layer="topology"), Datum(53.2686, -0.5245)
     converted = offline({"lanes.kml": LANE}, name, hints=hints, datum=datum, options=options)
     main = next(iter(converted.files))
     back = formats.read(Group(fmt, main, converted.files), ReadContext(frame=Layers({}, datum).frame))

@@ -12,7 +12,7 @@ from app.api.dependencies import ServicesDep
 from app.api.responses import StrictRoute, answer
 from app.api.schemas import AlignmentBody, AlignmentOut, EnvironmentPath, IdempotencyKey, IfMatch, OntoBody, told
 from app.errors import Invalid, Problem
-from app.ingest import Alignment
+from app.ingest import AlignmentRequest
 
 router = APIRouter(tags=["alignments"], route_class=StrictRoute)
 
@@ -42,7 +42,7 @@ def create_alignment(
         reason = "give either onto or pairs"
         raise Invalid(reason, [Problem(reason, where="body.onto")])
     onto = body.onto or OntoBody.model_validate({})
-    request = Alignment(
+    request = AlignmentRequest(
         grid=body.grid,
         level=body.level,
         layer=onto.layer,

@@ -25,7 +25,7 @@ from app.model.frame import Anchor
 from app.model.geodesy import local_frame
 from app.model.grid import OCCUPIED, OccupancyGrid
 from app.model.layers import VECTOR_LAYERS, PartKey
-from app.store.values import Delta, FeatureDelta, GridDelta, Rectangle, Version
+from app.store.values import ChangedCells, Delta, FeatureDelta, GridDelta, Version
 
 MAX_CELLS = 4 * 2**20
 """Where more cells of a grid changed, fetching the grid is less work than reading them as JSON."""
@@ -139,7 +139,7 @@ def _grid(services: Services, new: Version, change: GridDelta) -> dict[str, Any]
     return out
 
 
-def _update(rectangle: Rectangle) -> dict[str, Any]:
+def _update(rectangle: ChangedCells) -> dict[str, Any]:
     height, width = rectangle.cells.shape
     cells: NDArray[np.int8] = np.where(rectangle.cells > OCCUPIED, -1, rectangle.cells).astype(np.int8).ravel()
     data = orjson.Fragment(orjson.dumps(np.ascontiguousarray(cells), option=orjson.OPT_SERIALIZE_NUMPY))

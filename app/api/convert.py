@@ -27,7 +27,7 @@ from app.errors import Invalid, Problem
 from app.ingest.service import check_grid_name
 from app.model.frame import GROUND, Datum, Level
 from app.model.names import did_you_mean
-from app.upload_reader import DRAWN_LAYERS, Hints, drawn_layer
+from app.upload_reader import DRAWN_LAYERS, UploadHints, drawn_layer
 
 router = APIRouter(tags=["formats"], route_class=StrictRoute)
 
@@ -108,7 +108,7 @@ def _convert(services: Services, form: UploadForm) -> Response:
         accepted = ", ".join(sorted(written)) or "none"
         detail = f"{to} has no parameter {name[:80]!r}{did_you_mean(name, written | read)}; accepted: {accepted}"
         raise Invalid(detail, [Problem(f"unknown; accepted: {accepted}", where=name[:80])])
-    hints = Hints(source, layer, level, grid, {k: v for k, v in fields.items() if k not in written})
+    hints = UploadHints(source, layer, level, grid, {k: v for k, v in fields.items() if k not in written})
     values = {k: v for k, v in fields.items() if k in written}
     done = services.maps.convert({f.name: f.path for f in form.files}, to, hints=hints, datum=datum, options=values)
     return _answer(done, to, only_report)

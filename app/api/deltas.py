@@ -13,7 +13,7 @@ from collections import OrderedDict
 from collections.abc import Mapping
 
 from app.api.single_flight import SingleFlight
-from app.convert.cache import Cache, MadeFile
+from app.convert.cache import Cache, CachedFile
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -39,7 +39,7 @@ class Deltas:
         self._running: SingleFlight[tuple[str, str], bytes | None] = SingleFlight()
         self._lock = threading.Lock()
 
-    async def between(self, old: str, new: str, body: bytes | MadeFile) -> bytes | None:
+    async def between(self, old: str, new: str, body: bytes | CachedFile) -> bytes | None:
         """``dcz`` of the new file (by its SHA-256) against an old one; None where the old one is not known, or the
         delta is not smaller than the file."""
         key = (old, new)
@@ -49,7 +49,7 @@ class Deltas:
                 return self._known[key]
         return await self._running.run(key, self._between, key, body)
 
-    def _between(self, key: tuple[str, str], body: bytes | MadeFile) -> bytes | None:
+    def _between(self, key: tuple[str, str], body: bytes | CachedFile) -> bytes | None:
         before = self._cache.by_hash(key[0], MAX_BYTES)
         if before is None:
             return None  # not remembered: it may be made (again) at any moment, and anybody can ask for any hash

@@ -15,7 +15,7 @@ from app.api.schemas import DerivationBody, DerivationOut, EnvironmentPath, Idem
 from app.api.versions import told_as
 from app.catalogue import describe_derivations
 from app.errors import Invalid, NotFound, Problem
-from app.ingest import Wish, online
+from app.ingest import DerivationRequest, online
 
 router = APIRouter(tags=["derivations"], route_class=StrictRoute)
 
@@ -62,7 +62,7 @@ def create_derivation(
     site where the operator has set up a provider (503 while that is down); it goes stale when the fence or the datum
     changes, and is still used then.
     """
-    request = Wish(body.method, body.parameters, body.replace)
+    request = DerivationRequest(body.method, body.parameters, body.replace)
     try:
         carry_out = services.ingest.fetch_imagery if body.method == online.METHOD else services.ingest.derive
         outcome = carry_out(

@@ -27,7 +27,7 @@ from app.api.protocol import ON_STOP
 from app.api.responses import StrictRoute
 from app.api.schemas import told
 from app.api.single_flight import SingleFlight
-from app.convert.cache import MadeFile
+from app.convert.cache import CachedFile
 from app.convert.maps import file_of
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable
 from app.events import messages
@@ -308,7 +308,7 @@ def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
     return Reply(orjson.dumps([as_dict(environment, match) for environment, match in hits]), "application/json")
 
 
-def _answer_of(file: MadeFile, max_bytes: int) -> Reply:
+def _answer_of(file: CachedFile, max_bytes: int) -> Reply:
     if file.size > max_bytes:
         raise TooLarge(f"the map has {file.size} bytes, more than is sent over Zenoh ({max_bytes}): fetch it over HTTP")
     return Reply(file.read(), file.media_type)

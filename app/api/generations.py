@@ -12,7 +12,7 @@ from app.api.responses import StrictRoute, answer
 from app.api.schemas import EnvironmentPath, GenerationBody, GeneratorOut, IdempotencyKey, IfMatch, VersionOut, told
 from app.api.versions import told_as
 from app.errors import Invalid, NotFound, Problem
-from app.ingest import Order
+from app.ingest import GenerationRequest
 
 router = APIRouter(tags=["generations"], route_class=StrictRoute)
 
@@ -44,7 +44,7 @@ def create_generation(
 
     What was made up here before gives way; 409 where a source has told a part, unless `replace` is true.
     """
-    order = Order(body.generator, body.seed, body.parameters, body.replace)
+    order = GenerationRequest(body.generator, body.seed, body.parameters, body.replace)
     try:
         outcome = services.ingest.generate(
             env, order, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key

@@ -21,11 +21,11 @@ from app.api.auth import Principal, Viewer
 from app.api.dependencies import ServicesDep
 from app.api.responses import StrictRoute, answer, path_of
 from app.api.schemas import JobOut, JobPath, Limit, told
-from app.convert.cache import Made
+from app.convert.cache import CachedMap
 from app.convert.maps import Maps
 from app.convert.recipe import Recipe
 from app.errors import FleetMapError, NoRoom, NotFound, Unavailable
-from app.pool import Cancelled, Stop
+from app.pool import CancelHandle, Cancelled
 from app.store.store import Store
 from app.store.values import Job, State, rfc3339
 
@@ -49,8 +49,8 @@ class JobStarted:
 class _RunningConversion:
     """A map in the making. asking: requests that wait for it. jobs: principal's id -> job id."""
 
-    future: asyncio.Future[Made]
-    stop: Stop
+    future: asyncio.Future[CachedMap]
+    stop: CancelHandle
     asking: int = 0
     jobs: dict[str, str] = field(default_factory=dict)
 
@@ -65,7 +65,7 @@ class ConversionJobs:
         self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fleetmap-make")
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def make(self, recipe: Recipe, principal: Principal, address: str) -> Made | JobStarted:
+    async def make(self, recipe: Recipe, principal: Principal, address: str) -> CachedMap | JobStarted:
         """The map, or after ``seconds`` the job that will end with it. address: where the finished map is had.
 
         Raises what making raises; Unavailable where too much is being made.
@@ -107,7 +107,7 @@ class ConversionJobs:
         return False
 
     def _begin(self, recipe: Recipe) -> _RunningConversion:
-        stop = Stop()
+        stop = CancelHandle()
         future = asyncio.get_running_loop().run_in_executor(self._threads, self._maps.make, recipe, stop)
         running = self._running[recipe.key] = _RunningConversion(future, stop)
         future.add_done_callback(lambda _: self._finished(recipe, running))

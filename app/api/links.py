@@ -16,7 +16,7 @@ from app.api.maps import MapRequest, made_at, number_of
 from app.api.responses import API, StrictRoute, answer
 from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, told
 from app.api.signed import Grant
-from app.convert.cache import MadeFile
+from app.convert.cache import CachedFile
 from app.convert.maps import file_of
 from app.store.audit import about
 from app.store.values import Version, rfc3339
@@ -68,7 +68,7 @@ class LinkedFile:
 
     url: str
     expires: str | None
-    file: MadeFile
+    file: CachedFile
 
 
 async def link_to(

@@ -24,7 +24,7 @@ from app.api.maps import address_of, number_of, options_of
 from app.api.responses import StrictRoute, answer, json_bytes
 from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
 from app.convert import site
-from app.convert.cache import Made
+from app.convert.cache import CachedMap
 from app.convert.recipe import Recipe, own_options
 from app.errors import CannotConvert, CannotDerive, FleetMapError, Invalid, NotFound, Problem
 from app.events.messages import SIGNATURE
@@ -109,7 +109,7 @@ async def get_manifest(
     `level` names a file's level.
     """
     entries = _entries(formats, optional)
-    cached_maps: dict[str, Made] = {}
+    cached_maps: dict[str, CachedMap] = {}
     while True:
         outcome = await services.hot.shared(request, _signed, services, env, v, entries, closures, request, {})
         if (
@@ -161,7 +161,7 @@ def _signed(
     entries: list[_Entry],
     mode: ClosureMode | None,
     request: Request,
-    cached_maps: Mapping[str, Made],
+    cached_maps: Mapping[str, CachedMap],
 ) -> tuple[dict[str, str], bytes] | _PendingConversion:
     """The headers and the signed bytes; the first map that is to be made before that can be said.
 
@@ -217,7 +217,7 @@ def _seconds(moment: float) -> str:
 
 
 def _listed(
-    services: Services, version: Version, entries: list[_Entry], cached_maps: Mapping[str, Made]
+    services: Services, version: Version, entries: list[_Entry], cached_maps: Mapping[str, CachedMap]
 ) -> tuple[list[dict[str, Any]], list[dict[str, str]]] | _PendingConversion:
     """The files of all formats, and the optional formats that cannot be given; or a map that is to be made first."""
     files: list[dict[str, Any]] = []
@@ -307,7 +307,7 @@ def _entry(text: str, location: str, *, required: bool) -> _Entry:
     return _Entry(name, values, derive, closures, required, dict(parse_qsl(query, keep_blank_values=True)))
 
 
-async def _made(services: Services, recipe: Recipe, request: Request, principal: Any) -> Made | JobStarted | None:
+async def _made(services: Services, recipe: Recipe, request: Request, principal: Any) -> CachedMap | JobStarted | None:
     """A map that is not ready, or the job that makes it. None where it cannot be derived so: the next recipe goes
     another way, or says that there is none.
     """

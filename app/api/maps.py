@@ -37,7 +37,7 @@ from app.api.responses import API, StrictRoute, answer, path_of
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
 from app.api.signed import LINK
 from app.api.single_flight import SingleFlight
-from app.convert.cache import LostMap, Made, MadeFile
+from app.convert.cache import CachedFile, CachedMap, LostMap
 from app.convert.maps import file_of
 from app.convert.recipe import Recipe
 from app.errors import CannotDerive, Invalid, NotFound, Problem, Unavailable
@@ -92,7 +92,7 @@ class CachedResponse:
     bare: Headers
     size: int
     body: bytes | None
-    file: MadeFile | None
+    file: CachedFile | None
     sha256: str
     generation: int
     fresh_until: float
@@ -170,7 +170,7 @@ class ResponseCache:
         self._metrics.disk_hits.inc()
         return self._fill(key, empty, cached_map)
 
-    def _fill(self, key: Key, empty: CachedResponse, cached_map: Made) -> CachedResponse:
+    def _fill(self, key: Key, empty: CachedResponse, cached_map: CachedMap) -> CachedResponse:
         full = _filled(empty, cached_map)
         self._put(key, full)
         return full
@@ -331,7 +331,7 @@ def number_of(ref: str) -> str | int:
     return int(ref) if ref.isascii() and ref.isdigit() and len(ref) <= 18 else ref
 
 
-def _filled(empty: CachedResponse, cached_map: Made) -> CachedResponse:
+def _filled(empty: CachedResponse, cached_map: CachedMap) -> CachedResponse:
     """With headers and content of the made map. NotFound where it has no such file."""
     assert empty.recipe is not None
     file = file_of(empty.recipe, cached_map, empty.wanted.file)
@@ -358,7 +358,7 @@ def _dictionary(map_request: MapRequest) -> str:
     return f'match="{API}/environments/{env}/versions/*/maps/{name}{file}"'
 
 
-def _media_type(file: MadeFile) -> str:
+def _media_type(file: CachedFile) -> str:
     media_type = file.media_type
     return (
         f"{media_type}; charset=utf-8" if media_type.startswith("text/") and "charset" not in media_type else media_type
@@ -629,7 +629,7 @@ def add_routes(app: FastAPI) -> None:
 
 async def made_at(
     services: Services, map_request: MapRequest, query: bytes, principal: Principal
-) -> tuple[Recipe, Made] | JobStarted:
+) -> tuple[Recipe, CachedMap] | JobStarted:
     """The map that an address of a version's number gives, made where need be; the job that makes it if it takes long.
 
     query: the map's parameters, percent-encoded.
@@ -643,7 +643,7 @@ async def made_at(
 
 async def made_by(
     services: Services, plan: Callable[[], Recipe], address: str, principal: Principal
-) -> tuple[Recipe, Made] | JobStarted:
+) -> tuple[Recipe, CachedMap] | JobStarted:
     """The map of a recipe, made where need be; the job that makes it for ``address`` if it takes long.
 
     plan: called again if a derivation finds nothing to use; the next recipe goes another way, or says there is none.

@@ -28,7 +28,7 @@ from app.api.schemas import (
     ZoneSetsOut,
     told,
 )
-from app.convert.cache import Made
+from app.convert.cache import CachedMap
 from app.convert.closures import place_problem
 from app.errors import Conflict, Denied, Invalid, NotFound, Problem
 from app.fleet import live, overlays
@@ -315,5 +315,5 @@ async def _marked(
     return out
 
 
-def _files(cached_map: Made) -> dict[str, bytes]:
+def _files(cached_map: CachedMap) -> dict[str, bytes]:
     return {file.name: file.read() for file in cached_map.files}

@@ -18,7 +18,7 @@ from app.api.responses import StrictRoute, answer, page
 from app.api.schemas import CHANNEL, NAME, Cursor, Limit, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.audit import about
-from app.store.values import Channel, Heard, Held, Move, Report, Robot, rfc3339
+from app.store.values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport, rfc3339
 
 router = APIRouter(prefix="/robots", tags=["robots"], route_class=StrictRoute)
 
@@ -93,9 +93,9 @@ async def put_status(
         raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
     holds = None if body.holds is None else (body.holds.version, body.holds.root)
     more = (body.detail, body.sequence, body.time, body.overlays, holds)
-    report = Report(body.channel, body.version, body.root, body.state, *more)
+    report = RobotReport(body.channel, body.version, body.root, body.state, *more)
     # No thread waits for the store: a whole fleet reports at once, and others want maps meanwhile.
-    noting = services.fleet.noting(Heard(body.environment, robot, report, datetime.now(UTC)))
+    noting = services.fleet.noting(ReceivedReport(body.environment, robot, report, datetime.now(UTC)))
     await asyncio.wait({asyncio.wrap_future(noting)}, timeout=fleet.NOTE_SECONDS)
     fleet.settle(noting)
     if prefer is not None and prefer.strip().lower() == "return=minimal":
@@ -125,9 +125,9 @@ def may_report(principal: Principal, robot: str) -> None:
     raise Denied(f"your token {names}: it cannot tell the status of {robot[:128]}")
 
 
-def noted(services: Services, environment: str, robot: str, report: Report) -> dict[str, Any]:
+def noted(services: Services, environment: str, robot: str, report: RobotReport) -> dict[str, Any]:
     """Store a report; the robot as it is now."""
-    services.fleet.note(Heard(environment, robot, report, datetime.now(UTC)))
+    services.fleet.note(ReceivedReport(environment, robot, report, datetime.now(UTC)))
     return _one(services, services.store.robots(environment, robot))
 
 
@@ -142,7 +142,7 @@ def _told(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
     """As clients see them; without those whose environment is deleted meanwhile."""
     now = datetime.now(UTC)
     channels: dict[str, dict[str, Channel]] = {}
-    moves: dict[tuple[str, str], list[Move]] = {}
+    moves: dict[tuple[str, str], list[ChannelMove]] = {}
     out = []
     for robot in robots:
         name = robot.report.channel
@@ -174,12 +174,12 @@ def _told(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
     return out
 
 
-def _held(active_map: Held) -> dict[str, Any]:
+def _held(active_map: ActiveMap) -> dict[str, Any]:
     overlays = {} if active_map.overlays is None else {"overlays": active_map.overlays}
     return {"version": active_map.version, "root": active_map.root, **overlays, "since": rfc3339(active_map.since)}
 
 
-def _report(report: Report, heard: datetime) -> dict[str, Any]:
+def _report(report: RobotReport, heard: datetime) -> dict[str, Any]:
     body: dict[str, Any] = {
         "channel": report.channel,
         "version": report.version,

@@ -28,8 +28,8 @@ from app.api.schemas import (
 )
 from app.api.versions import told_as
 from app.formats import Format
-from app.ingest import TemplateWish
-from app.model.templates import Own, Templates
+from app.ingest import TemplateUpdate
+from app.model.templates import FormatTemplate, Templates
 from app.store.values import Version
 
 router = APIRouter(tags=["templates"], route_class=StrictRoute)
@@ -89,8 +89,8 @@ def put_templates(
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which another set holds, or other values of several formats at once. What is left out stays."""
-    format_templates = {name: Own(template.set, template.values) for name, template in body.formats.items()}
-    update = TemplateWish(body.set, format_templates, dry_run=body.dry_run).checked()
+    format_templates = {name: FormatTemplate(template.set, template.values) for name, template in body.formats.items()}
+    update = TemplateUpdate(body.set, format_templates, dry_run=body.dry_run).checked()
     return _said(services, env, update, body.message, principal, if_match, idempotency_key)
 
 
@@ -105,7 +105,7 @@ def delete_templates(
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which the formats' own defaults hold."""
-    update = TemplateWish(clear=True, dry_run=dry_run)
+    update = TemplateUpdate(clear=True, dry_run=dry_run)
     return _said(services, env, update, message, principal, if_match, idempotency_key)
 
 
@@ -144,7 +144,7 @@ def put_format_templates(
 
     Maps of the new version are made with them; old versions keep answering as they did.
     """
-    update = TemplateWish(None, {format: Own(body.set, body.values)}, dry_run=body.dry_run).checked("body")
+    update = TemplateUpdate(None, {format: FormatTemplate(body.set, body.values)}, dry_run=body.dry_run).checked("body")
     return _said(services, env, update, body.message, principal, if_match, idempotency_key)
 
 
@@ -165,14 +165,14 @@ def delete_format_templates(
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which the environment's set holds for the format again."""
-    update = TemplateWish(None, {format: Own()}, dry_run=dry_run).checked()
+    update = TemplateUpdate(None, {format: FormatTemplate()}, dry_run=dry_run).checked()
     return _said(services, env, update, message, principal, if_match, idempotency_key)
 
 
 def _said(
     services: Services,
     env: str,
-    update: TemplateWish,
+    update: TemplateUpdate,
     message: str,
     principal: Principal,
     if_match: str | None,

@@ -21,7 +21,7 @@ from app.api.robots import may_report, noted
 from app.api.schemas import CHANNEL, NAME, ActionsOut, EnvironmentPath, RobotPath, StateOut, VersionPath, told
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
-from app.store.values import Channel, Report, RobotState, Version
+from app.store.values import Channel, RobotReport, RobotState, Version
 
 router = APIRouter(tags=["vda5050"], route_class=StrictRoute)
 
@@ -274,7 +274,7 @@ def _report(
     text: str,
     detail: str | None,
     out: dict[str, list[dict[str, Any]]],
-) -> list[Report]:
+) -> list[RobotReport]:
     try:
         if not (text.isascii() and text.isdigit() and len(text) < 10):
             raise NotFound("its mapVersion is no version's number")
@@ -282,4 +282,4 @@ def _report(
     except NotFound as error:
         out["ignored"].append({"mapId": map_id, "mapVersion": text, "why": error.detail})
         return []
-    return [Report(channel, version.number, version.root, state, detail and detail[:2000])]
+    return [RobotReport(channel, version.number, version.root, state, detail and detail[:2000])]

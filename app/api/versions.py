@@ -33,7 +33,7 @@ from app.api.schemas import (
 )
 from app.api.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
-from app.ingest import Outcome, SpooledFile, Upload
+from app.ingest import CommitResult, SpooledFile, Upload
 from app.ingest.service import bad_name
 from app.model.frame import GROUND, Level
 from app.store.values import Source
@@ -249,7 +249,7 @@ def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Sourc
     return next((s for s in fitting if s.used), fitting[0])
 
 
-def told_as(outcome: Outcome) -> Response:
+def told_as(outcome: CommitResult) -> Response:
     """The answer for what became of a change: 201 where there is a new version, also when it is told again."""
     version = outcome.version
     if version is None:
@@ -323,9 +323,9 @@ def truth(text: str, parameter: str) -> bool:
 
 def _counted(
     services: Services, take: Any, env: str, upload: Upload, principal: Principal, if_match: str | None, key: str | None
-) -> Outcome:
+) -> CommitResult:
     try:
-        outcome: Outcome = take(env, upload, author=principal.name, if_match=if_match, idempotency=key)
+        outcome: CommitResult = take(env, upload, author=principal.name, if_match=if_match, idempotency=key)
     except FleetMapError:
         services.metrics.uploads.labels("refused").inc()
         raise
@@ -335,7 +335,7 @@ def _counted(
 
 def _revert(
     services: Services, env: str, body: RevertBody, principal: Principal, if_match: str | None, key: str | None
-) -> Outcome:
+) -> CommitResult:
     return services.ingest.revert(
         env, body.revert_to, message=body.message, author=principal.name, if_match=if_match, idempotency=key
     )

@@ -189,7 +189,7 @@ def convert(
     from app import formats, parameters
     from app.convert.files import offline
     from app.derive import all_derivations, takes
-    from app.upload_reader import Hints, drawn_layer
+    from app.upload_reader import UploadHints, drawn_layer
 
     if out == "-" and as_json:
         raise typer.BadParameter("--json and -o - both want standard output")
@@ -199,7 +199,7 @@ def convert(
     values = options.pairs(option)
     files, _, notes = _collect(paths)
     files = with_companions(files)
-    hints = Hints(format, drawn_layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
+    hints = UploadHints(format, drawn_layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
     format_options = {k: v for k, v in values.items() if k in ours}
     with output.progress_bar(f"converting to {to}"):
         data = {f.name: f.path.read_bytes() for f in files}

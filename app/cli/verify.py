@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from app.config import Settings
     from app.ingest.repair import Donor
     from app.store.store import Store
-    from app.store.verify import Finding, Verified
+    from app.store.verify import Finding, VerifyResult
 
 REMOVED = "nowhere: it was removed, since no version has it"
 MAX_ROUNDS = 10
@@ -104,7 +104,7 @@ def _open(settings: Settings, *, readonly: bool) -> Store:
     return Store(settings.database, settings.blob_dir, readonly=readonly)
 
 
-def _check(store: Store) -> Verified:
+def _check(store: Store) -> VerifyResult:
     with output.progress_bar("checking", count_bytes=True) as bar:
         return store.verifier(lambda _, size: bar.advance(size)).run()
     raise AssertionError("unreachable")
@@ -228,7 +228,7 @@ def _files(place: Path) -> Iterator[Path]:
 
 
 def _as_dict(
-    verification: Verified, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, ok: bool
+    verification: VerifyResult, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, ok: bool
 ) -> dict[str, Any]:
     findings = [{**f.as_dict(), "repaired_from": healed.get((f.kind, f.name))} for f in verification.findings]
     return {
@@ -241,7 +241,7 @@ def _as_dict(
 
 
 def _show(
-    verification: Verified, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, repaired: bool
+    verification: VerifyResult, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, repaired: bool
 ) -> None:
     counts = ", ".join(f"{count} {kind}s" for kind, count in verification.checked.items() if kind != "database")
     output.show(f"checked: {counts}, {cache[0]} cached maps")

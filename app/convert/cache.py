@@ -51,7 +51,7 @@ class LostMap(Unavailable):
 
 
 @dataclass(frozen=True, slots=True)
-class MadeFile:
+class CachedFile:
     """One file of a made map. place: the level and name of the part that it is of, in a map of several.
 
     path: None where it is in memory (``data``), since the disk refused it. on_damage: called with what is wrong.
@@ -92,11 +92,11 @@ class MadeFile:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class CachedMap:
     """A made map: its files (main file first), the one thing to download, the report; fresh: made just now."""
 
-    files: tuple[MadeFile, ...]
-    archive: MadeFile | None
+    files: tuple[CachedFile, ...]
+    archive: CachedFile | None
     report: dict[str, Any]
     fresh: bool = field(default=False, compare=False)
 
@@ -105,27 +105,27 @@ class Made:
         """Bytes of all its files."""
         return sum(file.size for file in self.every())
 
-    def every(self) -> tuple[MadeFile, ...]:
+    def every(self) -> tuple[CachedFile, ...]:
         """All files, and the archive of them."""
         return (*self.files, *([self.archive] if self.archive else []))
 
-    def whole(self) -> MadeFile:
+    def whole(self) -> CachedFile:
         """The file itself where the map is one file, else the zip of all."""
         return self.archive or self.files[0]
 
-    def file(self, name: str) -> MadeFile | None:
+    def file(self, name: str) -> CachedFile | None:
         """One file by its name."""
         return next((f for f in self.files if f.name == name), None)
 
 
 @dataclass(frozen=True, slots=True)
-class Product:
+class ConvertedMap:
     """What a maker returns: content by name with media types, an archive of it where there are several, the report.
 
     A made file instead of bytes is linked, if its content still has its hash. places: see ``MadeFile.place``.
     """
 
-    files: dict[str, tuple[bytes | MadeFile, str]]
+    files: dict[str, tuple[bytes | CachedFile, str]]
     archive: tuple[str, bytes] | None
     report: dict[str, Any]
     places: Mapping[str, tuple[str, str]] = field(default_factory=dict)
@@ -146,7 +146,7 @@ class Cache:
         self._locks: dict[str, threading.Lock] = {}
         self._guard = threading.Lock()
         self._checked: OrderedDict[str, tuple[int, int, int]] = OrderedDict()
-        self._spare: OrderedDict[str, Made] = OrderedDict()
+        self._spare: OrderedDict[str, CachedMap] = OrderedDict()
         self._syncing: ThreadPoolExecutor | None = None
         self.hits = self.misses = self.damaged = 0
         self.on_damage: Callable[[], None] = lambda: None
@@ -161,7 +161,7 @@ class Cache:
                     shutil.rmtree(old, ignore_errors=True)
         self._total = sum(size for _, size, _ in self._entries())
 
-    def get(self, key: str) -> Made | None:
+    def get(self, key: str) -> CachedMap | None:
         """The map, if it is made and intact."""
         cached_map = self._stored(key)
         if cached_map is not None:
@@ -169,7 +169,7 @@ class Cache:
         with self._guard:
             return self._spare.get(key)
 
-    def _stored(self, key: str) -> Made | None:
+    def _stored(self, key: str) -> CachedMap | None:
         """The entry on disk, hashed when this process first meets it; a bad one is removed."""
         entry = self._read_entry(key)
         if entry is None:
@@ -189,7 +189,7 @@ class Cache:
                 os.utime(folder)
         return cached_map
 
-    def _read_entry(self, key: str) -> tuple[Made, tuple[int, int, int]] | None:
+    def _read_entry(self, key: str) -> tuple[CachedMap, tuple[int, int, int]] | None:
         """What ``map.json`` describes; None where it is absent, cannot be read at the moment, or is not intact.
 
         The stamp with it changes when any of its files is written to or lost.
@@ -210,7 +210,7 @@ class Cache:
         damaged = partial(self.discard, key)
         files = tuple(_described(folder, f, damaged) for f in described["files"])
         archive = _described(folder, described["archive"], damaged) if described["archive"] else None
-        cached_map = Made(files, archive, described["report"])
+        cached_map = CachedMap(files, archive, described["report"])
         times = [status.st_mtime_ns, *(_written(file) for file in cached_map.every())]
         return cached_map, (status.st_ino, min(times), max(times))
 
@@ -261,7 +261,7 @@ class Cache:
         for key in random.sample(keys, math.ceil(len(keys) * share)):
             yield key, *self.check(key)
 
-    def get_or_make(self, key: str, maker: Callable[[], Product]) -> Made:
+    def get_or_make(self, key: str, maker: Callable[[], ConvertedMap]) -> CachedMap:
         """The map; made now if nobody has, and then by one caller only."""
         cached_map = self.get(key)
         if cached_map is not None:
@@ -276,7 +276,7 @@ class Cache:
             return replace(self._store(key, maker()), fresh=True)
 
     @contextlib.contextmanager
-    def holding(self) -> Iterator[Callable[[Made], Made]]:
+    def holding(self) -> Iterator[Callable[[CachedMap], CachedMap]]:
         """A function that keeps a made map's files until the block ends, whatever room the cache needs meanwhile.
 
         It raises LostMap where they are gone already.
@@ -290,7 +290,7 @@ class Cache:
             self._note_problem(reason_of(error))
             folder = None
 
-        def hold(cached_map: Made) -> Made:
+        def hold(cached_map: CachedMap) -> CachedMap:
             nonlocal count
             files = []
             for file in cached_map.files:
@@ -315,7 +315,7 @@ class Cache:
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
 
-    def _store(self, key: str, product: Product) -> Made:
+    def _store(self, key: str, product: ConvertedMap) -> CachedMap:
         try:
             cached_map = self._write(key, product)
         except OSError as error:
@@ -331,7 +331,7 @@ class Cache:
             self._make_room()
         return cached_map
 
-    def _write(self, key: str, product: Product) -> Made | None:
+    def _write(self, key: str, product: ConvertedMap) -> CachedMap | None:
         """The entry on disk; None where it is removed or cannot be read as soon as it is there.
 
         OSError where the disk refuses; LostMap where a file of the product is damaged.
@@ -381,17 +381,17 @@ class Cache:
             if error.errno in BROKEN | NO_ROOM:
                 self.discard(key, f"it could not be written: {reason_of(error)}")
 
-    def _keep_spare(self, key: str, product: Product) -> Made:
+    def _keep_spare(self, key: str, product: ConvertedMap) -> CachedMap:
         """The map in memory."""
 
-        def described(name: str, content: bytes | MadeFile, media_type: str) -> MadeFile:
-            data = content.read() if isinstance(content, MadeFile) else content
+        def described(name: str, content: bytes | CachedFile, media_type: str) -> CachedFile:
+            data = content.read() if isinstance(content, CachedFile) else content
             digest = hashlib.sha256(data).hexdigest()
-            return MadeFile(name, len(data), digest, media_type, None, product.places.get(name), data)
+            return CachedFile(name, len(data), digest, media_type, None, product.places.get(name), data)
 
         files = tuple(described(name, *content) for name, content in product.files.items())
         archive = described(*product.archive, "application/zip") if product.archive else None
-        cached_map = Made(files, archive, product.report)
+        cached_map = CachedMap(files, archive, product.report)
         with self._guard:
             self._spare[key] = cached_map
             while len(self._spare) > 1 and sum(m.size for m in self._spare.values()) > SPARE_BYTES:
@@ -421,7 +421,7 @@ class Cache:
             return None
         return data if hashlib.sha256(data).hexdigest() == sha256 else None
 
-    def _note_hash(self, file: MadeFile) -> None:
+    def _note_hash(self, file: CachedFile) -> None:
         path = self._hash_path(file.sha256)
         if file.path is None:
             return
@@ -486,9 +486,9 @@ class Cache:
         return self._folder / key[:2] / key
 
 
-def _write(folder: Path, stored: str, name: str, data: bytes | MadeFile, media_type: str) -> dict[str, Any]:
+def _write(folder: Path, stored: str, name: str, data: bytes | CachedFile, media_type: str) -> dict[str, Any]:
     target = folder / stored
-    if isinstance(data, MadeFile) and data.path is not None:
+    if isinstance(data, CachedFile) and data.path is not None:
         try:
             _link(data.path, target)
         except FileNotFoundError as error:
@@ -496,7 +496,7 @@ def _write(folder: Path, stored: str, name: str, data: bytes | MadeFile, media_t
         digest, size = _hash(target), target.stat().st_size
         data.check(digest)
     else:
-        content = data.read() if isinstance(data, MadeFile) else data
+        content = data.read() if isinstance(data, CachedFile) else data
         target.write_bytes(content)
         digest, size = hashlib.sha256(content).hexdigest(), len(content)
     return {"name": name, "stored": stored, "size": size, "sha256": digest, "media_type": media_type}
@@ -512,7 +512,7 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _written(file: MadeFile) -> int:
+def _written(file: CachedFile) -> int:
     try:
         return 0 if file.path is None else file.path.stat().st_mtime_ns
     except OSError:
@@ -524,7 +524,7 @@ def _hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _check_files(cached_map: Made) -> None:
+def _check_files(cached_map: CachedMap) -> None:
     """LostMap unless all files of an entry match their hashes; what is wrong is reported as damage."""
     for file in cached_map.every():
         assert file.path is not None
@@ -548,8 +548,8 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def _described(folder: Path, f: dict[str, Any], on_damage: Callable[[str], None]) -> MadeFile:
+def _described(folder: Path, f: dict[str, Any], on_damage: Callable[[str], None]) -> CachedFile:
     level, name = f.get("place") or (None, None)
     place = None if level is None or name is None else (level, name)
     path = folder / f["stored"]
-    return MadeFile(f["name"], f["size"], f["sha256"], f["media_type"], path, place, on_damage=on_damage)
+    return CachedFile(f["name"], f["size"], f["sha256"], f["media_type"], path, place, on_damage=on_damage)

@@ -17,7 +17,7 @@ from app.model.frame import Datum
 from app.model.layers import Layer, Layers
 from app.store.values import PartEntry, Provenance
 from app.templates import REQUEST
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ def offline(
     files: Files,
     to: str,
     *,
-    hints: Hints | None = None,
+    hints: UploadHints | None = None,
     datum: Datum | None = None,
     options: Mapping[str, str] | None = None,
     derived: bool = True,
@@ -45,13 +45,13 @@ def offline(
 
     Raises what reading and planning raise; see ``app.upload_reader.read`` and ``app.convert.recipe.chain``.
     """
-    return _offline(lambda: files, to, hints or Hints(), datum, options or {}, limits or Limits(), derived)
+    return _offline(lambda: files, to, hints or UploadHints(), datum, options or {}, limits or Limits(), derived)
 
 
 def _offline(
     load: Callable[[], Files],
     to: str,
-    hints: Hints,
+    hints: UploadHints,
     datum: Datum | None,
     options: Mapping[str, str],
     limits: Limits,
@@ -69,7 +69,7 @@ def _offline(
         required_layers = None  # further parts may be derived from any layer
     cells = bool(option_values) or not fmt.outlines  # an option may ask for the images, too
     complete = required_layers is None and cells
-    knowing = Known(datum, None, required_layers, cells, fmt.drawing or fmt.holds)
+    knowing = EnvironmentContext(datum, None, required_layers, cells, fmt.drawing or fmt.holds)
     upload_bundle = upload_reader.read(upload_reader.unpack(load(), limits), hints, knowing, limits)
     try:
         written = _made(fmt, upload_bundle, datum, option_values, derived=derived and complete)
@@ -94,7 +94,7 @@ def _made(
     option_values: Mapping[str, Any],
     *,
     derived: bool,
-) -> making.Written:
+) -> making.WrittenMap:
     credit = {key: upload_bundle.credit(key) for key in upload_bundle.parts}
     layers = upload_bundle.layers(datum)
     return making.from_layers(fmt, layers, option_values, derived=derived, origin=upload_bundle.origin, credit=credit)
@@ -119,7 +119,7 @@ def written(layers: Layers, to: str, options: Mapping[str, str], came: Provenanc
 def offline_paths(
     paths: Mapping[str, Path],
     to: str,
-    hints: Hints,
+    hints: UploadHints,
     datum: Datum | None,
     options: Mapping[str, str],
     limits: Limits,

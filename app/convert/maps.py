@@ -21,8 +21,8 @@ from app.convert import files as direct
 from app.convert import recipe as recipes
 from app.convert import site
 from app.convert import worker as making
-from app.convert.cache import Cache, LostMap, Made, MadeFile, Product
-from app.convert.recipe import Hindrance, Recipe
+from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap
+from app.convert.recipe import ChainFailure, Recipe
 from app.convert.trials import Trials
 from app.errors import (
     Ambiguous,
@@ -40,10 +40,10 @@ from app.formats import Limits, _shell, environment
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.model.names import did_you_mean
-from app.pool import Stop, WorkerDied
+from app.pool import CancelHandle, WorkerDied
 from app.store.store import Store
 from app.store.values import Version
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 
 Run = Callable[..., Any]
 """``run(function, *args, stop=…)``: call a module-level function somewhere safe, return its result (``Pool.run``)."""
@@ -123,7 +123,7 @@ class Maps:
     def _planned(self, version: Version, plan: Callable[[frozenset[str]], Recipe], origin: Mapping[str, str]) -> Recipe:
         """The cheapest recipe whose derivations are not known to fail. plan: a recipe without these derivations."""
         without: frozenset[str] = frozenset()
-        failed: list[Hindrance] = []
+        failed: list[ChainFailure] = []
         while True:
             try:
                 recipe = plan(without)
@@ -135,7 +135,7 @@ class Maps:
             without |= {tried.step}
             failed.append(tried)
 
-    def _hindered(self, version: Version, recipe: Recipe) -> Hindrance | None:
+    def _hindered(self, version: Version, recipe: Recipe) -> ChainFailure | None:
         """The step that is known to fail on this content. A map that may be empty is planned all the same."""
         for one in [recipe, *(member.recipe for member in recipe.members)]:
             if one.members or not one.steps or (one.spread is not None and one.spread.optional):
@@ -146,11 +146,11 @@ class Maps:
                     return tried
         return None
 
-    def ready(self, recipe: Recipe) -> Made | None:
+    def ready(self, recipe: Recipe) -> CachedMap | None:
         """The map, only if it is made already."""
         return self.cache.get(recipe.key)
 
-    def make(self, recipe: Recipe, stop: Stop | None = None) -> Made:
+    def make(self, recipe: Recipe, stop: CancelHandle | None = None) -> CachedMap:
         """The map; blocks until it is made. stop: ends the making from another thread, with Cancelled.
 
         CannotDerive where a step finds nothing to use: then ``recipe`` gives another way, if there is one.
@@ -161,7 +161,7 @@ class Maps:
             return self.cache.get_or_make(recipe.key, lambda: self._made(recipe, stop))
         except CannotDerive as error:
             if not recipe.members:  # else it is the member's
-                failure = Hindrance(error.step, error.detail, error.choose)
+                failure = ChainFailure(error.step, error.detail, error.choose)
                 key = _trial_key(recipe.version, recipe.chain)
                 self._trials.add(key, failure, lasting=_is_lasting(recipe.chain))
             raise
@@ -182,7 +182,7 @@ class Maps:
             while len(self._failures) > REMEMBERED:
                 self._failures.popitem(last=False)
 
-    def _put_together(self, recipe: Recipe, stop: Stop | None) -> Made:
+    def _put_together(self, recipe: Recipe, stop: CancelHandle | None) -> CachedMap:
         """A map of several: each is made by itself. Those that are there already stay while the others are made."""
         for _ in range(HOLD_ATTEMPTS):
             # A member whose file turns out to be damaged leaves the cache, and is made again.
@@ -191,7 +191,7 @@ class Maps:
                 return self.cache.get_or_make(recipe.key, partial(joined, recipe, cached_maps))
         raise Unavailable("cached maps are damaged repeatedly: check the disk of the cache")
 
-    def _held(self, recipe: Recipe, hold: Callable[[Made], Made], stop: Stop | None) -> Made:
+    def _held(self, recipe: Recipe, hold: Callable[[CachedMap], CachedMap], stop: CancelHandle | None) -> CachedMap:
         for _ in range(HOLD_ATTEMPTS):
             with contextlib.suppress(LostMap):  # the cache needed the room in this very moment
                 return hold(self.make(recipe, stop))
@@ -205,7 +205,7 @@ class Maps:
         *,
         derive: bool = True,
         file: str | None = None,
-    ) -> MadeFile:
+    ) -> CachedFile:
         """The map's wanted file, or the zip of all; blocks until it is made.
 
         Raises what ``recipe`` and ``make`` do; NotFound where the map has no such file.
@@ -220,13 +220,13 @@ class Maps:
         *,
         derive: bool = True,
         file: str | None = None,
-    ) -> Made:
+    ) -> CachedMap:
         """The map, by whichever way works; blocks until it is made. Raises what ``recipe`` and ``make`` do."""
         return self._by_any_chain(version, name, values, derive=derive, file=file)[1]
 
     def _by_any_chain(
         self, version: Version, name: str, values: Mapping[str, str] | None, *, derive: bool, file: str | None
-    ) -> tuple[Recipe, Made]:
+    ) -> tuple[Recipe, CachedMap]:
         """The first recipe whose derivations find something to use, and its map."""
         while True:
             recipe = self.recipe(version, name, values, derive=derive, file=file)
@@ -344,12 +344,14 @@ class Maps:
         except FleetMapError:
             return ()
 
-    def _way(self, version: Version, fmt: formats.Format, available: recipes.Stock) -> tuple[recipes.Chain, str | None]:
+    def _way(
+        self, version: Version, fmt: formats.Format, available: recipes.AvailableLayers
+    ) -> tuple[recipes.DerivationChain, str | None]:
         """The cheapest chain whose derivations work on what is stored, found by doing them once for each content; and
         what the caller has to name for it, where it works only so."""
         without: frozenset[str] = frozenset()
         failed: list[Problem] = []
-        unnamed: tuple[recipes.Chain, str | None] | None = None
+        unnamed: tuple[recipes.DerivationChain, str | None] | None = None
         while True:
             try:
                 template_values = templates.resolve(version.templates, fmt).values
@@ -372,7 +374,7 @@ class Maps:
                 unnamed = unnamed or (chain, hindrance.reason)
             without |= {hindrance.step}
 
-    def _check_content(self, version: Version, fmt: formats.Format, chain: recipes.Chain) -> None:
+    def _check_content(self, version: Version, fmt: formats.Format, chain: recipes.DerivationChain) -> None:
         """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
         if fmt.lacks is None:
             return
@@ -380,21 +382,23 @@ class Maps:
         if failure is not None:
             raise CannotConvert(failure.reason, [Problem(failure.reason)])
 
-    def _hindrance(self, version: Version, chain: recipes.Chain) -> Hindrance | None:
+    def _hindrance(self, version: Version, chain: recipes.DerivationChain) -> ChainFailure | None:
         """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""
         chain = recipes.needed(chain)
         return self._try(_trial_key(version, chain), chain, making.hindrance, version, chain)
 
-    def _try(self, key: str, chain: recipes.Chain, function: Callable[..., Any], *args: Any) -> Hindrance | None:
+    def _try(
+        self, key: str, chain: recipes.DerivationChain, function: Callable[..., Any], *args: Any
+    ) -> ChainFailure | None:
         """What a worker finds in the way, if it was not found before."""
         with contextlib.suppress(KeyError):
             return self._trials[key]
         store_location = (self._store.database_url, str(self._store.blob_dir))
         try:
-            failure: Hindrance | None = self._run_trial(function, *store_location, *args)
+            failure: ChainFailure | None = self._run_trial(function, *store_location, *args)
             lasting = _is_lasting(chain)
         except WorkerDied as error:
-            failure, lasting = Hindrance("", error.detail), False
+            failure, lasting = ChainFailure("", error.detail), False
         self._trials.add(key, failure, lasting=lasting)
         return failure
 
@@ -403,25 +407,25 @@ class Maps:
         files: Mapping[str, Path],
         to: str,
         *,
-        hints: Hints | None = None,
+        hints: UploadHints | None = None,
         datum: Datum | None = None,
         options: Mapping[str, str] | None = None,
     ) -> direct.Converted:
         """Convert spooled files without storing anything."""
         recipes.own_options(formats.get_format(to), options or {})
-        arguments = (dict(files), to, hints or Hints(), datum, dict(options or {}), self._limits)
+        arguments = (dict(files), to, hints or UploadHints(), datum, dict(options or {}), self._limits)
         try:
             converted: direct.Converted = self._run(direct.offline_paths, *arguments)
         except WorkerDied as error:
             raise UnreadableFile(f"the files could not be converted: {error.detail}") from error
         return converted
 
-    def _made(self, recipe: Recipe, stop: Stop | None) -> Product:
+    def _made(self, recipe: Recipe, stop: CancelHandle | None) -> ConvertedMap:
         values = parameters.canonical(recipe.options)
         store_location = (self._store.database_url, str(self._store.blob_dir))
         cancel_arguments = {} if stop is None else {"stop": stop}
         try:
-            written: making.Written = self._run(
+            written: making.WrittenMap = self._run(
                 making.make,
                 *store_location,
                 recipe.version,
@@ -433,16 +437,16 @@ class Maps:
             )
         except WorkerDied as error:
             raise CannotConvert(f"{recipe.format.name} could not be made: {error.detail}") from error
-        typed: dict[str, tuple[bytes | MadeFile, str]] = {
+        typed: dict[str, tuple[bytes | CachedFile, str]] = {
             name: (data, making.media_type(recipe.format, name)) for name, data in written.files.items()
         }
         archive = None
         if len(typed) > 1 and recipe.spread is None:
             archive = (f"{recipe.format.name}.zip", making.zipped(written.files))
-        return Product(typed, archive, written.report, written.places)
+        return ConvertedMap(typed, archive, written.report, written.places)
 
 
-def file_of(recipe: Recipe, cached_map: Made, file: str | None) -> MadeFile:
+def file_of(recipe: Recipe, cached_map: CachedMap, file: str | None) -> CachedFile:
     """The wanted file of a made map, or the zip of all. file: as the request names it. NotFound where it has none."""
     if file is None:
         return cached_map.whole()
@@ -458,9 +462,9 @@ def file_of(recipe: Recipe, cached_map: Made, file: str | None) -> MadeFile:
     return cached_file
 
 
-def joined(recipe: Recipe, cached_maps: Sequence[Made]) -> Product:
+def joined(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedMap:
     """The files of all members, each at its place; of two of one name the first stays, and the report says so."""
-    files: dict[str, tuple[bytes | MadeFile, str]] = {}
+    files: dict[str, tuple[bytes | CachedFile, str]] = {}
     places: dict[str, tuple[str, str]] = {}
     clashes: list[dict[str, Any]] = []
     for member, cached_map in zip(recipe.members, cached_maps, strict=True):
@@ -478,17 +482,17 @@ def joined(recipe: Recipe, cached_maps: Sequence[Made]) -> Product:
         raise site.nothing_made(recipe)
     archive = None
     if recipe.archive and len(files) > 1:
-        archive = (f"{recipe.format.name}.zip", making.zipped(_Contents({n: p for n, (p, _) in files.items()})))
+        archive = (f"{recipe.format.name}.zip", making.zipped(_LazyFiles({n: p for n, (p, _) in files.items()})))
     report = site.merged_report(
         [(m.folder, cached_map.report) for m, cached_map in zip(recipe.members, cached_maps, strict=True)]
     )
-    return Product(files, archive, {**report, "dropped": [*report["dropped"], *clashes]}, places)
+    return ConvertedMap(files, archive, {**report, "dropped": [*report["dropped"], *clashes]}, places)
 
 
-class _Contents(Mapping[str, bytes]):
+class _LazyFiles(Mapping[str, bytes]):
     """Files by name, read when they are needed."""
 
-    def __init__(self, files: Mapping[str, bytes | MadeFile]) -> None:
+    def __init__(self, files: Mapping[str, bytes | CachedFile]) -> None:
         self._files = files
 
     def __getitem__(self, name: str) -> bytes:
@@ -507,7 +511,7 @@ def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:
     return replace(recipe, origin=origin, members=members)
 
 
-def _trial_key(version: Version, chain: recipes.Chain, fmt: formats.Format | None = None) -> str:
+def _trial_key(version: Version, chain: recipes.DerivationChain, fmt: formats.Format | None = None) -> str:
     """The hash of what the outcome of a trial depends on: a chain's steps and, with ``fmt``, what a format lacks."""
     keys = recipes.needed(chain).keys if fmt is None else chain.keys
     entries = {e.key: e.hash for e in version.parts}
@@ -522,6 +526,6 @@ def _trial_key(version: Version, chain: recipes.Chain, fmt: formats.Format | Non
     return hashlib.sha256(orjson.dumps(ingredients)).hexdigest()
 
 
-def _is_lasting(chain: recipes.Chain) -> bool:
+def _is_lasting(chain: recipes.DerivationChain) -> bool:
     """Whether a trial of these steps comes out the same at any time: a model may be supplied or removed."""
     return not any(dict(step.given).get("model") for step in chain.steps)

@@ -40,7 +40,7 @@ SUPPLY: Mapping[Layer, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Stock:
+class AvailableLayers:
     """What there is to make maps from: the parts that have content, and whether there is a datum.
 
     anchors: of each part, which of ``local`` and ``wgs84`` its items are. blank: parts without items; an empty file is
@@ -56,7 +56,7 @@ class Stock:
     pinned: Mapping[Layer, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
     drawn: frozenset[PartKey] = frozenset()
 
-    def seen_by(self, fmt: Format) -> Stock:
+    def seen_by(self, fmt: Format) -> AvailableLayers:
         """The same with the blank parts that came from this format; a folder of maps holds all of them."""
         if fmt.holds:
             return replace(self, keys=self.keys | self.blank, blank=frozenset())
@@ -77,7 +77,7 @@ class Stock:
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class DerivationChain:
     """A way to a format: the derivation steps (none: direct), and the parts to load."""
 
     steps: tuple[Step, ...]
@@ -112,14 +112,14 @@ class Recipe:
     version: Version
     format: Format
     options: Any
-    chain: Chain
+    chain: DerivationChain
     key: str
     origin: Mapping[str, str] = field(default_factory=dict)
     spread: Spread | None = None
     members: tuple[Member, ...] = ()
     archive: bool = False
     file: str | None = None
-    failed: tuple[Hindrance, ...] = ()
+    failed: tuple[ChainFailure, ...] = ()
 
     @property
     def etag(self) -> str:
@@ -148,7 +148,7 @@ class Member:
     only_default: bool = False
 
 
-def stock(version: Version) -> Stock:
+def stock(version: Version) -> AvailableLayers:
     """What a version holds."""
     entries = [e for e in version.parts if e.count > 0]
     pinned = _pinned(version, entries)
@@ -156,10 +156,10 @@ def stock(version: Version) -> Stock:
     anchors = {e.key: frozenset(name for name, box in (e.bounds or {}).items() if box) for e in entries}
     blank = frozenset(e.key for e in version.parts if not e.count)
     drawn = frozenset(e.key for e in entries if not e.provenance.edited and derive.is_drawn(e.provenance.steps))
-    return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned, drawn)
+    return AvailableLayers(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned, drawn)
 
 
-def stock_of(layers: Layers) -> Stock:
+def stock_of(layers: Layers) -> AvailableLayers:
     """What layers at hand hold."""
     keys: set[PartKey] = set()
     blank: set[PartKey] = set()
@@ -172,7 +172,7 @@ def stock_of(layers: Layers) -> Stock:
             some = {"local"} if part.local.any() else set()
             anchors[key] = frozenset(some | ({"wgs84"} if part.needs_datum else set()))
         keys.add(key)
-    return Stock(frozenset(keys), layers.datum is not None, anchors, frozenset(blank))
+    return AvailableLayers(frozenset(keys), layers.datum is not None, anchors, frozenset(blank))
 
 
 def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mapping[str, Mapping[str, Any]]]:
@@ -196,13 +196,13 @@ def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mappi
 
 def chain(
     fmt: Format,
-    available: Stock,
+    available: AvailableLayers,
     options: Any,
     *,
     derived: bool = True,
     values: Mapping[str, str] | None = None,
     without: frozenset[str] = frozenset(),
-) -> Chain:
+) -> DerivationChain:
     """The cheapest way to a format. MissingLayer or MissingDatum say what to supply; Ambiguous names the choices.
 
     values: what was asked for, by name; what is no option of the format is a parameter of a step on the way. Where no
@@ -238,12 +238,12 @@ def chain(
     keys = sorted({*chosen, *(k for k in keys if k.layer in read and k not in available.drawn)})
     remembered = {name: value for steps in available.pinned.values() for name, value in steps.items()}
     steps = [derive.with_values([s], {**remembered.get(s.name, {}), **option_values})[0] for s in best.steps]
-    return Chain(tuple(steps), tuple(keys))
+    return DerivationChain(tuple(steps), tuple(keys))
 
 
 def _named(
-    fmt: Format, available: Stock, options: Any, option_values: Mapping[str, str], without: frozenset[str]
-) -> Chain | None:
+    fmt: Format, available: AvailableLayers, options: Any, option_values: Mapping[str, str], without: frozenset[str]
+) -> DerivationChain | None:
     """The way to a part that is asked for by name and not stored, where a derivation makes parts of that name."""
     parts = fmt.parts
     if parts is None or (name := getattr(options, parts.name)) is None:
@@ -265,11 +265,13 @@ def _named(
         if further <= derive.takes(d.name):
             keys = sorted(k for k in available.keys if k.layer in d.needs or (k.layer, k.name) == (layer, MAP))
             before = available.pinned.get(layer, {}).get(d.name, {})
-            return Chain(derive.with_values([d.step()], {**before, **option_values}), tuple(keys))
+            return DerivationChain(derive.with_values([d.step()], {**before, **option_values}), tuple(keys))
     return None
 
 
-def _best(fmt: Format, available: Stock, without: frozenset[str], *, derived: bool = True) -> derive.Plan | None:
+def _best(
+    fmt: Format, available: AvailableLayers, without: frozenset[str], *, derived: bool = True
+) -> derive.Plan | None:
     best: derive.Plan | None = derive.Plan((), 0.0) if _is_whole(fmt, available) else None
     for required in fmt.needs.one_of:
         plan = derive.plan(available.layers, required, without, available.dead)
@@ -278,7 +280,7 @@ def _best(fmt: Format, available: Stock, without: frozenset[str], *, derived: bo
     return best
 
 
-def _is_whole(fmt: Format, available: Stock) -> bool:
+def _is_whole(fmt: Format, available: AvailableLayers) -> bool:
     """Whether a map of this very format is stored, so that nothing else is needed."""
     return fmt.needs.own and any(k.layer == "objects" and k.name == fmt.family for k in available.keys)
 
@@ -289,12 +291,12 @@ def _taken(plan: derive.Plan) -> frozenset[str]:
 
 
 def _forced(
-    fmt: Format, available: Stock, without: frozenset[str], names: frozenset[str], *, derived: bool
-) -> tuple[Stock, derive.Plan]:
+    fmt: Format, available: AvailableLayers, without: frozenset[str], names: frozenset[str], *, derived: bool
+) -> tuple[AvailableLayers, derive.Plan]:
     """A way with a step that knows all these parameters, and the stock without what that step makes anew."""
     useful = frozenset().union(*fmt.needs.one_of)
     everything = derive.all_derivations()
-    candidates: list[tuple[float, str, Stock, derive.Plan]] = []
+    candidates: list[tuple[float, str, AvailableLayers, derive.Plan]] = []
     for name, step in everything.items() if derived else ():
         if not names <= derive.takes(name) or step.gives not in useful or name in without:
             continue
@@ -330,13 +332,13 @@ def _forced(
     raise Invalid(f"{', '.join(wrong)}: {problem}", [Problem(problem, where=name) for name in wrong])
 
 
-def needed(chain: Chain) -> Chain:
+def needed(chain: DerivationChain) -> DerivationChain:
     """The same with only those parts that its steps read."""
     read = {layer for step in chain.steps for layer in step.reads}
     return replace(chain, keys=tuple(k for k in chain.keys if k.layer in read))
 
 
-def missing(fmt: Format, available: Stock) -> list[str]:
+def missing(fmt: Format, available: AvailableLayers) -> list[str]:
     """What to supply for a format, one text for each alternative."""
     out = []
     for required in fmt.needs.one_of:
@@ -346,7 +348,7 @@ def missing(fmt: Format, available: Stock) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Hindrance:
+class ChainFailure:
     """Why a chain does not work on what is stored. step: the one to blame, empty where none is. choose: it would, with
     one of several things named."""
 
@@ -355,12 +357,12 @@ class Hindrance:
     choose: bool = False
 
 
-def detours(failed: Sequence[Hindrance]) -> list[dict[str, Any]]:
+def detours(failed: Sequence[ChainFailure]) -> list[dict[str, Any]]:
     """The warnings of a map that was made another way than the usual one: which step failed, and why."""
     return [{"problem": f"made another way, since {one.step} failed: {one.reason}"} for one in failed if one.step]
 
 
-def exhausted(error: MissingLayer, failed: Sequence[Hindrance]) -> CannotConvert:
+def exhausted(error: MissingLayer, failed: Sequence[ChainFailure]) -> CannotConvert:
     """Nothing is left to try: what to name or to supply, and why the derivations that were tried found nothing."""
     unnamed = next((one for one in failed if one.choose), None)
     if unnamed is not None:
@@ -389,7 +391,9 @@ def recipe(
     return of_chain(version, fmt, options, derivation_chain)
 
 
-def of_chain(version: Version, fmt: Format, options: Any, chain: Chain, spread: Spread | None = None) -> Recipe:
+def of_chain(
+    version: Version, fmt: Format, options: Any, chain: DerivationChain, spread: Spread | None = None
+) -> Recipe:
     """The recipe of a map by this chain. spread: see ``Recipe``."""
     entries = {e.key: e for e in version.parts}
     return Recipe(version, fmt, options, chain, _key(version, fmt, options, chain, entries, spread), spread=spread)
@@ -411,7 +415,7 @@ def _key(
     version: Version,
     fmt: Format,
     options: Any,
-    chain: Chain,
+    chain: DerivationChain,
     entries: Mapping[PartKey, PartEntry],
     spread: Spread | None,
 ) -> str:
@@ -442,7 +446,7 @@ def _key(
     return hashlib.sha256(orjson.dumps(ingredients, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
 
-def _check_anchor(fmt: Format, available: Stock, keys: list[PartKey]) -> None:
+def _check_anchor(fmt: Format, available: AvailableLayers, keys: list[PartKey]) -> None:
     """Refuse early what would fail on the way for want of a datum."""
     if fmt.needs.anchor is None or available.datum:
         return

@@ -20,7 +20,7 @@ import orjson
 from app import derive
 from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
-from app.convert.recipe import Chain, Member, Recipe, Spread, Stock
+from app.convert.recipe import AvailableLayers, DerivationChain, Member, Recipe, Spread
 from app.derive import Derivation
 from app.errors import MissingLayer, NotFound
 from app.formats import Format, Parts
@@ -94,9 +94,9 @@ class _Site:
     version: Version
     format: Format
     parts: Parts
-    available: Stock
+    available: AvailableLayers
     stored: tuple[PartKey, ...]
-    main: Chain | None
+    main: DerivationChain | None
     lacking: MissingLayer | None
     makers: tuple[Derivation, ...]
     default: str
@@ -230,7 +230,7 @@ def default_name(parts: Parts, names: Sequence[str]) -> str | None:
 
 def _spread(
     site: _Site,
-    chain: Chain,
+    chain: DerivationChain,
     levels: frozenset[str] | None,
     names: frozenset[str] | None,
     *,
@@ -251,11 +251,11 @@ def _spread(
     )
 
 
-def _way_of(site: _Site, maker: Derivation) -> Chain:
+def _way_of(site: _Site, maker: Derivation) -> DerivationChain:
     """The chain of a derivation that makes named parts: it may take the frame of the layer's usual part."""
     keys = (k for k in site.available.keys if k.layer in maker.needs or (k.layer, k.name) == (maker.gives, MAP))
     before = site.available.pinned.get(maker.gives, {}).get(maker.name, {})
-    return Chain(derive.with_values([maker.step()], {**before, **site.values}), tuple(sorted(keys)))
+    return DerivationChain(derive.with_values([maker.step()], {**before, **site.values}), tuple(sorted(keys)))
 
 
 def _made_by(site: _Site, maker: Derivation, levels: frozenset[str] | None, names: frozenset[str] | None) -> Member:
@@ -289,7 +289,9 @@ def _assembled(site: _Site, members: Sequence[Member], *, archive: bool) -> Reci
     keys = tuple(sorted({key for m in members for key in m.recipe.chain.keys}))
     options = members[0].recipe.options
     key = hashlib.sha256(text).hexdigest()
-    return Recipe(site.version, site.format, options, Chain(steps, keys), key, members=tuple(members), archive=archive)
+    return Recipe(
+        site.version, site.format, options, DerivationChain(steps, keys), key, members=tuple(members), archive=archive
+    )
 
 
 def _sorted(values: frozenset[str] | None) -> list[str] | None:

@@ -16,7 +16,7 @@ from uuid import uuid4
 
 import orjson
 
-from app.convert.recipe import Hindrance
+from app.convert.recipe import ChainFailure
 
 MOST = 10_000
 """Trials that are remembered; the file is written anew at twice as many lines."""
@@ -28,17 +28,17 @@ class Trials:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._guard = threading.Lock()
-        self._found: dict[str, Hindrance | None] = {}
+        self._found: dict[str, ChainFailure | None] = {}
         self._lines = 0
         for key, failure in self._read():
             self._put(key, failure)
 
-    def __getitem__(self, key: str) -> Hindrance | None:
+    def __getitem__(self, key: str) -> ChainFailure | None:
         """KeyError where it was not tried."""
         with self._guard:
             return self._found[key]
 
-    def add(self, key: str, failure: Hindrance | None, *, lasting: bool) -> None:
+    def add(self, key: str, failure: ChainFailure | None, *, lasting: bool) -> None:
         """Remember an outcome. lasting: also for the next start."""
         with self._guard:
             self._put(key, failure)
@@ -52,13 +52,13 @@ class Trials:
                     with self._path.open("ab", buffering=0) as file:  # one write: whole lines, whoever else writes
                         file.write(_line(key, failure))
 
-    def _put(self, key: str, failure: Hindrance | None) -> None:
+    def _put(self, key: str, failure: ChainFailure | None) -> None:
         self._found.pop(key, None)  # the latest last: the oldest goes first
         self._found[key] = failure
         while len(self._found) > MOST:
             self._found.pop(next(iter(self._found)))
 
-    def _read(self) -> Iterator[tuple[str, Hindrance | None]]:
+    def _read(self) -> Iterator[tuple[str, ChainFailure | None]]:
         try:
             lines = self._path.read_bytes().splitlines()
         except OSError:
@@ -70,7 +70,7 @@ class Trials:
                 continue
             with contextlib.suppress(TypeError, ValueError):  # of a release that knows other fields
                 key, failure = orjson.loads(text)
-                yield key, None if failure is None else Hindrance(**failure)
+                yield key, None if failure is None else ChainFailure(**failure)
 
     def _rewrite(self) -> None:
         temporary = self._path.with_suffix(f".{uuid4().hex}")
@@ -82,7 +82,7 @@ class Trials:
         self._lines = len(self._found)
 
 
-def _line(key: str, failure: Hindrance | None) -> bytes:
+def _line(key: str, failure: ChainFailure | None) -> bytes:
     text = orjson.dumps([key, None if failure is None else asdict(failure)])
     return _digest(text) + b" " + text + b"\n"
 

@@ -14,7 +14,7 @@ from app import derive, formats, parameters
 from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert import site
-from app.convert.recipe import Chain, Hindrance, Spread
+from app.convert.recipe import ChainFailure, DerivationChain, Spread
 from app.derive import Step
 from app.derive._crossings import crossings
 from app.errors import CannotConvert, CannotDerive, FleetMapError, MissingLayer, Problem
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class WrittenMap:
     """A map: its files, main file first, and the report on it. places: of the files of a map of several parts, the
     level and the name of the part that each is of."""
 
@@ -55,9 +55,9 @@ def make(
     version: Version,
     name: str,
     values: Mapping[str, Any],
-    chain: Chain,
+    chain: DerivationChain,
     spread: Spread | None = None,
-) -> Written:
+) -> WrittenMap:
     """In a worker: a stored version's map. The parts are addressed by content, so no later change can mix in."""
     store = open_store(database_url, blob_dir)
     fmt = formats.get_format(name)
@@ -70,15 +70,15 @@ def make(
     )
 
 
-def hindrance(database_url: str, blob_dir: str, version: Version, chain: Chain) -> Hindrance | None:
+def hindrance(database_url: str, blob_dir: str, version: Version, chain: DerivationChain) -> ChainFailure | None:
     """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
     layers = applied_closures.load(open_store(database_url, blob_dir), version, chain.keys)
     try:
         derive.attempt(chain.steps, layers)
     except CannotDerive as error:
-        return Hindrance(error.step, error.detail, error.choose)
+        return ChainFailure(error.step, error.detail, error.choose)
     except FleetMapError as error:
-        return Hindrance("", error.detail)
+        return ChainFailure("", error.detail)
     return None
 
 
@@ -94,23 +94,25 @@ def stored_crossings(
     return crossing_edges(fmt, applied_closures.close(fmt, used, version.closures)[0], layers)
 
 
-def lacking(database_url: str, blob_dir: str, version: Version, name: str, chain: Chain) -> Hindrance | None:
+def lacking(
+    database_url: str, blob_dir: str, version: Version, name: str, chain: DerivationChain
+) -> ChainFailure | None:
     """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
     fmt = formats.get_format(name)
     layers = applied_closures.load(open_store(database_url, blob_dir), version, chain.keys)
     try:
         derived_layers = derive.run(chain.steps, layers)
     except FleetMapError as error:
-        return Hindrance("", error.detail)
+        return ChainFailure("", error.detail)
     reason = fmt.lacks(derived_layers) if fmt.lacks is not None else None
-    return None if reason is None else Hindrance("", f"{name}: {reason}")
+    return None if reason is None else ChainFailure("", f"{name}: {reason}")
 
 
 def write(
     fmt: Format,
     layers: Layers,
     values: Mapping[str, Any],
-    chain: Chain,
+    chain: DerivationChain,
     entries: Mapping[PartKey, PartEntry] | None = None,
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
     credit: Mapping[PartKey, Sequence[str]] | None = None,
@@ -119,7 +121,7 @@ def write(
     spread: Spread | None = None,
     around: Layers | None = None,
     title: str = UNTITLED,
-) -> Written:
+) -> WrittenMap:
     """Derive and write. ``entries`` (of a stored version) or ``origin`` and ``credit`` (of files) say where each part
     came from, and under which licences and credits. templates: for the maps that a format holds. closures: to apply.
     spread: write every part that is derived. around: further layers, in which edges may meet obstacles. title: the
@@ -138,7 +140,7 @@ def write(
         if not spread.optional:
             raise
         if isinstance(error.__cause__, MissingLayer):
-            return Written({}, empty_report(fmt))
+            return WrittenMap({}, empty_report(fmt))
         raise CannotConvert(error.detail, error.problems) from error
     return _written_each(fmt, derived_layers, options, source, notes, spread)
 
@@ -148,7 +150,7 @@ class _Source:
     """What a map is made from, as ``write`` is given it."""
 
     layers: Layers
-    way: Chain
+    way: DerivationChain
     entries: Mapping[PartKey, PartEntry] | None
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None
     credit: Mapping[PartKey, Sequence[str]] | None
@@ -160,7 +162,7 @@ class _Source:
 
 def _written_each(
     fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.Notes, spread: Spread
-) -> Written:
+) -> WrittenMap:
     """One map of every part that was derived, each written as it would be by itself."""
     parts = fmt.parts
     if parts is None:
@@ -184,7 +186,7 @@ def _written_each(
         for name, data in one.files.items():
             files.setdefault(folder + name, data)
             places.setdefault(folder + name, (key.level, key.name))
-    return Written(files, site.merged_report(reports) if reports else empty_report(fmt), places)
+    return WrittenMap(files, site.merged_report(reports) if reports else empty_report(fmt), places)
 
 
 def empty_report(fmt: Format) -> dict[str, Any]:
@@ -194,7 +196,7 @@ def empty_report(fmt: Format) -> dict[str, Any]:
     return {"format": fmt.name, **empty}
 
 
-def _written(fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.Notes) -> Written:
+def _written(fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.Notes) -> WrittenMap:
     """One map of what was derived and what was there."""
     layers, chain, entries, origin = source.layers, source.way, source.entries, source.origin
     credit, closures = source.credit, source.closures
@@ -233,7 +235,7 @@ def _written(fmt: Format, derived_layers: Layers, options: Any, source: _Source,
         "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
         "closures": applied_closures.merged_lines([closed.lines, *inner_closures]),
     }
-    return Written(files, report)
+    return WrittenMap(files, report)
 
 
 def crossing_edges(fmt: Format, written: Layers, around: Layers) -> list[Problem]:
@@ -267,7 +269,7 @@ def from_layers(
     closures: Closures | None = None,
     around: Layers | None = None,
     title: str = UNTITLED,
-) -> Written:
+) -> WrittenMap:
     """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise.
 
     around: the layers in which edges may meet obstacles, if there are more than these.
@@ -276,7 +278,7 @@ def from_layers(
         return _every_part(fmt, layers, option_values, derived=derived, entries=entries, origin=origin, credit=credit)
     writer_options = recipes.own_options(fmt, option_values)
     without: frozenset[str] = frozenset()
-    failed: list[Hindrance] = []
+    failed: list[ChainFailure] = []
     stock = recipes.stock_of(layers)
     while True:
         try:
@@ -302,7 +304,7 @@ def from_layers(
             return replace(written, report={**written.report, "warnings": warnings})
         except CannotDerive as error:
             without |= {error.step}
-            failed.append(Hindrance(error.step, error.detail, error.choose))
+            failed.append(ChainFailure(error.step, error.detail, error.choose))
 
 
 def _every_part(
@@ -314,11 +316,11 @@ def _every_part(
     entries: Mapping[PartKey, PartEntry] | None,
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None,
     credit: Mapping[PartKey, Sequence[str]] | None,
-) -> Written:
+) -> WrittenMap:
     """The map of several parts (``app.convert.site``), of layers that are in memory."""
     version = _as_version(layers)
     without: frozenset[str] = frozenset()
-    failed: list[Hindrance] = []
+    failed: list[ChainFailure] = []
     while True:
         try:
             recipe = site.recipe(version, fmt, option_values, derived=derived, without=without, archive=False)
@@ -334,20 +336,20 @@ def _every_part(
                 values = parameters.canonical(member.recipe.options)
                 one = write(fmt, chain_layers, values, chain, entries, origin, credit, spread=spread)
                 reports.append((member.folder, one.report))
-                for file in site.select([_Placed(name, one.places.get(name)) for name in one.files], member):
+                for file in site.select([_PlacedFile(name, one.places.get(name)) for name in one.files], member):
                     files.setdefault(member.folder + file.name, one.files[file.name])
                     places.setdefault(member.folder + file.name, file.place or member.place or ("", ""))
         except CannotDerive as error:
             without |= {error.step}
-            failed.append(Hindrance(error.step, error.detail, error.choose))
+            failed.append(ChainFailure(error.step, error.detail, error.choose))
             continue
         if not files:
             raise site.nothing_made(recipe)
-        return Written(files, site.merged_report(reports), places)
+        return WrittenMap(files, site.merged_report(reports), places)
 
 
 @dataclass(frozen=True, slots=True)
-class _Placed:
+class _PlacedFile:
     """A file's name, and the level and name of the part that it is of, where it says so itself."""
 
     name: str
@@ -418,7 +420,7 @@ def zipped(files: Mapping[str, bytes]) -> bytes:
 def _told(
     used: Layers,
     before: Layers,
-    chain: Chain,
+    chain: DerivationChain,
     entries: Mapping[PartKey, PartEntry],
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]],
     noted: Mapping[PartKey, Sequence[str]],

@@ -19,7 +19,7 @@ from app.errors import FleetMapError, Invalid, Unavailable
 from app.events.messages import ROBOT_NAME, RobotStatus
 from app.store.base import ENVIRONMENT_NAME
 from app.store.store import Store
-from app.store.values import Heard, Report
+from app.store.values import ReceivedReport, RobotReport
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ NOTE_SECONDS = 20.0
 MAX_PRESENT = 100_000
 
 
-def report_of(status: RobotStatus) -> Report:
+def report_of(status: RobotStatus) -> RobotReport:
     """A status as the store takes it. A time that is none counts as not told: nothing depends on robots' clocks."""
     reported_at = None
     if status.time is not None:
@@ -46,14 +46,14 @@ def report_of(status: RobotStatus) -> Report:
             reported_at = datetime.fromisoformat(status.time)
             reported_at = reported_at.astimezone(UTC) if reported_at.tzinfo is not None else None
     more = (status.sequence, reported_at, status.overlays, status.holds)
-    return Report(status.channel, status.version, status.root, status.state, status.detail, *more)
+    return RobotReport(status.channel, status.version, status.root, status.state, status.detail, *more)
 
 
 @dataclass(frozen=True, slots=True)
 class _QueuedReport:
     """A report that waits. told: who waits to be told whether it was taken, None for what came over the bus."""
 
-    heard: Heard
+    heard: ReceivedReport
     told: Future[FleetMapError | None] | None = None
 
 
@@ -105,11 +105,11 @@ class ReportQueue:
                 return
             self._shares[robot] += 1
 
-    def note(self, heard: Heard) -> None:
+    def note(self, heard: ReceivedReport) -> None:
         """A report that came over HTTP: blocks until it is stored. Raises what the store has against it."""
         settle(self.noting(heard), NOTE_SECONDS)
 
-    def noting(self, heard: Heard) -> Future[FleetMapError | None]:
+    def noting(self, heard: ReceivedReport) -> Future[FleetMapError | None]:
         """The same without waiting: what the store has against it comes as the future's result."""
         result: Future[FleetMapError | None] = Future()
         if self._thread is None or self._ending.is_set():
@@ -247,7 +247,7 @@ def _warn(reasons: list[str]) -> None:
         log.warning("%s%s", reasons[0], f" (and {len(reasons) - 1} others)" if len(reasons) > 1 else "")
 
 
-def _read(environment: str, robot: str, payload: bytes, time: datetime, *, vouched: bool) -> Heard:
+def _read(environment: str, robot: str, payload: bytes, time: datetime, *, vouched: bool) -> ReceivedReport:
     if not ROBOT_NAME.fullmatch(robot) or not ENVIRONMENT_NAME.fullmatch(environment):
         raise Invalid("a robot's or environment's name cannot be used")
-    return Heard(environment, robot, report_of(RobotStatus.from_json(payload)), time, vouched)
+    return ReceivedReport(environment, robot, report_of(RobotStatus.from_json(payload)), time, vouched)

@@ -14,10 +14,10 @@ from datetime import datetime, timedelta
 from fractions import Fraction
 
 from app.fleet.status import is_online, is_ready
-from app.store.values import Robot, Rollout, Step, rfc3339
+from app.store.values import Robot, Rollout, RolloutStep, rfc3339
 
 
-def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Step | None:
+def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> RolloutStep | None:
     """The next step of a roll-out, None for waiting on. robots: of its channel; only those vouched for count."""
     robots = [robot for robot in robots if robot.vouched]
     begun = rollout.started if rollout.moved is None else rollout.moved
@@ -28,20 +28,20 @@ def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Step | N
     too_many = rollout.failed is not None and bool(names) and _reaches(len(names), rollout.failed, counted)
     if rollout.state == "watching":
         if too_many:
-            return Step("move_back", "rolled_back", broken)
+            return RolloutStep("move_back", "rolled_back", broken)
         if now >= begun + timedelta(seconds=rollout.window):
-            return Step("end", "done", broken if names else "")
+            return RolloutStep("end", "done", broken if names else "")
         return None
     if too_many:
-        return Step("end", "failed", f"{broken} to fetch it: the channel stays")
+        return RolloutStep("end", "failed", f"{broken} to fetch it: the channel stays")
     ready = [r for r in robots if is_online(r, now) and is_ready(r, rollout.root)]
     online = sum(is_online(r, now) for r in robots)
     enough = rollout.ready is None or (online > 0 and _reaches(len(ready), rollout.ready, online))
     if enough and (rollout.activate_at is None or now >= rollout.activate_at):
         reason = "its time has come" if rollout.ready is None else f"{len(ready)} of {online} robots are ready"
-        return Step("move", "waiting", reason)
+        return RolloutStep("move", "waiting", reason)
     if rollout.deadline is not None and now >= rollout.deadline:
-        return Step("end", "expired", f"only {len(ready)} of {online} robots are ready: the channel stays")
+        return RolloutStep("end", "expired", f"only {len(ready)} of {online} robots are ready: the channel stays")
     return None
 
 

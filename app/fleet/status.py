@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from app.store.values import Channel, Move, Robot, rfc3339
+from app.store.values import Channel, ChannelMove, Robot, rfc3339
 
 REPORT_FRESH = timedelta(seconds=180)
 """A robot that is not on the bus is online for so long after a report."""
@@ -51,7 +51,7 @@ class Lag:
         }
 
 
-def lag_of(robot: Robot, channel: Channel, moves: Sequence[Move]) -> Lag:
+def lag_of(robot: Robot, channel: Channel, moves: Sequence[ChannelMove]) -> Lag:
     """A robot's lag. moves: of the channel, oldest first.
 
     A robot that says no sequence has acted on the newest move that led to the root which it holds.

@@ -3,11 +3,21 @@
 ``prepare`` runs in a worker process (it reads hostile bytes and computes); ``service`` commits what it found.
 """
 
-from app.ingest.alignment import Alignment
-from app.ingest.derivation import Wish
-from app.ingest.generation import Order
+from app.ingest.alignment import AlignmentRequest
+from app.ingest.derivation import DerivationRequest
+from app.ingest.generation import GenerationRequest
 from app.ingest.online import Provider
-from app.ingest.service import Ingest, Outcome, SpooledFile, Upload
-from app.ingest.templates import TemplateWish
+from app.ingest.service import CommitResult, Ingest, SpooledFile, Upload
+from app.ingest.templates import TemplateUpdate
 
-__all__ = ["Alignment", "Ingest", "Order", "Outcome", "Provider", "SpooledFile", "TemplateWish", "Upload", "Wish"]
+__all__ = [
+    "AlignmentRequest",
+    "CommitResult",
+    "DerivationRequest",
+    "GenerationRequest",
+    "Ingest",
+    "Provider",
+    "SpooledFile",
+    "TemplateUpdate",
+    "Upload",
+]

@@ -29,7 +29,7 @@ WAYS: Mapping[str, str] = {"objects": "objects_to_occupancy", "voxels": "voxels_
 
 
 @dataclass(frozen=True, slots=True)
-class Alignment:
+class AlignmentRequest:
     """What is to be laid onto what. pairs: points (from, to) in metres, instead of a map. values: parameters of the
     derivation that makes a grid of the layer. angle: radians. least: the share that has to agree."""
 
@@ -48,7 +48,7 @@ class Alignment:
 
 
 @dataclass(frozen=True, slots=True)
-class Aligned:
+class AlignmentResult:
     """What was found. prepared: None where it is only told."""
 
     told: dict[str, Any]
@@ -56,7 +56,7 @@ class Aligned:
     prepared: Prepared | None
 
 
-def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: Alignment) -> Aligned:
+def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: AlignmentRequest) -> AlignmentResult:
     """In a worker: find where the grid lies, and put it there unless that is only to be told.
 
     Raises NotFound (no such grid), Invalid (parameters), CannotConvert (nothing fits well enough).
@@ -112,14 +112,14 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
     if any(k.layer in ("topology", "zones", "imagery") or (k.layer == "occupancy" and k != key) for k in entries):
         notes.warn("other layers keep their place: what was drawn on the grid in local metres does not move with it")
     if request.dry_run:
-        return Aligned(report, tuple(notes.warnings), None)
+        return AlignmentResult(report, tuple(notes.warnings), None)
     old = entries[key].provenance.marked()
     provenance = replace(old, steps=(*old.steps, {"step": ALIGNED, "parameters": report}))
     prepared = store.prepare(base, Changes((Replace(key, moved, provenance),)))
-    return Aligned(report, tuple(notes.warnings), prepared)
+    return AlignmentResult(report, tuple(notes.warnings), prepared)
 
 
-def told_before(version: Version, request: Alignment) -> dict[str, Any] | None:
+def told_before(version: Version, request: AlignmentRequest) -> dict[str, Any] | None:
     """What a version's provenance says of such an alignment, for a request that is sent again."""
     for entry in version.parts:
         if entry.key == PartKey("occupancy", request.level, request.grid):
@@ -128,7 +128,7 @@ def told_before(version: Version, request: Alignment) -> dict[str, Any] | None:
     return None
 
 
-def _by_points(request: Alignment, notes: Notes) -> tuple[alignment.Fit, dict[str, Any]]:
+def _by_points(request: AlignmentRequest, notes: Notes) -> tuple[alignment.Fit, dict[str, Any]]:
     fit, disagreeing, scale = alignment.of_pairs(
         np.array(request.pairs, np.float64).reshape(-1, 2, 2), near=request.near
     )
@@ -139,7 +139,7 @@ def _by_points(request: Alignment, notes: Notes) -> tuple[alignment.Fit, dict[st
     return fit, {"disagreeing": disagreeing, "scale": round(scale, 6)}
 
 
-def _seen(loaded: Layers, request: Alignment, target: PartKey, notes: Notes) -> OccupancyGrid:
+def _seen(loaded: Layers, request: AlignmentRequest, target: PartKey, notes: Notes) -> OccupancyGrid:
     """The layer as the grid that a derivation makes of it."""
     step = derive.all_derivations()[WAYS[request.layer]].step()
     unknown = request.values.keys() - derive.takes(step.name)

@@ -17,7 +17,7 @@ from app.store.values import PartEntry, Version, frame_line
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class DerivationRequest:
     """What is to be derived. values: parameters by name, of the method and of the steps before it. replace: also what
     a source has told."""
 
@@ -26,7 +26,7 @@ class Wish:
     replace: bool = False
 
 
-def check(request: Wish) -> None:
+def check(request: DerivationRequest) -> None:
     """NotFound for an unknown method (with the known ones), Invalid for a parameter that no derivation has."""
     derivations = derive.all_derivations()
     if request.method not in derivations:
@@ -44,7 +44,7 @@ def check(request: Wish) -> None:
 
 
 def prepare_derivation(
-    database_url: str, blob_dir: str, base: Version, request: Wish
+    database_url: str, blob_dir: str, base: Version, request: DerivationRequest
 ) -> tuple[Prepared, tuple[Problem, ...]]:
     """In a worker: carry out a derivation on a version, with what has to be derived before it.
 
@@ -125,7 +125,7 @@ def _steps(
     return (*before.steps, derivation.step())
 
 
-def _check_values(request: Wish, chain: Sequence[Step]) -> None:
+def _check_values(request: DerivationRequest, chain: Sequence[Step]) -> None:
     """Nothing is silently ignored: a parameter of a step that is not on the way is refused."""
     taken = frozenset().union(*(derive.takes(step.name) for step in chain))
     for name in request.values:
@@ -134,7 +134,7 @@ def _check_values(request: Wish, chain: Sequence[Step]) -> None:
             raise Invalid(f"{name}: {problem}", [Problem(problem, where=f"parameters.{name}")])
 
 
-def _check_free(request: Wish, keys: Any, existing_parts: Mapping[PartKey, PartEntry]) -> None:
+def _check_free(request: DerivationRequest, keys: Any, existing_parts: Mapping[PartKey, PartEntry]) -> None:
     for key in sorted(keys):
         entry = existing_parts.get(key)
         if entry is None or request.replace:

@@ -16,7 +16,7 @@ from app.store.values import PartEntry, Version
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class GenerationRequest:
     """What is to be made up. replace: also in place of what a source has told or people have edited."""
 
     generator: str
@@ -26,7 +26,7 @@ class Order:
 
 
 def prepare_generation(
-    database_url: str, blob_dir: str, base: Version, order: Order
+    database_url: str, blob_dir: str, base: Version, order: GenerationRequest
 ) -> tuple[Prepared, tuple[Problem, ...]]:
     """In a worker: carry out a generation on a version.
 
@@ -72,7 +72,10 @@ def _made_up(entry: PartEntry) -> bool:
 
 
 def _check_free(
-    order: Order, generator: generate.Generator, generated_layers: Layers, existing_parts: Mapping[PartKey, PartEntry]
+    order: GenerationRequest,
+    generator: generate.Generator,
+    generated_layers: Layers,
+    existing_parts: Mapping[PartKey, PartEntry],
 ) -> None:
     """A generator may replace what it was made to work on, and its like's work; the rest only where asked."""
     for key in sorted(generated_layers.parts):

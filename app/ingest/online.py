@@ -45,7 +45,7 @@ from app.model.layers import Layers, PartKey
 from app.parameters import describe, parameter
 from app.store.changes import Changes, Prepared, Provenance, Replace
 from app.store.values import Version
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 
 if TYPE_CHECKING:
     import httpx
@@ -122,7 +122,7 @@ class Parameters:
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class TileRequest:
     """One request: its place and size in the picture's pixels, and its address without the token."""
 
     column: int
@@ -133,10 +133,10 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
-class Sheet:
+class Mosaic:
     """All requests of a picture, its size in pixels and its transform in Web Mercator."""
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[TileRequest, ...]
     width: int
     height: int
     transform: tuple[float, float, float, float, float, float]
@@ -173,7 +173,7 @@ def site_box(site: Layers, chosen: Parameters) -> tuple[float, float, float, flo
 
 
 # --- what to ask for -------------------------------------------------------------------------------------------------
-def sheet(provider: Provider, box: tuple[float, float, float, float], resolution: float) -> Sheet:
+def sheet(provider: Provider, box: tuple[float, float, float, float], resolution: float) -> Mosaic:
     """The requests that cover a box (west, south, east, north in degrees). Invalid where they would be too many."""
     west, south, east, north = box
     if not (-180 <= west < east <= 180 and -85.05 <= south < north <= 85.05):
@@ -199,13 +199,13 @@ def sheet(provider: Provider, box: tuple[float, float, float, float], resolution
         )
     make = {"xyz": _tiles, "wms": _maps, "mapbox": _statics}[provider.kind]
     blocks = tuple(make(provider, (left, top, right, bottom), size, zoom))
-    return Sheet(blocks, width, height, (size, 0.0, left * size - HALF, 0.0, -size, HALF - top * size))
+    return Mosaic(blocks, width, height, (size, 0.0, left * size - HALF, 0.0, -size, HALF - top * size))
 
 
 Edges = tuple[int, int, int, int]
 
 
-def _tiles(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[Block]:  # noqa: ARG001
+def _tiles(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[TileRequest]:  # noqa: ARG001
     left, top, right, bottom = edges
     side, count = provider.tile, 2**zoom
     for y in range(top // side, -(-bottom // side)):
@@ -214,10 +214,10 @@ def _tiles(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator
             url = provider.url
             for name, value in values.items():
                 url = url.replace(f"{{{name}}}", str(value))
-            yield Block(x * side - left, y * side - top, side, side, url)
+            yield TileRequest(x * side - left, y * side - top, side, side, url)
 
 
-def _maps(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[Block]:  # noqa: ARG001
+def _maps(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[TileRequest]:  # noqa: ARG001
     url_parameters = dict(parse_qsl(urlsplit(provider.url).query, keep_blank_values=True))
     upper = {key.upper() for key in url_parameters}
     usual = {"SERVICE": "WMS", "VERSION": "1.3.0", "REQUEST": "GetMap", "STYLES": "", "FORMAT": "image/jpeg"}
@@ -233,16 +233,16 @@ def _maps(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[
             "WIDTH": str(w),
             "HEIGHT": str(h),
         }
-        yield Block(column, row, w, h, _with_query(provider.url, request_parameters))
+        yield TileRequest(column, row, w, h, _with_query(provider.url, request_parameters))
 
 
-def _statics(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[Block]:
+def _statics(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[TileRequest]:
     parts = urlsplit(provider.url)
     for column, row, w, h in _cut(edges, BLOCK["mapbox"]):
         middle = [(edges[0] + column + w / 2) * size - HALF, HALF - (edges[1] + row + h / 2) * size]
         ((lon, lat),) = between(MERCATOR, WGS84, np.array([middle])).tolist()
         path = f"{parts.path.rstrip('/')}/{lon:.9f},{lat:.9f},{zoom}/{w}x{h}"
-        yield Block(column, row, w, h, urlunsplit(parts._replace(path=path)))
+        yield TileRequest(column, row, w, h, urlunsplit(parts._replace(path=path)))
 
 
 def _cut(edges: Edges, side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -259,7 +259,7 @@ def _with_query(url: str, query: Mapping[str, str]) -> str:
 
 
 # --- asking -----------------------------------------------------------------------------------------------------------
-class _AgainError(Exception):
+class _RetryableError(Exception):
     """It may work another time. The text says what was wrong; wait: seconds that the provider asks for."""
 
     def __init__(self, text: str, wait: float = 0.0) -> None:
@@ -276,7 +276,7 @@ class Fetcher:
         for name in ("httpx", "httpcore"):
             logging.getLogger(name).setLevel(logging.WARNING)
 
-    def fetch(self, blocks: Sequence[Block]) -> list[bytes | None]:
+    def fetch(self, blocks: Sequence[TileRequest]) -> list[bytes | None]:
         """The pictures of all blocks, None where the provider has none (404).
 
         Raises CannotDerive where it refuses or sends something else, Unavailable where it is down or too slow.
@@ -285,7 +285,7 @@ class Fetcher:
 
         p = self.provider
         deadline = time.monotonic() + p.seconds
-        room = _Room(p.max_bytes)
+        room = _ByteBudget(p.max_bytes)
         timeout = httpx.Timeout(min(20.0, p.seconds))
         headers = {"Accept": "image/png, image/jpeg", "Accept-Encoding": "identity", "User-Agent": "fleet-map-server"}
         with (
@@ -301,7 +301,7 @@ class Fetcher:
                 room.stopped.set()
                 raise
 
-    def _one(self, client: httpx.Client, block: Block, deadline: float, room: _Room) -> bytes | None:
+    def _one(self, client: httpx.Client, block: TileRequest, deadline: float, room: _ByteBudget) -> bytes | None:
         cached = self._cached(block)
         if cached is not None:
             return cached
@@ -309,7 +309,7 @@ class Fetcher:
             try:
                 data = self._asked(client, block, deadline, room)
                 break
-            except _AgainError as error:
+            except _RetryableError as error:
                 wait = max(0.5 * 2**k, min(error.wait, LONGEST_WAIT))
                 last = k + 1 == self.provider.tries
                 if last or room.stopped.is_set() or time.monotonic() + wait > deadline:
@@ -319,7 +319,7 @@ class Fetcher:
             self._keep(block, data)
         return data
 
-    def _asked(self, client: httpx.Client, block: Block, deadline: float, room: _Room) -> bytes | None:
+    def _asked(self, client: httpx.Client, block: TileRequest, deadline: float, room: _ByteBudget) -> bytes | None:
         """One answer. The address with the token is in no message."""
         import httpx
 
@@ -332,11 +332,11 @@ class Fetcher:
                         continue
                     return self._body(answer, deadline, room)
         except httpx.TimeoutException:
-            raise _AgainError("does not answer in time") from None
+            raise _RetryableError("does not answer in time") from None
         except httpx.InvalidURL:
             raise self._wrong("leads to an address that is none") from None
         except httpx.HTTPError as error:
-            raise _AgainError(f"cannot be reached ({type(error).__name__})") from None
+            raise _RetryableError(f"cannot be reached ({type(error).__name__})") from None
         raise self._wrong(f"redirects more than {REDIRECTS} times")
 
     def _address(self, url: str) -> str:
@@ -353,7 +353,7 @@ class Fetcher:
             raise self._wrong("redirects to another host, which is not followed")
         return target
 
-    def _body(self, answer: httpx.Response, deadline: float, room: _Room) -> bytes | None:
+    def _body(self, answer: httpx.Response, deadline: float, room: _ByteBudget) -> bytes | None:
         status = answer.status_code
         if status == 404:
             return None
@@ -361,7 +361,7 @@ class Fetcher:
             raise self._wrong(f"refuses ({status}): check FLEETMAP_IMAGERY_TOKEN and what it allows")
         if status == 429 or status >= 500:
             retry_after = answer.headers.get("retry-after", "")
-            raise _AgainError(
+            raise _RetryableError(
                 f"answers {status}", float(retry_after) if retry_after.isascii() and retry_after.isdigit() else 0.0
             )
         if status != 200:
@@ -381,7 +381,7 @@ class Fetcher:
                 raise self._too_large()
             out += chunk
             if time.monotonic() > deadline:
-                raise _AgainError(f"has not sent everything within {self.provider.seconds:g} s")
+                raise _RetryableError(f"has not sent everything within {self.provider.seconds:g} s")
         data = bytes(out)
         if not any(data.startswith(magic) for magic in MAGIC):
             raise self._wrong("sends what is neither PNG nor JPEG: check FLEETMAP_IMAGERY_URL")
@@ -395,11 +395,11 @@ class Fetcher:
         return self._wrong(f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({max_bytes}): ask for a coarser resolution")
 
     # --- what was fetched before ---
-    def _file(self, block: Block) -> Path | None:
+    def _file(self, block: TileRequest) -> Path | None:
         folder = self.provider.cache_dir
         return None if folder is None else folder / hashlib.sha256(block.url.encode()).hexdigest()
 
-    def _cached(self, block: Block) -> bytes | None:
+    def _cached(self, block: TileRequest) -> bytes | None:
         file = self._file(block)
         if file is None:
             return None
@@ -410,7 +410,7 @@ class Fetcher:
             return None
         return data if any(data.startswith(magic) for magic in MAGIC) else None
 
-    def _keep(self, block: Block, data: bytes) -> None:
+    def _keep(self, block: TileRequest, data: bytes) -> None:
         """Remember an answer; what was not used for the longest time goes. A full disk is no reason to fail."""
         file = self._file(block)
         if file is None or len(data) > self.provider.cache_bytes:
@@ -423,7 +423,7 @@ class Fetcher:
             _trim(file.parent, self.provider.cache_bytes)
 
 
-class _Room:
+class _ByteBudget:
     """Bytes that all answers of a picture together may have."""
 
     def __init__(self, max_bytes: int) -> None:
@@ -454,11 +454,11 @@ def _trim(folder: Path, max_bytes: int) -> None:
 
 # --- in a worker ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
-class Fetched:
+class FetchedImagery:
     """What a provider sent, and what is to become of it. told: the step as the version's provenance says it. site: the
     fences that it was fetched for, as the provenance's inputs."""
 
-    sheet: Sheet
+    sheet: Mosaic
     answers: tuple[bytes | None, ...]
     chosen: Parameters
     told: Mapping[str, Any]
@@ -467,7 +467,7 @@ class Fetched:
 
 
 def prepare_picture(
-    database_url: str, blob_dir: str, base: Version, fetched: Fetched, limits: Limits
+    database_url: str, blob_dir: str, base: Version, fetched: FetchedImagery, limits: Limits
 ) -> tuple[Prepared, tuple[Problem, ...]]:
     """In a worker: decode what a provider sent, put it together, and prepare the version that has it.
 
@@ -485,7 +485,7 @@ def prepare_picture(
 
 
 def put_together(
-    mosaic: Sheet, answers: Iterable[bytes | None], attribution: tuple[str, ...], limits: Limits
+    mosaic: Mosaic, answers: Iterable[bytes | None], attribution: tuple[str, ...], limits: Limits
 ) -> tuple[Picture, int]:
     """(the picture, how many of its parts the provider does not have). CannotDerive where it has none."""
     pixels = np.zeros((mosaic.height, mosaic.width, 4), np.uint8)
@@ -506,13 +506,13 @@ def put_together(
     return Picture(image, mosaic.transform, MERCATOR, properties), missing
 
 
-def _decoded(block: Block, data: bytes, limits: Limits) -> NDArray[np.uint8]:
+def _decoded(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.uint8]:
     """An answer's pixels as RGBA: uint8 [height, width, 4]. It is read as an upload is."""
     end = next(kind for magic, kind in MAGIC.items() if data.startswith(magic))
     name = f"answer.{end}"
-    hints = Hints(format="satellite", options={"metres_per_pixel": "1"})
+    hints = UploadHints(format="satellite", options={"metres_per_pixel": "1"})
     try:
-        (part,) = upload_reader.read({name: data}, hints, Known(), limits).layers(None).parts.values()
+        (part,) = upload_reader.read({name: data}, hints, EnvironmentContext(), limits).layers(None).parts.values()
     except (BadUpload, ValueError) as error:
         raise CannotDerive(f"the imagery provider sends a picture that cannot be read: {error}", step=METHOD) from error
     assert isinstance(part, Picture)

@@ -27,7 +27,7 @@ from app.model.layers import Part, PartKey, Resources, cloud_name, join_levels
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Put, Replace
 from app.store.store import Store
 from app.store.values import Version
-from app.upload_reader import Bundle, Hints, Known
+from app.upload_reader import Bundle, EnvironmentContext, UploadHints
 
 Mode = Literal["replace", "merge"]
 
@@ -42,7 +42,7 @@ class FileNote:
 
 
 @dataclass(frozen=True, slots=True)
-class Proposal:
+class PreparedUpload:
     """What an upload would change, with all that was doubtful. members: content of unpacked archives."""
 
     prepared: Prepared
@@ -62,16 +62,16 @@ def prepare_upload(
     blob_dir: str,
     base: Version,
     paths: Mapping[str, Path],
-    hints: Hints,
+    hints: UploadHints,
     mode: Mode,
     limits: Limits,
-) -> Proposal:
+) -> PreparedUpload:
     """Read spooled files against a version: the version they would make. Raises what ``app.upload_reader.read``
     raises."""
     store = open_store(database_url, blob_dir)
     uploaded = {name: path.read_bytes() for name, path in paths.items()}
     files = upload_reader.unpack(uploaded, limits)
-    upload_bundle = upload_reader.read(files, hints, Known(base.datum, fence_of(store, base)), limits)
+    upload_bundle = upload_reader.read(files, hints, EnvironmentContext(base.datum, fence_of(store, base)), limits)
     renamed: dict[str, dict[str, str]] = {}
     # Sorted, so objects come before the topology that was drawn from them.
     operations: list[Operation] = [
@@ -97,7 +97,7 @@ def prepare_upload(
     notes = [FileNote(name, use.format, use.used) for name, use in upload_bundle.files.items()]
     notes += [FileNote(name, "zip", True) for name in uploaded.keys() - files.keys()]
     members = {name: files[name] for name in files.keys() - uploaded.keys()}
-    return Proposal(prepared, tuple(sorted(notes, key=lambda n: n.name)), tuple(warnings), members)
+    return PreparedUpload(prepared, tuple(sorted(notes, key=lambda n: n.name)), tuple(warnings), members)
 
 
 def _stale_clouds(base: Version, upload_bundle: Bundle) -> list[Drop]:
@@ -109,7 +109,7 @@ def _stale_clouds(base: Version, upload_bundle: Bundle) -> list[Drop]:
     return [Drop(key) for key in clouds if key in existing_keys and key not in upload_bundle.parts]
 
 
-def _idle(hints: Hints, upload_bundle: Bundle) -> list[Problem]:
+def _idle(hints: UploadHints, upload_bundle: Bundle) -> list[Problem]:
     """What the sender said and nothing came of, so that a misunderstanding is noticed."""
     out = []
     drawings = {f.name for f in formats.all_formats().values() if f.drawing}

@@ -22,10 +22,10 @@ from app.model.layers import PartKey
 from app.store.changes import Put
 from app.store.prepare import compose_operation
 from app.store.store import Store
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 from app.store.values import PartEntry, Version
 from app.store.verify import Finding
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 
 Run = Callable[..., Any]
 """``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
@@ -46,7 +46,7 @@ class Donor(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Rebuilt:
+class RecoveredData:
     """What reading a version's uploads again gives: hash (hex) -> bytes."""
 
     chunks: Mapping[str, bytes]
@@ -84,7 +84,7 @@ def repair(
         origin = f"the uploads of {environment} {number}"
         arguments = (store.database_url, str(store.blob_dir), environment, number, lost_chunks, lost_blobs, limits)
         try:
-            rebuilt: Rebuilt = run(read_again, *arguments)
+            rebuilt: RecoveredData = run(recover_from_uploads, *arguments)
         except FleetMapError:
             continue  # its uploads cannot be read: the finding stays
         for data in rebuilt.blobs.values():
@@ -94,7 +94,7 @@ def repair(
     return healed
 
 
-def read_again(
+def recover_from_uploads(
     database_url: str,
     blob_dir: str,
     environment: str,
@@ -102,7 +102,7 @@ def read_again(
     lost_chunks: Collection[str],
     lost_blobs: Collection[str],
     limits: Limits,
-) -> Rebuilt:
+) -> RecoveredData:
     """In a worker: the lost chunks and blobs that the uploaded files of a version give when they are read again.
 
     How they were sent (as which layer, under which name) is not stored: the ways that the version's parts suggest are
@@ -112,14 +112,16 @@ def read_again(
     version, base = store.version_and_base(environment, number)
     files, contents = _uploads(store, version, lost_blobs)
     chunks: dict[str, bytes] = {}
-    for hints in _ways(version.parts):
+    for hints in _possible_hints(version.parts):
         if len(chunks) == len(lost_chunks) and len(contents) == len(lost_blobs):
             break
         with contextlib.suppress(FleetMapError):
-            for draft, blobs in _composed(store, version, base, files, hints, limits):
-                chunks |= {n: draft.stream([bytes.fromhex(n)])[bytes.fromhex(n)] for n in _made(draft, lost_chunks)}
+            for draft, blobs in _compose_parts(store, version, base, files, hints, limits):
+                chunks |= {
+                    n: draft.stream([bytes.fromhex(n)])[bytes.fromhex(n)] for n in _staged_hashes(draft, lost_chunks)
+                }
                 contents |= {n: data for n, data in blobs.items() if n in lost_blobs}
-    return Rebuilt(chunks, contents)
+    return RecoveredData(chunks, contents)
 
 
 def _uploads(store: Store, version: Version, lost: Collection[str]) -> tuple[dict[str, bytes], dict[str, bytes]]:
@@ -154,30 +156,30 @@ def _members(data: bytes, sizes: Mapping[str, int]) -> dict[str, bytes]:
     return out
 
 
-def _ways(entries: Sequence[PartEntry]) -> Iterator[Hints]:
+def _possible_hints(entries: Sequence[PartEntry]) -> Iterator[UploadHints]:
     """How the files may have been sent."""
-    seen = [Hints()]
+    seen = [UploadHints()]
     for entry in entries:
         grid = entry.key.name if entry.key.layer == "occupancy" else None
         form = entry.provenance.format or None
         seen += [
-            Hints(form, layer, entry.key.level, name)
+            UploadHints(form, layer, entry.key.level, name)
             for layer in (None, entry.key.layer)
             for name in dict.fromkeys((None, grid))
         ]
-        seen += [Hints(None, layer, entry.key.level, grid) for layer in (None, entry.key.layer)]
+        seen += [UploadHints(None, layer, entry.key.level, grid) for layer in (None, entry.key.layer)]
     for k, hints in enumerate(seen):
         if hints not in seen[:k]:
             yield hints
 
 
-def _composed(
-    store: Store, version: Version, base: Version | None, files: Mapping[str, bytes], hints: Hints, limits: Limits
-) -> Iterator[tuple[Draft, Mapping[str, bytes]]]:
+def _compose_parts(
+    store: Store, version: Version, base: Version | None, files: Mapping[str, bytes], hints: UploadHints, limits: Limits
+) -> Iterator[tuple[ChunkStage, Mapping[str, bytes]]]:
     """The chunks and blobs of the parts that files are read as, replaced or merged."""
     start = version if base is None else base
     upload_bundle = upload_reader.read(
-        files, hints, Known(start.datum or version.datum, fence_of(store, start)), limits
+        files, hints, EnvironmentContext(start.datum or version.datum, fence_of(store, start)), limits
     )
     entries: Mapping[PartKey, PartEntry] = {} if base is None else {e.key: e for e in base.parts}
     for mode in ("replace", "merge"):
@@ -191,5 +193,5 @@ def _composed(
                 yield draft, encoded_part.blobs if encoded_part is not None else {}
 
 
-def _made(draft: Draft, hashes: Collection[str]) -> list[str]:
+def _staged_hashes(draft: ChunkStage, hashes: Collection[str]) -> list[str]:
     return [n for n in hashes if bytes.fromhex(n) in draft.new or bytes.fromhex(n) in draft.stored]

@@ -16,20 +16,20 @@ from app import generate as generators
 from app.errors import CannotDerive, Conflict, Invalid, Problem, StaleParent, UnreadableFile
 from app.formats import Limits
 from app.ingest import online
-from app.ingest.alignment import Aligned, Alignment, prepare_alignment, told_before
-from app.ingest.derivation import Wish, input_line, prepare_derivation
+from app.ingest.alignment import AlignmentRequest, AlignmentResult, prepare_alignment, told_before
+from app.ingest.derivation import DerivationRequest, input_line, prepare_derivation
 from app.ingest.derivation import check as check_wish
 from app.ingest.edits import edit_changes
-from app.ingest.generation import Order, prepare_generation
-from app.ingest.prepare import Mode, Proposal, moved, prepare_changes, prepare_upload
-from app.ingest.templates import TemplateWish
+from app.ingest.generation import GenerationRequest, prepare_generation
+from app.ingest.prepare import Mode, PreparedUpload, moved, prepare_changes, prepare_upload
+from app.ingest.templates import TemplateUpdate
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layer
 from app.pool import WorkerDied
 from app.store.changes import KEEP, Changes, Prepared
 from app.store.store import Store
 from app.store.values import Idempotency, Source, Version
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 
 Run = Callable[..., Any]
 """``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
@@ -70,7 +70,7 @@ class Upload:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CommitResult:
     """What became of a change. body: the version as JSON; ``version`` in it is null for a dry run."""
 
     status: Literal["created", "unchanged", "dry_run", "replayed"]
@@ -93,7 +93,7 @@ class Ingest:
         author: str,
         if_match: str | None = None,
         idempotency: str | None = None,
-    ) -> Outcome:
+    ) -> CommitResult:
         """Files -> one version, all or nothing.
 
         Raises BadUpload (nothing is stored), Invalid, StaleParent (``if_match`` names another version), Conflict (the
@@ -101,18 +101,18 @@ class Ingest:
         """
         _check_upload(upload)
         key = _idempotency(idempotency, _fingerprint(upload))
-        hints = Hints(upload.format, upload.layer, upload.level, upload.grid, dict(upload.options))
+        hints = UploadHints(upload.format, upload.layer, upload.level, upload.grid, dict(upload.options))
         paths = {f.name: f.path for f in upload.files}
 
-        def once(base: Version) -> Outcome:
-            proposal: Proposal = self._in_worker(prepare_upload, base, paths, hints, upload.mode, self._limits)
+        def once(base: Version) -> CommitResult:
+            proposal: PreparedUpload = self._in_worker(prepare_upload, base, paths, hints, upload.mode, self._limits)
             notes = {n.name: n for n in proposal.notes}
             if upload.dry_run:
                 sources = [
                     Source(f.name, f.size, f.sha256, notes[f.name].format, notes[f.name].used) for f in upload.files
                 ]
                 p, warnings = proposal.prepared, proposal.warnings
-                return Outcome("dry_run", None, self._preview(base, p, warnings, sources, author, upload.message))
+                return CommitResult("dry_run", None, self._preview(base, p, warnings, sources, author, upload.message))
             sources = self._keep(upload, proposal)
             return self._commit(
                 environment, base, proposal.prepared, author, upload.message, sources, proposal.warnings, key
@@ -129,7 +129,7 @@ class Ingest:
         author: str,
         if_match: str | None = None,
         idempotency: str | None = None,
-    ) -> Outcome:
+    ) -> CommitResult:
         """Edits -> one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
         if _deeper_than(MAX_DEPTH, changes):
             reason = f"nested deeper than {MAX_DEPTH} lists and objects"
@@ -139,7 +139,7 @@ class Ingest:
 
     def amend(
         self, environment: str, edits: Callable[[Version], Sequence[Mapping[str, Any]]], *, message: str, author: str
-    ) -> Outcome:
+    ) -> CommitResult:
         """Edits that follow from the version they are made on. Where the head moves meanwhile ``edits`` is asked again,
         so that nothing of what others wrote is put back; where it finds none, nothing changes.
         """
@@ -153,11 +153,11 @@ class Ingest:
         author: str,
         if_match: str | None,
         key: Idempotency | None,
-    ) -> Outcome:
-        def once(base: Version) -> Outcome:
+    ) -> CommitResult:
+        def once(base: Version) -> CommitResult:
             changes = edits(base)
             if not changes and key is None:
-                return Outcome("unchanged", base, base.as_dict())
+                return CommitResult("unchanged", base, base.as_dict())
             change_set, warnings = edit_changes(self._store, base, changes)
             prepared: Prepared = self._in_worker(prepare_changes, base, change_set)
             return self._commit(environment, base, prepared, author, message, (), warnings, key)
@@ -167,13 +167,13 @@ class Ingest:
     def derive(
         self,
         environment: str,
-        request: Wish,
+        request: DerivationRequest,
         *,
         message: str,
         author: str,
         if_match: str | None = None,
         idempotency: str | None = None,
-    ) -> Outcome:
+    ) -> CommitResult:
         """A layer computed from others -> one version.
 
         Raises NotFound, Invalid, CannotConvert, Conflict (a source has told that layer), StaleParent.
@@ -184,7 +184,7 @@ class Ingest:
         )
         text = message or f"Derived by {request.method}"
 
-        def once(base: Version) -> Outcome:
+        def once(base: Version) -> CommitResult:
             prepared, warnings = self._in_worker(
                 prepare_derivation, base, request, failure="the layer could not be derived"
             )
@@ -195,13 +195,13 @@ class Ingest:
     def generate(
         self,
         environment: str,
-        order: Order,
+        order: GenerationRequest,
         *,
         message: str,
         author: str,
         if_match: str | None = None,
         idempotency: str | None = None,
-    ) -> Outcome:
+    ) -> CommitResult:
         """A site made up from parameters and a seed -> one version.
 
         Raises NotFound, Invalid, CannotGenerate, MissingLayer, Conflict (a source has told that part), StaleParent.
@@ -211,7 +211,7 @@ class Ingest:
         key = _idempotency(idempotency, _digest(fingerprint))
         text = message or f"Generated by {order.generator}, seed {order.seed}"
 
-        def once(base: Version) -> Outcome:
+        def once(base: Version) -> CommitResult:
             prepared, warnings = self._in_worker(prepare_generation, base, order, failure="the site could not be made")
             return self._commit(environment, base, prepared, author, text, (), warnings, key)
 
@@ -220,13 +220,13 @@ class Ingest:
     def fetch_imagery(
         self,
         environment: str,
-        request: Wish,
+        request: DerivationRequest,
         *,
         message: str,
         author: str,
         if_match: str | None = None,
         idempotency: str | None = None,
-    ) -> Outcome:
+    ) -> CommitResult:
         """A picture of the site from the configured provider -> one version.
 
         Raises CannotDerive (no provider, or what it sends is of no use), MissingLayer or MissingDatum, Invalid,
@@ -242,9 +242,9 @@ class Ingest:
         chosen = parameters.parse(online.Parameters, request.values, f"parameter of {online.METHOD}")
         key = _idempotency(idempotency, _digest(["fetch", dict(request.values), request.replace, message]))
         text = message or f"Fetched from {provider.host}"
-        fetches: list[tuple[online.Sheet, tuple[bytes | None, ...]]] = []
+        fetches: list[tuple[online.Mosaic, tuple[bytes | None, ...]]] = []
 
-        def once(base: Version) -> Outcome:
+        def once(base: Version) -> CommitResult:
             online.check_free(base, chosen, replace=request.replace)
             fences = sorted((e for e in base.parts if e.key.layer == "location" and e.count), key=lambda e: e.key)
             site = self._store.load(base, [e.key for e in fences])
@@ -252,7 +252,7 @@ class Ingest:
             if not fetches or fetches[-1][0] != sheet:  # the same site again: what was fetched still holds
                 fetches.append((sheet, tuple(online.Fetcher(provider).fetch(sheet.blocks))))
             step, lines = provider.told(chosen), tuple(map(input_line, fences))
-            fetched = online.Fetched(sheet, fetches[-1][1], chosen, step, provider.attribution, lines)
+            fetched = online.FetchedImagery(sheet, fetches[-1][1], chosen, step, provider.attribution, lines)
             prepared, warnings = self._in_worker(
                 online.prepare_picture, base, fetched, self._limits, failure="the fetched picture could not be read"
             )
@@ -263,13 +263,13 @@ class Ingest:
     def align(
         self,
         environment: str,
-        request: Alignment,
+        request: AlignmentRequest,
         *,
         message: str,
         author: str,
         if_match: str | None = None,
         idempotency: str | None = None,
-    ) -> Outcome:
+    ) -> CommitResult:
         """A grid laid onto another map -> one version, or only what was found. body: {alignment, version, warnings}.
 
         Raises NotFound, Invalid, CannotConvert (nothing fits), StaleParent.
@@ -281,10 +281,12 @@ class Ingest:
             return dataclasses.replace(replayed, body=_aligned(report, replayed.version, replayed.version.warnings))
         text = message or f"Aligned the grid {request.level}/{request.grid}"
 
-        def once(base: Version) -> Outcome:
-            result: Aligned = self._in_worker(prepare_alignment, base, request, failure="the grid could not be aligned")
+        def once(base: Version) -> CommitResult:
+            result: AlignmentResult = self._in_worker(
+                prepare_alignment, base, request, failure="the grid could not be aligned"
+            )
             if result.prepared is None:
-                return Outcome("dry_run", None, _aligned(result.told, None, result.warnings))
+                return CommitResult("dry_run", None, _aligned(result.told, None, result.warnings))
             outcome = self._commit(environment, base, result.prepared, author, text, (), result.warnings, key)
             return dataclasses.replace(outcome, body=_aligned(result.told, outcome.version, result.warnings))
 
@@ -299,29 +301,29 @@ class Ingest:
         author: str,
         if_match: str | None = None,
         idempotency: str | None = None,
-    ) -> Outcome:
+    ) -> CommitResult:
         """A new version with an old one's content."""
         key = _idempotency(idempotency, _digest(["revert", to, message]))
         text = message or f"Revert to version {to}"
 
-        def once(base: Version) -> Outcome:
+        def once(base: Version) -> CommitResult:
             same = self._store.version(environment, to).root == base.root
             noted = Idempotency(key.key, UNCHANGED + key.fingerprint) if same and key is not None else key
             version = self._store.revert(
                 environment, to, author=author, message=text, expected=base.number, idempotency=noted
             )
-            return Outcome("unchanged" if same else "created", version, version.as_dict())
+            return CommitResult("unchanged" if same else "created", version, version.as_dict())
 
         return self._on_head(environment, key, if_match, once, "it can be reverted")
 
     def set_datum(
         self, environment: str, datum: Datum, *, author: str, if_match: str | None = None, message: str = ""
-    ) -> Outcome:
+    ) -> CommitResult:
         """A version with another datum: local items keep their metres, wgs84 items their place on earth."""
 
-        def once(base: Version) -> Outcome:
+        def once(base: Version) -> CommitResult:
             if base.datum == datum:
-                return Outcome("unchanged", base, base.as_dict())
+                return CommitResult("unchanged", base, base.as_dict())
             prepared = self._store.prepare(base, Changes((), datum, KEEP))
             text = message or "Set the datum"
             return self._commit(environment, base, prepared, author, text, (), moved(base, datum), None)
@@ -331,13 +333,13 @@ class Ingest:
     def template(
         self,
         environment: str,
-        update: TemplateWish,
+        update: TemplateUpdate,
         *,
         message: str,
         author: str,
         if_match: str | None = None,
         idempotency: str | None = None,
-    ) -> Outcome:
+    ) -> CommitResult:
         """What formats ask for and no layer has, said anew -> one version: robots get other maps by it.
 
         update: checked. Raises StaleParent, Conflict.
@@ -345,10 +347,10 @@ class Ingest:
         key = None if update.dry_run else _idempotency(idempotency, _digest(["template", update.as_dict(), message]))
         text = message or update.told()
 
-        def once(base: Version) -> Outcome:
+        def once(base: Version) -> CommitResult:
             prepared = self._store.prepare(base, Changes(templates=update.applied(base.templates)))
             if update.dry_run:
-                return Outcome("dry_run", None, self._preview(base, prepared, (), (), author, text))
+                return CommitResult("dry_run", None, self._preview(base, prepared, (), (), author, text))
             return self._commit(environment, base, prepared, author, text, (), (), key)
 
         return self._on_head(environment, key, if_match, once, "its templates can be set")
@@ -358,9 +360,9 @@ class Ingest:
         environment: str,
         key: Idempotency | None,
         if_match: str | None,
-        once: Callable[[Version], Outcome],
+        once: Callable[[Version], CommitResult],
         task: str,
-    ) -> Outcome:
+    ) -> CommitResult:
         """A change brought onto the head; again where the head has moved meanwhile and no condition forbids it.
 
         task: for the message, where the head moves each time. The answer that was given to ``key`` before is repeated.
@@ -388,7 +390,7 @@ class Ingest:
         sources: Sequence[Source],
         warnings: Sequence[Problem],
         key: Idempotency | None,
-    ) -> Outcome:
+    ) -> CommitResult:
         if not prepared.changed:
             # The key is remembered too: sent again after others have changed the map, this must not undo their work.
             noted = None if key is None else Idempotency(key.key, UNCHANGED + key.fingerprint)
@@ -397,7 +399,7 @@ class Ingest:
                 same = self._store.commit(
                     environment, prepared, author=author, message=message, sources=tuple(sources), idempotency=noted
                 )
-            return Outcome("unchanged", same, {**same.as_dict(), "warnings": [w.as_dict() for w in warnings]})
+            return CommitResult("unchanged", same, {**same.as_dict(), "warnings": [w.as_dict() for w in warnings]})
         version = self._store.commit(
             environment,
             prepared,
@@ -407,9 +409,9 @@ class Ingest:
             warnings=tuple(warnings),
             idempotency=key,
         )
-        return Outcome("created", version, version.as_dict())
+        return CommitResult("created", version, version.as_dict())
 
-    def _replayed(self, environment: str, key: Idempotency | None) -> Outcome | None:
+    def _replayed(self, environment: str, key: Idempotency | None) -> CommitResult | None:
         """The answer that was given to this key before; Conflict where it came with another request."""
         if key is None:
             return None
@@ -421,9 +423,9 @@ class Ingest:
             raise Conflict(f"the Idempotency-Key {key.key!r} was used for another request: choose a new one")
         version = self._store.version(environment, number)
         same = fingerprint.startswith(UNCHANGED)
-        return Outcome("unchanged" if same else "replayed", version, version.as_dict())
+        return CommitResult("unchanged" if same else "replayed", version, version.as_dict())
 
-    def _keep(self, upload: Upload, proposal: Proposal) -> list[Source]:
+    def _keep(self, upload: Upload, proposal: PreparedUpload) -> list[Source]:
         """Store the originals byte for byte, before the version that names them."""
         notes = {n.name: n for n in proposal.notes}
         names = [f.name for f in upload.files] + list(proposal.members)

@@ -7,20 +7,20 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from app import templates
-from app.model.templates import Own, Templates
+from app.model.templates import FormatTemplate, Templates
 
 
 @dataclass(frozen=True, slots=True)
-class TemplateWish:
+class TemplateUpdate:
     """What is to be said from now on. set: the environment's; None: it stays. formats: what is said of these, instead
     of all that was; an empty one takes it back. clear: also forget all that is not named here."""
 
     set: str | None = None
-    formats: Mapping[str, Own] = field(default_factory=dict)
+    formats: Mapping[str, FormatTemplate] = field(default_factory=dict)
     clear: bool = False
     dry_run: bool = False
 
-    def checked(self, location: str = "body.formats.{}") -> TemplateWish:
+    def checked(self, location: str = "body.formats.{}") -> TemplateUpdate:
         """The same with typed values. NotFound for a format, Invalid for a set or values that there are none of.
 
         location: the place of a format's templates in the request.
@@ -32,8 +32,10 @@ class TemplateWish:
             fmt, place = templates.check_format(name), location.format(name)
             if format_template.set is not None:
                 templates.check_set(format_template.set, f"{place}.set")
-            out[name] = Own(format_template.set, templates.check_values(fmt, format_template.values, f"{place}.values"))
-        return TemplateWish(self.set, out, self.clear, self.dry_run)
+            out[name] = FormatTemplate(
+                format_template.set, templates.check_values(fmt, format_template.values, f"{place}.values")
+            )
+        return TemplateUpdate(self.set, out, self.clear, self.dry_run)
 
     def applied(self, old: Templates) -> Templates:
         """What holds then."""

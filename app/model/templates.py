@@ -14,7 +14,7 @@ DEFAULT_SET: Final = "default"
 
 
 @dataclass(frozen=True, slots=True)
-class Own:
+class FormatTemplate:
     """What an environment says of one format. set: another set than the environment's, or None. values: by parameter,
     as JSON has them; they go before those of any set."""
 
@@ -32,11 +32,11 @@ class Templates:
     """The set that an environment has chosen, and by format what it says itself."""
 
     set: str = DEFAULT_SET
-    formats: Mapping[str, Own] = field(default_factory=dict)
+    formats: Mapping[str, FormatTemplate] = field(default_factory=dict)
 
-    def of(self, name: str) -> Own:
+    def of(self, name: str) -> FormatTemplate:
         """What is said of a format."""
-        return self.formats.get(name) or Own()
+        return self.formats.get(name) or FormatTemplate()
 
     def chosen(self, name: str) -> str:
         """The set that holds for a format."""
@@ -53,7 +53,7 @@ class Templates:
     def from_dict(cls, members: Mapping[str, Any]) -> Templates:
         """The reverse of ``as_dict``."""
         format_templates = {
-            str(name): Own(template.get("set"), dict(template.get("values", {})))
+            str(name): FormatTemplate(template.get("set"), dict(template.get("values", {})))
             for name, template in members.get("formats", {}).items()
         }
         return cls(members.get("set", DEFAULT_SET), format_templates)

@@ -33,7 +33,7 @@ from app.store import parts, tables, tree
 from app.store.changes import KEEP, Keep
 from app.store.encode import to_wkb
 from app.store.parts import PartRoot
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 from app.store.values import NO_AREA, Area, Box, PartEntry
 
 NEIGHBOURHOOD_METRES: Final = 2000.0
@@ -61,7 +61,7 @@ CIRCLE_SEGMENTS: Final = 16
 
 
 def area_after(
-    draft: Draft,
+    draft: ChunkStage,
     before: Sequence[PartEntry],
     after: Sequence[PartEntry],
     old_datum: Datum | None,
@@ -82,7 +82,7 @@ def area_after(
     return _guess(draft, after, datum)
 
 
-def area_of(draft: Draft, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
+def area_of(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
     """Compute the area of a version's content, whatever it takes."""
     fence = _fence(draft, entries, datum)
     return _guess(draft, entries, datum) if fence is None else area_on_earth(FENCE, fence)
@@ -96,7 +96,7 @@ def _frame(datum: Datum | None) -> LocalFrame | None:
     return None if datum is None or datum.latitude == 0.0 == datum.longitude else local_frame(datum)
 
 
-def _load(draft: Draft, entries: Iterable[PartEntry]) -> list[Features]:
+def _load(draft: ChunkStage, entries: Iterable[PartEntry]) -> list[Features]:
     loaded = parts.load(draft, {e.key: bytes.fromhex(e.hash) for e in entries}, lambda _: {})
     return [part for part in loaded.values() if isinstance(part, Features)]
 
@@ -104,7 +104,7 @@ def _load(draft: Draft, entries: Iterable[PartEntry]) -> list[Features]:
 # --- fence ---
 
 
-def _fence(draft: Draft, entries: Sequence[PartEntry], datum: Datum | None) -> Any:
+def _fence(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Any:
     """The fence as a valid (Multi)Polygon in degrees, beyond ±180 across the antimeridian; None if it has no area."""
     sites = _load(draft, (e for e in entries if e.key.layer == "location" and e.count))
     return fence_of(sites, _frame(datum))
@@ -154,7 +154,7 @@ def _floors(entries: Iterable[PartEntry], datum: Datum | None) -> list[PartEntry
     return [e for e in floor_entries if e.key.layer != "occupancy" or e.key.name not in masks.MASKS]
 
 
-def _guess(draft: Draft, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
+def _guess(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
     """The area of an environment without a fence."""
     frame = _frame(datum)
     if frame is None:
@@ -204,7 +204,7 @@ def _floor_objects(part: Features, frame: LocalFrame) -> list[Any]:
     return [p for p in (_polygonal(shapely.make_valid(s)) for s in flat) if p is not None]
 
 
-def free_rectangle(draft: Draft, grid: PartRoot) -> Any:
+def free_rectangle(draft: ChunkStage, grid: PartRoot) -> Any:
     """The rectangle in metres around a stored grid's free cells, turned as the grid is; None if no cell is free.
 
     Reads the grid tile by tile, equal tiles once.

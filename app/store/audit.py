@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, insert, select
 
 from app.store import tables
-from app.store.base import Base, utcnow
+from app.store.base import StoreBase, utcnow
 
 MAX_PATH = 1000
 """Characters of an address that are kept."""
@@ -92,7 +92,7 @@ def record(connection: Connection) -> Caller | None:
     return caller
 
 
-class Audit(Base):
+class Audit(StoreBase):
     """Reading the audit log."""
 
     def record_change(self) -> None:

@@ -26,7 +26,7 @@ CHANNEL_NAME: Final = re.compile(r"[a-z][a-z0-9_-]{0,62}")
 MAX_TEXT: Final = 64 * 2**10
 
 
-class Base:
+class StoreBase:
     """One database and one blob folder."""
 
     database_url: str

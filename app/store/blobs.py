@@ -53,7 +53,7 @@ _NAME = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True, slots=True)
-class _Row:
+class _BlobRow:
     size: int
     pack: str | None
     start: int
@@ -162,10 +162,10 @@ class Blobs:
                 )
         return names
 
-    def _touch(self, sizes: Mapping[str, int]) -> dict[str, _Row]:
+    def _touch(self, sizes: Mapping[str, int]) -> dict[str, _BlobRow]:
         """Rows that exist, marked as used now: from here on a collection leaves them alone."""
         names = sorted(sizes)
-        out: dict[str, _Row] = {}
+        out: dict[str, _BlobRow] = {}
         with self._database.read() as connection:
             if not self._rows(connection, names):
                 return out
@@ -176,7 +176,7 @@ class Blobs:
                 out.update(self._rows(connection, some))
         return out
 
-    def _problem(self, name: str, row: _Row) -> str | None:
+    def _problem(self, name: str, row: _BlobRow) -> str | None:
         """What is wrong with a stored file, None where it has its hash: ``lost``, ``damaged``."""
         digest = hashlib.sha256()
         try:
@@ -277,7 +277,7 @@ class Blobs:
             out[name] = data
         return out
 
-    def _read(self, name: str, row: _Row) -> bytes | None:
+    def _read(self, name: str, row: _BlobRow) -> bytes | None:
         try:
             if row.pack is None:
                 return self._path(name).read_bytes()
@@ -322,7 +322,7 @@ class Blobs:
         """Bytes of the content."""
         return self._row(sha256).size
 
-    def _row(self, name: str) -> _Row:
+    def _row(self, name: str) -> _BlobRow:
         with self._database.read() as connection:
             row = self._rows(connection, [name]).get(name)
         if row is None:
@@ -330,12 +330,12 @@ class Blobs:
         return row
 
     @staticmethod
-    def _rows(connection: Connection, names: Sequence[str]) -> dict[str, _Row]:
-        out: dict[str, _Row] = {}
+    def _rows(connection: Connection, names: Sequence[str]) -> dict[str, _BlobRow]:
+        out: dict[str, _BlobRow] = {}
         for start in range(0, len(names), BATCH):
             some = list(names[start : start + BATCH])
             query = select(blob.c.sha256, blob.c.size, blob.c.pack, blob.c.start).where(blob.c.sha256.in_(some))
-            out.update((r.sha256, _Row(r.size, r.pack, r.start)) for r in connection.execute(query))
+            out.update((r.sha256, _BlobRow(r.size, r.pack, r.start)) for r in connection.execute(query))
         return out
 
     # --- upkeep ---

@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, insert, select, update
 from app.errors import Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
-from app.store.base import CHANNEL_NAME, Base, environment_row, nearest_channel, text, utcnow
+from app.store.base import CHANNEL_NAME, StoreBase, environment_row, nearest_channel, text, utcnow
 from app.store.manifest import read_version
 from app.store.overlays import closures_in_force
 from app.store.robots import robots_of
@@ -20,11 +20,11 @@ from app.store.values import (
     LATEST,
     OPEN_ROLLOUTS,
     Channel,
-    Planned,
+    PlannedMove,
     Robot,
     Rollout,
     RolloutState,
-    Step,
+    RolloutStep,
     Version,
     rfc3339,
 )
@@ -32,7 +32,7 @@ from app.store.values import (
 _NO_PLAN: Final[Mapping[str, None]] = {"planned_version": None, "planned_at": None, "planned_author": None}
 
 
-class Channels(Base):
+class Channels(StoreBase):
     """The channels of environments."""
 
     def channels(self, environment: str) -> list[Channel]:
@@ -198,10 +198,10 @@ class Channels(Base):
         return out
 
 
-Decide = Callable[[Rollout, Sequence[Robot], datetime], Step | None]
+Decide = Callable[[Rollout, Sequence[Robot], datetime], RolloutStep | None]
 
 
-def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Decide) -> Step | None:
+def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Decide) -> RolloutStep | None:
     return decide(Rollout.from_row(channel.rollout), robots_of(connection, channel.environment_id, channel.name), now)
 
 
@@ -211,7 +211,7 @@ def _marked(connection: Connection, environment: Row[Any], channel: str, rollout
     return replace(rollout, said_before={r.robot: rfc3339(r.time) for r in failed_robots})
 
 
-def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step: Step, now: datetime) -> None:
+def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step: RolloutStep, now: datetime) -> None:
     """One step of a roll-out: the move or the way back with its event, or the end."""
     rollout = Rollout.from_row(channel.rollout)
     ended = replace(rollout, state=step.state, detail=step.detail)
@@ -279,7 +279,7 @@ def _as_channel(
 ) -> Channel:
     planned = None
     if row.planned_version is not None:
-        planned = Planned(row.planned_version, row.planned_at, row.planned_author or "", planned_root or "")
+        planned = PlannedMove(row.planned_version, row.planned_at, row.planned_author or "", planned_root or "")
     rollout = None if row.rollout is None else Rollout.from_row(row.rollout)
     more = (closures, environment.closures_sequence)
     return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time, rollout, *more)

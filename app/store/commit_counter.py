@@ -16,7 +16,7 @@ NAME = ".generation"
 _NUMBER = struct.Struct("<Q")
 
 
-class Generation:
+class CommitCounter:
     """The number, opened when first needed; without a folder it changes in this process alone."""
 
     def __init__(self, folder: Path) -> None:

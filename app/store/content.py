@@ -12,14 +12,14 @@ from app.model.geodesy import local_frame
 from app.model.layers import VECTOR_LAYERS, Layers, PartKey
 from app.model.templates import template_changes
 from app.store import diff, parts
-from app.store.base import Base
+from app.store.base import StoreBase
 from app.store.parts import PartRoot
 from app.store.prepare import differing_keys, frame_changes, part_names, roots_of
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 from app.store.values import Box, Delta, FeatureDelta, GridDelta, Version
 
 
-class Content(Base):
+class ContentReader(StoreBase):
     """Reading layers. Any version costs the same."""
 
     def load(self, version: Version, keys: Collection[PartKey] | None = None) -> Layers:
@@ -33,7 +33,7 @@ class Content(Base):
             if key not in entries:
                 raise NotFound(_missing(version, key))
         hashes = {key: bytes.fromhex(entries[key].hash) for key in chosen}
-        loaded = parts.load(Draft(self._chunks), hashes, self.blobs.get_many) if hashes else {}
+        loaded = parts.load(ChunkStage(self._chunks), hashes, self.blobs.get_many) if hashes else {}
         return Layers(loaded, version.datum, version.levels)
 
     def features(
@@ -52,7 +52,7 @@ class Content(Base):
         east crosses the antimeridian); features without coordinates are in no box. MissingDatum where the part has
         items anchored otherwise than ``crs`` and the version has no datum.
         """
-        draft = Draft(self._chunks)
+        draft = ChunkStage(self._chunks)
         root = self._root(draft, version, key)
         if bbox is None and ids is None:
             loaded = self.load(version, [key]).parts[key]
@@ -76,10 +76,10 @@ class Content(Base):
         """Those of the ids that the part has; none where there is no such part."""
         if version.part(key) is None:
             return set()
-        draft = Draft(self._chunks)
+        draft = ChunkStage(self._chunks)
         return set(parts.find_places(draft, self._root(draft, version, key), sorted(set(ids))))
 
-    def _root(self, draft: Draft, version: Version, key: PartKey) -> PartRoot:
+    def _root(self, draft: ChunkStage, version: Version, key: PartKey) -> PartRoot:
         if key.layer not in VECTOR_LAYERS:
             raise Invalid(f"{key.layer} has no features; there are {', '.join(sorted(VECTOR_LAYERS))}")
         root = roots_of(draft, key, {e.key: e for e in version.parts})
@@ -95,7 +95,7 @@ class Content(Base):
         resources: ``{name: {added, changed, deleted, fields?}}``, counts of voxels, tiles or files. ``datum`` and
         ``levels``: ``{from, to}``; ``templates`` as ``template_changes`` says them.
         """
-        draft = Draft(self._chunks)
+        draft = ChunkStage(self._chunks)
         before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
         names = part_names(sorted(before.keys() | after.keys()))
         out: dict[str, Any] = {}
@@ -117,7 +117,7 @@ class Content(Base):
 
     def delta_parts(self, a: Version, b: Version) -> Delta:
         """What turns version a into version b: features put and deleted, changed rectangles of grids."""
-        draft = Draft(self._chunks)
+        draft = ChunkStage(self._chunks)
         before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
         features, grids, other = [], [], []
         for key in differing_keys(before, after):
@@ -135,7 +135,7 @@ class Content(Base):
         return Delta(tuple(features), tuple(grids), tuple(other), "datum" in moved, "levels" in moved)
 
 
-def _grid_delta(draft: Draft, key: PartKey, old: PartRoot | None, new: PartRoot | None) -> GridDelta:
+def _grid_delta(draft: ChunkStage, key: PartKey, old: PartRoot | None, new: PartRoot | None) -> GridDelta:
     if new is None:
         return GridDelta(key, (), deleted=True)
     if old is None or old.header != new.header:

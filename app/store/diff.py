@@ -15,8 +15,8 @@ from app.model.voxels import DEPTH
 from app.store import parts, tree
 from app.store.encode import pack
 from app.store.parts import TILE, Item, PartRoot
-from app.store.tree import Draft
-from app.store.values import Box, Rectangle
+from app.store.tree import ChunkStage
+from app.store.values import Box, ChangedCells
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ def fields(a: Item, b: Item) -> list[str]:
     return sorted(out)
 
 
-def features(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> FeatureChanges:
+def features(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> FeatureChanges:
     """Changes between two collections; None is one without items."""
     before: dict[str, Item] = {}
     after: dict[str, Item] = {}
@@ -98,7 +98,7 @@ def same_frame(a: PartRoot, b: PartRoot) -> bool:
     return all(a.header[name] == b.header[name] for name in FRAME)
 
 
-def changed_tiles(draft: Draft, a: PartRoot, b: PartRoot) -> Iterator[TileChange]:
+def changed_tiles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> Iterator[TileChange]:
     """The tiles that differ between two grids of the same frame."""
     left, right = tree.differing(draft, a.trees["tiles"], b.trees["tiles"])
     raws = draft.read_many([*left, *right])
@@ -154,7 +154,7 @@ class CellChanges:
         return out
 
 
-def cells(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> CellChanges:
+def cells(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> CellChanges:
     """Changes between two grids. Outside of a grid cells count as unknown.
 
     Grids whose cells fall on the same raster (equal resolution and yaw, origins whole cells apart) are laid on each
@@ -182,7 +182,7 @@ def cells(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> CellChanges:
     return _laid_over(draft, a, b, out)
 
 
-def _laid_over(draft: Draft, a: PartRoot | None, b: PartRoot | None, out: CellChanges) -> CellChanges:
+def _laid_over(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None, out: CellChanges) -> CellChanges:
     """Compare grids of one raster on the rectangle around both, in blocks of rows."""
     header = b.header if b else a.header if a else {}
     place = (0, 0) if a is None or b is None else (_offset(a.header, b.header) or (0, 0))
@@ -222,7 +222,7 @@ def _window(
     return out
 
 
-def _all_cells(draft: Draft, root: PartRoot | None) -> NDArray[np.uint8]:
+def _all_cells(draft: ChunkStage, root: PartRoot | None) -> NDArray[np.uint8]:
     return parts.grid_cells(draft, root) if root else np.empty((0, 0), np.uint8)
 
 
@@ -252,21 +252,21 @@ def cell_box(header: Mapping[str, Any], x0: float, y0: float, x1: float, y1: flo
     return (min(xs), min(ys), max(xs), max(ys))
 
 
-def rectangles(draft: Draft, a: PartRoot, b: PartRoot) -> tuple[Rectangle, ...]:
+def rectangles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> tuple[ChangedCells, ...]:
     """The changed cells between two grids of one frame: the smallest rectangle in each tile that differs."""
     out = []
     for change in changed_tiles(draft, a, b):
         rows, columns = np.nonzero(change.before != change.after)
         r0, r1, c0, c1 = int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
         block = np.ascontiguousarray(change.after[r0:r1, c0:c1])
-        out.append(Rectangle(change.row + r0, change.column + c0, block))
+        out.append(ChangedCells(change.row + r0, change.column + c0, block))
     return tuple(out)
 
 
 # --- the other layers ---
 
 
-def others(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> dict[str, Any]:
+def others(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> dict[str, Any]:
     """Voxels, tiles of a picture, or files that came, changed and went, and the header members that differ."""
     if a is not None and b is not None and a.type != b.type:
         a = None
@@ -293,7 +293,7 @@ def others(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> dict[str, An
     return out
 
 
-def _rows(draft: Draft, names: Sequence[bytes], kind: str) -> dict[Any, Any]:
+def _rows(draft: ChunkStage, names: Sequence[bytes], kind: str) -> dict[Any, Any]:
     rows: dict[Any, Any] = {}
     for start in range(0, len(names), parts.TILE_BATCH):
         some = names[start : start + parts.TILE_BATCH]
@@ -313,7 +313,7 @@ class _Voxels(NamedTuple):
     said: NDArray[np.void]
 
 
-def _voxels(draft: Draft, names: Sequence[bytes], root: PartRoot | None) -> _Voxels:
+def _voxels(draft: ChunkStage, names: Sequence[bytes], root: PartRoot | None) -> _Voxels:
     colour = root is not None and bool(root.header["colour"])
     record = np.dtype([("odds", "<f4"), ("colour", "u1", 3), ("coloured", "u1")])
     keys, records = [np.empty(0, np.uint64)], [np.empty(0, record)]

@@ -18,7 +18,7 @@ from app.model.templates import NO_TEMPLATES, template_changes
 from app.store import outbox, tables
 from app.store.area import area_after
 from app.store.base import (
-    Base,
+    StoreBase,
     as_environment,
     check_environment_name,
     check_tags,
@@ -30,14 +30,14 @@ from app.store.changes import KEEP
 from app.store.index import meets
 from app.store.manifest import read_version
 from app.store.prepare import frame_changes, summarise, version_root
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 from app.store.values import Box, Environment, Version
 from app.store.versions import insert_version
 
 PAGE: Final = 500
 
 
-class Environments(Base):
+class Environments(StoreBase):
     """The mapped places."""
 
     def create_environment(
@@ -60,7 +60,7 @@ class Environments(Base):
         empty = version_root((), None, (Level(),))
         changes = self._first_changes(datum, clone)
         area = area_after(
-            Draft(self._chunks), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
+            ChunkStage(self._chunks), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
         )
         now = utcnow()
         with self._database.write() as connection:
@@ -144,7 +144,7 @@ class Environments(Base):
     def _first_changes(self, datum: Datum | None, clone: Version | None) -> dict[str, Any]:
         changes: dict[str, Any] = {}
         if clone is not None:
-            changes, _ = summarise(Draft(self._chunks), {}, {e.key: e for e in clone.parts})
+            changes, _ = summarise(ChunkStage(self._chunks), {}, {e.key: e for e in clone.parts})
         place = datum or (clone.datum if clone else None)
         changes |= template_changes(NO_TEMPLATES, clone.templates if clone else NO_TEMPLATES)
         return changes | frame_changes(None, place, (Level(),), clone.levels if clone else (Level(),))

@@ -14,9 +14,9 @@ from typing import Final
 from sqlalchemy import delete, select
 
 from app.store import chunks, parts, tables
-from app.store.base import Base, utcnow
+from app.store.base import StoreBase, utcnow
 from app.store.manifest import unpack_manifest
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 
 IDEMPOTENCY_DAYS: Final = 7
 EVENT_DAYS: Final = 30
@@ -27,7 +27,7 @@ ROBOT_DAYS: Final = 90
 PAGE: Final = 500
 
 
-class Collection(Base):
+class GarbageCollector(StoreBase):
     """Upkeep."""
 
     def collect(self, grace: timedelta) -> dict[str, int]:
@@ -61,7 +61,7 @@ class Collection(Base):
             blobs = set(connection.execute(select(tables.source.c.sha256).distinct()).scalars())
         live: set[bytes] = set()
         for name in hashes:
-            chunks_of, files = parts.all_chunks(Draft(self._chunks), bytes.fromhex(name), live)
+            chunks_of, files = parts.all_chunks(ChunkStage(self._chunks), bytes.fromhex(name), live)
             live |= chunks_of
             blobs |= files
         return live, blobs

@@ -26,14 +26,14 @@ from sqlalchemy import (
 
 from app.model.layers import VECTOR_LAYERS, Layer, PartKey
 from app.store import diff, tables
-from app.store.base import Base
+from app.store.base import StoreBase
 from app.store.changes import IndexRows
 from app.store.extent import geometry as to_geometry
 from app.store.manifest import read_version
 from app.store.parts import split_box
 from app.store.prepare import differing_keys, index_rows, roots_of
-from app.store.tree import Draft
-from app.store.values import Box, Found, PartEntry, Version
+from app.store.tree import ChunkStage
+from app.store.values import Box, FeatureHit, PartEntry, Version
 
 BATCH: Final = 500
 
@@ -88,10 +88,10 @@ def meets(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str) -> C
     return or_(*conditions)
 
 
-class SpatialIndex(Base):
+class SpatialIndex(StoreBase):
     """Questions across environments."""
 
-    def find(self, bbox: Box, *, layer: Layer | None = None, limit: int = 1000) -> list[Found]:
+    def find(self, bbox: Box, *, layer: Layer | None = None, limit: int = 1000) -> list[FeatureHit]:
         """Features of all environments' heads that meet ``bbox`` (west, south, east, north; west > east crosses the
         antimeridian): by their box on SQLite, by their geometry on PostgreSQL. Sorted by environment, part and id.
         """
@@ -112,7 +112,7 @@ class SpatialIndex(Base):
         with self._database.read() as connection:
             rows = connection.execute(query.limit(limit)).all()
         return [
-            Found(r.environment, PartKey(r.layer, r.level, r.name), r.feature, (r.west, r.south, r.east, r.north))
+            FeatureHit(r.environment, PartKey(r.layer, r.level, r.name), r.feature, (r.west, r.south, r.east, r.north))
             for r in rows
         ]
 
@@ -143,7 +143,7 @@ class SpatialIndex(Base):
         else:
             connection.execute(delete(tables.place).where(tables.place.c.environment_id == row.id))
         new = {e.key: e for e in head.parts}
-        draft = Draft(self._chunks)
+        draft = ChunkStage(self._chunks)
         for key in differing_keys(old, new):
             if key.layer not in VECTOR_LAYERS:
                 continue

@@ -9,11 +9,11 @@ from sqlalchemy import Row, delete, insert, select, update
 
 from app.errors import NotFound
 from app.store import tables
-from app.store.base import Base, clean, text, utcnow
+from app.store.base import StoreBase, clean, text, utcnow
 from app.store.values import Job, State
 
 
-class Jobs(Base):
+class Jobs(StoreBase):
     """The queue's memory."""
 
     def create_job(self, owner: str = "", detail: str = "") -> Job:

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, func, insert, select, update
 from app.errors import NotFound
 from app.event_types import EventType
 from app.store import tables
-from app.store.base import Base, environment_row
+from app.store.base import StoreBase, environment_row
 from app.store.values import Event, PartEntry, rfc3339
 
 REACH = 100_000
@@ -87,7 +87,7 @@ def _reach(connection: Connection) -> int:
     return int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one()) - REACH
 
 
-class Outbox(Base):
+class Outbox(StoreBase):
     """Reading the log."""
 
     def events(self, environment: str | None, since: int = 0, limit: int = 1000) -> list[Event]:

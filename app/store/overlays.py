@@ -21,7 +21,7 @@ from app.errors import Conflict, NotFound
 from app.event_types import EventType
 from app.model.closures import Closures
 from app.store import outbox, tables
-from app.store.base import Base, environment_row, text
+from app.store.base import StoreBase, environment_row, text
 from app.store.values import Overlay, OverlayState
 
 MAX_PENDING: Final = 1000
@@ -51,7 +51,7 @@ MAX_AT_ONCE: Final = 100
 """Maximum number of overlays that are ended in one call."""
 
 
-class Overlays(Base):
+class Overlays(StoreBase):
     """Pending and decided overlays."""
 
     def add_overlay(self, overlay: Overlay) -> tuple[Overlay, bool]:

@@ -41,7 +41,7 @@ from app.store.encode import (
     unpack,
     wkb_bounds,
 )
-from app.store.tree import Draft, Node
+from app.store.tree import ChunkStage, Node
 from app.store.values import Bounds, Box
 
 PartType = Literal["features", "grid", "voxels", "picture", "resources"]
@@ -74,7 +74,7 @@ class PartRoot:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class EncodedPart:
     """A part that became chunks. digest: of the canonical upload, empty where it is not worth one."""
 
     hash: bytes
@@ -184,19 +184,19 @@ def _members(raw: bytes, kind: str) -> list[Any]:
 # --- part roots ---
 
 
-def read_root(draft: Draft, name: bytes) -> PartRoot:
+def read_root(draft: ChunkStage, name: bytes) -> PartRoot:
     """A part's root chunk."""
     kind, header, trees = _members(draft.read(name), "part")
     return PartRoot(kind, header, {t: Node.from_list(n) for t, n in trees.items()})
 
 
-def put_root(draft: Draft, kind: PartType, header: Mapping[str, Any], trees: Mapping[str, Node | None]) -> bytes:
+def put_root(draft: ChunkStage, kind: PartType, header: Mapping[str, Any], trees: Mapping[str, Node | None]) -> bytes:
     """Keep a part's root chunk; its hash is the part's."""
     listed = {t: n.as_list() if n else None for t, n in trees.items()}
     return draft.put(pack([ENCODING, "part", kind, dict(header), listed]))
 
 
-def put_document(draft: Draft, document: Mapping[str, Any]) -> list[list[Any]]:
+def put_document(draft: ChunkStage, document: Mapping[str, Any]) -> list[list[Any]]:
     """A document's members for the header, in order: [key, 0, value], or [key, 1, hash] of a chunk of its own."""
     out: list[list[Any]] = []
     for key in sorted(document):
@@ -213,7 +213,7 @@ def document_chunks(root: PartRoot) -> list[bytes]:
     return [value for _, inline, value in root.header.get("document", ()) if inline]
 
 
-def read_document(draft: Draft, root: PartRoot) -> dict[str, Any]:
+def read_document(draft: ChunkStage, root: PartRoot) -> dict[str, Any]:
     """A collection's document."""
     raws = draft.read_many(document_chunks(root))
     return {
@@ -225,7 +225,7 @@ def read_document(draft: Draft, root: PartRoot) -> dict[str, Any]:
 # --- values -> chunks ---
 
 
-def compose(draft: Draft, part: Part, base: PartRoot | None, base_digest: str) -> Made | None:
+def compose(draft: ChunkStage, part: Part, base: PartRoot | None, base_digest: str) -> EncodedPart | None:
     """A part as chunks in the draft; None where its canonical upload is the very one that the base was made of."""
     if isinstance(part, Features):
         return _compose_features(draft, part, base_digest)
@@ -238,7 +238,7 @@ def compose(draft: Draft, part: Part, base: PartRoot | None, base_digest: str) -
     return _compose_resources(draft, part)
 
 
-def _compose_features(draft: Draft, part: Features, base_digest: str) -> Made | None:
+def _compose_features(draft: ChunkStage, part: Features, base_digest: str) -> EncodedPart | None:
     document = put_document(draft, part.document)
     table = columns(part)
     digest = table.digest(pack(document))
@@ -249,10 +249,10 @@ def _compose_features(draft: Draft, part: Features, base_digest: str) -> Made | 
         trees[name] = _build_features(draft, table, np.flatnonzero(mask))
     trees["ids"] = _build_ids(draft, table)
     root = put_root(draft, "features", {"document": document}, trees)
-    return Made(root, len(part), feature_bounds(draft, trees, part), digest)
+    return EncodedPart(root, len(part), feature_bounds(draft, trees, part), digest)
 
 
-def _build_features(draft: Draft, table: Columns, index: NDArray[np.intp]) -> Node | None:
+def _build_features(draft: ChunkStage, table: Columns, index: NDArray[np.intp]) -> Node | None:
     if not len(index):
         return None
     cells = table.cells[index]
@@ -278,7 +278,7 @@ def _build_features(draft: Draft, table: Columns, index: NDArray[np.intp]) -> No
     )
 
 
-def _build_ids(draft: Draft, table: Columns) -> Node | None:
+def _build_ids(draft: ChunkStage, table: Columns) -> Node | None:
     places = _places(table)
     order = sorted(range(len(table.ids)), key=table.ids.__getitem__)
     ids = [table.ids[k] for k in order]
@@ -296,7 +296,7 @@ def _places(table: Columns) -> list[bytes]:
     return [(b"\x00" if local else b"\x01") + cells[8 * k : 8 * k + 8] for k, local in enumerate(table.local.tolist())]
 
 
-def _compose_grid(draft: Draft, part: OccupancyGrid, base: PartRoot | None) -> Made:
+def _compose_grid(draft: ChunkStage, part: OccupancyGrid, base: PartRoot | None) -> EncodedPart:
     header = {
         "height": part.height,
         "width": part.width,
@@ -310,10 +310,10 @@ def _compose_grid(draft: Draft, part: OccupancyGrid, base: PartRoot | None) -> M
     }
     tiles = _build_tiles(draft, part.cells, _tile_names(draft, base))
     name = put_root(draft, "grid", header, {"tiles": tiles})
-    return Made(name, int(part.cells.size), {"local": _around(part.corners()), "wgs84": None})
+    return EncodedPart(name, int(part.cells.size), {"local": _around(part.corners()), "wgs84": None})
 
 
-def _compose_picture(draft: Draft, part: Picture, base: PartRoot | None) -> Made:
+def _compose_picture(draft: ChunkStage, part: Picture, base: PartRoot | None) -> EncodedPart:
     pixels = part.pixels
     header = {
         "height": pixels.shape[0],
@@ -326,7 +326,7 @@ def _compose_picture(draft: Draft, part: Picture, base: PartRoot | None) -> Made
     }
     tiles = _build_tiles(draft, pixels, _tile_names(draft, base))
     name = put_root(draft, "picture", header, {"tiles": tiles})
-    return Made(name, int(pixels.shape[0] * pixels.shape[1]), picture_bounds(header))
+    return EncodedPart(name, int(pixels.shape[0] * pixels.shape[1]), picture_bounds(header))
 
 
 def _dtype_name(dtype: np.dtype[Any]) -> str:
@@ -335,7 +335,7 @@ def _dtype_name(dtype: np.dtype[Any]) -> str:
     return f"{dtype.kind}{dtype.itemsize}"
 
 
-def _build_tiles(draft: Draft, cells: NDArray[Any], existing_names: Container[bytes]) -> Node | None:
+def _build_tiles(draft: ChunkStage, cells: NDArray[Any], existing_names: Container[bytes]) -> Node | None:
     little = cells.dtype.newbyteorder("<")
     rows, cols = tile_counts(cells.shape[0], cells.shape[1])
     code = interleave(
@@ -368,7 +368,7 @@ def tile_leaf(raw: bytes) -> list[tuple[int, bytes]]:
     ]
 
 
-def _tile_names(draft: Draft, base: PartRoot | None) -> set[bytes]:
+def _tile_names(draft: ChunkStage, base: PartRoot | None) -> set[bytes]:
     """The names of a raster's tiles."""
     root = base.trees.get("tiles") if base else None
     if root is None:
@@ -377,7 +377,7 @@ def _tile_names(draft: Draft, base: PartRoot | None) -> set[bytes]:
     return {name for raw in draft.read_many(leaves).values() for _, name in tile_leaf(raw)}
 
 
-def _compose_voxels(draft: Draft, part: VoxelMap) -> Made:
+def _compose_voxels(draft: ChunkStage, part: VoxelMap) -> EncodedPart:
     depth, code = part.depth, part.code
     log_odds = (part.log_odds + np.float32(0.0)).astype("<f4")
     colour = None if part.colour is None else np.ascontiguousarray(part.colour)
@@ -398,7 +398,7 @@ def _compose_voxels(draft: Draft, part: VoxelMap) -> Made:
     }
     leaves = tree.build(draft, _EvenKeys(flat.tobytes(), VOXEL_KEY), 12, encode)
     name = put_root(draft, "voxels", header, {"voxels": leaves})
-    return Made(name, len(code), {"local": _voxel_box(part), "wgs84": None})
+    return EncodedPart(name, len(code), {"local": _voxel_box(part), "wgs84": None})
 
 
 class _EvenKeys(Sequence[bytes]):
@@ -432,7 +432,7 @@ def _voxel_box(part: VoxelMap) -> Box | None:
     return (x0, y0, x1, y1)
 
 
-def _compose_resources(draft: Draft, part: Resources) -> Made:
+def _compose_resources(draft: ChunkStage, part: Resources) -> EncodedPart:
     paths = sorted(part.files)
     contents = [bytes(part.files[p]) for p in paths]
     hashes = [hashlib.sha256(data).digest() for data in contents]
@@ -443,7 +443,7 @@ def _compose_resources(draft: Draft, part: Resources) -> Made:
     files = tree.build(draft, [p.encode() for p in paths], 6, encode)
     name = put_root(draft, "resources", {}, {"files": files})
     blobs = {h.hex(): data for h, data in zip(hashes, contents, strict=True)}
-    return Made(name, len(paths), {"local": None, "wgs84": None}, blobs=blobs)
+    return EncodedPart(name, len(paths), {"local": None, "wgs84": None}, blobs=blobs)
 
 
 def file_leaf(raw: bytes) -> list[tuple[str, int, str]]:
@@ -471,7 +471,7 @@ def picture_bounds(header: Mapping[str, Any]) -> Bounds:
     return {"local": None, "wgs84": crs_bounds(header["crs"], corners)}
 
 
-def feature_bounds(draft: Draft, trees: Mapping[str, Node | None], part: Features | None = None) -> Bounds:
+def feature_bounds(draft: ChunkStage, trees: Mapping[str, Node | None], part: Features | None = None) -> Bounds:
     """Where a collection's items lie; the box of wgs84 items crosses the antimeridian where that makes it smaller."""
     local, wgs84 = trees["local"], trees["wgs84"]
     out: dict[Literal["local", "wgs84"], Box | None] = {
@@ -503,7 +503,9 @@ def crossing_box(points: NDArray[np.float64]) -> Box:
 # --- edits by id ---
 
 
-def edit_features(draft: Draft, root: PartRoot, put: Features | None, deleted: Collection[str], label: str) -> Made:
+def edit_features(
+    draft: ChunkStage, root: PartRoot, put: Features | None, deleted: Collection[str], label: str
+) -> EncodedPart:
     """A collection with features put (added, or replaced by id) and others deleted; NotFound names unknown ids."""
     table = columns(put) if put is not None and len(put) else None
     touched = sorted({*(table.ids if table else ()), *deleted})
@@ -535,15 +537,15 @@ def edit_features(draft: Draft, root: PartRoot, put: Features | None, deleted: C
         joined = {row[0]: row for row in [*header.get("document", ()), *put_document(draft, put.document)]}
         header["document"] = [joined[key] for key in sorted(joined)]
     count = trees["ids"].count if trees["ids"] else 0
-    return Made(put_root(draft, "features", header, trees), count, feature_bounds(draft, trees))
+    return EncodedPart(put_root(draft, "features", header, trees), count, feature_bounds(draft, trees))
 
 
-def empty_features(draft: Draft) -> bytes:
+def empty_features(draft: ChunkStage) -> bytes:
     """An empty collection's root."""
     return put_root(draft, "features", {"document": []}, {"local": None, "wgs84": None, "ids": None})
 
 
-def find_places(draft: Draft, root: PartRoot, ids: Sequence[str]) -> dict[str, bytes]:
+def find_places(draft: ChunkStage, root: PartRoot, ids: Sequence[str]) -> dict[str, bytes]:
     """Sorted ids -> anchor and cell (9 bytes), of those that exist."""
     keys = [i.encode() for i in ids]
     out: dict[str, bytes] = {}
@@ -557,7 +559,7 @@ def find_places(draft: Draft, root: PartRoot, ids: Sequence[str]) -> dict[str, b
     return out
 
 
-def items_by_id(draft: Draft, root: PartRoot, ids: Collection[str]) -> dict[str, Item]:
+def items_by_id(draft: ChunkStage, root: PartRoot, ids: Collection[str]) -> dict[str, Item]:
     """The stored items with these ids, as far as they exist."""
     places = find_places(draft, root, sorted(set(ids)))
     out: dict[str, Item] = {}
@@ -568,7 +570,7 @@ def items_by_id(draft: Draft, root: PartRoot, ids: Collection[str]) -> dict[str,
     return out
 
 
-def leaf_items(draft: Draft, names: Sequence[bytes], anchor: int) -> Iterator[tuple[str, Item]]:
+def leaf_items(draft: ChunkStage, names: Sequence[bytes], anchor: int) -> Iterator[tuple[str, Item]]:
     """(id, item) of leaves of vector items."""
     for start in range(0, len(names), BATCH):
         some = names[start : start + BATCH]
@@ -611,7 +613,7 @@ def trusted(
 # --- box queries ---
 
 
-def features_in_box(draft: Draft, root: PartRoot, box: Box, crs: str, frame: LocalFrame | None) -> dict[str, Item]:
+def features_in_box(draft: ChunkStage, root: PartRoot, box: Box, crs: str, frame: LocalFrame | None) -> dict[str, Item]:
     """Items whose box meets ``box``, given in local metres or in degrees (west > east crosses the antimeridian)."""
     out: dict[str, Item] = {}
     for anchor, name in enumerate(("local", "wgs84")):
@@ -747,7 +749,7 @@ class _Columns:
     local: int = 0
 
 
-def load(draft: Draft, root_hashes: Mapping[Any, bytes], fetch: FetchBlobs) -> dict[Any, Part]:
+def load(draft: ChunkStage, root_hashes: Mapping[Any, bytes], fetch: FetchBlobs) -> dict[Any, Part]:
     """Parts by their hashes, with few queries for all of them together."""
     draft.read_many(list(root_hashes.values()))
     roots = {key: read_root(draft, name) for key, name in root_hashes.items()}
@@ -765,7 +767,7 @@ def load(draft: Draft, root_hashes: Mapping[Any, bytes], fetch: FetchBlobs) -> d
     return {key: out[key] for key in root_hashes}
 
 
-def _load_collections(draft: Draft, roots: Mapping[Any, PartRoot]) -> Iterator[tuple[Any, Features]]:
+def _load_collections(draft: ChunkStage, roots: Mapping[Any, PartRoot]) -> Iterator[tuple[Any, Features]]:
     trees = [(key, name, r.trees[name]) for key, r in roots.items() for name in ("local", "wgs84")]
     present = [(key, name, node) for key, name, node in trees if node is not None]
     documents = [name for r in roots.values() for name in document_chunks(r)]
@@ -802,7 +804,7 @@ def _load_collections(draft: Draft, roots: Mapping[Any, PartRoot]) -> Iterator[t
         )
 
 
-def _load_tiles(draft: Draft, root: PartRoot, out: NDArray[Any]) -> None:
+def _load_tiles(draft: ChunkStage, root: PartRoot, out: NDArray[Any]) -> None:
     node = root.trees["tiles"]
     if node is None:
         return
@@ -853,14 +855,14 @@ def tile_cells(raw: bytes) -> NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8)
 
 
-def grid_cells(draft: Draft, root: PartRoot) -> NDArray[np.uint8]:
+def grid_cells(draft: ChunkStage, root: PartRoot) -> NDArray[np.uint8]:
     """A grid's cells."""
     cells = np.empty((root.header["height"], root.header["width"]), np.uint8)
     _load_tiles(draft, root, cells)
     return cells
 
 
-def _load_grid(draft: Draft, root: PartRoot) -> OccupancyGrid:
+def _load_grid(draft: ChunkStage, root: PartRoot) -> OccupancyGrid:
     h = root.header
     cells = grid_cells(draft, root)
     x, y, yaw = h["origin"]
@@ -876,7 +878,7 @@ def _load_grid(draft: Draft, root: PartRoot) -> OccupancyGrid:
     )
 
 
-def _load_picture(draft: Draft, root: PartRoot) -> Picture:
+def _load_picture(draft: ChunkStage, root: PartRoot) -> Picture:
     h = root.header
     pixels = np.empty((h["height"], h["width"], h["bands"]), np.dtype(h["dtype"]) if h["dtype"] != "b1" else np.bool_)
     _load_tiles(draft, root, pixels)
@@ -896,7 +898,7 @@ def voxel_leaf(raw: bytes, colour: bool) -> tuple[NDArray[Any], NDArray[Any], ND
     )
 
 
-def _load_voxels(draft: Draft, root: PartRoot) -> VoxelMap:
+def _load_voxels(draft: ChunkStage, root: PartRoot) -> VoxelMap:
     h = root.header
     node = root.trees["voxels"]
     leaves = tree.leaves(draft, [node])[0] if node else []
@@ -921,7 +923,7 @@ def _load_voxels(draft: Draft, root: PartRoot) -> VoxelMap:
     )
 
 
-def resource_files(draft: Draft, root: PartRoot) -> list[tuple[str, int, str]]:
+def resource_files(draft: ChunkStage, root: PartRoot) -> list[tuple[str, int, str]]:
     """(path, size, SHA-256 in hex) of all files of a resources part."""
     node = root.trees["files"]
     if node is None:
@@ -931,13 +933,13 @@ def resource_files(draft: Draft, root: PartRoot) -> list[tuple[str, int, str]]:
     return [row for name in leaves for row in file_leaf(raws[name])]
 
 
-def _load_resources(draft: Draft, root: PartRoot, fetch: FetchBlobs) -> Resources:
+def _load_resources(draft: ChunkStage, root: PartRoot, fetch: FetchBlobs) -> Resources:
     rows = resource_files(draft, root)
     contents = fetch([h for _, _, h in rows])
     return Resources({path: contents[h] for path, _, h in rows})
 
 
-def all_chunks(draft: Draft, name: bytes, existing_names: Container[bytes]) -> tuple[set[bytes], set[str]]:
+def all_chunks(draft: ChunkStage, name: bytes, existing_names: Container[bytes]) -> tuple[set[bytes], set[str]]:
     """Everything a part refers to, but what is below known nodes: hashes of its chunks, and of its blobs (hex)."""
     root = read_root(draft, name)
     out = {name, *document_chunks(root)}
@@ -951,7 +953,7 @@ def all_chunks(draft: Draft, name: bytes, existing_names: Container[bytes]) -> t
     return out, blobs
 
 
-def new_chunks(draft: Draft, name: bytes, existing_names: Container[bytes]) -> tuple[list[bytes], list[bytes]]:
+def new_chunks(draft: ChunkStage, name: bytes, existing_names: Container[bytes]) -> tuple[list[bytes], list[bytes]]:
     """The draft's own chunks that a part needs: (nodes and documents, tiles). known: chunks that the base has."""
     root = read_root(draft, name)
     nodes = [h for h in (name, *document_chunks(root)) if h in draft.new and not draft.was_read(h)]

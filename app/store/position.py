@@ -15,11 +15,11 @@ from app.errors import Damaged, Invalid, Problem
 from app.model.geodesy import distance
 from app.store import tables
 from app.store.area import area_of, put_area
-from app.store.base import Base, as_environment, datum_of
+from app.store.base import StoreBase, as_environment, datum_of
 from app.store.encode import from_wkb, to_wkb
 from app.store.environments import filters, reaches
 from app.store.manifest import read_version
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 from app.store.values import Area, Box, Environment, Match
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class _Hit:
     match: Match
 
 
-class Position(Base):
+class Position(StoreBase):
     """Queries by position."""
 
     def locate(
@@ -149,7 +149,7 @@ class Position(Base):
             if head is None:
                 continue
             try:
-                computed[environment_id] = head.number, area_of(Draft(self._chunks), head.parts, head.datum)
+                computed[environment_id] = head.number, area_of(ChunkStage(self._chunks), head.parts, head.datum)
             except Damaged as error:
                 log.critical("area of %s: not computed, its last one stays: %s", head.environment, error.detail)
         moved: list[str] = []

@@ -24,8 +24,8 @@ class PlainGeometry(Geometry):
         """Values stay bytes."""
 
     def bind_expression(self, bindvalue: BindParameter[Any]) -> None:
-        """``app.store.tables.Place`` does it, by dialect."""
+        """``app.store.tables.WkbGeometry`` does it, by dialect."""
 
     def column_expression(self, col: ColumnElement[Any]) -> ColumnElement[Any]:
-        """``app.store.tables.Place`` does it, by dialect."""
+        """``app.store.tables.WkbGeometry`` does it, by dialect."""
         return col

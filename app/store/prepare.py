@@ -20,8 +20,8 @@ from app.store.area import area_after
 from app.store.changes import KEEP, Changes, Delete, Drop, IndexRows, Operation, Prepared, Replace
 from app.store.diff import CellChanges, FeatureChanges
 from app.store.encode import bounds, compress, from_wkb, pack, root_hash, to_wkb
-from app.store.parts import Item, Made, PartRoot
-from app.store.tree import Draft
+from app.store.parts import EncodedPart, Item, PartRoot
+from app.store.tree import ChunkStage
 from app.store.values import PartEntry, Provenance, Version
 
 MAX_INDEX_ROWS: Final = 2000
@@ -32,13 +32,13 @@ IsIntact = Callable[[str], bool]
 """Whether all stored chunks of a part (its hash) still have their hashes."""
 
 
-def prepare(draft: Draft, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
+def prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
     """A version on top of a base. What is damaged of a part that is replaced is stored again."""
     with parts.no_garbage_collection():
         return _prepare(draft, base, changes, is_intact)
 
 
-def _prepare(draft: Draft, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
+def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
     entries = {entry.key: entry for entry in base.parts}
     before = dict(entries)
     blobs: dict[str, bytes] = {}
@@ -122,7 +122,7 @@ def _check_levels(levels: Sequence[Level]) -> tuple[Level, ...]:
     return tuple(sorted(levels, key=lambda level: (level.elevation, level.name)))
 
 
-def compose_operation(draft: Draft, entries: dict[PartKey, PartEntry], operation: Operation) -> Made | None:
+def compose_operation(draft: ChunkStage, entries: dict[PartKey, PartEntry], operation: Operation) -> EncodedPart | None:
     """Carry out an operation on a version's entries: its chunks are in the draft; None where there are none."""
     key = operation.key
     entry = entries.get(key)
@@ -184,7 +184,7 @@ def joined(old: Provenance, new: Provenance) -> Provenance:
 # --- what changed ---
 
 
-def roots_of(draft: Draft, key: PartKey, entries: Mapping[PartKey, PartEntry]) -> PartRoot | None:
+def roots_of(draft: ChunkStage, key: PartKey, entries: Mapping[PartKey, PartEntry]) -> PartRoot | None:
     """The decoded root of a part, or None."""
     entry = entries.get(key)
     return parts.read_root(draft, bytes.fromhex(entry.hash)) if entry else None
@@ -210,7 +210,7 @@ def part_names(keys: Sequence[PartKey]) -> dict[PartKey, str]:
 
 
 def summarise(
-    draft: Draft,
+    draft: ChunkStage,
     before: Mapping[PartKey, PartEntry],
     after: Mapping[PartKey, PartEntry],
     replaced: Mapping[PartKey, Replace] | None = None,
@@ -329,7 +329,9 @@ def placed(
 # --- chunks that the base does not have ---
 
 
-def _fresh(draft: Draft, before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry]) -> dict[str, bytes]:
+def _fresh(
+    draft: ChunkStage, before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry]
+) -> dict[str, bytes]:
     """Hash (hex) -> stored bytes of the chunks of changed parts that were not read from the store."""
     out: dict[bytes, bytes] = {}
     for key in differing_keys(before, after):

@@ -12,9 +12,9 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
-from app.store.base import Base, clean, environment_row
+from app.store.base import StoreBase, clean, environment_row
 from app.store.overlays import CHANGE_CLOSURES
-from app.store.values import LATEST, NO_ROOT, Heard, Held, Move, Report, Robot
+from app.store.values import LATEST, NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, Robot, RobotReport
 
 HISTORY: Final = 200
 """So many reports of each robot in each environment are kept."""
@@ -27,10 +27,10 @@ MAX_MOVES: Final = 1000
 """So many moves of a channel are looked back on."""
 
 
-class Robots(Base):
+class Robots(StoreBase):
     """The fleet's memory."""
 
-    def note_reports(self, heard: Sequence[Heard]) -> list[FleetMapError | None]:
+    def note_reports(self, heard: Sequence[ReceivedReport]) -> list[FleetMapError | None]:
         """Take in what robots say, in the order given, in one transaction: for each None, or why it was refused.
 
         The same said again, or the same report come by another way, only renews the time. NotFound where there is no
@@ -99,7 +99,7 @@ class Robots(Base):
                 cursor = _cursor(robots[-1])
         return out[:limit], _cursor(out[limit - 1]) if len(out) > limit else None
 
-    def robot_history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, Report]]:
+    def robot_history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, RobotReport]]:
         """What a robot said in an environment and when it was heard, newest first, each time it was something new."""
         table = tables.robot_history
         with self._database.read() as connection:
@@ -142,7 +142,7 @@ class Robots(Base):
                     )
                 )
 
-    def moves(self, environment: str, channel: str) -> list[Move]:
+    def moves(self, environment: str, channel: str) -> list[ChannelMove]:
         """The newest events that brought a channel somewhere, oldest first; of ``latest`` each new version.
 
         Events that changed which closures are in force are among them, with an empty root: they move no channel.
@@ -159,12 +159,12 @@ class Robots(Base):
             )
             rows = connection.execute(query.order_by(table.c.sequence.desc()).limit(MAX_MOVES)).all()
         return [
-            Move(r.sequence, r.body["version"], "" if "overlay" in r.body else r.body["root"], r.time)
+            ChannelMove(r.sequence, r.body["version"], "" if "overlay" in r.body else r.body["root"], r.time)
             for r in reversed(rows)
         ]
 
 
-def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMapError | None:
+def _note(connection: Connection, environment_id: str, heard: ReceivedReport) -> FleetMapError | None:
     table, report = tables.robot, heard.report
     conditions = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
     row = connection.execute(select(table).where(*conditions).with_for_update()).one_or_none()
@@ -204,7 +204,7 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     return None
 
 
-def _held_values(report: Report, row: Row[Any] | None, time: datetime) -> dict[str, Any]:
+def _held_values(report: RobotReport, row: Row[Any] | None, time: datetime) -> dict[str, Any]:
     """What a robot runs, from its report: columns that change. Its own statement counts, whatever the report is about:
     a status may be lost, so that a failure of the next version is the first that is received after a switch.
     """
@@ -220,7 +220,9 @@ def _held_values(report: Report, row: Row[Any] | None, time: datetime) -> dict[s
     return {**values, "held_overlays": report.overlays}
 
 
-def _told_before(connection: Connection, environment_id: str, heard: Heard, report_columns: dict[str, Any]) -> bool:
+def _told_before(
+    connection: Connection, environment_id: str, heard: ReceivedReport, report_columns: dict[str, Any]
+) -> bool:
     """Whether this very report came before, by another way: robots tell over Zenoh and HTTP, and one may be late."""
     table = tables.robot_history
     if heard.report.said is None:
@@ -234,7 +236,9 @@ def _told_before(connection: Connection, environment_id: str, heard: Heard, repo
     return connection.execute(query.limit(1)).scalar_one_or_none() is not None
 
 
-def _remember(connection: Connection, environment_id: str, heard: Heard, report_columns: dict[str, Any]) -> None:
+def _remember(
+    connection: Connection, environment_id: str, heard: ReceivedReport, report_columns: dict[str, Any]
+) -> None:
     table = tables.robot_history
     connection.execute(
         insert(table).values(
@@ -264,8 +268,8 @@ def robots_of(connection: Connection, environment_id: str, channel: str) -> list
     return [_as_robot(row) for row in connection.execute(query.order_by(table.c.robot))]
 
 
-def _as_report(row: Row[Any]) -> Report:
-    return Report(row.channel, row.version, row.root, row.state, row.detail, row.sequence, row.said, row.overlays)
+def _as_report(row: Row[Any]) -> RobotReport:
+    return RobotReport(row.channel, row.version, row.root, row.state, row.detail, row.sequence, row.said, row.overlays)
 
 
 def _cursor(robot: Robot) -> str:
@@ -275,7 +279,7 @@ def _cursor(robot: Robot) -> str:
 def _as_robot(row: Row[Any]) -> Robot:
     active_map = None
     if row.held_root is not None:
-        active_map = Held(row.held_version, row.held_root, row.held_sequence, row.held_since, row.held_overlays)
+        active_map = ActiveMap(row.held_version, row.held_root, row.held_sequence, row.held_since, row.held_overlays)
     return Robot(
         row.robot, row.environment, _as_report(row), row.time, row.since, active_map, row.there, row.seen, row.vouched
     )

@@ -14,12 +14,12 @@ from app.store.base import environment_row
 from app.store.blobs import Blobs
 from app.store.channels import Channels
 from app.store.chunks import Chunks, delete, insert, problem, select_rows
-from app.store.commit_counter import Generation
-from app.store.content import Content
+from app.store.commit_counter import CommitCounter
+from app.store.content import ContentReader
 from app.store.database import Database
 from app.store.encode import compress, digest
 from app.store.environments import Environments
-from app.store.garbage_collection import Collection
+from app.store.garbage_collection import GarbageCollector
 from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
 from app.store.manifest import read_version
@@ -28,9 +28,9 @@ from app.store.overlays import Overlays
 from app.store.position import Position
 from app.store.robots import Robots
 from app.store.tokens import Tokens
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 from app.store.values import Version
-from app.store.verify import Progress, Verified, Verifier
+from app.store.verify import Progress, Verifier, VerifyResult
 from app.store.versions import Versions
 
 ABANDONED_SECONDS = 24 * 3600.0
@@ -41,7 +41,7 @@ class Store(
     Audit,
     Environments,
     Versions,
-    Content,
+    ContentReader,
     SpatialIndex,
     Position,
     Channels,
@@ -50,7 +50,7 @@ class Store(
     Jobs,
     Robots,
     Overlays,
-    Collection,
+    GarbageCollector,
 ):
     """One database and one blob folder. Thread-safe; cheap to open again in a worker process.
 
@@ -63,7 +63,7 @@ class Store(
         self.database_url = database_url
         self.blob_dir = Path(blob_dir)
         self.readonly = readonly
-        self.generation = Generation(self.blob_dir)
+        self.generation = CommitCounter(self.blob_dir)
         self._database = Database(database_url, readonly=readonly, written=self.generation.change, record=record)
         self._chunks = Chunks(self._database)
         self.blobs = Blobs(self._database, self.blob_dir, readonly=readonly)
@@ -120,9 +120,9 @@ class Store(
             base = read_version(connection, row, number - 1) if number else None
             return read_version(connection, row, number), base
 
-    def draft(self) -> Draft:
+    def draft(self) -> ChunkStage:
         """Chunks in the making over the stored ones."""
-        return Draft(self._chunks)
+        return ChunkStage(self._chunks)
 
     def chunk(self, sha256: str) -> bytes:
         """A chunk's canonical bytes, hashed again; Damaged where it is lost or damaged."""
@@ -136,7 +136,7 @@ class Store(
         with self._database.write() as connection:
             insert(connection, {name: compress(raw) for name, raw in chunks.items()})
 
-    def remove_unused_chunks(self, verification: Verified) -> set[str]:
+    def remove_unused_chunks(self, verification: VerifyResult) -> set[str]:
         """Remove damaged chunks that no version has; their hashes. For when all others were healed.
 
         A check takes minutes: a chunk that was used or healed since it started stays.

@@ -33,7 +33,7 @@ from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeDecorator, TypeEngine
 
 
-class Moment(TypeDecorator[datetime]):
+class UtcDateTime(TypeDecorator[datetime]):
     """An aware time in UTC; SQLite keeps it without the zone."""
 
     impl = DateTime(timezone=True)
@@ -82,7 +82,7 @@ def _as_wkb(element: as_wkb, compiler: Any, **kw: Any) -> str:
     return f"ST_AsBinary({compiler.process(next(iter(element.clauses)), **kw)})"
 
 
-class Place(TypeDecorator[bytes]):
+class WkbGeometry(TypeDecorator[bytes]):
     """A geometry in degrees (WGS 84): WKB in and out; PostGIS' type on PostgreSQL, bytes on SQLite."""
 
     impl = LargeBinary
@@ -141,11 +141,11 @@ environment = Table(
     Column("closures_sequence", BigInteger, nullable=False, server_default="0"),
     Column("datum", JSON(none_as_null=True), nullable=True),
     Column("indexed", Integer, nullable=False),
-    Column("created", Moment, nullable=False),
-    Column("updated", Moment, nullable=False),
-    Column("deleted", Moment, nullable=True),
+    Column("created", UtcDateTime, nullable=False),
+    Column("updated", UtcDateTime, nullable=False),
+    Column("deleted", UtcDateTime, nullable=True),
     *_box(),
-    Column("extent", Place, nullable=True),
+    Column("extent", WkbGeometry, nullable=True),
     Column("area_stale", Boolean, nullable=False, server_default=true(), index=True),
 )
 """head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event that changed
@@ -165,7 +165,7 @@ area = Table(
     Column("basis", String(8), nullable=False),
     Column("size", Float(53), nullable=False),
     *_box(),
-    Column("geometry", Place, nullable=False),
+    Column("geometry", WkbGeometry, nullable=False),
 )
 """The heads' areas on earth, see ``app.store.area``: for "which map am I on". A piece does not cross the antimeridian.
 size: square metres of all pieces. It can be rebuilt from the trees at any time."""
@@ -182,7 +182,7 @@ version = Table(
     Column("parent", Integer, nullable=True),
     Column("author", Text, nullable=False),
     Column("message", Text, nullable=False),
-    Column("time", Moment, nullable=False),
+    Column("time", UtcDateTime, nullable=False),
     Column("sequence", BigInteger, nullable=False),
     Column("changes", JSON, nullable=False),
     Column("warnings", JSON, nullable=False),
@@ -234,9 +234,9 @@ channel = Table(
     Column("version", Integer, nullable=True),
     Column("sequence", BigInteger, nullable=False),
     Column("author", Text, nullable=False),
-    Column("time", Moment, nullable=False),
+    Column("time", UtcDateTime, nullable=False),
     Column("planned_version", Integer, nullable=True),
-    Column("planned_at", Moment, nullable=True, index=True),
+    Column("planned_at", UtcDateTime, nullable=True, index=True),
     Column("planned_author", Text, nullable=True),
     Column("rollout", JSON(none_as_null=True), nullable=True),
     Column("rollout_state", String(16), nullable=True, index=True),
@@ -251,7 +251,7 @@ event = Table(
     Column("environment", String(63), nullable=False),
     Column("sequence", BigInteger, nullable=False),
     Column("body", JSON, nullable=False),
-    Column("time", Moment, nullable=False),
+    Column("time", UtcDateTime, nullable=False),
     Index("uq_event_sequence", "environment_id", "sequence", unique=True),
 )
 """The outbox, which is the log. Rows outlive their environment, so that its end is still told after a purge."""
@@ -288,7 +288,7 @@ idempotency = Table(
     Column("key", String(255), primary_key=True),
     Column("fingerprint", Text, nullable=False),
     Column("version", Integer, nullable=False),
-    Column("time", Moment, nullable=False),
+    Column("time", UtcDateTime, nullable=False),
 )
 
 token = Table(
@@ -300,9 +300,9 @@ token = Table(
     Column("role", String(16), nullable=False),
     Column("environments", Text, nullable=True),
     Column("robot", Text, nullable=True),
-    Column("expires", Moment, nullable=True),
-    Column("created", Moment, nullable=False),
-    Column("ended", Moment, nullable=True),
+    Column("expires", UtcDateTime, nullable=True),
+    Column("created", UtcDateTime, nullable=False),
+    Column("ended", UtcDateTime, nullable=True),
 )
 
 job = Table(
@@ -315,8 +315,8 @@ job = Table(
     Column("result", JSON(none_as_null=True), nullable=True),
     Column("problem", JSON(none_as_null=True), nullable=True),
     Column("owner", Text, nullable=False),
-    Column("created", Moment, nullable=False),
-    Column("updated", Moment, nullable=False),
+    Column("created", UtcDateTime, nullable=False),
+    Column("updated", UtcDateTime, nullable=False),
 )
 
 
@@ -330,8 +330,8 @@ def _report() -> list[Column[Any]]:
         Column("detail", Text, nullable=True),
         Column("sequence", BigInteger, nullable=True),
         Column("overlays", String(64), nullable=True),
-        Column("said", Moment, nullable=True),
-        Column("time", Moment, nullable=False),
+        Column("said", UtcDateTime, nullable=True),
+        Column("time", UtcDateTime, nullable=False),
     ]
 
 
@@ -341,12 +341,12 @@ robot = Table(
     _environment(primary_key=True),
     Column("robot", String(128), primary_key=True, index=True),
     *_report(),
-    Column("since", Moment, nullable=False),
+    Column("since", UtcDateTime, nullable=False),
     Column("held_version", BigInteger, nullable=True),
     Column("held_root", String(64), nullable=True),
     Column("held_sequence", BigInteger, nullable=True),
     Column("held_overlays", String(64), nullable=True),
-    Column("held_since", Moment, nullable=True),
+    Column("held_since", UtcDateTime, nullable=True),
     Column("vouched", Boolean, nullable=False, server_default=true()),
 )
 """Robots as they are now, for each environment. since: when they first said this. held: what they drive on, which a
@@ -384,10 +384,10 @@ overlay = Table(
     Column("crs", String(8), nullable=True),
     Column("detail", Text, nullable=True),
     Column("reporter", Text, nullable=False),
-    Column("created", Moment, nullable=False),
-    Column("expires", Moment, nullable=False),
+    Column("created", UtcDateTime, nullable=False),
+    Column("expires", UtcDateTime, nullable=False),
     Column("decided_by", Text, nullable=True),
-    Column("decided", Moment, nullable=True),
+    Column("decided", UtcDateTime, nullable=True),
     Column("version", Integer, nullable=True),
     Index("ix_overlay_environment", "environment_id", "state"),
     Index("ix_overlay_expires", "state", "expires"),
@@ -400,7 +400,7 @@ presence = Table(
     metadata,
     Column("robot", String(128), primary_key=True),
     Column("there", Boolean, nullable=False),
-    Column("time", Moment, nullable=False),
+    Column("time", UtcDateTime, nullable=False),
 )
 """Robots' liveliness on the bus. time: of the change, and while they are there of the last look."""
 
@@ -414,7 +414,7 @@ place = Table(
     Column("name", String(256), nullable=False),
     Column("feature", String(512), nullable=False),
     *_box(),
-    Column("geometry", Place, nullable=False),
+    Column("geometry", WkbGeometry, nullable=False),
     Index("ix_place_feature", "environment_id", "feature"),
 )
 """The heads' vector items on earth, for questions across environments. It can be rebuilt from the trees at any time."""
@@ -426,7 +426,7 @@ audit = Table(
     "audit",
     metadata,
     Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
-    Column("time", Moment, nullable=False),
+    Column("time", UtcDateTime, nullable=False),
     Column("token_id", String(32), nullable=False),
     Column("token", Text, nullable=False),
     Column("role", String(16), nullable=False),

@@ -15,7 +15,7 @@ from sqlalchemy.exc import IntegrityError
 from app.errors import Conflict, Invalid, NotFound, Unavailable
 from app.store import tables
 from app.store.audit import about
-from app.store.base import Base, text, utcnow
+from app.store.base import StoreBase, text, utcnow
 from app.store.values import Role, Token, rfc3339
 
 log = logging.getLogger(__name__)
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 SECRET_BYTES: Final = 32
 
 
-class Tokens(Base):
+class Tokens(StoreBase):
     """Who may do what."""
 
     def create_token(

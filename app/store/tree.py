@@ -36,7 +36,7 @@ TOP: Final = 12
 Box = tuple[float, float, float, float]
 
 
-class Source(Protocol):
+class ChunkReader(Protocol):
     """Where chunks are read."""
 
     def read_many(self, hashes: Sequence[bytes]) -> Mapping[bytes, bytes]:
@@ -124,10 +124,10 @@ def encode_inner(level: int, children: Sequence[Node]) -> bytes:
     )
 
 
-class Draft:
+class ChunkStage:
     """Chunks in the making over the stored ones. What is read is kept, so one operation reads nothing twice."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: ChunkReader) -> None:
         self._source = source
         self.new: dict[bytes, bytes] = {}
         self.stored: dict[bytes, bytes] = {}
@@ -222,7 +222,7 @@ def ends_node(key: bytes, level: int, bits: int) -> bool:
 
 
 def build(
-    draft: Draft,
+    draft: ChunkStage,
     keys: Sequence[bytes],
     bits: int,
     encode: Callable[[int, int], bytes],
@@ -250,7 +250,7 @@ def join_boxes(boxes: NDArray[np.float64], starts: Sequence[int]) -> list[Box]:
     return [(a, b, c, d) for (a, b), (c, d) in zip(low.tolist(), high.tolist(), strict=True)]
 
 
-def inner_nodes(draft: Draft, children: Sequence[Node], level: int) -> list[Node]:
+def inner_nodes(draft: ChunkStage, children: Sequence[Node], level: int) -> list[Node]:
     """Group the nodes of the level below into inner nodes of this level."""
     ends = cut(key_hashes((c.key for c in children), level), FANOUT_BITS) if level < TOP else [len(children)]
     out = []
@@ -266,7 +266,7 @@ def inner_nodes(draft: Draft, children: Sequence[Node], level: int) -> list[Node
     return out
 
 
-def raise_tree(draft: Draft, nodes: list[Node], level: int) -> Node:
+def raise_tree(draft: ChunkStage, nodes: list[Node], level: int) -> Node:
     """Inner levels above these nodes, until one is left."""
     while len(nodes) > 1:
         nodes = inner_nodes(draft, nodes, level)
@@ -286,7 +286,7 @@ def check_leaves(root: Node | None) -> None:
 # --- reading ---
 
 
-def leaves(draft: Draft, roots: Sequence[Node]) -> list[list[bytes]]:
+def leaves(draft: ChunkStage, roots: Sequence[Node]) -> list[list[bytes]]:
     """The hashes of each tree's leaves, in order; one query for each level of the tallest."""
     frontier: list[list[Node]] = [[root] for root in roots]
     while any(node.level for nodes in frontier for node in nodes):
@@ -299,7 +299,7 @@ def leaves(draft: Draft, roots: Sequence[Node]) -> list[list[bytes]]:
 
 
 def select(
-    draft: Draft, root: Node | None, predicate: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+    draft: ChunkStage, root: Node | None, predicate: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 ) -> list[bytes]:
     """The hashes of the leaves whose box passes: wanted(boxes float64 [n, 4]) -> bool [n]."""
     if root is None or not bool(predicate(np.array([root.box]))[0]):
@@ -315,7 +315,7 @@ def select(
     return nodes
 
 
-def paths(draft: Draft, root: Node | None, keys: Sequence[bytes]) -> list[bytes]:
+def paths(draft: ChunkStage, root: Node | None, keys: Sequence[bytes]) -> list[bytes]:
     """The hashes of the leaves in which these sorted keys are, or would be; all nodes on the way are read."""
     if root is None or not keys:
         return []
@@ -338,7 +338,7 @@ def paths(draft: Draft, root: Node | None, keys: Sequence[bytes]) -> list[bytes]
     return names
 
 
-def differing(draft: Draft, a: Node | None, b: Node | None) -> tuple[list[bytes], list[bytes]]:
+def differing(draft: ChunkStage, a: Node | None, b: Node | None) -> tuple[list[bytes], list[bytes]]:
     """Leaves of a that b does not have, and the reverse: reads nothing below equal nodes."""
     left, right = [a] if a else [], [b] if b else []
     while True:
@@ -355,7 +355,7 @@ def differing(draft: Draft, a: Node | None, b: Node | None) -> tuple[list[bytes]
         )
 
 
-def names(draft: Draft, root: Node | None, existing_names: Container[bytes] = ()) -> set[bytes]:
+def names(draft: ChunkStage, root: Node | None, existing_names: Container[bytes] = ()) -> set[bytes]:
     """The hashes of all nodes of a tree, but of known ones and what is below them. Leaves are not read."""
     out: set[bytes] = set()
     nodes = [root] if root else []
@@ -390,7 +390,7 @@ class LeafCodec(Protocol):
 
 
 def edit(
-    draft: Draft, codec: LeafCodec, root: Node | None, put: Mapping[bytes, Any], removed: Iterable[bytes]
+    draft: ChunkStage, codec: LeafCodec, root: Node | None, put: Mapping[bytes, Any], removed: Iterable[bytes]
 ) -> Node | None:
     """The tree with items put (added or replaced by key) and keys removed: the very tree that building anew gives."""
     deletions = set(removed) - put.keys()
@@ -472,7 +472,7 @@ def _between(keys: Sequence[bytes], lo: bytes | None, hi: bytes | None) -> Seque
 
 
 def _edit_level(
-    draft: Draft,
+    draft: ChunkStage,
     root: Node,
     level: int,
     bits: int,
@@ -512,7 +512,7 @@ def _edit_level(
     return new, old_keys, False
 
 
-def _first(draft: Draft, root: Node, level: int, key: bytes, *, strict: bool = False) -> Node | None:
+def _first(draft: ChunkStage, root: Node, level: int, key: bytes, *, strict: bool = False) -> Node | None:
     """The first node of a level whose last key is not before (strict: is after) this key."""
     node = draft.inner(root.hash)
     while True:
@@ -524,14 +524,14 @@ def _first(draft: Draft, root: Node, level: int, key: bytes, *, strict: bool = F
         node = draft.inner(node.hashes[k])
 
 
-def _last(draft: Draft, root: Node, level: int) -> Node:
+def _last(draft: ChunkStage, root: Node, level: int) -> Node:
     node = draft.inner(root.hash)
     while node.level > level + 1:
         node = draft.inner(node.hashes[-1])
     return node.child(len(node.keys) - 1)
 
 
-def _before(draft: Draft, root: Node, level: int, key: bytes) -> Node | None:
+def _before(draft: ChunkStage, root: Node, level: int, key: bytes) -> Node | None:
     """The last node of a level whose last key is before this key."""
 
     def search(node: Inner) -> Node | None:

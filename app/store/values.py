@@ -348,7 +348,7 @@ class Rollout:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class RolloutStep:
     """What a roll-out does next: move, move back, or end as ``state`` says; and why."""
 
     do: Literal["move", "move_back", "end"]
@@ -357,7 +357,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedMove:
     """A channel's next move. activate_at: None where it waits for robots alone."""
 
     version: int
@@ -378,7 +378,7 @@ class Channel:
     version: int | None
     root: str | None
     sequence: int
-    planned: Planned | None
+    planned: PlannedMove | None
     author: str
     time: datetime
     rollout: Rollout | None = None
@@ -441,7 +441,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class RobotReport:
     """What a robot says of itself. said: when, by its own clock. sequence: of the last event that it has processed.
 
     holds: version and root that it has loaded, ``NO_ROOT`` for none; None where it does not say. It is not part of the
@@ -460,7 +460,7 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class ReceivedReport:
     """A report, of whom, and when it was heard by the server's clock.
 
     vouched: whether it came with authority: with a token that may report for the robot, or over a router with users.
@@ -468,13 +468,13 @@ class Heard:
 
     environment: str
     robot: str
-    report: Report
+    report: RobotReport
     time: datetime
     vouched: bool = True
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class ActiveMap:
     """What a robot drives on. sequence: of the event that it acted on, where it says so. since: server's clock.
     overlays: digest of the closures in it.
     """
@@ -501,10 +501,10 @@ class Robot:
 
     robot: str
     environment: str
-    report: Report
+    report: RobotReport
     time: datetime
     since: datetime
-    held: Held | None
+    held: ActiveMap | None
     there: bool | None = None
     seen: datetime | None = None
     vouched: bool = True
@@ -515,7 +515,7 @@ class Robot:
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class ChannelMove:
     """An event that brought a channel to a version."""
 
     sequence: int
@@ -588,7 +588,7 @@ class FeatureDelta:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rectangle:
+class ChangedCells:
     """Changed cells: uint8 [height, width] with cells[0, 0] at (row, column), row 0 at the bottom."""
 
     row: int
@@ -605,7 +605,7 @@ class GridDelta:
     """
 
     key: PartKey
-    rectangles: tuple[Rectangle, ...]
+    rectangles: tuple[ChangedCells, ...]
     whole: bool = False
     deleted: bool = False
 
@@ -622,7 +622,7 @@ class Delta:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FeatureHit:
     """A feature of some environment's head that stands in a box on earth: box in degrees."""
 
     environment: str

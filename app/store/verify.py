@@ -20,7 +20,7 @@ from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.manifest import unpack_manifest
 from app.store.prepare import version_root
-from app.store.tree import Draft, Node
+from app.store.tree import ChunkStage, Node
 from app.store.values import PartEntry
 
 Kind = Literal["database", "blob", "chunk", "version", "cache"]
@@ -52,7 +52,7 @@ class Finding:
 
 
 @dataclass(slots=True)
-class Verified:
+class VerifyResult:
     """What was checked (count by kind), and what was found. started: when, in seconds since 1970."""
 
     checked: dict[Kind, int] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class Verified:
 
 
 @dataclass(frozen=True, slots=True)
-class _Below:
+class _PartReferences:
     """What a part refers to: chunks that are lost or damaged (hex), and blobs (hex)."""
 
     bad: frozenset[str]
@@ -77,9 +77,9 @@ class Verifier:
     ) -> None:
         self._database, self._chunks, self._blobs, self._progress = database, chunks, blobs, progress
 
-    def run(self) -> Verified:
+    def run(self) -> VerifyResult:
         """Check everything. Unavailable where the database cannot be read at all."""
-        out = Verified()
+        out = VerifyResult()
         problem = self._database.integrity(MAX_LINES, quick=False)
         self._count(out, "database", 0)
         if problem is not None:
@@ -92,7 +92,7 @@ class Verifier:
             out.findings.append(Finding("database", "database", f"the check ended early: {error.detail}"))
         return out
 
-    def _content(self, out: Verified) -> None:
+    def _content(self, out: VerifyResult) -> None:
         bad: dict[str, str] = {}
         present: set[bytes] = set()
         for name, size, problem in self._chunks.checked():
@@ -121,7 +121,7 @@ class Verifier:
             blob_users.setdefault(blob, []).append((environment, number))
         self._check_blobs(out, blob_users)
 
-    def _check_blobs(self, out: Verified, users: Mapping[str, list[VersionName]]) -> None:
+    def _check_blobs(self, out: VerifyResult, users: Mapping[str, list[VersionName]]) -> None:
         missing = dict.fromkeys(users)
         for name, size, problem in self._blobs.checked():
             self._count(out, "blob", size)
@@ -132,7 +132,7 @@ class Verifier:
             if not self._blobs.has(name):  # else it was stored meanwhile
                 out.findings.append(Finding("blob", name, "lost", tuple(dict.fromkeys(users[name]))))
 
-    def _count(self, out: Verified, kind: Kind, size: int) -> None:
+    def _count(self, out: VerifyResult, kind: Kind, size: int) -> None:
         out.checked[kind] = out.checked.get(kind, 0) + 1
         out.size += size
         self._progress(kind, size)
@@ -186,10 +186,10 @@ class _Walk:
 
     def __init__(self, chunks: Chunks, bad: Mapping[str, str], present: set[bytes]) -> None:
         self._chunks, self._bad, self._present = chunks, bad, present
-        self._parts: dict[bytes, _Below] = {}
-        self._nodes: dict[bytes, _Below] = {}
+        self._parts: dict[bytes, _PartReferences] = {}
+        self._nodes: dict[bytes, _PartReferences] = {}
 
-    def below(self, part: bytes) -> _Below:
+    def below(self, part: bytes) -> _PartReferences:
         """What a part refers to."""
         if part not in self._parts:
             self._parts[part] = self._part(part)
@@ -200,21 +200,21 @@ class _Walk:
             self._present.add(name)  # it was stored after its turn had come
         return name not in self._present or name.hex() in self._bad
 
-    def _part(self, name: bytes) -> _Below:
+    def _part(self, name: bytes) -> _PartReferences:
         if self._is_bad(name):
-            return _Below(frozenset({name.hex()}), _NOTHING)
-        draft = Draft(self._chunks)
+            return _PartReferences(frozenset({name.hex()}), _NOTHING)
+        draft = ChunkStage(self._chunks)
         root = parts.read_root(draft, name)
         subtrees = [self._node(draft, node, root.type) for node in root.trees.values() if node is not None]
         documents = {h.hex() for h in parts.document_chunks(root) if self._is_bad(h)}
         return _joined(subtrees, documents)
 
-    def _node(self, draft: Draft, node: Node, kind: str) -> _Below:
+    def _node(self, draft: ChunkStage, node: Node, kind: str) -> _PartReferences:
         cached = self._nodes.get(node.hash)
         if cached is not None:
             return cached
         if self._is_bad(node.hash):
-            below = _Below(frozenset({node.hash.hex()}), _NOTHING)
+            below = _PartReferences(frozenset({node.hash.hex()}), _NOTHING)
         elif node.level:
             children = draft.inner(node.hash).children()
             below = _joined([self._node(draft, child, kind) for child in children], set())
@@ -223,12 +223,14 @@ class _Walk:
             below = _joined([], {tile.hex() for _, tile in parts.tile_leaf(raw) if self._is_bad(tile)})
         elif kind == "resources":
             (raw,) = draft.stream([node.hash]).values()
-            below = _Below(_NOTHING, frozenset(h for _, _, h in parts.file_leaf(raw)))
+            below = _PartReferences(_NOTHING, frozenset(h for _, _, h in parts.file_leaf(raw)))
         else:
-            below = _Below(_NOTHING, _NOTHING)
+            below = _PartReferences(_NOTHING, _NOTHING)
         self._nodes[node.hash] = below
         return below
 
 
-def _joined(subtrees: list[_Below], bad: set[str]) -> _Below:
-    return _Below(frozenset(bad).union(*(b.bad for b in subtrees)), _NOTHING.union(*(b.blobs for b in subtrees)))
+def _joined(subtrees: list[_PartReferences], bad: set[str]) -> _PartReferences:
+    return _PartReferences(
+        frozenset(bad).union(*(b.bad for b in subtrees)), _NOTHING.union(*(b.blobs for b in subtrees))
+    )

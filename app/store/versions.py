@@ -15,12 +15,12 @@ from app.model.templates import Templates, template_changes
 from app.store import chunks, index, outbox, parts, tables
 from app.store.area import area_after, put_area
 from app.store.audit import changes_nothing
-from app.store.base import Base, clean, clean_problem, environment_row, nearest_channel, text, utcnow
+from app.store.base import StoreBase, clean, clean_problem, environment_row, nearest_channel, text, utcnow
 from app.store.changes import KEEP, Changes, Keep, Prepared
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
 from app.store.prepare import frame_changes, prepare, summarise
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 from app.store.values import LATEST, Area, Idempotency, PartEntry, Source, Version
 
 REVERT_TRIES: Final = 8
@@ -149,7 +149,7 @@ def hold_blobs(connection: Connection, hashes: set[str]) -> None:
         connection.execute(update(tables.blob).where(tables.blob.c.sha256.in_(batch)).values(used=now))
 
 
-class Versions(Base):
+class Versions(StoreBase):
     """Versions of environments."""
 
     def version(self, environment: str, ref: str | int = LATEST) -> Version:
@@ -175,12 +175,12 @@ class Versions(Base):
 
         Raises Invalid where something cannot be stored, NotFound where something to delete is not there.
         """
-        return prepare(Draft(self._chunks), base, changes, self._is_intact)
+        return prepare(ChunkStage(self._chunks), base, changes, self._is_intact)
 
     def _is_intact(self, part: str) -> bool:
         """Whether the database has all chunks of a part, whatever is in memory."""
         try:
-            names, _ = parts.all_chunks(Draft(self._chunks), bytes.fromhex(part), ())
+            names, _ = parts.all_chunks(ChunkStage(self._chunks), bytes.fromhex(part), ())
         except Damaged:
             return False
         return not self._chunks.damaged(sorted(names))
@@ -310,9 +310,9 @@ class Versions(Base):
         changes: dict[str, Any] = {}
         area: Area | Literal[Keep.KEEP] | None = KEEP
         if changed:
-            area = area_after(Draft(self._chunks), head.parts, target.parts, head.datum, target.datum)
+            area = area_after(ChunkStage(self._chunks), head.parts, target.parts, head.datum, target.datum)
             before, after = {e.key: e for e in head.parts}, {e.key: e for e in target.parts}
-            changes, _ = summarise(Draft(self._chunks), before, after)
+            changes, _ = summarise(ChunkStage(self._chunks), before, after)
             changes |= frame_changes(head.datum, target.datum, head.levels, target.levels)
             changes |= template_changes(head.templates, target.templates)
         contents = (target.parts, target.datum, target.levels, target.templates)

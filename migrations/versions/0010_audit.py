@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
-from app.store.tables import Moment
+from app.store.tables import UtcDateTime
 
 revision = "0010"
 down_revision = "0009"
@@ -21,7 +21,7 @@ def upgrade() -> None:
     op.create_table(
         "audit",
         sa.Column("id", sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True),
-        sa.Column("time", Moment, nullable=False),
+        sa.Column("time", UtcDateTime, nullable=False),
         sa.Column("token_id", sa.String(32), nullable=False),
         sa.Column("token", sa.Text, nullable=False),
         sa.Column("role", sa.String(16), nullable=False),

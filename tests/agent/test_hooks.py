@@ -361,7 +361,7 @@ def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> 
 def test_networks_are_read_as_the_server_writes_them(tmp_path: Path) -> None:
     pytest.importorskip("numpy", reason="the server's packages")
     from app.convert.files import offline
-    from app.upload_reader import Hints
+    from app.upload_reader import UploadHints
 
     names = ["a: b", "it's", "'", '"', "1e3", "yes", "- x", "name: y", "\u00e9 \U0001f600", "#", "~"]
     pose = {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "orientation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
@@ -379,7 +379,7 @@ def test_networks_are_read_as_the_server_writes_them(tmp_path: Path) -> None:
     ]
     frames = {"child": "topo_map", "parent": "map", "rotation": pose["orientation"], "translation": pose["position"]}
     body = {"meta": {}, "name": "it's: m", "metric_map": "m", "pointset": "p", "transformation": frames, "nodes": nodes}
-    converted = offline({"n.tmap2.yaml": yaml.safe_dump(body).encode()}, "tmap2", hints=Hints("tmap2"))
+    converted = offline({"n.tmap2.yaml": yaml.safe_dump(body).encode()}, "tmap2", hints=UploadHints("tmap2"))
     (data,) = converted.files.values()
     (tmp_path / "n.yaml").write_bytes(data)
     network = loading.read_network(tmp_path / "n.yaml")

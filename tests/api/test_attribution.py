@@ -13,7 +13,7 @@ from lxml import etree
 from app import formats
 from app.convert.files import offline
 from app.model.frame import Datum
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 from tests.api.conftest import Api
 
 HERE = Datum(53.2686, -0.5245)
@@ -54,11 +54,11 @@ def test_a_format_with_a_place_carries_the_credits_and_gives_them_back(name: str
     assert sorted(converted.report["attribution"]) == sorted(CREDIT)
     assert all(text in attribution_of(name, converted.files) for text in CREDIT)
     # Read back they are known again: to the report, and to the next format.
-    again = offline(converted.files, name, hints=Hints(name), datum=HERE)
+    again = offline(converted.files, name, hints=UploadHints(name), datum=HERE)
     assert again.files == converted.files
     assert all(text in "; ".join(again.report["attribution"]) for text in CREDIT)
     assert all(
-        text in attribution_of("kml", offline(converted.files, "kml", hints=Hints(name), datum=HERE).files)
+        text in attribution_of("kml", offline(converted.files, "kml", hints=UploadHints(name), datum=HERE).files)
         for text in CREDIT
     )
 
@@ -101,7 +101,7 @@ def test_what_a_licence_file_says_in_a_line(name: str, text: bytes, expected: st
 
 
 def test_a_drawing_with_a_licence_shows_it_and_comes_back_as_it_was() -> None:
-    converted = offline({"LICENSE": LICENSE, "gate.kml": KML}, "kml", hints=Hints())
+    converted = offline({"LICENSE": LICENSE, "gate.kml": KML}, "kml", hints=UploadHints())
     assert attribution_of("kml", converted.files) == MIT
     assert offline(converted.files, "kml").files == converted.files, "read back and written, the same bytes"
     alone = offline({"gate.kml": KML}, "kml")

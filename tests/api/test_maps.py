@@ -16,7 +16,7 @@ import pytest
 import yaml
 from lxml import etree
 
-from app.pool import Cancelled, Pool, Stop
+from app.pool import CancelHandle, Cancelled, Pool
 from tests.api import samples
 from tests.api.conftest import Api, problem, running, settings_for
 
@@ -463,7 +463,7 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
 
     stopped = threading.Event()
 
-    def endless(self: Maps, recipe: object, stop: Stop) -> object:
+    def endless(self: Maps, recipe: object, stop: CancelHandle) -> object:
         for _ in range(600):
             if stop.called:
                 stopped.set()
@@ -486,7 +486,7 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
 def test_coverage_does_not_wait_for_busy_workers(api: Api, farm: str) -> None:
     """The table of content that nobody has looked at, while the only worker is at work."""
     services = api.app.state.services
-    stop = Stop()
+    stop = CancelHandle()
     working = threading.Thread(target=_outlast, args=(services.pool, stop))
     working.start()
     try:
@@ -502,6 +502,6 @@ def test_coverage_does_not_wait_for_busy_workers(api: Api, farm: str) -> None:
         working.join(60)
 
 
-def _outlast(pool: Pool, stop: Stop) -> None:
+def _outlast(pool: Pool, stop: CancelHandle) -> None:
     with contextlib.suppress(Cancelled):
         pool.run(time.sleep, 300, stop=stop)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from app.model.templates import Own, Templates
+from app.model.templates import FormatTemplate, Templates
 from tests.api import samples
 from tests.api.conftest import Api
 
@@ -229,7 +229,7 @@ def test_what_this_release_does_not_know_is_told_and_no_robot_stands_without_a_m
     from app.store.changes import Changes
 
     store = api.app.state.services.store
-    templates = Templates("of-tomorrow", {"tmap2": Own(None, {"colour": "red", "xy_goal_tolerance": 0.4})})
+    templates = Templates("of-tomorrow", {"tmap2": FormatTemplate(None, {"colour": "red", "xy_goal_tolerance": 0.4})})
     store.commit(env, store.prepare(store.version(env), Changes(templates=templates)), author="", message="")
     assert tolerance(api, env) == 0.4
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()

@@ -15,7 +15,7 @@ from app.errors import CannotConvert, CannotDerive, Invalid, MissingLayer
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 from tests.api.conftest import Api
 
 SQUARE = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"name": "bed"},
@@ -96,7 +96,7 @@ def test_wrong_parameters_are_named(blank: None) -> None:
         offline({"a.geojson": SQUARE}, "occupancy_grid", options={"colour": "red"})
     assert [p.where for p in caught.value.problems] == ["colour"]
     with pytest.raises(Invalid, match="outlines"):  # a derivation's, but not one on the way to this format
-        offline({"a.geojson": SQUARE}, "datum", options={"outlines": "true"}, hints=Hints(layer="location"))
+        offline({"a.geojson": SQUARE}, "datum", options={"outlines": "true"}, hints=UploadHints(layer="location"))
 
 
 def test_a_failing_step_is_named() -> None:

@@ -20,7 +20,7 @@ from app.convert.files import offline
 from app.formats import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 from tests.bench import closures, derived, events, floors, generate, http, large, networks
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -52,7 +52,7 @@ def conversions(tries: int) -> list[dict[str, Any]]:
         cases.append(("osm → tmap2", place, {"map.osm": osm}, "tmap2", {}, lambda d=osm: floors.osm_to_tmap2(d)))
     for name in (FARM + "topological/r_sp_man_tmap.kml", "kml/riseholme_park_farm_mid_19/mid_19_man_tmap.kml"):
         kml = data(name)
-        more = {"hints": Hints(layer="topology")}
+        more = {"hints": UploadHints(layer="topology")}
         cases.append(
             (
                 "kml → tmap2",
@@ -206,7 +206,9 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
 def farm_grid() -> OccupancyGrid:
     """The real map of 4000 × 4000 cells."""
     files = {name: (DATA / FARM / "metric/map" / name).read_bytes() for name in ("map.yaml", "map.png")}
-    upload_bundle = upload_reader.read(files, Hints(), upload_reader.Known(None, None, None, True, False), Limits())
+    upload_bundle = upload_reader.read(
+        files, UploadHints(), upload_reader.EnvironmentContext(None, None, None, True, False), Limits()
+    )
     (grid,) = upload_bundle.layers(None).grids().values()
     return grid
 

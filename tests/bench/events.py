@@ -30,7 +30,7 @@ from app.derive import _native
 from app.events import messages
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
-from app.store.commit_counter import Generation
+from app.store.commit_counter import CommitCounter
 from tests.bench import changes, http
 
 SESSIONS = 100
@@ -151,7 +151,7 @@ def latency() -> list[dict[str, Any]]:
             declarations.append(session.declare_subscriber("bare/events", take_bare))
         time.sleep(3.0)
         arrived.clear()
-        generation, ours = Generation(Path(folder) / "blobs"), []
+        generation, ours = CommitCounter(Path(folder) / "blobs"), []
         for k in range(COMMITS):
             before = len(arrived)
             writer = threading.Thread(target=commit, args=(client, 0.001 * (k + 1)))

@@ -23,7 +23,7 @@ from app.formats import Limits
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.model.voxels import LOG_ODDS, VoxelMap, morton
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 from tests.bench.memory import peak, reset, resident
 
 SEED = 2026
@@ -322,7 +322,7 @@ def _child(name: str, folder: Path, files: list[str]) -> None:
     case = CASES[name]
 
     def convert(paths: Mapping[str, Path]) -> None:
-        offline_paths(paths, case.to, Hints(), case.datum, case.options, Limits())
+        offline_paths(paths, case.to, UploadHints(), case.datum, case.options, Limits())
 
     small = folder / "small"
     small.mkdir()

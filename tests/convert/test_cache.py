@@ -16,15 +16,15 @@ from typing import Any
 import pytest
 
 from app.convert import cache as caching
-from app.convert.cache import Cache, LostMap, Product
+from app.convert.cache import Cache, ConvertedMap, LostMap
 
 
 def key(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def product(data: bytes = b"hello", archive: bytes | None = None) -> Product:
-    return Product({"map.kml": (data, "text/xml")}, ("kml.zip", archive) if archive else None, {"format": "kml"})
+def product(data: bytes = b"hello", archive: bytes | None = None) -> ConvertedMap:
+    return ConvertedMap({"map.kml": (data, "text/xml")}, ("kml.zip", archive) if archive else None, {"format": "kml"})
 
 
 def test_a_made_map_comes_back_with_its_bytes_hash_and_report(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_several_files_come_with_an_archive(tmp_path: Path) -> None:
 def test_one_of_many_askers_makes_it(tmp_path: Path) -> None:
     cache, count, lock = Cache(tmp_path, 10**6), [], threading.Lock()
 
-    def slow() -> Product:
+    def slow() -> ConvertedMap:
         with lock:
             count.append(1)
         time.sleep(0.2)
@@ -66,7 +66,7 @@ def test_one_of_many_askers_makes_it(tmp_path: Path) -> None:
 def test_a_failed_maker_leaves_nothing_and_the_next_one_tries(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
 
-    def fail() -> Product:
+    def fail() -> ConvertedMap:
         raise ValueError("no")
 
     with pytest.raises(ValueError, match="no"):

@@ -14,7 +14,7 @@ from app import formats, upload_reader
 from app.convert import files as direct
 from app.convert import worker
 from app.formats import Limits
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from tests.worlds import CRATE, WALLS, house
 
 
@@ -40,7 +40,9 @@ def test_offline_conversion_equals_the_map_of_all_layers(shared: Path, wanted: s
     world = (root / "worlds/no_roof_small_warehouse.world").read_bytes()
     files["worlds/a.world"] = world.replace(b"</world>", CRATE + b"</world>")
     options = {"resolution": "0.25"}
-    upload_bundle = upload_reader.read(upload_reader.unpack(files, Limits()), Hints(), Known(), Limits())
+    upload_bundle = upload_reader.read(
+        upload_reader.unpack(files, Limits()), UploadHints(), EnvironmentContext(), Limits()
+    )
     fmt = formats.get_format(wanted)
     complete = worker.from_layers(fmt, upload_bundle.layers(None), options, derived=True, origin=upload_bundle.origin)
     assert direct.offline(files, wanted, options=options).files == complete.files

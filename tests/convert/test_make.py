@@ -32,7 +32,7 @@ def network(**edge_properties: object) -> Layers:
     return Layers({PartKey("topology", "ground", NETWORK): features(rows, "local")}, Datum(53.2, -0.5))
 
 
-def write_map(name: str, layers: Layers, mode: ClosureMode = "apply") -> worker.Written:
+def write_map(name: str, layers: Layers, mode: ClosureMode = "apply") -> worker.WrittenMap:
     closures = Closures(mode=mode)
     return worker.from_layers(formats.get_format(name), layers, {}, derived=False, closures=closures)
 

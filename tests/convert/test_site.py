@@ -12,9 +12,9 @@ import shapely
 
 from app import formats
 from app.convert import site, worker
-from app.convert.cache import Cache, LostMap, Product
+from app.convert.cache import Cache, ConvertedMap, LostMap
 from app.convert.maps import file_of, joined
-from app.convert.recipe import Chain, Member, Recipe, Spread
+from app.convert.recipe import DerivationChain, Member, Recipe, Spread
 from app.errors import MissingLayer, NotFound
 from app.model.features import features
 from app.model.frame import Level
@@ -27,11 +27,11 @@ EMPTY = worker.empty_report(formats.get_format("satellite"))
 def recipe(key: str, **more: Any) -> Recipe:
     version: Any = None
     fmt = formats.get_format("satellite")
-    return Recipe(version, fmt, fmt.write_options(), Chain((), ()), key, **more)
+    return Recipe(version, fmt, fmt.write_options(), DerivationChain((), ()), key, **more)
 
 
-def product(name: str, **more: Any) -> Product:
-    return Product({name: (name.encode(), "image/tiff")}, None, {**EMPTY, **more})
+def product(name: str, **more: Any) -> ConvertedMap:
+    return ConvertedMap({name: (name.encode(), "image/tiff")}, None, {**EMPTY, **more})
 
 
 def test_files_of_one_name_are_reported(tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_held_files_outlive_the_cache(tmp_path: Path) -> None:
 def test_linked_files_are_stored_as_they_are(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     (file,) = cache.get_or_make("0" * 64, lambda: product("a.tif")).files
-    linked = Product({"L2/a.tif": (file, file.media_type)}, None, EMPTY, {"L2/a.tif": ("L2", "a")})
+    linked = ConvertedMap({"L2/a.tif": (file, file.media_type)}, None, EMPTY, {"L2/a.tif": ("L2", "a")})
     (cached_file,) = cache.get_or_make("1" * 64, lambda: linked).files
     assert (cached_file.size, cached_file.sha256, cached_file.place) == (file.size, file.sha256, ("L2", "a"))
     assert cached_file.path.read_bytes() == b"a.tif"
@@ -83,7 +83,7 @@ def test_default_part_of_each_level_is_selected(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     files: dict[str, Any] = dict.fromkeys(("satellite.tif", "plan.tif", "L2/plan.tif"), (b"x", "image/tiff"))
     places = {"satellite.tif": ("ground", "satellite"), "plan.tif": ("ground", "plan"), "L2/plan.tif": ("L2", "plan")}
-    cached_files = cache.get_or_make("0" * 64, lambda: Product(files, None, EMPTY, places)).files
+    cached_files = cache.get_or_make("0" * 64, lambda: ConvertedMap(files, None, EMPTY, places)).files
     spread = recipe("0", spread=Spread("ground"))
     assert [f.name for f in site.select(cached_files, Member(spread, only_default=True))] == [
         "satellite.tif",
@@ -98,7 +98,7 @@ def test_default_part_of_each_level_is_selected(tmp_path: Path) -> None:
 def test_file_of_a_map_of_several_parts_is_found_on_its_only_level(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     files: dict[str, Any] = dict.fromkeys(("L2/a.tif", "L2/b.tif", "b.tif"), (b"x", "image/tiff"))
-    cached_map = cache.get_or_make("0" * 64, lambda: Product(files, None, EMPTY))
+    cached_map = cache.get_or_make("0" * 64, lambda: ConvertedMap(files, None, EMPTY))
     spread = recipe("0", spread=Spread("ground"))
     assert file_of(spread, cached_map, "a.tif").name == "L2/a.tif"
     assert file_of(spread, cached_map, "b.tif").name == "b.tif"

@@ -12,20 +12,20 @@ from app import derive
 from app.convert import maps as module
 from app.convert import trials
 from app.convert.maps import Maps
-from app.convert.recipe import Chain, Hindrance
+from app.convert.recipe import ChainFailure, DerivationChain
 from app.convert.trials import Trials
 from app.formats import Limits
 from app.pool import WorkerDied
 from tests.api import samples
 from tests.api.conftest import Api
 
-FAILED = Hindrance("occupancy_to_topology", "name one\nwith grid=", choose=True)
+FAILED = ChainFailure("occupancy_to_topology", "name one\nwith grid=", choose=True)
 
 
 def test_outcomes_last(tmp_path: Path) -> None:
     first = Trials(tmp_path / "trials")
     first.add("works", None, lasting=True)
-    first.add("fails", Hindrance("a", "first"), lasting=True)
+    first.add("fails", ChainFailure("a", "first"), lasting=True)
     first.add("fails", FAILED, lasting=True)
     first.add("for now", FAILED, lasting=False)
     assert first["for now"] == FAILED
@@ -143,11 +143,11 @@ def test_dead_workers_are_no_lasting_verdict(api: Api, version: Any, tmp_path: P
 
 def test_verdict_of_a_model_does_not_last(version: Any) -> None:
     step = derive.all_derivations()["imagery_to_objects"].step()
-    plain = Chain((step,), ())
+    plain = DerivationChain((step,), ())
     assert module._is_lasting(plain)
     with_model = derive.with_values([step], {"model": "trees"})
-    assert not module._is_lasting(Chain(with_model, ()))
-    assert module._trial_key(version, plain) != module._trial_key(version, Chain(with_model, ()))
+    assert not module._is_lasting(DerivationChain(with_model, ()))
+    assert module._trial_key(version, plain) != module._trial_key(version, DerivationChain(with_model, ()))
 
 
 def test_trials_do_not_wait_for_maps(api: Api, version: Any, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from app.model.geodesy import local_frame
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import Picture
 from app.model.layers import MAP, Layers, PartKey, Resources
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from tests.derive.pictures import BRANCH, BUILDING, CROWN, PATH, PATH_WIDTH, TREES, farm, local, plan
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -382,7 +382,7 @@ def test_plans_of_real_buildings_have_their_walls(folder: str, levels: int) -> N
 def real(folder: str) -> Layers:
     root = DATA / "openrmf_building" / folder
     files = {p.name: p.read_bytes() for p in root.iterdir() if p.name.endswith((".building.yaml", ".png"))}
-    return upload_reader.read(files, Hints(format="openrmf"), Known(), Limits()).layers(None)
+    return upload_reader.read(files, UploadHints(format="openrmf"), EnvironmentContext(), Limits()).layers(None)
 
 
 def test_a_plan_that_a_robot_made_agrees_with_its_map() -> None:
@@ -391,7 +391,9 @@ def test_a_plan_that_a_robot_made_agrees_with_its_map() -> None:
     if not folder.is_dir():
         pytest.skip("the real maps are not here")
     files = {p.name: p.read_bytes() for p in (folder / "ros_map").iterdir()}
-    map_layers = upload_reader.read(files, Hints(format="occupancy_grid"), Known(), Limits()).layers(None)
+    map_layers = upload_reader.read(files, UploadHints(format="occupancy_grid"), EnvironmentContext(), Limits()).layers(
+        None
+    )
     (true,) = map_layers.grids().values()
     pixels = cv2.imread(str(folder / "small_sim_map.png"), cv2.IMREAD_GRAYSCALE)
     assert pixels is not None
@@ -423,8 +425,10 @@ def test_the_strawberry_farm_from_above() -> None:
     file = DATA / "environment_template/riseholme_park_farm_strawberry_polytunnels/config/location/satellite-auto.png"
     if not file.is_file():
         pytest.skip("the real maps are not here")
-    hints = Hints(format="satellite", options={"corners": "53.2694,-0.5262,53.2682,-0.5224", "picture": "satellite"})
-    upload_bundle = upload_reader.read({"satellite-auto.png": file.read_bytes()}, hints, Known(), Limits())
+    hints = UploadHints(
+        format="satellite", options={"corners": "53.2694,-0.5262,53.2682,-0.5224", "picture": "satellite"}
+    )
+    upload_bundle = upload_reader.read({"satellite-auto.png": file.read_bytes()}, hints, EnvironmentContext(), Limits())
     content = upload_bundle.layers(Datum(53.268642038, -0.524509505881))
     part = objects(content)
     assert not part.local.any()

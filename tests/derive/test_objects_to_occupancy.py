@@ -29,7 +29,7 @@ from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, SITE, Layers, Part, PartKey, Resources
 from app.model.obstacles import OF_OSM
 from app.model.solids import TYPES
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from tests.model.test_meshes import stl
 
 BOX = {"type": "box", "size": [1, 2, 3], "pose": [0, 0, 1.5, 0, 0, 0]}
@@ -631,7 +631,10 @@ def test_it_is_planned_with_what_it_may_also_read() -> None:
 def read(*paths: Path) -> Layers:
     files = {p.name: p.read_bytes() for p in paths}
     upload_bundle = upload_reader.read(
-        upload_reader.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits()
+        upload_reader.unpack(files, Limits()),
+        UploadHints(),
+        EnvironmentContext(None, None, None, True, False),
+        Limits(),
     )
     return upload_bundle.layers(None)
 

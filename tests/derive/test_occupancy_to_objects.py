@@ -27,7 +27,7 @@ from app.model.features import Features
 from app.model.frame import Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 
 CELL = 0.05
 Array = NDArray[np.float64]
@@ -341,7 +341,10 @@ def test_parameters_are_checked_and_the_planner_prefers_all_other_ways() -> None
 def load(folder: Path) -> Layers:
     files = {p.name: p.read_bytes() for p in sorted(folder.iterdir()) if p.is_file()}
     upload_bundle = upload_reader.read(
-        upload_reader.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits()
+        upload_reader.unpack(files, Limits()),
+        UploadHints(),
+        EnvironmentContext(None, None, None, True, False),
+        Limits(),
     )
     return upload_bundle.layers(None)
 
@@ -412,8 +415,8 @@ def test_a_gazebo_world_of_the_objects_has_their_cylinders_and_boxes() -> None:
 def test_a_grid_alone_still_is_a_gazebo_world_of_its_cells() -> None:
     gazebo = formats.get_format("gazebo")
     key = PartKey("occupancy")
-    chain = recipe.chain(gazebo, recipe.Stock(frozenset({key}), datum=False), gazebo.write_options())
-    assert chain == recipe.Chain((), (key,))
+    chain = recipe.chain(gazebo, recipe.AvailableLayers(frozenset({key}), datum=False), gazebo.write_options())
+    assert chain == recipe.DerivationChain((), (key,))
     # Objects that were made of it stand for it, unless it is named.
     both = [PartKey("objects", "ground", NAME), key]
     assert gazebo.choose(both, gazebo.write_options()) == both[:1]

@@ -36,7 +36,7 @@ from app.model.grid import (
 )
 from app.model.imagery import Picture
 from app.model.layers import MAP, NETWORK, Layers, PartKey
-from app.upload_reader import Hints, Known, read
+from app.upload_reader import EnvironmentContext, UploadHints, read
 
 METHODS = ("skeleton", "roadmap", "voronoi")
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config"
@@ -455,7 +455,7 @@ def strawberry() -> tuple[OccupancyGrid, Features]:
         pytest.skip("the real maps are not beside the checkout")
     files = {n: (DATA / FARM / "metric/map" / n).read_bytes() for n in ("map.yaml", "map.png")}
     files["network.tmap2.yaml"] = (DATA / FARM / "topological/network.tmap2.yaml").read_bytes()
-    layers = read(files, Hints(), Known(None, None, None, True, False), Limits()).layers(None)
+    layers = read(files, UploadHints(), EnvironmentContext(None, None, None, True, False), Limits()).layers(None)
     (network,) = layers.vector("topology").values()
     (g,) = layers.grids().values()
     return g, network

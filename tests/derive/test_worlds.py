@@ -25,7 +25,7 @@ from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
 from app.model.solids import Solids
 from app.model.voxels import VoxelMap
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 
 PAIRS = {
     # world: folder, file, map, shift of the map (metres), the share of its occupied cells within 10 cm
@@ -44,7 +44,10 @@ PAIRS = {
 
 def read(files: dict[str, bytes]) -> Layers:
     upload_bundle = upload_reader.read(
-        upload_reader.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits()
+        upload_reader.unpack(files, Limits()),
+        UploadHints(),
+        EnvironmentContext(None, None, None, True, False),
+        Limits(),
     )
     return upload_bundle.layers(None)
 

@@ -22,7 +22,7 @@ from app.model.features import features
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 from tests.api.conftest import Api, running, settings_for
 
 KEEPOUT, SPEED = PartKey("occupancy", "ground", "keepout"), PartKey("occupancy", "ground", "speed")
@@ -209,7 +209,7 @@ def drawn(*names: str) -> bytes:
 
 
 def test_offline_from_a_drawing() -> None:
-    hints = Hints(layer="zones")
+    hints = UploadHints(layer="zones")
     files = offline({"zones.kml": drawn("pond")}, "occupancy_grid", hints=hints, options={"grid": "keepout"}).files
     assert list(files) == ["keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"]
     with pytest.raises((NotFound, MissingLayer)):

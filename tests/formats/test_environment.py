@@ -32,8 +32,8 @@ from app.model.layers import Layers, Part, PartKey, Resources
 from app.model.templates import NO_TEMPLATES
 from app.model.voxels import VoxelMap
 from app.store import parts as store_parts
-from app.store.tree import Draft
-from app.upload_reader import Bundle, Hints, Known
+from app.store.tree import ChunkStage
+from app.upload_reader import Bundle, EnvironmentContext, UploadHints
 
 FORMAT = get_format("environment")
 SAMPLE = (Path(__file__).resolve().parents[1] / "samples/environment/yard.zip").read_bytes()
@@ -64,7 +64,7 @@ def folder(shared: Path, name: str) -> dict[str, bytes]:
 
 
 def read_upload(files: dict[str, bytes], name: str | None = None) -> Bundle:
-    return upload_reader.read(upload_reader.unpack(files, Limits()), Hints(name), Known(), Limits())
+    return upload_reader.read(upload_reader.unpack(files, Limits()), UploadHints(name), EnvironmentContext(), Limits())
 
 
 def written(layers: Layers, **options: Any) -> tuple[dict[str, bytes], dict[str, Any]]:
@@ -127,7 +127,7 @@ def test_real_environments_come_back_and_their_scripts_work(
     files["config/environment.sh"] = b"".join(
         b"export %s='%s'\n" % (k.encode(), v.encode()) for k, v in literals.items()
     )
-    converted = offline(files, "environment", hints=Hints("environment"))
+    converted = offline(files, "environment", hints=UploadHints("environment"))
     assert same("environment", files, converted.files) == []
     inner = unzipped(converted.files[MAIN])
     root = tmp_path / "a folder 'with' $odd \"names\""[:22]
@@ -190,7 +190,7 @@ def test_the_sample_is_detected_read_and_written_whole() -> None:
     assert not detect("yard.kmz", SAMPLE)
     assert not detect("a.zip", _archive.pack({"doc.kml": b"<kml/>"}))
     first = read_upload({"yard.zip": SAMPLE}, "environment")
-    converted = offline({"yard.zip": SAMPLE}, "environment", hints=Hints("environment"))
+    converted = offline({"yard.zip": SAMPLE}, "environment", hints=UploadHints("environment"))
     second = read_upload(maps_of(unzipped(converted.files[MAIN])), "environment")
     assert second.datum == first.datum
     assert second.parts.keys() == first.parts.keys()
@@ -410,7 +410,7 @@ def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
 
 def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.MonkeyPatch) -> None:
     version: Any = SimpleNamespace(environment="e", datum=None, levels=(), templates=NO_TEMPLATES, closures=None)
-    chain = recipe.Chain((), ())
+    chain = recipe.DerivationChain((), ())
 
     def keys() -> list[str]:
         return [recipe._key(version, get_format(n), None, chain, {}, None) for n in ("environment", "datum")]
@@ -552,7 +552,7 @@ def offline_layers() -> Layers:
 
 def hashes(parts: Mapping[PartKey, Part]) -> dict[PartKey, bytes]:
     """What the store would call these parts."""
-    encoded_parts = {key: store_parts.compose(Draft(lambda _: {}), part, None, "") for key, part in parts.items()}
+    encoded_parts = {key: store_parts.compose(ChunkStage(lambda _: {}), part, None, "") for key, part in parts.items()}
     return {key: part.hash for key, part in encoded_parts.items() if part is not None}
 
 

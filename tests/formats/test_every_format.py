@@ -18,8 +18,8 @@ from app.model.features import features
 from app.model.frame import Datum
 from app.model.layers import LAYERS, Layers, PartKey
 from app.store import parts
-from app.store.tree import Draft
-from app.upload_reader import Hints, Known, read, unpack
+from app.store.tree import ChunkStage
+from app.upload_reader import EnvironmentContext, UploadHints, read, unpack
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 HERE = Datum(53.2686, -0.5245, heading=12.5)
@@ -44,8 +44,8 @@ CASES = [pytest.param(f, files, id=case) for f, case, files in cases()]
 NAMES = sorted(formats.all_formats())
 
 
-def layers_of(name: str, files: dict[str, bytes], hints: Hints | None = None) -> Layers:
-    bundle = read(unpack(files, LIMITS), hints or Hints(name), Known(), LIMITS)
+def layers_of(name: str, files: dict[str, bytes], hints: UploadHints | None = None) -> Layers:
+    bundle = read(unpack(files, LIMITS), hints or UploadHints(name), EnvironmentContext(), LIMITS)
     return bundle.layers(HERE)
 
 
@@ -72,10 +72,12 @@ def test_content_alone_tells_the_format(name: str, files: dict[str, bytes]) -> N
 
 @pytest.mark.parametrize(("name", "files"), CASES)
 def test_what_is_written_reads_as_the_same_and_writes_the_same_bytes(name: str, files: dict[str, bytes]) -> None:
-    first = offline(files, name, hints=Hints(name), datum=HERE).files
-    second = offline(first, name, hints=Hints(name), datum=HERE).files
+    first = offline(files, name, hints=UploadHints(name), datum=HERE).files
+    second = offline(first, name, hints=UploadHints(name), datum=HERE).files
     assert first == second
-    assert offline(files, name, hints=Hints(name), datum=HERE).files == first, "the same input gives the same bytes"
+    assert offline(files, name, hints=UploadHints(name), datum=HERE).files == first, (
+        "the same input gives the same bytes"
+    )
 
 
 def mutations(data: bytes, seed: int) -> list[bytes]:
@@ -121,13 +123,13 @@ def test_damaged_files_are_refused_with_file_and_reason_or_read(name: str, files
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_format_is_not_made_from_nothing(name: str) -> None:
-    from app.convert.recipe import Stock, chain
+    from app.convert.recipe import AvailableLayers, chain
 
     fmt = formats.get_format(name)
     if fmt.write is None:
         pytest.fail(f"{name} is not served: say so in CHANGELOG.md first")
     with pytest.raises((MissingLayer, CannotConvert)) as caught:
-        chain(fmt, Stock(frozenset(), False), fmt.write_options())
+        chain(fmt, AvailableLayers(frozenset(), False), fmt.write_options())
     assert "supply" in caught.value.detail or "needs" in caught.value.detail
 
 
@@ -139,7 +141,7 @@ FILE_NAME_IS_CONTENT = {"gazebo": "worlds are chosen by their file", "rmf_nav_gr
 def test_equal_files_under_other_names_are_equal_content(name: str, files: dict[str, bytes]) -> None:
     def hashes(named: dict[str, bytes]) -> dict[PartKey, bytes]:
         encoded_parts = {
-            k: parts.compose(Draft(lambda _: {}), p, None, "") for k, p in layers_of(name, named).parts.items()
+            k: parts.compose(ChunkStage(lambda _: {}), p, None, "") for k, p in layers_of(name, named).parts.items()
         }
         return {key: part.hash for key, part in encoded_parts.items() if part is not None}
 

@@ -31,7 +31,7 @@ from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey, Resources
 from app.model.meshes import read_mesh
-from app.upload_reader import Bundle, Hints, Known, unpack
+from app.upload_reader import Bundle, EnvironmentContext, UploadHints, unpack
 from app.upload_reader import read as read_bundle
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "gazebo"
@@ -46,8 +46,8 @@ def folder(path: Path) -> dict[str, bytes]:
     return {p.relative_to(path).as_posix(): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
 
 
-def read_upload(files: dict[str, bytes], name: str | None = None, context: Known | None = None) -> Bundle:
-    return read_bundle(unpack(files, LIMITS), Hints(name), context or Known(), LIMITS)
+def read_upload(files: dict[str, bytes], name: str | None = None, context: EnvironmentContext | None = None) -> Bundle:
+    return read_bundle(unpack(files, LIMITS), UploadHints(name), context or EnvironmentContext(), LIMITS)
 
 
 def objects(bundle: Bundle) -> Features:
@@ -545,7 +545,7 @@ def test_zero_zero_is_no_place_and_a_known_datum_stays() -> None:
     assert read_upload(world(place.format(0, 0, 0))).datum is None
     assert read_upload(world(place.format(10, 20, 270))).datum == Datum(10, 20, heading=90.0)
     datum = Datum(10.0, 20.5)
-    bundle = read_upload(world(place.format(10, 20, 0)), context=Known(datum))
+    bundle = read_upload(world(place.format(10, 20, 0)), context=EnvironmentContext(datum))
     assert bundle.datum is None
     assert any("not the environment's datum" in w.problem for w in bundle.warnings)
     files = world(place.format(10, 20, 0))
@@ -828,7 +828,7 @@ def test_real_worlds_have_their_facts_and_come_back(shared: Path, facts_json: di
             if text:
                 properties = next(p for p in objects(bundle).properties if p["name"] == name and p["kind"] == "model")
                 assert properties["pose"] == pytest.approx([float(v) for v in text.split()]), (key, name)
-        out = offline(files, "gazebo", hints=Hints("gazebo")).files
+        out = offline(files, "gazebo", hints=UploadHints("gazebo")).files
         assert same("gazebo", files, out) == [], key
         assert etree.fromstring(out["world.sdf"]).get("version") == facts["sdf_version"]
         again = offline(out, "gazebo").files
@@ -940,7 +940,7 @@ def test_what_is_a_world_and_what_is_not() -> None:
 
 def test_empty_worlds_are_kept_and_come_back() -> None:
     files = world("<gravity>0 0 -1.6</gravity>", name="moon base")
-    out = offline(files, "gazebo", hints=Hints("gazebo")).files
+    out = offline(files, "gazebo", hints=UploadHints("gazebo")).files
     assert tree(out).get("name") == "moon base"
     assert tree(out).findtext("gravity") == "0 0 -1.6"
     assert tree(out).find("model") is None

@@ -25,7 +25,7 @@ from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, speed_of
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from app.upload_reader import read as read_bundle
 
 FORMAT = get_format("lanelet2")
@@ -550,8 +550,8 @@ def test_real_networks_become_valid_lanelets_and_come_back(shared: Path, tmp_pat
     datum = Datum(53.268642038, -0.524509505881) if to == "tmap2" else Datum(44.7644, -93.2073)
     converted = offline(files, "lanelet2", datum=datum)
     valid(converted.files[MAIN])
-    before = read_bundle(files, Hints(), Known(datum), Limits()).layers(datum)
-    after = read_bundle(converted.files, Hints(), Known(datum), Limits()).layers(datum)
+    before = read_bundle(files, UploadHints(), EnvironmentContext(datum), Limits()).layers(datum)
+    after = read_bundle(converted.files, UploadHints(), EnvironmentContext(datum), Limits()).layers(datum)
     one, two = part(before), part(after)
     places = dict(zip(two.ids, two.in_local(after.frame), strict=True))
     assert set(one.ids) == set(two.ids)

@@ -23,7 +23,7 @@ from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, PartKey
 from app.model.voxels import VoxelMap
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from app.upload_reader import read as read_bundle
 from tests.formats import clouds
 
@@ -236,7 +236,7 @@ def test_damaged_compressed_points_are_refused_or_read(capfd: pytest.CaptureFixt
             data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
         cut = bytes(data[: dice.choice([len(data), len(data), dice.randrange(len(data))])])
         try:
-            read_bundle({"a.laz": cut}, Hints("las"), Known(), Limits())
+            read_bundle({"a.laz": cut}, UploadHints("las"), EnvironmentContext(), Limits())
         except BadUpload as error:
             refused += 1
             assert error.problems[0].file == "a.laz"

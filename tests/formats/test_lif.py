@@ -20,7 +20,7 @@ from app.formats.lif import WriteOptions
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 
 FORMAT = get_format("lif")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "lif"
@@ -432,7 +432,9 @@ def test_a_layout_without_a_level_goes_where_it_is_asked_to() -> None:
     layers, _ = read(layout(), level="cellar")
     assert {k.level for k in layers.parts} == {"cellar"}
     assert "layoutLevelId" not in json.loads(write(layers)[0])["layouts"][0]
-    lif_data = offline({"a.json": json.dumps(layout()).encode()}, "lif", hints=Hints("lif")).files["layout.lif.json"]
+    lif_data = offline({"a.json": json.dumps(layout()).encode()}, "lif", hints=UploadHints("lif")).files[
+        "layout.lif.json"
+    ]
     assert check(lif_data)
 
 

@@ -22,7 +22,7 @@ from app.formats._yaml import Tagged, load
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 
 FORMAT = get_format("navgraph")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "navgraph"
@@ -511,7 +511,7 @@ def test_yaml_tags_are_for_formats_that_name_them() -> None:
 
 def test_hints_name_the_format() -> None:
     files = {"plain.yaml": b"nodes:\n- name: A\n  pos: [1, 2]\n"}
-    assert b"pos: [1.0, 2.0]" in offline(files, "navgraph", hints=Hints("navgraph")).files["navgraph.yaml"]
+    assert b"pos: [1.0, 2.0]" in offline(files, "navgraph", hints=UploadHints("navgraph")).files["navgraph.yaml"]
 
 
 def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:

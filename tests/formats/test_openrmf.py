@@ -21,7 +21,7 @@ from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, Part, PartKey, Resources
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 
 FORMAT = get_format("openrmf")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "openrmf"
@@ -77,7 +77,7 @@ def test_every_real_building_comes_back_the_same_with_its_images(shared: Path, s
         assert same("openrmf", files, back) == [], path
         for name, data in back.items():
             assert name == "building.yaml" or data == files[name], "an image is kept byte for byte"
-        assert offline(back, "openrmf", hints=Hints("openrmf")).files == back
+        assert offline(back, "openrmf", hints=UploadHints("openrmf")).files == back
 
 
 def test_facts_of_every_real_building_hold_in_the_layers(shared: Path, facts_json: dict[str, Any]) -> None:

@@ -19,7 +19,7 @@ from app.formats import Group, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from app.upload_reader import read as read_bundle
 
 FORMAT = get_format("prm")
@@ -30,7 +30,7 @@ Edges = set[tuple[str, str]]
 
 
 def read(files: dict[str, bytes], **options: str) -> tuple[Features, Any]:
-    bundle = read_bundle(files, Hints(options=options), Known(), Limits())
+    bundle = read_bundle(files, UploadHints(options=options), EnvironmentContext(), Limits())
     part = bundle.parts[NETWORK]
     assert isinstance(part, Features)
     return part, bundle
@@ -185,7 +185,7 @@ def test_without_its_map_it_says_what_to_supply() -> None:
 def test_beside_a_tmap2_in_a_template_the_roadmap_is_set_aside() -> None:
     tmap2 = (SAMPLE.parent / "tmap2" / "orchard.tmap2.yaml").read_bytes()
     files = {"config/topological/network.tmap2.yaml": tmap2, "config/topological/prm_autogen.yaml": MEADOW["prm.yaml"]}
-    bundle = read_bundle(files, Hints(), Known(), Limits())
+    bundle = read_bundle(files, UploadHints(), EnvironmentContext(), Limits())
     assert not bundle.files["config/topological/prm_autogen.yaml"].used
     assert any("richer tmap2" in w.problem for w in bundle.warnings)
 

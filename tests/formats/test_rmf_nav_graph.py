@@ -19,7 +19,7 @@ from app.errors import MissingLayer, UnreadableFile
 from app.formats import Group, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.layers import Layers, PartKey
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 
 FORMAT = get_format("rmf_nav_graph")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
@@ -307,7 +307,7 @@ def test_what_is_wrong_is_named(text: str) -> None:
 
 def test_a_building_wins_over_its_graphs_on_the_same_level() -> None:
     files = {**sample("openrmf", "clinic"), **sample("rmf_nav_graph", "clinic")}
-    building = yaml.safe_load(offline(files, "openrmf", hints=Hints()).files["building.yaml"])
+    building = yaml.safe_load(offline(files, "openrmf", hints=UploadHints()).files["building.yaml"])
     alone = yaml.safe_load(offline(sample("openrmf", "clinic"), "openrmf").files["building.yaml"])
     assert building == alone
     assert offline(files, "rmf_nav_graph").files == offline(sample("openrmf", "clinic"), "rmf_nav_graph").files

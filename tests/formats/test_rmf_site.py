@@ -22,7 +22,7 @@ from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, Part, PartKey
-from app.upload_reader import Hints
+from app.upload_reader import UploadHints
 
 FORMAT = get_format("rmf_site")
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "rmf_site"
@@ -345,7 +345,7 @@ def test_real_buildings_go_through_a_site_with_all_that_both_can_say(shared: Pat
     for path in sorted((shared / "data" / "openrmf_building").glob("*/*.building.yaml")):
         files = {path.name: path.read_bytes(), **{p.name: p.read_bytes() for p in path.parent.glob("*.png")}}
         site = offline(files, "rmf_site").files
-        back = offline(site, "openrmf", hints=Hints("rmf_site")).files
+        back = offline(site, "openrmf", hints=UploadHints("rmf_site")).files
         original, building = yaml.safe_load(files[path.name]), yaml.safe_load(back["building.yaml"])
         assert summary(building) == summary(original), path
         assert all(back[name] == files[name] for name in back if name != "building.yaml")

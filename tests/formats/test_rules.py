@@ -22,12 +22,12 @@ import yaml
 from app import formats
 from app.convert import worker
 from app.convert.files import offline
-from app.convert.recipe import Chain
+from app.convert.recipe import DerivationChain
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Limits, Needs, WriteContext
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
-from app.upload_reader import Hints, unpack
+from app.upload_reader import UploadHints, unpack
 from tests.formats.test_every_format import CASES, HERE, mutations
 
 ERROR, WARNING = "error", "warning"
@@ -42,7 +42,7 @@ def findings_of(name: str, files: dict[str, bytes]) -> Found:
 @pytest.mark.parametrize(("name", "files"), CASES)
 def test_what_is_served_would_be_loaded_where_the_sample_would(name: str, files: dict[str, bytes]) -> None:
     """Samples with dangling edges and the like come back with them, and with an error."""
-    served = offline(files, name, hints=Hints(name), datum=HERE)
+    served = offline(files, name, hints=UploadHints(name), datum=HERE)
     groups, _ = formats.group(files, name)
     if formats.get_format(name).holds:  # its parts are checked by their own formats' rules
         inside, _ = formats.group(unpack(files, Limits()))
@@ -208,7 +208,7 @@ def test_a_speed_mask_has_no_unknown_cells(said: dict[str, str | None], expected
 def test_a_wide_grid_is_told_in_its_report() -> None:
     cells = np.zeros((1, 32768), np.uint8)
     layers = Layers({PartKey("occupancy", "ground", "map"): OccupancyGrid(cells, 0.05, (0.0, 0.0, 0.5))})
-    chain = Chain((), tuple(layers.parts))
+    chain = DerivationChain((), tuple(layers.parts))
     report = worker.write(formats.get_format("occupancy_grid"), layers, {}, chain).report
     warnings = {(w["level"], w["file"], w.get("where")) for w in report["warnings"]}
     assert warnings == {(ERROR, "map.pgm", None), (WARNING, "map.yaml", "origin")}

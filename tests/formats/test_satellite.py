@@ -27,7 +27,7 @@ from app.model.geodesy import crs_bounds
 from app.model.imagery import Picture, placed
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resampled
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "satellite"
 FACTS: dict[str, Any] = json.loads((SAMPLES / "facts.json").read_text())
@@ -349,14 +349,14 @@ def test_numbers_like_degrees_are_degrees_and_others_metres() -> None:
 def test_a_world_file_finds_its_picture(world: str, picture: str) -> None:
     kind = {"png": "PNG", "tif": "TIFF"}.get(picture[-3:].lower(), "JPEG")
     files = {picture: image(kind=kind), world: b"2\n0\n0\n-2\n665000\n5905000\n", "else.txt": b"?"}
-    upload_bundle = upload_reader.read(files, Hints(options={"crs": UTM}), Known(), LIMITS)
+    upload_bundle = upload_reader.read(files, UploadHints(options={"crs": UTM}), EnvironmentContext(), LIMITS)
     assert [k.name for k in upload_bundle.parts] == ["a"]
     assert {n for n, use in upload_bundle.files.items() if use.used} == {world, picture}
 
 
 def test_a_geotiff_is_believed_before_its_world_file() -> None:
     files = {"a.tif": tif(utm()), "a.tfw": b"9 0 0 -9 9 9"}
-    upload_bundle = upload_reader.read(files, Hints(), Known(), LIMITS)
+    upload_bundle = upload_reader.read(files, UploadHints(), EnvironmentContext(), LIMITS)
     (picture,) = upload_bundle.parts.values()
     assert isinstance(picture, Picture)
     assert picture.transform == utm().transform
@@ -386,7 +386,7 @@ def test_wrong_world_files_are_refused(world: bytes, line: int | None, said: str
 
 def test_a_world_file_without_its_picture_says_what_to_add() -> None:
     with pytest.raises(UnreadableFile, match=r"add a\.png beside it"):
-        upload_reader.read({"a.pgw": b"1 0 0 -1 0 0"}, Hints(), Known(), LIMITS)
+        upload_reader.read({"a.pgw": b"1 0 0 -1 0 0"}, UploadHints(), EnvironmentContext(), LIMITS)
 
 
 def test_a_crs_stands_beside_the_picture() -> None:
@@ -394,7 +394,7 @@ def test_a_crs_stands_beside_the_picture() -> None:
     world = b"2 0 0 -2 665000 5905000"
     for name, body in (("a.prj", wkt), ("a.png.aux.xml", b"<PAMDataset><SRS>" + wkt + b"</SRS></PAMDataset>")):
         files = {"a.png": image(), "a.pgw": world, name: body}
-        upload_bundle = upload_reader.read(files, Hints(), Known(), LIMITS)
+        upload_bundle = upload_reader.read(files, UploadHints(), EnvironmentContext(), LIMITS)
         (picture,) = upload_bundle.parts.values()
         assert isinstance(picture, Picture)
         assert picture.crs == UTM
@@ -474,9 +474,9 @@ def test_wrong_options_are_refused_by_name(options: dict[str, Any], where: str) 
 
 
 def test_a_picture_alone_says_what_to_supply() -> None:
-    for hints in (Hints(), Hints("satellite")):
+    for hints in (UploadHints(), UploadHints("satellite")):
         with pytest.raises(UnreadableFile, match=r"world file .*corners=.*metres_per_pixel") as caught:
-            upload_reader.read({"a.png": image()}, hints, Known(), LIMITS)
+            upload_reader.read({"a.png": image()}, hints, EnvironmentContext(), LIMITS)
         assert caught.value.problems[0].file == "a.png"
         assert "corners=" in caught.value.problems[0].problem
 
@@ -492,13 +492,15 @@ def test_in_a_folder_a_picture_without_a_place_stays_a_source_unless_it_is_given
         "config/metric/map/map.yaml": ROOM,
         "config/metric/map/map.png": image((5, 5)),
     }
-    upload_bundle = upload_reader.read(files, Hints(), Known(), LIMITS)
+    upload_bundle = upload_reader.read(files, UploadHints(), EnvironmentContext(), LIMITS)
     assert [k.layer for k in upload_bundle.parts] == ["occupancy"]
     (warning,) = upload_bundle.warnings
     assert warning.file == "config/location/satellite-auto.png"
     assert "kept as a source" in warning.problem
     assert "corners=" in warning.problem
-    upload_bundle = upload_reader.read(files, Hints(options={"corners": "53.2,-0.6,53.1,-0.5"}), Known(), LIMITS)
+    upload_bundle = upload_reader.read(
+        files, UploadHints(options={"corners": "53.2,-0.6,53.1,-0.5"}), EnvironmentContext(), LIMITS
+    )
     assert sorted(k.layer for k in upload_bundle.parts) == ["imagery", "occupancy"]
     assert upload_bundle.files["config/location/satellite-auto.png"].format == "satellite"
 
@@ -506,16 +508,16 @@ def test_in_a_folder_a_picture_without_a_place_stays_a_source_unless_it_is_given
 def test_of_several_pictures_the_options_place_the_one_that_is_named() -> None:
     files = {"a.png": image(), "b.png": image(seed=2)}
     options = {"metres_per_pixel": "0.5"}
-    for hints in (Hints(options=options), Hints("satellite", options=options)):
+    for hints in (UploadHints(options=options), UploadHints("satellite", options=options)):
         with pytest.raises(Invalid, match=r"file=….*a\.png, b\.png"):
-            upload_reader.read(files, hints, Known(), LIMITS)
+            upload_reader.read(files, hints, EnvironmentContext(), LIMITS)
     upload_bundle = upload_reader.read(
-        files, Hints(options={**options, "file": "b.png", "picture": "roof"}), Known(), LIMITS
+        files, UploadHints(options={**options, "file": "b.png", "picture": "roof"}), EnvironmentContext(), LIMITS
     )
     assert [k.name for k in upload_bundle.parts] == ["roof"]
     assert {n for n, use in upload_bundle.files.items() if use.used} == {"b.png"}
     with pytest.raises(Invalid, match="no file"):
-        upload_reader.read(files, Hints(options={**options, "file": "c.png"}), Known(), LIMITS)
+        upload_reader.read(files, UploadHints(options={**options, "file": "c.png"}), EnvironmentContext(), LIMITS)
 
 
 def test_what_says_where_it_lies_is_not_moved_by_options() -> None:

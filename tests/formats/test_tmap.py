@@ -18,7 +18,7 @@ from app.errors import UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.layers import Layers, PartKey
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from app.upload_reader import read as read_bundle
 
 FORMAT = get_format("tmap")
@@ -134,14 +134,14 @@ def test_it_is_told_by_its_content_and_may_still_be_called_tmap2() -> None:
     assert formats.detect("list.txt", OLD) is None
     assert formats.detect("waypoints.yaml", b"- node: WayPoint3\n- node: WayPoint4\n") is None
     for format_name in ("tmap", "tmap2", None):
-        bundle = read_bundle({"old.tmap": OLD}, Hints(format_name), Known(), Limits())
+        bundle = read_bundle({"old.tmap": OLD}, UploadHints(format_name), EnvironmentContext(), Limits())
         assert list(bundle.parts) == [NETWORK]
         assert bundle.files["old.tmap"].format == (format_name or "tmap")
 
 
 def test_beside_a_tmap2_the_tmap2_is_believed() -> None:
     files = {"old.tmap": OLD, "a_rather_long_name.tmap2.yaml": (SAMPLES / "tmap2" / "orchard.tmap2.yaml").read_bytes()}
-    bundle = read_bundle(files, Hints(), Known(), Limits())
+    bundle = read_bundle(files, UploadHints(), EnvironmentContext(), Limits())
     assert bundle.parts[NETWORK].document["tmap2"]["name"] == "orchard_full"  # type: ignore[union-attr]
     assert not bundle.files["old.tmap"].used
 

@@ -22,7 +22,7 @@ from app.model import osm_areas
 from app.model.frame import Datum
 from app.model.grid import OCCUPIED, OccupancyGrid
 from app.model.layers import Layers
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 DATUM = Datum(53.2, -0.5)
@@ -63,7 +63,7 @@ def courtyard(without: int | None = None) -> bytes:
 
 
 def read(files: dict[str, bytes], datum: Datum | None = DATUM) -> upload_reader.Bundle:
-    return upload_reader.read(upload_reader.unpack(files, Limits()), Hints(), Known(datum), Limits())
+    return upload_reader.read(upload_reader.unpack(files, Limits()), UploadHints(), EnvironmentContext(datum), Limits())
 
 
 def written(layers: Layers, to: str, **options: Any) -> dict[str, bytes]:

@@ -15,7 +15,7 @@ from app.derive import Notes
 from app.errors import CannotGenerate, Conflict, Invalid, MissingLayer, NotFound
 from app.formats import Limits
 from app.generate import Source, generates
-from app.ingest import Ingest, Order
+from app.ingest import GenerationRequest, Ingest
 from app.model.features import Features
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layers, PartKey
@@ -80,8 +80,8 @@ def ingest(store: Store) -> Ingest:
     return Ingest(store, lambda function, *args: function(*args), Limits())
 
 
-def order(name: str = "some_posts", seed: int = 7, replace: bool = False, **values: object) -> Order:
-    return Order(name, seed, values, replace)
+def order(name: str = "some_posts", seed: int = 7, replace: bool = False, **values: object) -> GenerationRequest:
+    return GenerationRequest(name, seed, values, replace)
 
 
 def test_streams_are_the_same_everywhere_and_independent() -> None:

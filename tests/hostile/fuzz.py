@@ -26,7 +26,7 @@ from app import formats, upload_reader
 from app.errors import BadUpload, FleetMapError, Invalid
 from app.formats import Limits, WriteContext
 from app.model.frame import Datum
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import sample_maps
 
 CPU_SECONDS = 10.0
@@ -126,7 +126,9 @@ def outcome(name: str | None, files: Files) -> str:
 
 def _outcome(name: str | None, files: Files) -> str:
     try:
-        upload_bundle = upload_reader.read(upload_reader.unpack(files, LIMITS), Hints(name), Known(HERE), LIMITS)
+        upload_bundle = upload_reader.read(
+            upload_reader.unpack(files, LIMITS), UploadHints(name), EnvironmentContext(HERE), LIMITS
+        )
     except (BadUpload, Invalid) as error:
         assert error.detail, "refused without a reason"
         if isinstance(error, BadUpload):
@@ -152,7 +154,7 @@ def _again(upload_bundle: upload_reader.Bundle) -> str:
         except FleetMapError as error:  # what was read lacks what the format needs: a network without an edge
             assert error.detail
             continue
-        upload_reader.read(written, Hints(name), Known(HERE), LIMITS)
+        upload_reader.read(written, UploadHints(name), EnvironmentContext(HERE), LIMITS)
     return "read"
 
 

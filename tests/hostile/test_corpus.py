@@ -13,7 +13,7 @@ from app import upload_reader
 from app.errors import BadUpload, Invalid, TooLarge
 from app.formats import Limits
 from app.formats._text import numbers
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import ACCORDING_TO_KIND, Case, cases, damaged, sample_maps, zipped
 
 SECONDS = 15.0
@@ -39,7 +39,7 @@ def outcome(case: Case) -> str:
     start = time.monotonic()
     try:
         upload_bundle = upload_reader.read(
-            upload_reader.unpack(case.files, LIMITS), Hints(case.format), Known(), LIMITS
+            upload_reader.unpack(case.files, LIMITS), UploadHints(case.format), EnvironmentContext(), LIMITS
         )
     except (BadUpload, Invalid) as error:
         result = "refused"

@@ -14,10 +14,10 @@ from app import upload_reader
 from app.errors import BadUpload, Problem
 from app.formats import Limits, grouped
 from app.model.frame import Datum
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import KML, SAMPLES
 
-HERE = Known(Datum(50.0, 7.0))
+HERE = EnvironmentContext(Datum(50.0, 7.0))
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def changed(row: Row) -> dict[str, bytes]:
 
 
 def read(files: dict[str, bytes]) -> list[Problem]:
-    return upload_reader.read(files, Hints(), HERE, Limits()).warnings
+    return upload_reader.read(files, UploadHints(), HERE, Limits()).warnings
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.sample.partition('/')[0]}: {row.new[:40]}")

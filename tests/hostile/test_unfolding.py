@@ -18,7 +18,7 @@ from app import upload_reader
 from app.errors import BadUpload, TooLarge
 from app.formats import UNPACKED_FREE_BYTES, Limits, ReadContext, get_format
 from app.pool import Pool
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import KML, ROOM, SAMPLES, zipped
 
 MEMORY_BYTES = 400 * 2**20
@@ -31,7 +31,9 @@ def measured_upload(path: str) -> tuple[str, int, float]:
     before, start = _peak_bytes(), time.process_time()
     data = Path(path).read_bytes()
     try:
-        upload_reader.read(upload_reader.unpack({Path(path).name: data}, Limits()), Hints(), Known(), Limits())
+        upload_reader.read(
+            upload_reader.unpack({Path(path).name: data}, Limits()), UploadHints(), EnvironmentContext(), Limits()
+        )
     except BadUpload as error:
         result = type(error).__name__
         assert all(p.problem and p.file for p in error.problems), error.problems

@@ -19,14 +19,14 @@ import shapely
 from numpy.typing import NDArray
 
 from app import formats, upload_reader
-from app.convert.recipe import Stock, chain
+from app.convert.recipe import AvailableLayers, chain
 from app.convert.worker import write
 from app.errors import FleetMapError
 from app.formats import Limits
 from app.model.features import NO_GEOMETRY, Features
 from app.model.frame import Datum
 from app.model.layers import Layers
-from app.upload_reader import Hints, Known
+from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import sample_maps
 
 HERE = Datum(50.0, 7.0, heading=30.0)
@@ -101,7 +101,10 @@ def bases() -> Iterator[tuple[str, Layers]]:
             if layer and not formats.get_format(name).drawing:
                 continue
             upload_bundle = upload_reader.read(
-                upload_reader.unpack(files, Limits()), Hints(name, layer=layer), Known(HERE), Limits()
+                upload_reader.unpack(files, Limits()),
+                UploadHints(name, layer=layer),
+                EnvironmentContext(HERE),
+                Limits(),
             )
             layers = upload_bundle.layers(HERE)
             parts = {key: smaller(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
@@ -125,7 +128,7 @@ def smaller(part: Features) -> Features:
 def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
     """Of writing every format, deriving what it takes: exceptions that nobody could tell a user."""
     out: list[tuple[str, BaseException]] = []
-    stock = Stock(frozenset(layers.parts), layers.datum is not None)
+    stock = AvailableLayers(frozenset(layers.parts), layers.datum is not None)
     for name, fmt in formats.all_formats().items():
         try:
             written = write(fmt, layers, {}, chain(fmt, stock, fmt.write_options()))

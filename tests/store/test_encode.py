@@ -15,7 +15,7 @@ from app.model.features import features
 from app.store import encode, parts
 from app.store.changes import Replace
 from app.store.store import Store
-from app.store.tree import Draft
+from app.store.tree import ChunkStage
 from tests.store.samples import TOPOLOGY, grid, mixed, network, picture, save, typed, voxels
 
 
@@ -25,7 +25,7 @@ class Nothing:
 
 
 def part_hash(part) -> str:
-    return parts.compose(Draft(Nothing()), part, None, "").hash.hex()
+    return parts.compose(ChunkStage(Nothing()), part, None, "").hash.hex()
 
 
 def test_hashes_of_this_encoding_never_change():

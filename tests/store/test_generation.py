@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from app.store.commit_counter import Generation
+from app.store.commit_counter import CommitCounter
 from app.store.store import Store
 
 
@@ -25,7 +25,7 @@ def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> No
 
 
 def test_another_process_sees_it(tmp_path: Path) -> None:
-    counter = Generation(tmp_path)
+    counter = CommitCounter(tmp_path)
     before = counter()
     code = "from pathlib import Path; from app.store.commit_counter import Generation; "
     code += f"Generation(Path({str(tmp_path)!r})).change()"
@@ -35,7 +35,7 @@ def test_another_process_sees_it(tmp_path: Path) -> None:
 
 
 def test_without_a_folder_it_works_in_this_process(tmp_path: Path) -> None:
-    counter = Generation(tmp_path / "absent")
+    counter = CommitCounter(tmp_path / "absent")
     before = counter()
     counter.change()
     assert counter() != before

@@ -14,20 +14,20 @@ from app.fleet import holding, is_online, lag_of
 from app.store import robots
 from app.store.changes import Replace
 from app.store.store import Store
-from app.store.values import NO_ROOT, Heard, Held, Move, Report
+from app.store.values import NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, RobotReport
 from tests.store.samples import DATUM, GRID, grid, save
 
 NOW = datetime(2031, 5, 1, 14, 0, tzinfo=UTC)
 A, B = "a" * 64, "b" * 64
 
 
-def heard(robot: str, minute: float, root: str = A, state: Any = "active", **more: Any) -> Heard:
+def heard(robot: str, minute: float, root: str = A, state: Any = "active", **more: Any) -> ReceivedReport:
     """A report, so many minutes after NOW."""
     version = more.pop("version", 1)
     channel = more.pop("channel", "production")
     environment = more.pop("environment", "farm")
-    report = Report(channel, version, root, state, **more)
-    return Heard(environment, robot, report, NOW + timedelta(minutes=minute))
+    report = RobotReport(channel, version, root, state, **more)
+    return ReceivedReport(environment, robot, report, NOW + timedelta(minutes=minute))
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def farm(store: Store) -> Store:
 
 
 def test_held_version_follows_the_statement_of_the_robot(farm: Store):
-    def active_map() -> Held | None:
+    def active_map() -> ActiveMap | None:
         return farm.robots("farm", "r1")[0].held
 
     def say(minute: float, root: str, state: Any, holds: tuple[int, str] | None, **more: Any) -> None:
@@ -45,16 +45,16 @@ def test_held_version_follows_the_statement_of_the_robot(farm: Store):
 
     say(0, A, "active", None, sequence=3)
     say(1, "c" * 64, "failed", (2, B), version=3, sequence=5)
-    assert active_map() == Held(2, B, 5, NOW + timedelta(minutes=1)), "the status active of B was lost"
+    assert active_map() == ActiveMap(2, B, 5, NOW + timedelta(minutes=1)), "the status active of B was lost"
     say(2, "c" * 64, "failed", (2, B), version=3, sequence=5)
-    assert active_map() == Held(2, B, 5, NOW + timedelta(minutes=1))
+    assert active_map() == ActiveMap(2, B, 5, NOW + timedelta(minutes=1))
     assert len(farm.robot_history("farm", "r1")) == 2
     say(3, "c" * 64, "failed", (1, A), version=3, sequence=5)
-    assert active_map() == Held(1, A, 5, NOW + timedelta(minutes=3)), "the same failure, and it went back"
+    assert active_map() == ActiveMap(1, A, 5, NOW + timedelta(minutes=3)), "the same failure, and it went back"
     say(4, "c" * 64, "downloading", None, version=3)
-    assert active_map() == Held(1, A, 5, NOW + timedelta(minutes=3)), "it does not say"
+    assert active_map() == ActiveMap(1, A, 5, NOW + timedelta(minutes=3)), "it does not say"
     say(5, "c" * 64, "active", (1, A), version=3)
-    assert active_map() == Held(3, "c" * 64, None, NOW + timedelta(minutes=5)), "active is what it runs"
+    assert active_map() == ActiveMap(3, "c" * 64, None, NOW + timedelta(minutes=5)), "active is what it runs"
     say(6, A, "downloading", (0, NO_ROOT), version=1)
     assert active_map() is None, "its disk is empty"
 
@@ -82,17 +82,17 @@ def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
     reported_at = NOW - timedelta(hours=5)
     assert farm.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, said=reported_at)]) == [None]
     (robot,) = farm.robots("farm")
-    assert robot.report == Report("production", 1, A, "active", "ok\ufffd", 4, reported_at)
+    assert robot.report == RobotReport("production", 1, A, "active", "ok\ufffd", 4, reported_at)
     assert (robot.environment, robot.robot, robot.time, robot.since) == ("farm", "r1", NOW, NOW)
-    assert robot.held == Held(1, A, 4, NOW)
+    assert robot.held == ActiveMap(1, A, 4, NOW)
     assert (robot.there, robot.seen) == (None, None)
     farm.note_reports([heard("r1", 1, B, "downloading", version=2), heard("r1", 2, B, "failed", version=2)])
     (robot,) = farm.robots("farm", "r1")
     assert (robot.report.state, robot.report.version) == ("failed", 2)
-    assert robot.held == Held(1, A, 4, NOW)
+    assert robot.held == ActiveMap(1, A, 4, NOW)
     farm.note_reports([heard("r1", 3, B, version=2, sequence=9), heard("r1", 4, B, version=2, sequence=9)])
     (robot,) = farm.robots("farm", "r1")
-    assert robot.held == Held(2, B, 9, NOW + timedelta(minutes=3))
+    assert robot.held == ActiveMap(2, B, 9, NOW + timedelta(minutes=3))
     assert (robot.since, robot.time) == (NOW + timedelta(minutes=3), NOW + timedelta(minutes=4))
     history = farm.robot_history("farm", "r1")
     assert [(t, r.state) for t, r in history] == [
@@ -173,8 +173,8 @@ def test_presence(farm: Store, monkeypatch: pytest.MonkeyPatch):
 
 def test_silent_robots_are_tidied_away(farm: Store):
     old = datetime.now(UTC) - timedelta(days=91)
-    farm.note_reports([Heard("farm", "old", Report("latest", 0, A, "active"), old)])
-    farm.note_reports([Heard("farm", "new", Report("latest", 0, A, "active"), datetime.now(UTC))])
+    farm.note_reports([ReceivedReport("farm", "old", RobotReport("latest", 0, A, "active"), old)])
+    farm.note_reports([ReceivedReport("farm", "new", RobotReport("latest", 0, A, "active"), datetime.now(UTC))])
     farm.note_presence({"old"}, set(), old)
     farm.collect(timedelta(hours=6))
     assert [r.robot for r in farm.robots()] == ["new"]
@@ -201,8 +201,8 @@ def test_convergence_is_proved(farm: Store):
     base = channel.time
 
     def say(robot: str, seconds: float, root: str, state: Any = "active", **more: Any) -> None:
-        report = Report(more.pop("channel", "production"), 0, root, state, **more)
-        farm.note_reports([Heard("farm", robot, report, base + timedelta(seconds=seconds))])
+        report = RobotReport(more.pop("channel", "production"), 0, root, state, **more)
+        farm.note_reports([ReceivedReport("farm", robot, report, base + timedelta(seconds=seconds))])
 
     def stand(seconds: float = 60) -> Any:
         return holding(farm.robots("farm"), channel, base + timedelta(seconds=seconds))
@@ -233,8 +233,8 @@ def test_convergence_is_proved(farm: Store):
     say("a", 20, old, "ready")
     ready = holding(farm.robots("farm"), planned, base, old)
     assert (ready.holding, ready.ready) == (1, 1)
-    report = Report("production", 1, old, "ready")
-    farm.note_reports([Heard("farm", "made-up", report, base + timedelta(seconds=21), vouched=False)])
+    report = RobotReport("production", 1, old, "ready")
+    farm.note_reports([ReceivedReport("farm", "made-up", report, base + timedelta(seconds=21), vouched=False)])
     ready = holding(farm.robots("farm"), planned, base, old)
     assert (ready.total, ready.ready) == (2, 1), "it is listed, and does not count in the roll-out"
 
@@ -243,10 +243,10 @@ def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
     farm = sqlite_store
     farm.create_environment("farm", datum=DATUM)
     channel = next(c for c in farm.channels("farm"))
-    moves = [Move(n, n, str(n) * 64, NOW + timedelta(minutes=n)) for n in (2, 5, 7)]
+    moves = [ChannelMove(n, n, str(n) * 64, NOW + timedelta(minutes=n)) for n in (2, 5, 7)]
     channel = replace(channel, root=moves[-1].root)
 
-    def lag(*reports: Heard) -> Any:
+    def lag(*reports: ReceivedReport) -> Any:
         farm.note_reports(list(reports))
         (robot,) = farm.robots("farm", reports[0].robot)
         lag = lag_of(robot, channel, moves)

@@ -10,7 +10,7 @@ import pytest
 from app.fleet import decide
 from app.store.changes import Replace
 from app.store.store import Store
-from app.store.values import Channel, Heard, Report, Robot, Rollout
+from app.store.values import Channel, ReceivedReport, Robot, RobotReport, Rollout
 from tests.store.samples import GRID, grid, save
 
 
@@ -28,8 +28,10 @@ class Fleet:
         return self.start + timedelta(seconds=seconds)
 
     def say(self, robots: str, version: int, state: Any, seconds: float = 1, *, vouched: bool = True) -> None:
-        report = Report("production", version, self.roots[version], state)
-        assert not any(self.store.note_reports([Heard("farm", r, report, self.at(seconds), vouched) for r in robots]))
+        report = RobotReport("production", version, self.roots[version], state)
+        assert not any(
+            self.store.note_reports([ReceivedReport("farm", r, report, self.at(seconds), vouched) for r in robots])
+        )
 
     def roll(self, version: int = 2, activate_at: datetime | None = None, **more: Any) -> Channel:
         rollout = Rollout(0, "", self.start, **more)
@@ -108,7 +110,8 @@ def test_exactly_the_share_is_enough(count: int, share: float, enough: int):
         rollout = Rollout(2, "b", now, ready=share, failed=share, state=state, moved=now, before=1)
         reports = [(version, "b") if k < those else ("active", "a") for k in range(count)]
         robots = [
-            Robot(f"r{k}", "farm", Report("production", 1, r, s), now, now, None) for k, (s, r) in enumerate(reports)
+            Robot(f"r{k}", "farm", RobotReport("production", 1, r, s), now, now, None)
+            for k, (s, r) in enumerate(reports)
         ]
         return decide(rollout, robots, now)
 

@@ -19,7 +19,7 @@ from app.store.database import Database
 from app.store.schema import comparison, config, newest
 from app.store.store import Store
 from app.store.tables import metadata
-from app.store.values import Heard, Report
+from app.store.values import ReceivedReport, RobotReport
 
 
 def test_models_and_migrations_do_not_differ(store: Store, database_url: str):
@@ -47,8 +47,8 @@ def test_migrating_again_changes_nothing_and_check_passes(store: Store):
 
 def test_robots_of_before_are_vouched_for(store: Store, database_url: str):
     store.create_environment("farm")
-    report = Report("latest", 0, "a" * 64, "active")
-    store.note_reports([Heard("farm", "old", report, datetime.now(UTC), vouched=False)])
+    report = RobotReport("latest", 0, "a" * 64, "active")
+    store.note_reports([ReceivedReport("farm", "old", report, datetime.now(UTC), vouched=False)])
     settings = config()
     before = ScriptDirectory.from_config(settings).get_revision("0008").down_revision
     database = Database(database_url, readonly=False)

@@ -45,7 +45,7 @@ class Numbers:
 
 
 def fresh(codec: Numbers, items: dict[bytes, int]) -> tree.Node | None:
-    return tree.edit(tree.Draft(Memory()), codec, None, items, ())
+    return tree.edit(tree.ChunkStage(Memory()), codec, None, items, ())
 
 
 keys = st.integers(0, 400).map(lambda n: str(n).encode())
@@ -70,7 +70,7 @@ def test_an_edited_tree_is_the_one_built_anew(rounds: list[tuple[dict[bytes, int
     root: tree.Node | None = None
     items: dict[bytes, int] = {}
     for put, removed in rounds:
-        draft = tree.Draft(memory)
+        draft = tree.ChunkStage(memory)
         root = tree.edit(draft, codec, root, put, removed)
         memory.chunks.update(draft.new)
         for key in removed - put.keys():
@@ -85,18 +85,18 @@ def test_an_edited_tree_is_the_one_built_anew(rounds: list[tuple[dict[bytes, int
 def test_one_edit_in_a_large_tree_touches_one_path():
     codec, memory = Numbers(4), Memory()
     items = {b"%06d" % i: i for i in range(20_000)}
-    draft = tree.Draft(memory)
+    draft = tree.ChunkStage(memory)
     root = tree.edit(draft, codec, None, items, ())
     assert root is not None
     memory.chunks.update(draft.new)
     assert root.level >= 5
-    draft = tree.Draft(memory)
+    draft = tree.ChunkStage(memory)
     new = tree.edit(draft, codec, root, {b"010000": 7}, ())
     assert len(draft.new) <= 3 * (root.level + 1)
     assert memory.reads <= 4 * (root.level + 1)
     memory.chunks.update(draft.new)
     memory.reads = 0
-    left, right = tree.differing(tree.Draft(memory), root, new)
+    left, right = tree.differing(tree.ChunkStage(memory), root, new)
     assert len(left) == len(right) == 1
     assert memory.reads <= 2 * root.level
 
@@ -104,7 +104,7 @@ def test_one_edit_in_a_large_tree_touches_one_path():
 def test_paths_reach_every_key_and_select_every_box():
     codec, memory = Numbers(2), Memory()
     items = {b"%05d" % i: i for i in range(3000)}
-    draft = tree.Draft(memory)
+    draft = tree.ChunkStage(memory)
     root = tree.edit(draft, codec, None, items, ())
     keys = [b"%05d" % i for i in range(0, 3000, 17)]
     path_keys = {k for name in tree.paths(draft, root, keys) for k in codec.decode(draft.read(name))[0]}

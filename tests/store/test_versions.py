@@ -18,7 +18,7 @@ from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavai
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, Part, PartKey, Resources
-from app.model.templates import NO_TEMPLATES, Own, Templates
+from app.model.templates import NO_TEMPLATES, FormatTemplate, Templates
 from app.model.voxels import VoxelMap
 from app.store.changes import Changes, Delete, Drop, Put, Replace
 from app.store.store import Store
@@ -658,7 +658,9 @@ def test_a_chunk_that_is_used_again_is_kept(farm: Store):
 
 # --- templates ---
 
-OUTDOOR = Templates("outdoor", {"tmap2": Own(None, {"xy_goal_tolerance": 0.4}), "lif": Own("default")})
+OUTDOOR = Templates(
+    "outdoor", {"tmap2": FormatTemplate(None, {"xy_goal_tolerance": 0.4}), "lif": FormatTemplate("default")}
+)
 
 
 def say(store: Store, templates: Templates, env: str = "farm") -> Any:

@@ -74,10 +74,10 @@ def test_as_the_server_writes_it(tmp_path: Path) -> None:
     """A grid that the server has read and written, against the server's own cells."""
     np = pytest.importorskip("numpy", reason="the server's packages")
     from app.convert.files import offline
-    from app.upload_reader import Hints
+    from app.upload_reader import UploadHints
     from tests.api import samples
 
-    converted = offline(samples.grid(), "occupancy_grid", hints=Hints())
+    converted = offline(samples.grid(), "occupancy_grid", hints=UploadHints())
     for name, data in converted.files.items():
         (tmp_path / name).write_bytes(data)
     (path,) = tmp_path.glob("*.yaml")
