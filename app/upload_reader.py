@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from app import formats
 from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFile
-from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _content, _json, _shell, _xml, _yaml
+from app.formats import FileGroup, Files, Format, Limits, ReadContext, _archive, _content, _json, _shell, _xml, _yaml
 from app.model import network
 from app.model.features import Features, concatenate, from_columns, unique_ids
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum, Level
 from app.model.geodesy import local_frame
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import NETWORK, SITE, ZONES, Layer, Layers, Part, PartKey, Resources, is_empty, join_levels
 from app.model.names import did_you_mean
 
@@ -90,7 +90,7 @@ class ParsedPart:
 
     key: PartKey
     part: Part
-    group: Group
+    group: FileGroup
 
 
 @dataclass(slots=True)
@@ -120,7 +120,7 @@ class Bundle:
         """Licences and credits of a part: what its files say themselves, and the licence files of their folders."""
         part = self.parts[key]
         attribution = part.document.get("attribution", ()) if isinstance(part, Features) else ()
-        attribution = part.attribution if isinstance(part, Picture) else attribution
+        attribution = part.attribution if isinstance(part, GeoImage) else attribution
         texts = [text for text in attribution if isinstance(text, str)] if isinstance(attribution, list | tuple) else []
         texts += self.credits.get(key, ())
         names, _ = self.origin.get(key, ((), ""))
@@ -325,7 +325,7 @@ def _notice(name: str, data: bytes) -> str | None:
     return f"{', '.join([*title_lines, *filter(None, [holder])])} ({name})"
 
 
-def _group(files: Files, hints: UploadHints) -> tuple[list[Group], list[str]]:
+def _group(files: Files, hints: UploadHints) -> tuple[list[FileGroup], list[str]]:
     present = {name: data for name, data in files.items() if data}
     if not present:
         raise UnreadableFile("all files are empty", [Problem("the file is empty", name) for name in sorted(files)])
@@ -339,7 +339,9 @@ def _group(files: Files, hints: UploadHints) -> tuple[list[Group], list[str]]:
     return groups, sorted({*rest, *(files.keys() - present.keys())})
 
 
-def _completed(fmt: Format, groups: list[Group], rest: list[str], files: Files, main_name: str | None) -> Group | None:
+def _completed(
+    fmt: Format, groups: list[FileGroup], rest: list[str], files: Files, main_name: str | None
+) -> FileGroup | None:
     """The file that options of the upload make a map, where it says too little by itself: a picture and its place."""
     lone = {g.main for g in groups if g.format is fmt and fmt.lacking(g.main, g.files[g.main])}
     names = sorted(n for n in {*rest, *lone} if fmt.lacking(n, files[n]))
@@ -356,7 +358,7 @@ def _completed(fmt: Format, groups: list[Group], rest: list[str], files: Files, 
         return None
     main = names[0]
     others = [n for n in fmt.companions(main, files[main], sorted(files)) if n in files]
-    return Group(fmt, main, {n: files[n] for n in [main, *others]})
+    return FileGroup(fmt, main, {n: files[n] for n in [main, *others]})
 
 
 def _lacking(name: str, data: bytes) -> str:
@@ -382,7 +384,7 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
     return set(names)
 
 
-def _set_aside(groups: list[Group], bundle: Bundle) -> list[Group]:
+def _set_aside(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]:
     """Leave out what another file tells better, without reading it: ``X_autogen`` beside ``X``, a drawn network beside
     a real one in ``topological/``, a drawn fence beside a datum in ``location/``."""
     mains = {g.main: g for g in groups}
@@ -415,12 +417,12 @@ def _set_aside(groups: list[Group], bundle: Bundle) -> list[Group]:
     return out
 
 
-def _known_options(group: Group, hints: UploadHints) -> dict[str, str]:
+def _known_options(group: FileGroup, hints: UploadHints) -> dict[str, str]:
     names = {f.name for f in dataclasses.fields(group.format.read_options)}
     return {name: value for name, value in hints.options.items() if name in names}
 
 
-def _check_options(groups: list[Group], hints: UploadHints) -> None:
+def _check_options(groups: list[FileGroup], hints: UploadHints) -> None:
     """An option that no format of the upload knows is refused, not ignored."""
     option_names = {f.name for g in groups for f in dataclasses.fields(g.format.read_options)}
     for name in hints.options:
@@ -435,7 +437,7 @@ def _is_regions(name: str) -> bool:
 
 
 def _read_group(
-    group: Group, hints: UploadHints, upload_context: EnvironmentContext, limits: Limits, bundle: Bundle
+    group: FileGroup, hints: UploadHints, upload_context: EnvironmentContext, limits: Limits, bundle: Bundle
 ) -> list[ParsedPart]:
     folder = template_folder(group.main)
     layer = hints.layer

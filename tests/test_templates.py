@@ -7,7 +7,7 @@ import pytest
 from app import formats, parameters, templates
 from app.convert.files import offline
 from app.errors import Invalid
-from app.formats import Group, ReadContext
+from app.formats import FileGroup, ReadContext
 from app.model.features import Features
 from app.model.frame import Datum
 from app.model.layers import Layers
@@ -115,7 +115,7 @@ def test_no_text_breaks_out_of_a_file(name: str) -> None:
     hints, datum = UploadHints(layer="topology"), Datum(53.2686, -0.5245)
     converted = offline({"lanes.kml": LANE}, name, hints=hints, datum=datum, options=options)
     main = next(iter(converted.files))
-    back = formats.read(Group(fmt, main, converted.files), ReadContext(frame=Layers({}, datum).frame))
+    back = formats.read(FileGroup(fmt, main, converted.files), ReadContext(frame=Layers({}, datum).frame))
     content = str([(p.ids, p.properties, p.document) for p in back.parts.values() if isinstance(p, Features)])
     filled = {line["option"] for line in converted.report["template"] if line.get("option") in options}
     assert filled

@@ -30,7 +30,7 @@ from app.model.features import Features
 from app.model.frame import GROUND, MAX_METRES, Anchor
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture, displayed
+from app.model.imagery import GeoImage, displayed
 from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, PartKey
 from app.model.voxels import DEPTH, Box3, VoxelMap
 from app.model.voxels import cut as cut_voxels
@@ -140,7 +140,7 @@ def get_layer(
             raise Invalid(f"{layer} cannot be cut to a bbox", [Problem("not for this layer", where="bbox")])
         else:
             part = services.store.load(version, [key]).parts[key]
-            assert isinstance(part, Picture)
+            assert isinstance(part, GeoImage)
             response = _picture(key, part, accept)
     for header, value in headers.items():
         response.headers[header] = value
@@ -329,7 +329,7 @@ def _voxels(services: Services, version: Version, key: PartKey, box: Box | None,
     )
 
 
-def _picture(key: PartKey, picture: Picture, accept: str) -> Response:
+def _picture(key: PartKey, picture: GeoImage, accept: str) -> Response:
     kind = _choose(accept, "image/png", "application/json")
     height, width, bands = picture.pixels.shape
     if kind == "application/json":

@@ -23,14 +23,14 @@ def run(arguments: Sequence[str]) -> int:
         sys.stdout.write(f"fleetmap {__version__}\n")
         return 0
     from app.cli.commands import build, needed
-    from app.cli.problems import Refused, problem_of
+    from app.cli.problems import RequestFailed, problem_of
     from app.errors import FleetMapError
 
     try:
         build(needed(arguments))(list(arguments), prog_name="fleetmap", standalone_mode=True)
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else int(error.code is not None)
-    except (Refused, FleetMapError, ModuleNotFoundError, OSError) as error:
+    except (RequestFailed, FleetMapError, ModuleNotFoundError, OSError) as error:
         problem, hint = problem_of(error)
         if problem is None:
             raise

@@ -10,7 +10,7 @@ import typer
 from app.cli import completion, options, output
 from app.cli.client import Client, path_of
 from app.cli.groups import Commands
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 from app.model.names import did_you_mean
 
 commands = Commands("List channels, the versions they point to, and how their robots follow. `promote` moves one.")
@@ -70,7 +70,7 @@ def show(
     if row is None:
         names = [row["channel"] for row in rows]
         detail = f"{environment} has no channel {channel!r}{did_you_mean(channel, names)}; it has: {', '.join(names)}"
-        raise Refused({"title": "Not found", "detail": detail}, status=404)
+        raise RequestFailed({"title": "Not found", "detail": detail}, status=404)
     if as_json:
         output.show_json(row)
         return

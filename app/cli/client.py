@@ -19,8 +19,8 @@ from urllib.parse import quote, unquote, urljoin
 import httpx
 
 from app.cli import variables
-from app.cli.output import Bar, progress_bar, say
-from app.cli.problems import Refused
+from app.cli.output import ProgressBar, progress_bar, say
+from app.cli.problems import RequestFailed
 from app.events.credentials import trusting
 from app.model.names import did_you_mean
 
@@ -298,7 +298,7 @@ class Client:
         hint = _hint(answer, self.token)
         if answer.status_code == httpx.codes.NOT_FOUND and "no environment" in str(problem.get("detail")):
             hint = self._other_environments(answer.url)
-        raise Refused(problem, status=answer.status_code, hint=hint)
+        raise RequestFailed(problem, status=answer.status_code, hint=hint)
 
     def _other_environments(self, url: httpx.URL) -> str:
         """Return the environment that a mistyped one probably means; only those that the token may see."""
@@ -307,7 +307,7 @@ class Client:
         )
         near = ""
         if url.path != f"{API}/environments":
-            with suppress(Refused):
+            with suppress(RequestFailed):
                 near = did_you_mean(
                     environment, (row["name"] for row in self.pages("/environments", {}, limit=MAX_NAMES))
                 )
@@ -328,14 +328,16 @@ class Client:
             return answer.json()
         except ValueError as error:
             detail = f"{answer.url} does not answer as a Fleet Map Server: its answer is no JSON"
-            raise Refused({"title": "Not a Fleet Map Server", "detail": detail}, status=answer.status_code) from error
+            raise RequestFailed(
+                {"title": "Not a Fleet Map Server", "detail": detail}, status=answer.status_code
+            ) from error
 
     def _wait(self, answer: httpx.Response) -> dict[str, Any]:
         """Follow a job to its end with a bar; Refused with the job's problem where it fails."""
         location = answer.headers.get("Location")
         if answer.status_code != httpx.codes.ACCEPTED or not location:
             detail = f"unexpected answer {answer.status_code} of {answer.url}"
-            raise Refused({"title": "Unexpected answer", "detail": detail}, status=answer.status_code)
+            raise RequestFailed({"title": "Unexpected answer", "detail": detail}, status=answer.status_code)
         location, pause = urljoin(str(answer.url), location), POLL_SECONDS
         with progress_bar("waiting", total=1.0) as bar:
             while True:
@@ -350,7 +352,7 @@ class Client:
                         "title": f"The job was {job['state']}",
                         "detail": job.get("detail"),
                     }
-                    raise Refused(problem, status=problem.get("status"))
+                    raise RequestFailed(problem, status=problem.get("status"))
                 time.sleep(pause)
                 pause = min(MAX_POLL_SECONDS, pause * 1.5)
 
@@ -360,7 +362,7 @@ def path_of(*parts: Any) -> str:
     return "/" + "/".join(quote(str(part), safe="") for part in parts)
 
 
-def _multipart(files: Sequence[LocalFile], fields: Mapping[str, str], bar: Bar) -> dict[str, Any]:
+def _multipart(files: Sequence[LocalFile], fields: Mapping[str, str], bar: ProgressBar) -> dict[str, Any]:
     bar.update(completed=0)
     for file in files:
         file.on_read = bar.advance
@@ -399,10 +401,10 @@ def _seconds(retry_after: str, otherwise: float) -> float:
         return otherwise
 
 
-def _unreachable(server: str, error: httpx.TransportError) -> Refused:
+def _unreachable(server: str, error: httpx.TransportError) -> RequestFailed:
     detail = f"no answer from {server}: {error or type(error).__name__}"
     hint = "Is it running? Start it with `fleetmap serve`, or name another with --server or FLEETMAP_SERVER."
-    return Refused({"title": "Server unreachable", "detail": detail}, hint=hint)
+    return RequestFailed({"title": "Server unreachable", "detail": detail}, hint=hint)
 
 
 def _hint(answer: httpx.Response, token: str | None) -> str:

@@ -22,7 +22,7 @@ def with_companions(files: Sequence[LocalFile]) -> list[LocalFile]:
     for file in files:
         if "/" in file.name or file.path.name != file.name:  # of a folder, which is taken with all its files
             continue
-        beside = _Beside(file.path)
+        beside = _FilesBeside(file.path)
         # A picture says nothing of itself: what speaks for it is a file of its name (a world file, a YAML).
         same = [n for n in beside if "/" not in n and n != file.name and _stem(n) == _stem(file.name)]
         speaking = [n for n in same if file.name in _companions(n, beside)]
@@ -35,7 +35,7 @@ def _stem(name: str) -> str:
     return name.rpartition(".")[0].lower()
 
 
-def _companions(main: str, beside: _Beside) -> list[str]:
+def _companions(main: str, beside: _FilesBeside) -> list[str]:
     """The files that a map names, of those beside and below it; none if it is no map."""
     from app import formats
 
@@ -50,7 +50,7 @@ def _companions(main: str, beside: _Beside) -> list[str]:
     return [name for name in companion_names if name in beside and name != main]
 
 
-class _Beside(Mapping[str, bytes]):
+class _FilesBeside(Mapping[str, bytes]):
     """The files beside and below a map by name, read when they are needed."""
 
     def __init__(self, path: Path) -> None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from app.cli.client import MAX_NAMES, Client, path_of
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 from app.errors import FleetMapError, Invalid
 from app.model.frame import Datum
 
@@ -40,12 +40,14 @@ def ensured(
     datum_values = datum.as_dict() if datum else None
     try:
         environment = client.get(path_of("environments", name))
-    except Refused as refused:
+    except RequestFailed as refused:
         if refused.status != 404 or str(refused.problem.get("type")).endswith(":gone"):
             raise
         if dry_run:
             detail = f"there is no environment {name} yet, and a dry run does not create it"
-            raise Refused({"title": "No such environment", "detail": detail}, status=404, hint=refused.hint) from None
+            raise RequestFailed(
+                {"title": "No such environment", "detail": detail}, status=404, hint=refused.hint
+            ) from None
         _check_new(client, name, create, refused)
         new_environment = client.post("/environments", {"name": name, "title": title, "datum": datum_values})
         with _undone(
@@ -61,7 +63,7 @@ def ensured(
         yield False
 
 
-def _check_new(client: Client, name: str, create: bool | None, refused: Refused) -> None:
+def _check_new(client: Client, name: str, create: bool | None, refused: RequestFailed) -> None:
     """Raise Refused or Invalid unless an environment of this name may be created."""
     if create is False:
         raise refused
@@ -79,8 +81,8 @@ def _undone(undo: Any, failure: str) -> Iterator[None]:
     except BaseException as error:
         try:
             undo()
-        except (Refused, FleetMapError) as second:
-            if isinstance(error, Refused):
+        except (RequestFailed, FleetMapError) as second:
+            if isinstance(error, RequestFailed):
                 error.hint = f"{error.hint}\n{failure}: {second}".strip()
         raise
 

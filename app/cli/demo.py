@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from app.cli.client import Client, path_of
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 
 NAME = "orchard"
 TITLE = "Demo orchard"
@@ -31,7 +31,7 @@ def install(client: Client) -> dict[str, Any]:
     """
     try:
         client.post("/environments", {"name": NAME, "title": TITLE, "tags": ["demo"]})
-    except Refused as refused:
+    except RequestFailed as refused:
         if refused.status != 409:
             raise
     head = client.get(path_of("environments", NAME, "versions", "latest"))

@@ -13,7 +13,7 @@ import typer
 
 from app.cli import completion, options, output
 from app.cli.client import RETRY_SECONDS, Client
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 
 MAX_PAUSE_SECONDS = 30.0
 """Longest pause before a stream that ended is opened again."""
@@ -66,7 +66,7 @@ def _follow(client: Client, environment: str | None, last: int | None, *, as_jso
             for event in client.stream("/events", {"environment": environment, "since": last}):
                 _show(event, as_json=as_json)
                 last, pause = event["id"], RETRY_SECONDS
-        except Refused as refused:
+        except RequestFailed as refused:
             if refused.status is not None and refused.status < 500:
                 raise
             output.say(f"{refused}; trying again in {pause:g} s", style="yellow")

@@ -34,7 +34,7 @@ RESERVED = frozenset({"robots", "server"})
 
 
 @dataclass(frozen=True, slots=True)
-class Folder:
+class UploadFolder:
     """Files to upload. root: what the names are relative to. notes: what was left out, and why."""
 
     root: Path
@@ -43,7 +43,7 @@ class Folder:
     notes: tuple[str, ...]
 
 
-def collect(folder: Path) -> Folder:
+def collect(folder: Path) -> UploadFolder:
     """All files of a folder that belong to its environment, sorted by name.
 
     Of an environment_template only ``config`` and the scripts beside it are taken: the rest of the package is no map.
@@ -57,7 +57,7 @@ def collect(folder: Path) -> Folder:
         files += [_local(root / name, root) for name in SCRIPTS if (root / name).is_file()]
     if not files:
         raise Invalid(f"{folder} has no files to upload")
-    return Folder(root, tuple(sorted(files, key=lambda f: f.name)), template_paths is not None, tuple(notes))
+    return UploadFolder(root, tuple(sorted(files, key=lambda f: f.name)), template_paths is not None, tuple(notes))
 
 
 def environment_name(text: str) -> str:

@@ -163,7 +163,7 @@ def _write(
     local.require_server_python("generate --to")
     from app import formats, generate, parameters
     from app.convert.files import written
-    from app.derive import Notes
+    from app.derive import DerivationNotes
     from app.model.layers import Layers
     from app.store.values import Provenance
 
@@ -176,7 +176,7 @@ def _write(
     ours = {p["name"] for p in parameters.describe(generator.parameters)}
     _check_names(site, ours, to, values)
     generator_values = {n: v for n, v in values.items() if n in ours}
-    notes = Notes()
+    notes = DerivationNotes()
     with output.progress_bar(f"generating {site}"):
         layers = generate.run(site, seed, generator_values, Layers(datum=datum), notes)
         how = generate.step(site, seed, generator_values, {}, layers.datum if datum is None else None)

@@ -9,7 +9,7 @@ import typer
 from app.cli import options, output
 from app.cli.client import Client
 from app.cli.groups import Commands
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 from app.model.names import did_you_mean
 
 commands = Commands("List, show and rotate the keys that sign what robots fetch.")
@@ -54,7 +54,7 @@ def show(
     row = next((row for row in rows if key in (None, row["id"])), None)
     if row is None:
         near = did_you_mean(key or "", [row["id"] for row in rows])
-        raise Refused({"title": "Not found", "detail": f"the server has no key {key!r}{near}"}, status=404)
+        raise RequestFailed({"title": "Not found", "detail": f"the server has no key {key!r}{near}"}, status=404)
     output.show_json(row) if as_json else output.show(row["public_key"])
 
 

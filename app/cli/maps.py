@@ -18,7 +18,7 @@ from app.errors import Invalid, NotFound
 from app.model.frame import GROUND
 
 if TYPE_CHECKING:
-    from app.formats import Format, Needs
+    from app.formats import Format, LayerRequirements
 
 
 def import_maps(
@@ -322,7 +322,7 @@ def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
         show_parameters([p for p in described["options"] if p["for"] == use], title)
 
 
-def _needed(needs: Needs) -> str:
+def _needed(needs: LayerRequirements) -> str:
     """Format what a map needs: ``objects, or occupancy; and a datum``."""
     layers = ", or ".join(" with ".join(sorted(layers)) for layers in needs.one_of)
     datum = "a datum" if needs.datum else "a datum, if any content is in metres" if needs.anchor == "wgs84" else ""

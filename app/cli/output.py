@@ -175,7 +175,7 @@ def size(count: int) -> str:
     return f"{value:.1f} GB"
 
 
-class Bar:
+class ProgressBar:
     """One line of progress; it moves forward only where standard error is a terminal."""
 
     def __init__(self, progress: Progress | None, task: TaskID | None) -> None:
@@ -196,12 +196,12 @@ class Bar:
 
 
 @contextmanager
-def progress_bar(description: str, *, total: float | None = None, count_bytes: bool = False) -> Iterator[Bar]:
+def progress_bar(description: str, *, total: float | None = None, count_bytes: bool = False) -> Iterator[ProgressBar]:
     """A progress bar on standard error while the block runs; ``total=None`` shows that work goes on."""
     if not sys.stderr.isatty():
-        yield Bar(None, None)
+        yield ProgressBar(None, None)
         return
     columns = [SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn()]
     columns += [DownloadColumn()] if count_bytes else []
     with Progress(*columns, TimeElapsedColumn(), console=_console(stderr=True), transient=True) as progress:
-        yield Bar(progress, progress.add_task(plain(description), total=total))
+        yield ProgressBar(progress, progress.add_task(plain(description), total=total))

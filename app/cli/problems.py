@@ -8,7 +8,7 @@ from typing import Any
 from app.errors import FleetMapError
 
 
-class Refused(Exception):
+class RequestFailed(Exception):
     """The server's answer is a problem, or there is no answer. ``problem`` has RFC 9457's members."""
 
     def __init__(self, problem: Mapping[str, Any], *, status: int | None = None, hint: str = "") -> None:
@@ -36,7 +36,7 @@ def as_problem(error: FleetMapError) -> dict[str, Any]:
 
 def problem_of(error: Exception) -> tuple[dict[str, Any] | None, str]:
     """Return the problem of an error and a hint; None for an error that is not the user's to mend."""
-    if isinstance(error, Refused):
+    if isinstance(error, RequestFailed):
         kind = str(error.problem.get("type", "")).rpartition(":")[2]
         return error.problem, error.hint or HINTS.get(kind, "")
     if isinstance(error, FleetMapError):

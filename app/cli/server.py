@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 import typer
 
 from app.cli import local, options, output, variables
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 from app.errors import FleetMapError, NoRoom, Unavailable
 
 if TYPE_CHECKING:
@@ -384,7 +384,7 @@ def _bring_demo(address: str, token: str | None) -> None:
         wait_ready(address)
         with Client(address, token) as client:
             result = orchard.install(client)
-    except (FleetMapError, Refused, OSError) as error:
+    except (FleetMapError, RequestFailed, OSError) as error:
         output.say(f"the demo could not be installed: {error}", style="yellow")
         return
     output.show(f"demo environment: {result['environment']}, version {result['version']}")

@@ -12,7 +12,7 @@ import typer
 
 from app.cli import local, options, output
 from app.cli.client import Client
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 from app.errors import FleetMapError, Invalid
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ class ServerDonor:
         try:
             with self._client.download(f"/stored/{kind}/{sha256}") as download:
                 return download.path.read_bytes()
-        except Refused as refused:
+        except RequestFailed as refused:
             if refused.problem.get("status") == 404:
                 return None
             raise

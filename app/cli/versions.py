@@ -11,7 +11,7 @@ import typer
 from app.cli import completion, local, options, output
 from app.cli.client import Client, path_of
 from app.cli.environments import list_environments
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 
 
 def versions(
@@ -296,7 +296,7 @@ def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
             with Client(server, token) as client:
                 rows: list[dict[str, Any]] = client.get("/derivations")
                 return rows
-        except Refused as refused:
+        except RequestFailed as refused:
             if refused.status is not None:
                 raise
             why = str(refused)

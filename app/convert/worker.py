@@ -18,7 +18,7 @@ from app.convert.recipe import ChainFailure, DerivationChain, Spread
 from app.derive import Step
 from app.derive._crossings import crossings
 from app.errors import CannotConvert, CannotDerive, FleetMapError, MissingLayer, Problem
-from app.formats import UNTITLED, Format, Inner, WriteContext, _archive
+from app.formats import UNTITLED, Format, NestedMap, WriteContext, _archive
 from app.model.closures import Closures
 from app.model.features import Features
 from app.model.frame import GROUND
@@ -127,7 +127,7 @@ def write(
     spread: write every part that is derived. around: further layers, in which edges may meet obstacles. title: the
     environment's name, for formats with a place for one.
     """
-    notes = derive.Notes()
+    notes = derive.DerivationNotes()
     options = recipes.own_options(fmt, values)
     if entries is None:  # of files; what is stored was loaded without them
         layers = applied_closures.without_timed_marks(layers)
@@ -161,7 +161,7 @@ class _Source:
 
 
 def _written_each(
-    fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.Notes, spread: Spread
+    fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.DerivationNotes, spread: Spread
 ) -> WrittenMap:
     """One map of every part that was derived, each written as it would be by itself."""
     parts = fmt.parts
@@ -196,7 +196,9 @@ def empty_report(fmt: Format) -> dict[str, Any]:
     return {"format": fmt.name, **empty}
 
 
-def _written(fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.Notes) -> WrittenMap:
+def _written(
+    fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.DerivationNotes
+) -> WrittenMap:
     """One map of what was derived and what was there."""
     layers, chain, entries, origin = source.layers, source.way, source.entries, source.origin
     credit, closures = source.credit, source.closures
@@ -375,7 +377,7 @@ def _inner(
     layers: Layers,
     values: Mapping[str, Any],
     derived: bool,
-) -> Inner:
+) -> NestedMap:
     """What ``WriteContext.make`` does; layers that were derived on the way are noted in ``derivations``."""
     fmt = formats.get_format(name)
     option_values = {**resolve(source.templates, fmt).values, **values}
@@ -394,7 +396,7 @@ def _inner(
     report = written_map.report
     derivations += [line for line in report["layers"] if line["information"] == "derived"]
     closed.append(report["closures"])
-    return Inner(
+    return NestedMap(
         written_map.files,
         tuple(report["layers"]),
         tuple(report["dropped"]),

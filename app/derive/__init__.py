@@ -26,7 +26,7 @@ from app.model.voxels import VoxelMap
 
 
 @dataclass(slots=True)
-class Notes:
+class DerivationNotes:
     """Where a step says what was doubtful, what it left out, and what it made up (it goes into the map's report)."""
 
     warnings: list[Problem] = field(default_factory=list)
@@ -48,7 +48,7 @@ class Notes:
         self.template.append({"what": subject, "value": value, "why": why, **option_entry})
 
 
-Function = Callable[[Layers, Any, Notes], Layers]
+Function = Callable[[Layers, Any, DerivationNotes], Layers]
 """(stored and derived layers, parameters, notes) -> the new parts. Pure but for the notes."""
 
 Trial = Callable[[Layers, Any], None]
@@ -217,9 +217,9 @@ def _says_nothing(part: Part) -> bool:
     return isinstance(part, Features | VoxelMap) and not len(part)
 
 
-def run(steps: Iterable[Step], layers: Layers, notes: Notes | None = None) -> Layers:
+def run(steps: Iterable[Step], layers: Layers, notes: DerivationNotes | None = None) -> Layers:
     """Carry out a plan: the layers with what each step adds. CannotDerive names the step that found nothing to use."""
-    notes = notes or Notes()
+    notes = notes or DerivationNotes()
     for step in steps:
         derivation = all_derivations()[step.name]
         with _blaming(step):

@@ -64,7 +64,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class MaskShapes:
     """What a mask shows. areas: polygons (shapely), in cells. specks: how many figures were too small."""
 
     discs: list[Disc]
@@ -75,7 +75,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True)
-class Sizes:
+class ShapeLimits:
     """How large figures are, in cells. speck: the least. disc: the widest round one. box: the longest rectangle.
     wall: the widest wall. small: up to this length all counts as round. tolerance: how far straight edges may be from
     the cells."""
@@ -88,7 +88,7 @@ class Sizes:
     tolerance: float
 
 
-def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: Sizes) -> Found:
+def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits) -> MaskShapes:
     """All figures of a mask, in order of their rows and columns.
 
     free: bool [height, width], which cells are known to be free; what closes around such a cell is no solid figure but
@@ -99,7 +99,7 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: Sizes) -> F
     if pieces(mask) > PIECES:
         raise CannotConvert(f"this is noise: it has more than {PIECES} pieces and holes")
     contours, tree = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    shapes = Found([], [], [], [], 0)
+    shapes = MaskShapes([], [], [], [], 0)
     specks = 0
     rest = np.zeros(mask.shape, np.uint8)
     links = np.empty((0, 4), np.int64) if tree is None else np.asarray(tree[0], np.int64)
@@ -131,7 +131,7 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: Sizes) -> F
             cv2.drawContours(rest, [contours[k], *(contours[c] for c in inner)], -1, 1, cv2.FILLED)
     if rest.any():
         _others(rest & mask, sizes, shapes)
-    return Found(shapes.discs, shapes.boxes, shapes.walls, shapes.areas, specks)
+    return MaskShapes(shapes.discs, shapes.boxes, shapes.walls, shapes.areas, specks)
 
 
 def _holds(contour: Any, free: NDArray[np.bool_]) -> bool:
@@ -187,7 +187,7 @@ def _rectangle(contour: Any) -> tuple[Box, float, tuple[float, float]]:
     return box, cells / (box.length * box.width), (w, h)
 
 
-def _disc(points: NDArray[Any], sides: tuple[float, float], sizes: Sizes) -> Disc | None:
+def _disc(points: NDArray[Any], sides: tuple[float, float], sizes: ShapeLimits) -> Disc | None:
     """A round figure, or None. sides: of the rectangle around it, between the middles of cells."""
     import cv2
 
@@ -207,7 +207,7 @@ def _disc(points: NDArray[Any], sides: tuple[float, float], sizes: Sizes) -> Dis
     return Disc(x + 0.5, y + 0.5, math.sqrt(area / math.pi) if round_ else radius)
 
 
-def _others(rest: NDArray[np.uint8], sizes: Sizes, shapes: Found) -> None:
+def _others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShapes) -> None:
     """Figures that are neither: their thin parts are walls, the others rectangles or areas."""
     from app.derive import _skeleton
 
@@ -248,7 +248,7 @@ def _opened(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
     return np.asarray(mask & (1 - far), np.uint8)
 
 
-def _areas(thick: NDArray[np.uint8], sizes: Sizes, mask_shapes: Found, at: NDArray[np.float64]) -> list[Any]:
+def _areas(thick: NDArray[np.uint8], sizes: ShapeLimits, mask_shapes: MaskShapes, at: NDArray[np.float64]) -> list[Any]:
     """Rectangles among the thick figures go to the boxes; the others' outlines, in order of their rows."""
     import cv2
     import shapely

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from app.derive import Notes, _onnx, _pixels, _sam, _yolo
-from app.derive._pictures import Ground
+from app.derive import DerivationNotes, _onnx, _pixels, _sam, _yolo
+from app.derive._pictures import GroundImage
 from app.derive._segments import Segmentation, Segments
 from app.errors import CannotConvert, Invalid, Problem
 
 
-def segments(ground: Ground, how: Segmentation, notes: Notes, name: str) -> Segments:
+def segments(ground: GroundImage, how: Segmentation, notes: DerivationNotes, name: str) -> Segments:
     """What the model ``how.model`` finds in a picture.
 
     Two files are of the Segment-Anything family; one file that gives a table of boxes is of the YOLO family; one that

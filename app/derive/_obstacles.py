@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, _raster
+from app.derive import DerivationNotes, _raster
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer, NotFound, Problem, TooLarge
 from app.model import obstacles, solids, worlds
 from app.model.features import NO_GEOMETRY, Features, Properties
@@ -37,7 +37,7 @@ IN_NO_WAY = "nothing in a robot's way"
 
 
 @dataclass(slots=True)
-class Site:
+class LevelObstacles:
     """What stands on a level, in metres of the local frame.
 
     footprints: areas, lines or points (shapely); base and top: of each, metres above the level's floor (infinite where
@@ -60,7 +60,7 @@ class Site:
         """How many obstacles there are."""
         return len(self.footprints) + len(np.unique(self.owner))
 
-    def cut(self, low: float, high: float) -> Site:
+    def cut(self, low: float, high: float) -> LevelObstacles:
         """What of it stands between two heights above the floor, or where they are equal at that height."""
         meets = (self.triangles[:, :, 2].min(axis=1) <= high) & (self.triangles[:, :, 2].max(axis=1) >= low)
         # A solid around the band without a surface in it still fills it.
@@ -87,14 +87,14 @@ class Site:
         np.maximum.at(highest, index, self.triangles[:, :, 2].max(axis=1))
         return np.asarray(((lowest <= height) & (highest > height))[index])
 
-    def draw(self, cells: NDArray[np.uint8], frame: _raster.Frame, low: float, high: float) -> None:
+    def draw(self, cells: NDArray[np.uint8], frame: _raster.RasterFrame, low: float, high: float) -> None:
         """Occupy every cell that is touched between two heights by what ``cut`` has given for them."""
         slab = np.array([[low, high]])
         _raster.paint(cells, _raster.surfaces(self.triangles, frame, slab), OCCUPIED)
         _raster.paint(cells, _raster.insides(self.triangles, self.owner, frame, slab[:, 0]), OCCUPIED)
         _raster.paint(cells, _raster.areas(self.footprints, frame, touched=True), OCCUPIED)
 
-    def draw_unknown(self, cells: NDArray[np.uint8], frame: _raster.Frame) -> None:
+    def draw_unknown(self, cells: NDArray[np.uint8], frame: _raster.RasterFrame) -> None:
         """Make the ground of ``unknown`` unknown where it is not occupied."""
         if self.unknown:
             solid = cells == OCCUPIED
@@ -116,21 +116,21 @@ class Site:
 
 def sites(
     layers: Layers,
-    notes: Notes,
+    notes: DerivationNotes,
     *,
     doors_closed: bool = False,
     visuals: bool = False,
     world: str | None = None,
     surroundings: float = SURROUNDINGS,
     unknown_radius: float = UNKNOWN_RADIUS_METRES,
-) -> dict[str, Site]:
+) -> dict[str, LevelObstacles]:
     """The sites of all levels that have objects; of several worlds one (``app.model.worlds``).
 
     surroundings: metres around a solid that cannot be read. unknown_radius: metres around an object of unknown extent.
     Raises MissingDatum where objects are places on earth without one, Invalid where there is no such world.
     """
     solid_reader = solids.Solids(layers.resources(), visuals=visuals)
-    out: dict[str, Site] = {}
+    out: dict[str, LevelObstacles] = {}
     reader = _Reader(layers, notes, solid_reader, doors_closed, surroundings, unknown_radius)
     parts = {key: part for key, part in layers.vector("objects").items() if len(part)}
     if world is not None and not any(worlds.names(part) for part in parts.values()):
@@ -143,12 +143,12 @@ def sites(
         if others:
             notes.warn(f"one world is looked at; ask for another one with world=: {', '.join(others)}")
         if len(one):
-            reader.read(one, out.setdefault(key.level, Site()), key.level)
+            reader.read(one, out.setdefault(key.level, LevelObstacles()), key.level)
     reader.report()
     return {level: reader.finished(site, level) for level, site in out.items()}
 
 
-def fences(layers: Layers, notes: Notes) -> dict[str, Any]:
+def fences(layers: Layers, notes: DerivationNotes) -> dict[str, Any]:
     """The polygons of the location layer by level, joined, in metres (shapely)."""
     out: dict[str, Any] = {}
     for key, part in layers.vector("location").items():
@@ -186,7 +186,7 @@ class _Reader:
     def __init__(
         self,
         layers: Layers,
-        notes: Notes,
+        notes: DerivationNotes,
         solid_reader: solids.Solids,
         doors_closed: bool,
         surroundings: float,
@@ -205,7 +205,7 @@ class _Reader:
         self.bodiless = 0
         self.triangles = 0
 
-    def read(self, part: Features, site: Site, level: str) -> None:
+    def read(self, part: Features, site: LevelObstacles, level: str) -> None:
         """Sort a part's objects into a site."""
         rows: list[int] = []
         for k, p in enumerate(part.properties):
@@ -240,7 +240,7 @@ class _Reader:
                 self.broken += 1
                 self._around(part, k, geometry, error.detail, site)
 
-    def _outline(self, part: Features, k: int, geometry: Any, site: Site, level: str) -> None:
+    def _outline(self, part: Features, k: int, geometry: Any, site: LevelObstacles, level: str) -> None:
         """An object by its geometry in metres: a body, or ground that is free."""
         p = part.properties[k]
         role = obstacles.role_of(p, doors_closed=self.doors_closed)
@@ -268,13 +268,13 @@ class _Reader:
             self.bodiless += 1
             self._around(part, k, geometry, NO_AREA, site)
 
-    def _around(self, part: Features, k: int, geometry: Any, reason: str, site: Site) -> None:
+    def _around(self, part: Features, k: int, geometry: Any, reason: str, site: LevelObstacles) -> None:
         """The ground of an object of unknown extent. geometry: what there is of it, in metres."""
         p = part.properties[k]
         if p.get("kind") != "floor":  # a floor is free only where it is known
             self._unknown(part, k, obstacles.surroundings_of(p, geometry, self.unknown_radius), reason, site)
 
-    def _unknown(self, part: Features, k: int, ground: Any, reason: str, site: Site) -> None:
+    def _unknown(self, part: Features, k: int, ground: Any, reason: str, site: LevelObstacles) -> None:
         if ground is None or ground.is_empty:
             self.nowhere.append(_name(part, k))
             return
@@ -287,7 +287,7 @@ class _Reader:
             return geometry
         return frame.geometries_to_local(np.array([geometry], object))[0]
 
-    def _solids(self, part: Features, k: int, site: Site, level: str) -> None:
+    def _solids(self, part: Features, k: int, site: LevelObstacles, level: str) -> None:
         p = part.properties[k]
         try:
             triangles, unreadable = self.known.read(p)
@@ -317,7 +317,7 @@ class _Reader:
         ground = obstacles.surroundings_of(part.properties[k], geometry, self.surroundings)
         return shapely.Point(0, 0).buffer(self.surroundings) if ground is None else ground
 
-    def _surround(self, name: str, p: Properties, ground: Any, reasons: Iterable[str], site: Site) -> None:
+    def _surround(self, name: str, p: Properties, ground: Any, reasons: Iterable[str], site: LevelObstacles) -> None:
         """The ground around solids of unknown extent, and what of the object is seen or said to be there."""
         around = [ground]
         shapes = p.get("shapes")
@@ -332,7 +332,7 @@ class _Reader:
             if reason not in site.unreadable:
                 site.unreadable.append(reason)
 
-    def finished(self, site: Site, level: str) -> Site:  # noqa: ARG002
+    def finished(self, site: LevelObstacles, level: str) -> LevelObstacles:  # noqa: ARG002
         """The site with its solids' triangles."""
         pieces = self.found.get(id(site), [])
         if pieces:

@@ -49,7 +49,7 @@ Shape = list[int | str | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Supplied:
+class ModelFiles:
     """A model of the operator's. files: the model, or its encoder and its decoder."""
 
     name: str
@@ -62,7 +62,7 @@ class Supplied:
 
 
 @dataclass(frozen=True, slots=True)
-class Loaded:
+class LoadedModel:
     """One loaded file. inputs and outputs: (type, shape) by name, in the file's order; free sizes are texts or None."""
 
     session: Any
@@ -89,7 +89,7 @@ class Loaded:
         return f"({describe(self.inputs)}) → ({describe(self.outputs)})"[:600]
 
 
-def supplied(name: str) -> Supplied:
+def supplied(name: str) -> ModelFiles:
     """The operator's model of that name. CannotConvert or NotFound say what to supply, TooLarge what is too much."""
     folder = os.environ.get(FOLDER, "")
     if not folder:
@@ -109,7 +109,7 @@ def supplied(name: str) -> Supplied:
         raise TooLarge(
             f"the files of the model {name} are larger than {max_bytes} bytes: the operator may set {LARGEST}"
         )
-    return Supplied(name, files)
+    return ModelFiles(name, files)
 
 
 def _known(folder: Path) -> dict[str, tuple[Path, ...]]:
@@ -124,7 +124,7 @@ def _known(folder: Path) -> dict[str, tuple[Path, ...]]:
     return dict(sorted({**{stem: (f,) for stem, f in files.items() if f not in taken}, **pairs}.items()))
 
 
-def loaded(file: Path, name: str) -> Loaded:
+def loaded(file: Path, name: str) -> LoadedModel:
     """A file's session on one thread, so that sums are made in one order: the same picture, the same map."""
     try:
         runtime = importlib.import_module("onnxruntime")
@@ -140,10 +140,10 @@ def loaded(file: Path, name: str) -> Loaded:
     inputs, outputs = (
         {v.name: (v.type, list(v.shape)) for v in values} for values in (session.get_inputs(), session.get_outputs())
     )
-    return Loaded(session, name, inputs, outputs)
+    return LoadedModel(session, name, inputs, outputs)
 
 
-def classes(model: Supplied, session: Any) -> tuple[tuple[str | None, ...], Mapping[str, Any]]:
+def classes(model: ModelFiles, session: Any) -> tuple[tuple[str | None, ...], Mapping[str, Any]]:
     """(the kind that each class becomes, or None; what else its file says).
 
     The file is a list of kinds, or a mapping with the list as ``classes``; without a file the names in the model's own
@@ -174,7 +174,7 @@ def classes(model: Supplied, session: Any) -> tuple[tuple[str | None, ...], Mapp
     return kinds, more
 
 
-def one_picture(model: Supplied, file: Loaded, reason: str, usual: int) -> int:
+def one_picture(model: ModelFiles, file: LoadedModel, reason: str, usual: int) -> int:
     """The side of the one picture [1, 3, h, w] that a model takes. told: of a model that takes something else, for the
     error. CannotConvert says what it should take."""
     (kind, shape), *more = file.inputs.values()

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from app.derive import Notes, _model, _plans
-from app.derive._pictures import Ground, infrared
+from app.derive import DerivationNotes, _model, _plans
+from app.derive._pictures import GroundImage, infrared
 from app.derive._segments import OWN, Segmentation, Segments, segments
 from app.errors import Invalid, Problem
 from app.model.geodesy import LocalFrame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import LOCAL, Picture, displayed
+from app.model.imagery import LOCAL, GeoImage, displayed
 from app.model.resampling import resampled
 
 THUMB = 2**20
 """Pixels by which it is told whether a picture is a plan."""
 
 
-def method_of(picture: Picture, how: Segmentation) -> str:
+def method_of(picture: GeoImage, how: Segmentation) -> str:
     """The method, found out where it is ``auto``. Invalid for parameters that belong to another one."""
     method: str = how.segmentation
     if method == "auto":
         step = max(1, round((picture.pixels.shape[0] * picture.pixels.shape[1] / THUMB) ** 0.5))
-        few = Picture(picture.pixels[::step, ::step].copy(), picture.transform, picture.crs, picture.properties)
+        few = GeoImage(picture.pixels[::step, ::step].copy(), picture.transform, picture.crs, picture.properties)
         shown = displayed(few)
         bands = shown.shape[2]
         valid = shown[..., -1] >= 128 if bands in (2, 4) else shown[..., 0] >= 0
@@ -37,7 +37,9 @@ def method_of(picture: Picture, how: Segmentation) -> str:
     return method
 
 
-def seen(on: Ground, picture: Picture, how: Segmentation, method: str, notes: Notes, name: str) -> Segments:
+def seen(
+    on: GroundImage, picture: GeoImage, how: Segmentation, method: str, notes: DerivationNotes, name: str
+) -> Segments:
     """A picture told apart."""
     if method == "model":
         if not how.model:
@@ -47,8 +49,12 @@ def seen(on: Ground, picture: Picture, how: Segmentation, method: str, notes: No
     return segments(on, how, method, nir, notes, name)
 
 
-def plan_of(picture: Picture, frame: LocalFrame | None, how: Segmentation, notes: Notes, name: str) -> OccupancyGrid:
+def plan_of(
+    picture: GeoImage, frame: LocalFrame | None, how: Segmentation, notes: DerivationNotes, name: str
+) -> OccupancyGrid:
     """A plan as a grid."""
     upright = picture if picture.crs == LOCAL else resampled(picture, frame, crs=LOCAL)
     speck = 0.05 if how.minimum_area is None else how.minimum_area
-    return _plans.grid_of(upright, _plans.Plan(how.gap, speck, how.resolution, how.outside_free), notes, name)
+    return _plans.grid_of(
+        upright, _plans.FloorPlanOptions(how.gap, speck, how.resolution, how.outside_free), notes, name
+    )

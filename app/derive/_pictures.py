@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive._select import named, one_each
 from app.errors import CannotConvert, Invalid
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
-from app.model.imagery import CLEAR, LOCAL, Picture, displayed
+from app.model.imagery import CLEAR, LOCAL, GeoImage, displayed
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resampled
 
@@ -37,7 +37,7 @@ INFRARED = ("nir", "near infrared", "near-infrared", "near_infrared", "infrared"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ground:
+class GroundImage:
     """A picture on a grid of the local frame, row 0 on top, north up.
 
     rgb: uint8 [h, w, 3]. known: bool [h, w], where there is a picture. resolution: metres a pixel. left, top: metres of
@@ -61,9 +61,9 @@ class Ground:
         return (self.resolution, 0.0, self.left, 0.0, -self.resolution, self.top)
 
 
-def chosen(layers: Layers, name: str | None) -> dict[PartKey, Picture]:
+def chosen(layers: Layers, name: str | None) -> dict[PartKey, GeoImage]:
     """One picture for each level: the named one, else ``satellite``, else the only one. NotFound, or Ambiguous."""
-    pictures = {key: part for key, part in layers.of("imagery").items() if isinstance(part, Picture)}
+    pictures = {key: part for key, part in layers.of("imagery").items() if isinstance(part, GeoImage)}
     if name is not None:
         return named(pictures, name, "picture")
     return one_each(pictures, SATELLITE, "picture", "picture")
@@ -74,7 +74,9 @@ def called(key: PartKey) -> str:
     return f"the picture {key.name!r} of level {key.level!r}"
 
 
-def ground(picture: Picture, frame: LocalFrame | None, resolution: float | None, notes: Notes, name: str) -> Ground:
+def ground(
+    picture: GeoImage, frame: LocalFrame | None, resolution: float | None, notes: DerivationNotes, name: str
+) -> GroundImage:
     """A picture as the local frame sees it. frame: None uses a passing one at a picture's own place on earth.
 
     Raises CannotConvert where it would be too large, Invalid where PROJ knows no way.
@@ -107,10 +109,10 @@ def ground(picture: Picture, frame: LocalFrame | None, resolution: float | None,
     if not valid.any():
         raise CannotConvert(f"{name} shows nothing: all of it is transparent or without data")
     _, _, left, _, _, top = seen.transform
-    return Ground(rgb, valid, seen.transform[0], left, top, seen.pixels, frame, grey, on_earth)
+    return GroundImage(rgb, valid, seen.transform[0], left, top, seen.pixels, frame, grey, on_earth)
 
 
-def infrared(picture: Picture, number: int | None, name: str) -> int | None:
+def infrared(picture: GeoImage, number: int | None, name: str) -> int | None:
     """The place of the near-infrared band: the told one (counted from 1), else the one that says so."""
     count = picture.pixels.shape[2]
     if number is not None:
@@ -128,7 +130,7 @@ def infrared(picture: Picture, number: int | None, name: str) -> int | None:
     return None
 
 
-def _middle(picture: Picture) -> Datum:
+def _middle(picture: GeoImage) -> Datum:
     """The middle of a picture on earth."""
     outline = picture.outline()
     lonlat = crs_to_wgs84(picture.crs, np.column_stack([outline, np.zeros(len(outline))]))[:, :2].mean(axis=0)
@@ -137,7 +139,7 @@ def _middle(picture: Picture) -> Datum:
     return Datum(round(float(lonlat[1]), 9), round(float(lonlat[0]), 9))
 
 
-def _native(picture: Picture, frame: LocalFrame | None) -> float:
+def _native(picture: GeoImage, frame: LocalFrame | None) -> float:
     """Metres a pixel of the picture itself, in its middle."""
     if picture.crs == LOCAL or frame is None:
         a, b, _, d, e, _ = picture.transform
@@ -154,6 +156,6 @@ def _native(picture: Picture, frame: LocalFrame | None) -> float:
     return size
 
 
-def _count(picture: Picture, size: float, resolution: float) -> float:
+def _count(picture: GeoImage, size: float, resolution: float) -> float:
     height, width = picture.pixels.shape[:2]
     return float(float(height) * width * (size / resolution) ** 2)

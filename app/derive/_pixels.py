@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
-from app.derive._onnx import Array, Loaded, Supplied, classes, one_picture, starts
-from app.derive._pictures import Ground
+from app.derive import DerivationNotes
+from app.derive._onnx import Array, LoadedModel, ModelFiles, classes, one_picture, starts
+from app.derive._pictures import GroundImage
 from app.derive._segments import Region, Segments, way
 from app.errors import CannotConvert
 
@@ -37,7 +37,7 @@ MOST = 100_000
 class Model:
     """A loaded model. classes: the kind that each class becomes, or None. side: pixels of a tile."""
 
-    file: Loaded
+    file: LoadedModel
     name: str
     classes: tuple[str | None, ...]
     side: int
@@ -45,7 +45,7 @@ class Model:
     deviation: Array
 
 
-def model_of(supplied: Supplied, file: Loaded) -> Model:
+def model_of(supplied: ModelFiles, file: LoadedModel) -> Model:
     """A loaded file as a model that tells pixels. CannotConvert says what it should take."""
     side = one_picture(supplied, file, "tells no pixels", SIDE)
     kinds, metadata = classes(supplied, file.session)
@@ -55,7 +55,7 @@ def model_of(supplied: Supplied, file: Loaded) -> Model:
     return Model(file, supplied.name, kinds, side, mean, deviation)
 
 
-def _three(metadata: Mapping[str, Any], word: str, usual: tuple[float, ...], supplied: Supplied) -> Array:
+def _three(metadata: Mapping[str, Any], word: str, usual: tuple[float, ...], supplied: ModelFiles) -> Array:
     try:
         values = np.array([float(v) for v in metadata.get(word, usual)], np.float32)
     except (TypeError, ValueError):
@@ -65,7 +65,9 @@ def _three(metadata: Mapping[str, Any], word: str, usual: tuple[float, ...], sup
     return values
 
 
-def segments(ground: Ground, model: Model, sure: float, min_area: float, notes: Notes, name: str) -> Segments:
+def segments(
+    ground: GroundImage, model: Model, sure: float, min_area: float, notes: DerivationNotes, name: str
+) -> Segments:
     """What a model tells of each pixel. least: square metres."""
     import cv2
 

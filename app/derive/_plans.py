@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
-from app.derive._raster import Frame, limited
+from app.derive import DerivationNotes
+from app.derive._raster import RasterFrame, limited
 from app.errors import CannotConvert
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.imagery import Picture, displayed, placed
+from app.model.imagery import GeoImage, displayed, placed
 
 RESOLUTION = 0.05
 """Metres a cell unless asked otherwise or the picture is coarser."""
@@ -44,7 +44,7 @@ PAPER = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class FloorPlanOptions:
     """What a plan is made with. gap, speck: metres and square metres. outside: whether that is free."""
 
     gap: float
@@ -68,7 +68,7 @@ def looks_like(rgb: NDArray[np.uint8], valid: NDArray[np.bool_]) -> bool:
     return bool(around[180:].max() >= PAPER * len(grey)) and bool((grey < 128).any())
 
 
-def grey_of(picture: Picture) -> NDArray[np.uint8]:
+def grey_of(picture: GeoImage) -> NDArray[np.uint8]:
     """The picture in grey on white paper: uint8 [h, w]."""
     shown = displayed(picture)
     rgb = shown[..., :3] if shown.shape[2] >= 3 else shown[..., :1]
@@ -85,7 +85,7 @@ def _luma(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def grid_of(picture: Picture, how: Plan, notes: Notes, name: str) -> OccupancyGrid:
+def grid_of(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNotes, name: str) -> OccupancyGrid:
     """A plan in the local frame as a grid: ink occupied, rooms free, else unknown. Its origin is a multiple of a cell.
 
     Raises CannotConvert for a picture without ink or without a closed room.
@@ -109,7 +109,7 @@ def grid_of(picture: Picture, how: Plan, notes: Notes, name: str) -> OccupancyGr
         raise CannotConvert(f"{name} reaches beyond the local frame")
     low, high = corners.min(axis=0), corners.max(axis=0)
     frame = limited(
-        Frame.around((float(low[0]), float(low[1]), float(high[0]), float(high[1])), resolution), MOST, LONGEST
+        RasterFrame.around((float(low[0]), float(low[1]), float(high[0]), float(high[1])), resolution), MOST, LONGEST
     )
     walls = _walls(ink, picture, frame, size)
     paper, shaded = _looked_up(~unknown, picture, frame)
@@ -140,7 +140,7 @@ def grid_of(picture: Picture, how: Plan, notes: Notes, name: str) -> OccupancyGr
     return OccupancyGrid(cells, resolution, (*frame.origin, 0.0))
 
 
-def _shades(grey: NDArray[np.uint8], level: int, notes: Notes, name: str) -> NDArray[np.bool_]:
+def _shades(grey: NDArray[np.uint8], level: int, notes: DerivationNotes, name: str) -> NDArray[np.bool_]:
     """Pixels of even shades between ink and paper."""
     counts = np.bincount(grey.ravel(), minlength=256)
     paper = int(np.argmax(counts[level + 1 :])) + level + 1
@@ -156,7 +156,7 @@ def _shades(grey: NDArray[np.uint8], level: int, notes: Notes, name: str) -> NDA
     return np.asarray(np.isin(grey, shades))
 
 
-def _walls(ink: NDArray[np.bool_], picture: Picture, frame: Frame, size: float) -> NDArray[np.uint8]:
+def _walls(ink: NDArray[np.bool_], picture: GeoImage, frame: RasterFrame, size: float) -> NDArray[np.uint8]:
     """Cells with ink, uint8 [rows, columns], row 0 lowest: every pixel of ink marks the cell of its middle, and every
     cell whose middle is ink is marked, so that no line is lost whichever of the two is finer."""
     walls = np.zeros((frame.height, frame.width), np.uint8)
@@ -173,7 +173,7 @@ def _walls(ink: NDArray[np.bool_], picture: Picture, frame: Frame, size: float) 
 
 
 def _looked_up(
-    bright: NDArray[np.bool_], picture: Picture, frame: Frame
+    bright: NDArray[np.bool_], picture: GeoImage, frame: RasterFrame
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(cells whose middle is in the picture, those of them where it is not bright)."""
     a, b, c, d, e, f = picture.transform

@@ -37,7 +37,7 @@ NONE: Spans = np.empty((0, 4), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class RasterFrame:
     """Where a grid lies: origin (x, y) of its lower left corner in metres, metres a cell, cells along x and y."""
 
     origin: tuple[float, float]
@@ -46,7 +46,7 @@ class Frame:
     height: int
 
     @classmethod
-    def around(cls, box: tuple[float, float, float, float], resolution: float) -> Frame:
+    def around(cls, box: tuple[float, float, float, float], resolution: float) -> RasterFrame:
         """The grid of whole cells around a box (min x, min y, max x, max y), its origin a multiple of a cell."""
         first = [math.floor(v / resolution + 1e-6) for v in box[:2]]
         end = [math.ceil(v / resolution - 1e-6) for v in box[2:]]
@@ -66,7 +66,7 @@ class Frame:
 # --- surfaces --------------------------------------------------------------------------------------------------------
 
 
-def surfaces(triangles: Array, frame: Frame, slabs: Array) -> Iterator[Spans]:
+def surfaces(triangles: Array, frame: RasterFrame, slabs: Array) -> Iterator[Spans]:
     """The cells that triangles (float64 [n, 3, 3], metres) touch between the heights of each slab.
 
     slabs: float64 [k, 2], low and high in metres, ascending and one after another, or one of any thickness; its number
@@ -126,7 +126,7 @@ def _clipped(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np
     return np.concatenate(parts), np.concatenate(owners)
 
 
-def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], frame: Frame) -> Iterator[Spans]:
+def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], frame: RasterFrame) -> Iterator[Spans]:
     """The cells that convex pieces touch, a span for each row: between the leftmost and the rightmost of what their
     edges (float64 [m, 2, 2], in cells) have in that row. layer: of each piece."""
     order = np.argsort(owner, kind="stable")
@@ -182,7 +182,7 @@ def _shorter(low: Array, high: Array, end: float) -> tuple[Array, Array]:
 # --- insides ---------------------------------------------------------------------------------------------------------
 
 
-def insides(triangles: Array, owner: NDArray[np.int64], frame: Frame, heights: Array) -> Iterator[Spans]:
+def insides(triangles: Array, owner: NDArray[np.int64], frame: RasterFrame, heights: Array) -> Iterator[Spans]:
     """The cells whose middle lies inside solids at each of the heights (metres, ascending): the height's number is the
     spans' layer. owner: int64 [n], the solid that a triangle belongs to; a solid is judged on its own."""
     if not len(triangles):
@@ -223,7 +223,7 @@ def _crossings(corners: Array, height: Array) -> tuple[Array, NDArray[np.bool_]]
     return np.stack([at[n, up.argmax(axis=1)], at[n, down.argmax(axis=1)]], axis=1), through
 
 
-def _enclosed(edges: Array, group: NDArray[np.int64], layers: int, frame: Frame) -> Iterator[Spans]:
+def _enclosed(edges: Array, group: NDArray[np.int64], layers: int, frame: RasterFrame) -> Iterator[Spans]:
     """The cells whose middle lies inside closed directed edges (float64 [m, 2, 2], in cells), each group on its own;
     the layer is the group modulo ``layers``."""
     y0, y1 = edges[:, 0, 1], edges[:, 1, 1]
@@ -263,7 +263,7 @@ def _enclosed(edges: Array, group: NDArray[np.int64], layers: int, frame: Frame)
 # --- polygons --------------------------------------------------------------------------------------------------------
 
 
-def areas(polygons: Iterable[object], frame: Frame, *, touched: bool) -> Iterator[Spans]:
+def areas(polygons: Iterable[object], frame: RasterFrame, *, touched: bool) -> Iterator[Spans]:
     """The cells that polygons (shapely, metres) enclose, and with ``touched`` also those that their outlines meet.
     The layer is 0. Lines and points count by the cells that they touch, in both cases."""
     # Twice: a collection may hold several polygons in one of its parts.
@@ -294,7 +294,7 @@ def _in_one(parts: Iterable[Spans]) -> Iterator[Spans]:
         yield spans
 
 
-def lines(edges: Array, frame: Frame) -> Iterator[Spans]:
+def lines(edges: Array, frame: RasterFrame) -> Iterator[Spans]:
     """The cells that straight lines (float64 [n, 2, 2], metres) touch; a line's number is the spans' layer."""
     if len(edges):
         xy = frame.of(edges)
@@ -374,7 +374,7 @@ def grown(cells: NDArray[np.uint8], value: int, distance: float) -> None:
             cells[low : low + rows][near] = value
 
 
-def limited(frame: Frame, cap: int, longest: int) -> Frame:
+def limited(frame: RasterFrame, cap: int, longest: int) -> RasterFrame:
     """The frame; CannotConvert where it has more cells than ``cap`` or a side longer than ``longest`` cells."""
     if frame.cells > cap or max(frame.width, frame.height) > longest:
         side = max(frame.width, frame.height) * frame.resolution

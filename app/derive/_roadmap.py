@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive._skeleton import Graph, Space, clear_only, lengths, only, pieces, tidy
+from app.derive._skeleton import FreeSpace, Graph, clear_only, lengths, only, pieces, tidy
 
 NEAR = 16
 """To how many nodes of the skeleton a sample may be joined."""
 
 
 def roadmap(
-    free_space: Space, skeleton: Graph, *, samples: int, neighbours: int, max_edge: float, seed: int
+    free_space: FreeSpace, skeleton: Graph, *, samples: int, neighbours: int, max_edge: float, seed: int
 ) -> tuple[Graph, int]:
     """Seeded samples joined to their nearest neighbours by collision-free straight lines. Lengths are in cells.
 
@@ -35,7 +35,7 @@ def roadmap(
     return _joined(Graph(cells, edges), skeleton, free_space)
 
 
-def _along(skeleton: Graph, free_space: Space, count: int, random: np.random.Generator) -> NDArray[np.int64]:
+def _along(skeleton: Graph, free_space: FreeSpace, count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Cells on the skeleton's edges, evenly by length."""
     if not len(skeleton.edges):
         return np.empty((0, 2), np.int64)
@@ -46,7 +46,7 @@ def _along(skeleton: Graph, free_space: Space, count: int, random: np.random.Gen
     return np.asarray(cells[free_space.mask[cells[:, 0], cells[:, 1]] == 1])
 
 
-def _anywhere(free_space: Space, count: int, random: np.random.Generator) -> NDArray[np.int64]:
+def _anywhere(free_space: FreeSpace, count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Different cells of the space, evenly."""
     before = np.concatenate([[0], np.cumsum(free_space.mask.sum(axis=1, dtype=np.int64))])
     chosen = np.sort(random.choice(int(before[-1]), size=min(count, int(before[-1])), replace=False))
@@ -59,7 +59,7 @@ def _anywhere(free_space: Space, count: int, random: np.random.Generator) -> NDA
     return out
 
 
-def _joined(graph: Graph, skeleton: Graph, free_space: Space) -> tuple[Graph, int]:
+def _joined(graph: Graph, skeleton: Graph, free_space: FreeSpace) -> tuple[Graph, int]:
     """The roadmap with what of the skeleton is needed to join its pieces, without what nothing can join."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree

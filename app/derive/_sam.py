@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
-from app.derive._onnx import Array, Loaded, Supplied, loaded, square, starts
-from app.derive._pictures import Ground
-from app.derive._segments import Colours, Region, Segments
+from app.derive import DerivationNotes
+from app.derive._onnx import Array, LoadedModel, ModelFiles, loaded, square, starts
+from app.derive._pictures import GroundImage
+from app.derive._segments import ColourRules, Region, Segments
 from app.errors import CannotConvert
 
 USUAL = 1024
@@ -75,8 +75,8 @@ class Model:
     whether the encoder takes [height, width, 3]. stretched: whether a tile fills the square, whatever its shape.
     together: whether the decoder takes several prompts at once."""
 
-    encoder: Loaded
-    decoder: Loaded
+    encoder: LoadedModel
+    decoder: LoadedModel
     name: str
     passed: Mapping[str, str]
     side: int
@@ -103,12 +103,12 @@ class Mask:
         return np.unpackbits(self.bits, count=(y1 - y0) * (x1 - x0)).astype(bool).reshape(y1 - y0, x1 - x0)
 
 
-def model_of(supplied: Supplied) -> Model:
+def model_of(supplied: ModelFiles) -> Model:
     """The two files as a model. CannotConvert says which inputs and outputs are expected."""
     name = supplied.name
     encoder, decoder = (loaded(file, f"{name} ({file.name})") for file in supplied.files)
 
-    def wrong(file: Loaded) -> CannotConvert:
+    def wrong(file: LoadedModel) -> CannotConvert:
         return CannotConvert(
             f"the model {name} is not of the Segment-Anything family: expected are {EXPECTED}; {file.name} is "
             f"{file.signature()}"
@@ -135,12 +135,19 @@ def model_of(supplied: Supplied) -> Model:
     return Model(encoder, decoder, name, passed, side, upright, len(wants) > 1, together)
 
 
-def _answers(decoder: Loaded) -> bool:
+def _answers(decoder: LoadedModel) -> bool:
     return "iou_predictions" in decoder.outputs and bool({"low_res_masks", "masks"} & set(decoder.outputs))
 
 
 def segments(
-    ground: Ground, model: Model, sure: float, stable: float, points: int, min_area: float, notes: Notes, name: str
+    ground: GroundImage,
+    model: Model,
+    sure: float,
+    stable: float,
+    points: int,
+    min_area: float,
+    notes: DerivationNotes,
+    name: str,
 ) -> Segments:
     """What a model sees as a thing of its own, the smaller ones above the larger ones. least: square metres.
 
@@ -190,7 +197,7 @@ def _grid(tile: tuple[int, int, int, int], points: int, valid: NDArray[np.bool_]
 
 
 def _seen(
-    ground: Ground, tile: tuple[int, int, int, int], places: Array, model: Model, sure: float, stable: float
+    ground: GroundImage, tile: tuple[int, int, int, int], places: Array, model: Model, sure: float, stable: float
 ) -> list[Mask]:
     """The good masks of one tile."""
     import cv2
@@ -305,7 +312,9 @@ def _without_twice(masks: list[Mask]) -> list[Mask]:
     return [masks[k] for k in sorted(int(i) for i in np.asarray(indices).ravel())]
 
 
-def _told(ground: Ground, masks: list[Mask], model: Model, min_area: float, notes: Notes, name: str) -> Segments:
+def _told(
+    ground: GroundImage, masks: list[Mask], model: Model, min_area: float, notes: DerivationNotes, name: str
+) -> Segments:
     """The masks as regions, by their colours and shapes."""
     label = np.zeros(ground.known.shape, np.int32)
     pixels = max(min_area / ground.resolution**2, 1.0)
@@ -315,7 +324,7 @@ def _told(ground: Ground, masks: list[Mask], model: Model, min_area: float, note
         x0, y0, x1, y1 = mask.box
         label[y0:y1, x0:x1][cleaned & ground.known[y0:y1, x0:x1]] = k
     seen = np.bincount(label.ravel(), minlength=len(clean) + 1)
-    colours = Colours(ground, min_area)
+    colours = ColourRules(ground, min_area)
     regions: list[Region] = []
     numbers = np.zeros(len(clean) + 1, np.int32)
     unsure = 0

@@ -18,8 +18,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
-from app.derive._pictures import Ground
+from app.derive import DerivationNotes
+from app.derive._pictures import GroundImage
 from app.errors import CannotConvert
 from app.parameters import parameter
 
@@ -157,7 +157,9 @@ class Segments:
     open_: NDArray[np.bool_]
 
 
-def segments(ground: Ground, how: Segmentation, method: str, nir: int | None, notes: Notes, name: str) -> Segments:
+def segments(
+    ground: GroundImage, how: Segmentation, method: str, nir: int | None, notes: DerivationNotes, name: str
+) -> Segments:
     """What a picture shows. nir: the place of the near-infrared band in ``ground.raw``.
 
     Raises CannotConvert for a picture without colours, or of one.
@@ -175,7 +177,7 @@ def segments(ground: Ground, how: Segmentation, method: str, nir: int | None, no
             "segmentation=plan"
         )
     min_area = 1.0 if how.minimum_area is None else how.minimum_area
-    work = _Work(ground, min_area)
+    work = _RegionBuilder(ground, min_area)
     if method == "index":
         grows = _by_index(ground, nir, notes, name)
         work.vegetation(grows)
@@ -205,7 +207,7 @@ def segments(ground: Ground, how: Segmentation, method: str, nir: int | None, no
     return Segments(work.label, work.regions, work.open_)
 
 
-def _by_index(ground: Ground, nir: int | None, notes: Notes, name: str) -> NDArray[np.bool_]:
+def _by_index(ground: GroundImage, nir: int | None, notes: DerivationNotes, name: str) -> NDArray[np.bool_]:
     """Where vegetation is."""
     import cv2
 
@@ -235,7 +237,7 @@ def _by_index(ground: Ground, nir: int | None, notes: Notes, name: str) -> NDArr
     return np.asarray(ground.known & (index > threshold))
 
 
-def _red(ground: Ground) -> NDArray[np.float64]:
+def _red(ground: GroundImage) -> NDArray[np.float64]:
     """Red as the bands have it, in the same unit as near infrared."""
     return np.asarray(ground.raw[..., 0], np.float64)
 
@@ -263,10 +265,10 @@ def _groups(
     return out.reshape(valid.shape), centres
 
 
-class _Work:
+class _RegionBuilder:
     """Regions as they are found."""
 
-    def __init__(self, ground: Ground, min_area: float) -> None:
+    def __init__(self, ground: GroundImage, min_area: float) -> None:
         import cv2
 
         self.size = ground.resolution
@@ -283,7 +285,7 @@ class _Work:
         """A length as an odd number of pixels, at least 3."""
         return max(3, int(metres / self.size) // 2 * 2 + 1)
 
-    def small(self, notes: Notes, name: str) -> None:
+    def small(self, notes: DerivationNotes, name: str) -> None:
         """Say what was left out for its size."""
         min_area = self.least * self.size**2
         notes.drop("spots", self.few, f"{name}: smaller than minimum_area={min_area:g} m²")
@@ -391,10 +393,10 @@ class _Work:
             self.add(piece, at, region)
 
 
-class Colours:
+class ColourRules:
     """Tells the kinds of areas that somebody else has found, by the same colours and shapes."""
 
-    def __init__(self, ground: Ground, min_area: float) -> None:
+    def __init__(self, ground: GroundImage, min_area: float) -> None:
         """least: square metres of the smallest thing."""
         import cv2
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive._select import named, one_each
 from app.errors import MissingLayer
 from app.model import masks
@@ -27,7 +27,7 @@ def chosen(layers: Layers, name: str | None, label: str) -> dict[PartKey, Occupa
     return one_each(maps, MAP, "occupancy grid", "grid")
 
 
-def seen(grid: OccupancyGrid, name: str, notes: Notes) -> OccupancyGrid:
+def seen(grid: OccupancyGrid, name: str, notes: DerivationNotes) -> OccupancyGrid:
     """The grid with free cells of unknown's grey as unknown, and a warning where there are such cells."""
     grey = unknown_grey(grid)
     if grey is not None:

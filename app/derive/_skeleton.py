@@ -12,7 +12,7 @@ from app.model.grid import FREE, UNKNOWN, OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Space:
+class FreeSpace:
     """Where a round robot's centre may be.
 
     mask: uint8 [h, w], 1 where it may; a border of zeros all around. gap: uint16 [h, w], distance to the next obstacle
@@ -51,7 +51,7 @@ def free_cells(grid: OccupancyGrid, unknown: bool) -> tuple[NDArray[np.uint8], i
     return out, top - 1, left - 1
 
 
-def space(free: NDArray[np.uint8], row: int, column: int, radius: float) -> Space:
+def space(free: NDArray[np.uint8], row: int, column: int, radius: float) -> FreeSpace:
     """The places for a robot of this radius (cells): farther than it from every obstacle's centre."""
     from app.derive import _kernels_space as kernels
 
@@ -59,10 +59,10 @@ def space(free: NDArray[np.uint8], row: int, column: int, radius: float) -> Spac
     kernels.gaps(free, gap)
     # A hair more, so that 0.3 m in cells of 0.05 m are 6 and not 5.999…: what touches, collides.
     count = kernels.erode(gap, (radius * (1.0 + 1e-9)) ** 2, free)
-    return Space(free, gap, row, column, int(count))
+    return FreeSpace(free, gap, row, column, int(count))
 
 
-def widest(free_space: Space) -> float:
+def widest(free_space: FreeSpace) -> float:
     """How far the freest cell is from obstacles, in cells."""
     from app.derive import _kernels_space as kernels
 
@@ -77,7 +77,7 @@ def widest(free_space: Space) -> float:
 
 
 def skeleton(
-    free_space: Space, *, merge: float, spur: float, tolerance: float, island: float, voronoi: bool = False
+    free_space: FreeSpace, *, merge: float, spur: float, tolerance: float, island: float, voronoi: bool = False
 ) -> tuple[Graph, int]:
     """The skeleton of a space as a graph of straight, collision-free edges. Lengths are in cells.
 
@@ -151,7 +151,7 @@ def _by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], limit: int) -> I
         low = high
 
 
-def without_islands(graph: Graph, free_space: Space, island: float) -> tuple[Graph, int]:
+def without_islands(graph: Graph, free_space: FreeSpace, island: float) -> tuple[Graph, int]:
     """The graph without pieces that are less than ``island`` cells across, but always with the largest one.
 
     And how many such pieces there were.
@@ -195,7 +195,7 @@ def only(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
 
 
 def filled(
-    graph: Graph, free_space: Space, *, spacing: float, detour: float, phase: tuple[float, float] = (0.0, 0.0)
+    graph: Graph, free_space: FreeSpace, *, spacing: float, detour: float, phase: tuple[float, float] = (0.0, 0.0)
 ) -> Graph:
     """The graph with nodes ``spacing`` cells apart also in the open, and the straight ways that save a detour.
 
@@ -225,7 +225,7 @@ def filled(
     return tidy(full.nodes, full.edges)
 
 
-def clear_only(pairs: NDArray[np.int64], nodes: NDArray[np.int64], free_space: Space) -> NDArray[np.int64]:
+def clear_only(pairs: NDArray[np.int64], nodes: NDArray[np.int64], free_space: FreeSpace) -> NDArray[np.int64]:
     """The pairs whose straight line is collision-free."""
     from app.derive import _kernels_space as kernels
 
@@ -247,7 +247,7 @@ def lengths(nodes: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.fl
     return np.asarray(np.hypot(*(nodes[pairs[:, 0]] - nodes[pairs[:, 1]]).T))
 
 
-def divided(graph: Graph, free_space: Space, spacing: float) -> Graph:
+def divided(graph: Graph, free_space: FreeSpace, spacing: float) -> Graph:
     """Nodes also along the edges, at most ``spacing`` apart where the cells allow."""
     if not len(graph.edges):
         return graph
@@ -270,7 +270,7 @@ def divided(graph: Graph, free_space: Space, spacing: float) -> Graph:
     return tidy(np.concatenate([graph.nodes, cells]), np.concatenate([graph.edges[undivided], divided]))
 
 
-def _lattice(graph: Graph, free_space: Space, spacing: float, phase: tuple[float, float]) -> NDArray[np.int64]:
+def _lattice(graph: Graph, free_space: FreeSpace, spacing: float, phase: tuple[float, float]) -> NDArray[np.int64]:
     """Cells of the space on a square lattice that are not near to a node already."""
     from scipy.spatial import cKDTree
 

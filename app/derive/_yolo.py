@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
-from app.derive._onnx import Array, Loaded, Supplied, classes, one_picture, starts
-from app.derive._pictures import Ground
+from app.derive import DerivationNotes
+from app.derive._onnx import Array, LoadedModel, ModelFiles, classes, one_picture, starts
+from app.derive._pictures import GroundImage
 from app.derive._segments import Region, Segments, way
 from app.errors import CannotConvert
 
@@ -33,7 +33,7 @@ MOST = 20_000
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class Detection:
     """One detection: its box (x0, y0, x1, y1) in pixels, its class, its score, and its mask within the box's pixels."""
 
     box: tuple[float, float, float, float]
@@ -46,21 +46,23 @@ class Found:
 class Model:
     """A loaded model. classes: the kind that each class becomes, or None. side: pixels of a tile."""
 
-    file: Loaded
+    file: LoadedModel
     name: str
     classes: tuple[str | None, ...]
     side: int
 
 
-def model_of(supplied: Supplied, file: Loaded) -> Model:
+def model_of(supplied: ModelFiles, file: LoadedModel) -> Model:
     """A loaded file as a model of the family. CannotConvert says what it should take."""
     side = one_picture(supplied, file, "is not of the YOLO family", SIDE)
     return Model(file, supplied.name, classes(supplied, file.session)[0], side)
 
 
-def segments(ground: Ground, model: Model, confidence: float, min_area: float, notes: Notes, name: str) -> Segments:
+def segments(
+    ground: GroundImage, model: Model, confidence: float, min_area: float, notes: DerivationNotes, name: str
+) -> Segments:
     """What a model finds in a picture, the surest first where things overlap. least: square metres."""
-    detections: list[Found] = []
+    detections: list[Detection] = []
     for column in starts(ground.rgb.shape[1], model.side):
         for row in starts(ground.rgb.shape[0], model.side):
             detections += _tile(ground.rgb, row, column, model, confidence)
@@ -93,7 +95,7 @@ def segments(ground: Ground, model: Model, confidence: float, min_area: float, n
     return Segments(label, regions, np.zeros(label.shape, bool))
 
 
-def _tile(rgb: NDArray[np.uint8], row: int, column: int, model: Model, confidence: float) -> list[Found]:
+def _tile(rgb: NDArray[np.uint8], row: int, column: int, model: Model, confidence: float) -> list[Detection]:
     """The detections in one tile, in the picture's pixels."""
     side = model.side
     part = rgb[row : row + side, column : column + side]
@@ -114,7 +116,7 @@ def _tile(rgb: NDArray[np.uint8], row: int, column: int, model: Model, confidenc
             continue
         mask = None if masks is None else _mask(weights[k], masks, side, (x0, y0, x1, y1))
         box = (x0 + column, y0 + row, x1 + column, y1 + row)
-        out.append(Found(box, int(kinds[k]), float(scores[k]), mask))
+        out.append(Detection(box, int(kinds[k]), float(scores[k]), mask))
     return out
 
 
@@ -149,7 +151,7 @@ def _mask(weights: Array, prototypes: Array, side: int, box: tuple[float, float,
     return np.asarray(full[y0:y1, x0:x1] > 0.0)  # the sigmoid is above a half where its argument is above 0
 
 
-def _without_twice(detections: list[Found]) -> list[Found]:
+def _without_twice(detections: list[Detection]) -> list[Detection]:
     """Non-maximum suppression over all tiles, class by class; the surest first."""
     import cv2
 

@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.derive._picture_methods import method_of, plan_of, seen
-from app.derive._pictures import Ground, called, chosen, ground
+from app.derive._pictures import GroundImage, called, chosen, ground
 from app.derive._segments import Segmentation, Segments
 from app.errors import CannotConvert
 from app.model.features import features
@@ -35,7 +35,7 @@ class Parameters(Segmentation):
 
 
 @derives(gives="objects", needs={"imagery"}, parameters=Parameters, cost=30.0)
-def imagery_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def imagery_to_objects(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """What a picture shows as objects: fields, trees, vegetation, paths, roads, buildings; of a plan walls and floors.
 
     Polygons with a ``confidence`` of 0 to 1, told by shape and shade; a path or road also has its middle line, of kind
@@ -64,7 +64,7 @@ def imagery_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -> 
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _regions(segments: Segments, on: Ground, parameters: Parameters) -> list[Row]:
+def _regions(segments: Segments, on: GroundImage, parameters: Parameters) -> list[Row]:
     """Each region as a polygon, then the middle lines of paths and roads, in the local frame."""
     tolerance = on.resolution if parameters.outline_tolerance is None else parameters.outline_tolerance
     shapes = polygons(segments.label, on.transform, tolerance)
@@ -97,7 +97,7 @@ def polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict
     return out
 
 
-def _middles(segments: Segments, on: Ground) -> list[Row]:
+def _middles(segments: Segments, on: GroundImage) -> list[Row]:
     """The middle lines of paths and roads, joined where these meet."""
     from app.derive import _kernels_space, _skeleton
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.derive._picture_methods import method_of, plan_of, seen
 from app.derive._pictures import called, chosen, ground
 from app.derive._segments import Segmentation
@@ -24,7 +24,7 @@ class Parameters(Segmentation):
 
 
 @derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0)
-def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """A picture as an occupancy grid: trees, vegetation, buildings and walls are occupied.
 
     Fields, paths, roads and a plan's rooms are free, everything else (also a model's ``area``) is unknown. The origin

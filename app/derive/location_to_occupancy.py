@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import shapely
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.derive._obstacles import fences, sites, unreadable_error
 from app.derive.objects_to_occupancy import blank, cell_size, framed
 from app.errors import MissingLayer
@@ -30,14 +30,14 @@ class Parameters:
     version=3,
     last=True,
 )
-def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def location_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """A blank occupancy grid: free inside the fence, unknown outside; it knows of no obstacle.
 
     The ground around objects of unknown extent is unknown. The origin is a whole multiple of the resolution, yaw 0.
     Raises MissingLayer where there is a datum but no fence, or objects have solids that cannot be read; CannotConvert
     where the grid would be too large.
     """
-    reading_notes = Notes()
+    reading_notes = DerivationNotes()
     obstacles = sites(layers, reading_notes)
     unreadable = [reason for site in obstacles.values() for reason in site.unreadable]
     if unreadable:

@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, _raster, derives
-from app.derive._obstacles import IN_NO_WAY, SURROUNDINGS, Site, fence_of, fences, sites, unreadable_error
-from app.derive._raster import Frame
+from app.derive import DerivationNotes, _raster, derives
+from app.derive._obstacles import IN_NO_WAY, SURROUNDINGS, LevelObstacles, fence_of, fences, sites, unreadable_error
+from app.derive._raster import RasterFrame
 from app.errors import Invalid, MissingLayer, Problem
 from app.model.frame import GROUND
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -110,7 +110,7 @@ class Parameters:
     cost=4.0,
     version=3,
 )
-def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """What stands on the ground at a height, as an occupancy grid for each level.
 
     Solids are cut, footprints rasterised; every cell that an obstacle touches is occupied. Free: the floors where there
@@ -162,7 +162,12 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
 
 
 def _grid(
-    site: Site, fence: Any, band: tuple[float, float], parameters: Parameters, level: str, notes: Notes
+    site: LevelObstacles,
+    fence: Any,
+    band: tuple[float, float],
+    parameters: Parameters,
+    level: str,
+    notes: DerivationNotes,
 ) -> OccupancyGrid | None:
     """A level's grid; None where nothing stands in the way and no floor says what is free."""
     low, high = band
@@ -198,14 +203,14 @@ def _grid(
     return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
 
 
-def framed(box: tuple[float, ...], resolution: float | None, notes: Notes) -> Frame:
+def framed(box: tuple[float, ...], resolution: float | None, notes: DerivationNotes) -> RasterFrame:
     """The grid around a box (min x, min y, max x, max y in metres). CannotConvert where it would be too large."""
     low_x, low_y, high_x, high_y = box[:4]
     if resolution is not None:
-        return _raster.limited(Frame.around((low_x, low_y, high_x, high_y), resolution), MOST, LONGEST)
-    frame = Frame.around((low_x, low_y, high_x, high_y), COARSER[0])
+        return _raster.limited(RasterFrame.around((low_x, low_y, high_x, high_y), resolution), MOST, LONGEST)
+    frame = RasterFrame.around((low_x, low_y, high_x, high_y), COARSER[0])
     for coarser in COARSER:
-        frame = Frame.around((low_x, low_y, high_x, high_y), coarser)
+        frame = RasterFrame.around((low_x, low_y, high_x, high_y), coarser)
         if frame.cells <= EASY and max(frame.width, frame.height) <= LONGEST:
             break
     if frame.resolution != RESOLUTION:
@@ -214,7 +219,7 @@ def framed(box: tuple[float, ...], resolution: float | None, notes: Notes) -> Fr
     return _raster.limited(frame, MOST, LONGEST)
 
 
-def blank(frame: Frame, fence: Any, free: list[Any]) -> NDArray[np.uint8]:
+def blank(frame: RasterFrame, fence: Any, free: list[Any]) -> NDArray[np.uint8]:
     """Cells, uint8 [height, width], that are free on the floors, within the fence, or all where there is neither."""
     cells = np.full((frame.height, frame.width), FREE if fence is None and not free else UNKNOWN, np.uint8)
     inside = free

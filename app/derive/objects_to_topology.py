@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.errors import MissingLayer
 from app.model import network
 from app.model.features import Features, concatenate, unique_ids
@@ -32,7 +32,7 @@ class Parameters:
 
 
 @derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=1.0)
-def objects_to_topology(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:  # noqa: ARG001
+def objects_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:  # noqa: ARG001
     """Drawn lines and points of interest as a network of nodes and directed edges.
 
     One network for each level, from all its drawings. Raises MissingLayer where there is nothing to make it from.

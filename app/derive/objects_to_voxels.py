@@ -11,9 +11,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, _raster, derives
-from app.derive._obstacles import Site, sites, unreadable_error
-from app.derive._raster import Array, Frame, Spans
+from app.derive import DerivationNotes, _raster, derives
+from app.derive._obstacles import LevelObstacles, sites, unreadable_error
+from app.derive._raster import Array, RasterFrame, Spans
 from app.errors import CannotConvert, MissingLayer
 from app.model import solids, voxels
 from app.model.frame import GROUND
@@ -67,7 +67,7 @@ class Parameters:
     version=3,
     last=True,
 )
-def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def objects_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Solids and extruded footprints as occupied voxels, all levels in one map; nothing is said of free space.
 
     Every voxel that a surface touches is occupied, and with ``filled`` those whose middle lies inside. Raises
@@ -100,7 +100,7 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> L
     return Layers({PartKey("voxels", GROUND, MAP): made_of}, layers.datum, layers.levels)
 
 
-def _extruded(site: Site, otherwise: float) -> tuple[list[Array], int]:
+def _extruded(site: LevelObstacles, otherwise: float) -> tuple[list[Array], int]:
     """The footprints as closed solids, and how many of them took the height from the parameter."""
     out, without = [], 0
     for footprint, base, top in zip(site.footprints, site.base, site.top, strict=True):
@@ -125,7 +125,7 @@ def _expected(corners: Array, owner: NDArray[np.int64], resolution: float, *, fi
     return area / resolution**2 + float(volume) / resolution**3
 
 
-def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, notes: Notes) -> VoxelMap:
+def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, notes: DerivationNotes) -> VoxelMap:
     flat = corners.reshape(-1, 3)
     low, high = flat.min(axis=0).tolist(), flat.max(axis=0).tolist()
     edge = parameters.resolution or next(
@@ -142,7 +142,7 @@ def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, no
         )
     if _expected(corners, owner, edge, filled=parameters.filled) > 4 * MOST:
         _too_many(edge)
-    frame = Frame.around((low[0], low[1], high[0], high[1]), edge)
+    frame = RasterFrame.around((low[0], low[1], high[0], high[1]), edge)
     first = math.floor(low[2] / edge + 1e-6)
     end = max(math.ceil(high[2] / edge - 1e-6), first + 1)
     levels = np.round(np.arange(first, end + 1) * edge, 9)
@@ -160,7 +160,7 @@ def _fits(low: Sequence[float], high: Sequence[float], edge: float) -> bool:
     return bool(max(map(abs, (*low, *high))) / edge <= HALF - 1)
 
 
-def _codes(spans: Iterable[Spans], frame: Frame, first: int) -> voxels.Codes:
+def _codes(spans: Iterable[Spans], frame: RasterFrame, first: int) -> voxels.Codes:
     """The Morton codes of all cells of spans, each once, ascending."""
     x0, y0 = (round(v / frame.resolution) for v in frame.origin)
     out = np.empty(0, np.uint64)

@@ -11,12 +11,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, _raster, derives
-from app.derive._raster import Frame
+from app.derive import DerivationNotes, _raster, derives
+from app.derive._raster import RasterFrame
 from app.derive._select_grids import called, chosen, seen
 from app.errors import CannotConvert, MissingDatum
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Layers, Part, PartKey
 from app.parameters import parameter
 
@@ -72,7 +72,7 @@ def _try(layers: Layers, parameters: Parameters) -> None:
     last=True,
     trial=_try,
 )
-def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """A plan in plain colours, drawn from the grid with objects and, if asked for, the network over it.
 
     Pixels [height, width, 4] red, green, blue, alpha, where unknown cells are transparent; in the local frame, along
@@ -88,7 +88,7 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -
         if step > 1 and parameters.pixel is None:
             notes.warn(f"a pixel is {step} cells wide, {size:g} m: drawn finer, the plan would be too large")
         pixels = _coloured(cells)
-        frame = Frame((0.0, 0.0), size, cells.shape[1], cells.shape[0])
+        frame = RasterFrame((0.0, 0.0), size, cells.shape[1], cells.shape[0])
         if parameters.draw_objects:
             _draw_objects(pixels, layers, key.level, grid, frame, notes)
         if parameters.draw_network:
@@ -97,7 +97,7 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -
         c, s = math.cos(yaw), math.sin(yaw)
         up = cells.shape[0] * size
         transform = (size * c, size * s, x - s * up, size * s, -size * c, y + c * up)
-        parts[PartKey("imagery", key.level, NAME)] = Picture(np.ascontiguousarray(pixels[::-1]), transform)
+        parts[PartKey("imagery", key.level, NAME)] = GeoImage(np.ascontiguousarray(pixels[::-1]), transform)
     notes.warn("the picture is a plan drawn from the map, no photograph")
     return Layers(parts, layers.datum, layers.levels)
 
@@ -136,7 +136,12 @@ def _coloured(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _draw_objects(
-    pixels: NDArray[np.uint8], layers: Layers, level: str, grid: OccupancyGrid, frame: Frame, notes: Notes
+    pixels: NDArray[np.uint8],
+    layers: Layers,
+    level: str,
+    grid: OccupancyGrid,
+    frame: RasterFrame,
+    notes: DerivationNotes,
 ) -> None:
     shapes: dict[str, list[Any]] = {}
     for part in layers.vector("objects", level).values():
@@ -159,7 +164,12 @@ def _draw_objects(
 
 
 def _draw_network(
-    pixels: NDArray[np.uint8], layers: Layers, level: str, grid: OccupancyGrid, frame: Frame, notes: Notes
+    pixels: NDArray[np.uint8],
+    layers: Layers,
+    level: str,
+    grid: OccupancyGrid,
+    frame: RasterFrame,
+    notes: DerivationNotes,
 ) -> None:
     for part in layers.vector("topology", level).values():
         edges = part.of_kind("edge")
@@ -172,7 +182,7 @@ def _draw_network(
 
 
 def _paint(
-    pixels: NDArray[np.uint8], shapes: list[Any], colour: tuple[int, int, int], grid: OccupancyGrid, frame: Frame
+    pixels: NDArray[np.uint8], shapes: list[Any], colour: tuple[int, int, int], grid: OccupancyGrid, frame: RasterFrame
 ) -> None:
     """Polygons filled, lines one pixel wide; points are nothing."""
     x, y, yaw = grid.origin

@@ -26,8 +26,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, derives
-from app.derive._figures import MOST, Box, Disc, Found, Sizes, figures
+from app.derive import DerivationNotes, derives
+from app.derive._figures import MOST, Box, Disc, MaskShapes, ShapeLimits, figures
 from app.derive._select_grids import called, chosen, seen
 from app.errors import CannotConvert, TooLarge
 from app.model.features import features
@@ -92,7 +92,7 @@ class Parameters:
 
 
 @derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=2)
-def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """A grid's obstacles as objects: posts or trees, walls and furniture by their shapes, of the height of a context.
 
     In local metres with ``pose`` and ``shapes`` (cylinders, boxes) but where the outline is irregular, which has a
@@ -117,11 +117,11 @@ def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: Notes, name: str) -> list[Row]:
+def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: DerivationNotes, name: str) -> list[Row]:
     context = CONTEXTS[parameters.context]
     cell = grid.resolution
     mask = _occupied(grid, name)
-    sizes = Sizes(
+    sizes = ShapeLimits(
         speck=2.0 if parameters.minimum_size is None else parameters.minimum_size / cell,
         disc=context.widest / cell,
         box=context.longest / cell,
@@ -166,7 +166,7 @@ def _occupied(grid: OccupancyGrid, name: str) -> NDArray[np.uint8]:
     return mask
 
 
-def _rows(shapes: Found, grid: OccupancyGrid, context: Context, height: float | None, floor: float) -> list[Row]:
+def _rows(shapes: MaskShapes, grid: OccupancyGrid, context: Context, height: float | None, floor: float) -> list[Row]:
     """Posts, walls, furniture, obstacles, each numbered from 1, in the local frame."""
     cell = grid.resolution
     x, y, yaw = grid.origin

@@ -18,16 +18,16 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.derive._select_grids import called, chosen, grey_warning
 from app.errors import CannotConvert, Invalid, Problem, TooLarge
-from app.model.features import Compact, Features, Properties, from_columns, points
+from app.model.features import Features, Properties, SharedKeyDicts, from_columns, points
 from app.model.grid import OccupancyGrid, as_seen, unknown_grey
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
 
 if TYPE_CHECKING:
-    from app.derive._skeleton import Graph, Space
+    from app.derive._skeleton import FreeSpace, Graph
 
 RASTERS = (0.5, 0.1, 0.01)
 """Metres: a node is named after its place on the first of these on which no other node has the same."""
@@ -100,7 +100,7 @@ class Parameters:
 
 
 @derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0)
-def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """The ways through an occupancy grid's free space as a network of nodes and directed edges.
 
     One network for each level. Raises CannotConvert where a grid has no ways (nothing free, no obstacle, too narrow for
@@ -113,7 +113,7 @@ def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: Notes) 
     return Layers(parts, layers.datum, layers.levels)
 
 
-def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: str) -> Features:
+def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str) -> Features:
     """One grid's network. called: what errors call the grid."""
     from app.derive import _roadmap, _skeleton
 
@@ -162,7 +162,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
     return _features(grid, row, column, graph, width)
 
 
-def _without_unseen(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: str) -> OccupancyGrid:
+def _without_unseen(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str) -> OccupancyGrid:
     """The grid with its free cells of unknown's grey as unknown, unless they are to be free."""
     grey = unknown_grey(grid)
     if grey is None:
@@ -184,7 +184,7 @@ def _check(parameters: Parameters) -> None:
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
 
 
-def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> Space:
+def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> FreeSpace:
     """Where the robot may be; says what is wrong with a grid that has no such place, or nothing to go around."""
     from app.derive import _skeleton
 
@@ -214,7 +214,7 @@ def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> Space:
     return space
 
 
-def _phase(grid: OccupancyGrid, space: Space, spacing: float) -> tuple[float, float]:
+def _phase(grid: OccupancyGrid, space: FreeSpace, spacing: float) -> tuple[float, float]:
     """Where a lattice that is fixed to the local frame begins in a space: row and column."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
@@ -222,7 +222,7 @@ def _phase(grid: OccupancyGrid, space: Space, spacing: float) -> tuple[float, fl
     return (-(across + space.row) % spacing, -(along + space.column) % spacing)
 
 
-def _widths(space: Space, graph: Graph) -> NDArray[np.float64]:
+def _widths(space: FreeSpace, graph: Graph) -> NDArray[np.float64]:
     """The free width along each edge, in cells."""
     from app.derive import _kernels_space
 
@@ -244,7 +244,7 @@ def _features(grid: OccupancyGrid, row: int, column: int, graph: Graph, width: N
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     ends, metres = ends[order], [metres[k] for k in order]
     pairs = [(names[a], names[b]) for a, b in ends.tolist()]
-    compact = Compact()
+    compact = SharedKeyDicts()
     properties: list[Properties] = [compact({"kind": "node", "name": n}) for n in names]
     properties += [
         compact({"kind": "edge", "source": a, "target": b, "width": w}) for (a, b), w in zip(pairs, metres, strict=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.derive._select_grids import called, seen
 from app.errors import CannotConvert, MissingLayer
 from app.model import masks
@@ -62,7 +62,7 @@ def _try(layers: Layers, parameters: Parameters) -> None:
 
 
 @derives(gives="voxels", needs={"occupancy"}, parameters=Parameters, cost=8.0, version=2, trial=_try)
-def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """The extrusion of a grid: each occupied cell as a column from the level's floor up, each free one as free space.
 
     One voxel map of its name for each grid; where a level has a grid ``map``, of that one alone, and never of costmap

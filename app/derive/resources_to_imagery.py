@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.errors import MissingLayer
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Layers, Part, PartKey
 
 MOST_PIXELS = 2**26
@@ -26,7 +26,7 @@ class Parameters:
 
 
 @derives(gives="imagery", needs={"resources", "objects"}, parameters=Parameters, cost=15.0)
-def resources_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:  # noqa: ARG001
+def resources_to_imagery(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:  # noqa: ARG001
     """The floor plans of an Open-RMF building as pictures in the local frame.
 
     They lie where the building's measurements and fiducials put them. Raises MissingLayer where no building names a
@@ -46,7 +46,7 @@ def resources_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -
             notes.warn("the building has no measurement: a pixel of its drawing counts as a metre", where=level)
         c, s = scale * math.cos(rotation), scale * math.sin(rotation)
         # A building's pixels point downward, and are turned with y up.
-        picture = Picture(pixels, (c, s, x, s, -c, y))
+        picture = GeoImage(pixels, (c, s, x, s, -c, y))
         parts[PartKey("imagery", level, name.rpartition("/")[2].rpartition(".")[0] or "plan")] = picture
     if not parts:
         raise MissingLayer(
@@ -77,7 +77,7 @@ def _found(path: str, files: Mapping[str, bytes]) -> str:
     return path if path in files else next((f for f in sorted(files) if f.rpartition("/")[2] == base), path)
 
 
-def _pixels(data: bytes, name: str, level: str, notes: Notes) -> NDArray[np.uint8] | None:
+def _pixels(data: bytes, name: str, level: str, notes: DerivationNotes) -> NDArray[np.uint8] | None:
     """A drawing's pixels, grey or RGB, with alpha where it has some; None, with a warning, where it is no picture."""
     from PIL import Image
 

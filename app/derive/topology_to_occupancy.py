@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, _raster, derives
-from app.derive._obstacles import Site, fence_of, fences, sites
+from app.derive import DerivationNotes, _raster, derives
+from app.derive._obstacles import LevelObstacles, fence_of, fences, sites
 from app.derive.objects_to_occupancy import HEIGHT, blank, cell_size, framed
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
 from app.model.features import Features, Properties
@@ -65,7 +65,7 @@ class Parameters:
     cost=40.0,
     version=3,
 )
-def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Free along a network's edges, as wide as they are; occupied where objects stand; elsewhere unknown.
 
     Objects win over edges, but in OpenStreetMap's passages through buildings. A fence cuts the free space. The origin
@@ -105,7 +105,7 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) 
 
 
 def _free(
-    layers: Layers, level: str, parameters: Parameters, notes: Notes
+    layers: Layers, level: str, parameters: Parameters, notes: DerivationNotes
 ) -> tuple[NDArray[np.object_], NDArray[np.object_]]:
     """The ground of a level's edges in metres, polygons and lines: of usual ones, and of those through buildings."""
     shapes: list[Any] = []
@@ -162,7 +162,7 @@ def _tag(p: Properties, key: str) -> str:
     return value if isinstance(value, str) else ""
 
 
-def _obstacles(layers: Layers, notes: Notes) -> dict[str, Site]:
+def _obstacles(layers: Layers, notes: DerivationNotes) -> dict[str, LevelObstacles]:
     """What stands on each level; nothing where the objects are places on earth and there is no datum."""
     try:
         return sites(layers, notes)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.errors import CannotConvert, MissingLayer
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, Part, PartKey
@@ -55,7 +55,7 @@ class Parameters:
 
 
 @derives(gives="occupancy", needs={"voxels"}, parameters=Parameters, cost=2.0)
-def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """The projection of a height band: occupied where any voxel of the column is, free where only free ones are.
 
     One grid of its name for each voxel map; around all its voxels whatever the band, so that the frame stays when the
@@ -83,7 +83,9 @@ def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) ->
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _doubts(key: PartKey, voxels: VoxelMap, grid: OccupancyGrid, parameters: Parameters, notes: Notes) -> None:
+def _doubts(
+    key: PartKey, voxels: VoxelMap, grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes
+) -> None:
     counts = grid.counts()
     known_cells = counts["occupied"] + counts["free"]
     if parameters.band is None and counts["occupied"] >= FULL * known_cells:

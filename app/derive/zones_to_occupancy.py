@@ -17,13 +17,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.errors import CannotConvert, MissingLayer
 from app.model import masks
 from app.model.features import Features
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
-from app.model.masks import Info
+from app.model.masks import FilterInfo
 from app.parameters import parameter
 
 KEEPOUT, SPEED = "keepout", "speed"
@@ -74,7 +74,7 @@ class Parameters:
     cost=1.0,
     makes=frozenset({KEEPOUT, SPEED}),
 )
-def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Keepout and speed zones as costmap filter masks, the grids keepout and speed, in the frame of the level's map.
 
     Raises MissingLayer where no zone is of these kinds, MissingDatum for zones on earth without a datum, CannotConvert
@@ -95,7 +95,9 @@ def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> 
             _burn(cells, frame, blocked, [OCCUPIED] * len(blocked), touched=True)
             if lanes:
                 notes.fill("cost beside preferred lanes", parameters.lane_cost, "no zone says it", "lane_cost")
-            parts[PartKey("occupancy", level, KEEPOUT)] = frame.grid(cells, KEEPOUT, Info(masks.KEEPOUT, 0.0, 1.0))
+            parts[PartKey("occupancy", level, KEEPOUT)] = frame.grid(
+                cells, KEEPOUT, FilterInfo(masks.KEEPOUT, 0.0, 1.0)
+            )
         slow = [z for z in zones if z.kind in SPEEDS]
         values, info = _limits(slow, parameters, notes) if slow else ([], None)
         if info is not None:
@@ -132,7 +134,7 @@ class _Frame:
     width: int
     height: int
 
-    def grid(self, cells: NDArray[np.uint8], name: str, info: Info) -> OccupancyGrid:
+    def grid(self, cells: NDArray[np.uint8], name: str, info: FilterInfo) -> OccupancyGrid:
         """The mask; ``scale`` from white to black says each of its values."""
         properties = {masks.NAME: {"params": masks.params(name, info)}}
         return OccupancyGrid(cells, self.resolution, (self.x, self.y, 0.0), "scale", 1.0, 0.0, False, properties)
@@ -144,7 +146,7 @@ class _Frame:
         )
 
 
-def _zones(layers: Layers, level: str, notes: Notes) -> list[_Zone]:
+def _zones(layers: Layers, level: str, notes: DerivationNotes) -> list[_Zone]:
     """The zones of a level that masks are made of, in the order of their parts and ids."""
     out = []
     other = expiring = flat = 0
@@ -203,7 +205,7 @@ def _coarse_enough(cell: float, low_high: Any) -> float:
     return cell
 
 
-def _report_outside(zones: list[_Zone], frame: _Frame, level: str, notes: Notes) -> None:
+def _report_outside(zones: list[_Zone], frame: _Frame, level: str, notes: DerivationNotes) -> None:
     box = frame.box()
     outside = [z.id for z in zones if not z.shape.intersects(box)]
     cut = sum(not box.covers(z.shape) for z in zones) - len(outside)
@@ -224,7 +226,7 @@ def _burn(cells: NDArray[np.uint8], frame: _Frame, shapes: list[Any], values: li
     rasterize(drawn, out=cells, transform=to_metres, all_touched=touched)
 
 
-def _limits(zones: list[_Zone], parameters: Parameters, notes: Notes) -> tuple[list[int], Info | None]:
+def _limits(zones: list[_Zone], parameters: Parameters, notes: DerivationNotes) -> tuple[list[int], FilterInfo | None]:
     """(the cell of each zone, 0 where it has no limit; what cells stand for, None where there is no limit at all).
 
     Limits are rounded down to what a cell can say, and never to 0, which would be none.
@@ -267,7 +269,7 @@ def _limits(zones: list[_Zone], parameters: Parameters, notes: Notes) -> tuple[l
     if stopped:
         notes.warn(f"{stopped} speed zones have the limit 0, which Nav2 takes for none: they get {step:g} {unit}")
     kind = masks.SPEED_PERCENT if percent else masks.SPEED_METRES
-    return values, Info(kind, 0.0, step) if any(values) else None
+    return values, FilterInfo(kind, 0.0, step) if any(values) else None
 
 
 def _said(zone: _Zone) -> tuple[float, bool] | None:

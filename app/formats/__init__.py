@@ -113,7 +113,7 @@ class ReadContext:
 
 
 @dataclass(frozen=True, slots=True)
-class Inner:
+class NestedMap:
     """A map inside another one: its files, main file first, and what its writer declared (see ``WriteContext``).
 
     layers: what the report says of each layer in it.
@@ -144,7 +144,7 @@ class WriteContext:
     title: str = UNTITLED
     options: Any = None
     attribution: tuple[str, ...] = ()
-    make: Callable[[str, Layers, Mapping[str, Any], bool], Inner] | None = None
+    make: Callable[[str, Layers, Mapping[str, Any], bool], NestedMap] | None = None
     stored: Mapping[PartKey, Sequence[str]] | None = None
     dropped: list[dict[str, Any]] = field(default_factory=list)
     template: list[dict[str, Any]] = field(default_factory=list)
@@ -166,7 +166,7 @@ class WriteContext:
 
 
 @dataclass(frozen=True, slots=True)
-class Needs:
+class LayerRequirements:
     """What a writer needs: one of these sets of layers, and a datum or not.
 
     one_of: alternatives, the first that is complete is enough; every carried layer that is there is written.
@@ -241,7 +241,7 @@ class Format:
     detect: Callable[[str, bytes], bool]
     read: Callable[[Files, ReadContext], Layers] | None = None
     write: Callable[[Layers, WriteContext], dict[str, bytes]] | None = None
-    needs: Needs = field(default_factory=lambda: Needs(()))
+    needs: LayerRequirements = field(default_factory=lambda: LayerRequirements(()))
     companions: Callable[[str, bytes, Sequence[str]], Iterable[str]] = lambda main, data, names: ()
     looks_at: Callable[[str, Sequence[str]], Iterable[str]] = lambda main, names: ()
     read_options: type[Any] = NoOptions
@@ -269,7 +269,7 @@ class Format:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class FileGroup:
     """The files of an upload that are one map: a main file and what belongs to it.
 
     borrowed: what belongs to other maps, and is looked into.
@@ -323,7 +323,7 @@ _APPLE_DOUBLE = b"\x00\x05\x16\x07"
 """What macOS packs beside each file of an archive, under the file's name with ``._`` before it."""
 
 
-def group(files: Files, format_name: str | None = None) -> tuple[list[Group], list[str]]:
+def group(files: Files, format_name: str | None = None) -> tuple[list[FileGroup], list[str]]:
     """Sort an upload into maps: the groups, and the names that belong to none.
 
     With a format name every file that the format accepts as main file is one; where none looks like it, the only file
@@ -373,7 +373,7 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
         used.update([main, *companions])
         own_files = {n: files[n] for n in [main, *companions]}
         seen = {n: files[n] for n in fmt.looks_at(main, names) if n in files and n not in own_files}
-        out.append(Group(fmt, main, own_files, seen))
+        out.append(FileGroup(fmt, main, own_files, seen))
     return out, sorted(set(files) - used)
 
 
@@ -411,7 +411,7 @@ BAD_INPUT = (
 """What readers raise on input they cannot use; anything else is a bug of ours and stays one."""
 
 
-def read(item: Group, context: ReadContext) -> Layers:
+def read(item: FileGroup, context: ReadContext) -> Layers:
     """One map's files -> layers. The read boundary: whatever is wrong with the bytes becomes a BadUpload.
 
     Raises UnreadableFile (with file, line and reason), TooLarge or UnsafeArchive.
@@ -606,7 +606,7 @@ def _in_file(problem: Problem, file: str) -> Problem:
     return problem if problem.file else Problem(problem.problem, file, problem.line, problem.where)
 
 
-def _said(error: FleetMapError, item: Group) -> Problem:
+def _said(error: FleetMapError, item: FileGroup) -> Problem:
     return Problem(error.detail, item.main)
 
 

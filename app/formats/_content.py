@@ -27,7 +27,7 @@ from app.errors import Problem, TooLarge, UnreadableFile
 from app.formats import Files, Limits, _json, _raster
 from app.model.features import Features
 from app.model.frame import Datum, Level
-from app.model.imagery import LOCAL, Picture
+from app.model.imagery import LOCAL, GeoImage
 from app.model.layers import PART_TYPES, Layers, Part, PartKey, Resources
 
 FOLDER = "fleet_map/"
@@ -168,12 +168,12 @@ def _decoded(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes], l
         if not isinstance(values.get(name, expected_class()), expected_class):
             raise TypeError(f"{name} of the {key.layer} is no {expected_class.__name__}")
     part: Part = kind(**values)
-    if isinstance(part, Picture):
+    if isinstance(part, GeoImage):
         _check_place(part)
     return part
 
 
-def _check_place(picture: Picture) -> None:
+def _check_place(picture: GeoImage) -> None:
     """Refuse a picture that lies nowhere, or whose CRS PROJ would look for in files."""
     if picture.crs != LOCAL and not _raster.CRS_NAME.fullmatch(picture.crs):
         _raster.crs_from_wkt(picture.crs)

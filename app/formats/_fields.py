@@ -64,16 +64,16 @@ class Number:
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
+class OneOf:
     """One of a closed set of texts (or truth values); others are doubtful."""
 
-    known: tuple[Any, ...]
+    allowed: tuple[Any, ...]
 
     def check(self, value: Any) -> tuple[str, str]:
         """Return why the value is doubtful."""
-        if any(value == literal and type(value) is type(literal) for literal in self.known):
+        if any(value == literal and type(value) is type(literal) for literal in self.allowed):
             return "", ""
-        return "", f"unknown value {_shown(value)}: it is one of {', '.join(map(str, self.known))}"
+        return "", f"unknown value {_shown(value)}: it is one of {', '.join(map(str, self.allowed))}"
 
 
 @dataclass(frozen=True, slots=True)

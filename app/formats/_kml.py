@@ -43,12 +43,12 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import ReadContext, _image, _xml
-from app.formats._fields import COORDINATE, LATITUDE, LONGITUDE, Number, Words
+from app.formats._fields import COORDINATE, LATITUDE, LONGITUDE, Number, OneOf
 from app.model.features import MAX_ID, NO_GEOMETRY, Features, unique_ids
 from app.model.frame import MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import MAP, NETWORK, SITE, VECTOR_LAYERS, ZONES, Layers, Part, PartKey
 
 FAMILY = "kml"
@@ -419,7 +419,7 @@ _JSON_STARTS = frozenset('-0123456789{["')
 
 
 @dataclass(slots=True)
-class _Own:
+class _OwnItems:
     """Items of ours on their way back to one part."""
 
     ids: list[str] = field(default_factory=list)
@@ -493,8 +493,8 @@ ELEMENTS = frozenset(_NAMES.split())
 _ANGLE = Number(-360.0, 360.0, unit="degrees")
 _TURN = replace(_ANGLE, doubtful=True)
 _SIZE = Number(0.0, MAX_METRES, doubtful=True)
-_FLAG = Words(("0", "1", "true", "false"))
-_VALUES: Mapping[str, Number | Words] = {
+_FLAG = OneOf(("0", "1", "true", "false"))
+_VALUES: Mapping[str, Number | OneOf] = {
     "rotation": _ANGLE,
     **dict.fromkeys(("heading", "tilt", "roll"), _TURN),
     **dict.fromkeys(("leftFov", "rightFov", "bottomFov", "topFov"), _TURN),
@@ -504,7 +504,7 @@ _VALUES: Mapping[str, Number | Words] = {
     **dict.fromkeys(("width", "scale", "refreshInterval", "viewRefreshTime", "viewBoundScale"), _SIZE),
     "range": Number(0.0, 1e9, unit="metres", doubtful=True),
     **dict.fromkeys(("open", "visibility", "extrude", "tessellate", "fill", "outline"), _FLAG),
-    "altitudeMode": Words(
+    "altitudeMode": OneOf(
         ("clampToGround", "relativeToGround", "absolute", "clampToSeaFloor", "relativeToSeaFloor"),
     ),
 }
@@ -548,8 +548,8 @@ class _Reader:
         self.used: set[str] = set()
         self.datum: Datum | None = None
         self.levels: dict[str, float] = {}
-        self.own: dict[PartKey, _Own] = {}
-        self.rasters: dict[PartKey, OccupancyGrid | Picture] = {}
+        self.own: dict[PartKey, _OwnItems] = {}
+        self.rasters: dict[PartKey, OccupancyGrid | GeoImage] = {}
         self.columns: dict[str, list[tuple[list[str], list[Any], list[dict[str, Any]]]]] = {}
         self.documents: dict[str, dict[str, Any]] = {}
         self.credit: list[str] = []
@@ -644,7 +644,7 @@ class _Reader:
             shape = drawn
             if values.get("geometry") == "GeometryCollection" and drawn.geom_type != "GeometryCollection":
                 shape = shapely.geometrycollections(list(shapely.get_parts(drawn)))
-            part_items = self.own.setdefault(self._key(values, layer), _Own())
+            part_items = self.own.setdefault(self._key(values, layer), _OwnItems())
             part_items.ids.append(_usable(values.get("id") or title or local_name(element)))
             part_items.geometry.append(shape)
             part_items.properties.append(properties)
@@ -699,7 +699,7 @@ class _Reader:
             properties if isinstance(properties, dict) else {},
         )
 
-    def _picture(self, data: bytes, href: str, parameters: Mapping[str, Any]) -> Picture:
+    def _picture(self, data: bytes, href: str, parameters: Mapping[str, Any]) -> GeoImage:
         """A picture: its pixels, and the exact place that its overlay has in our words."""
         image = _image.read_image(data, self.context.limits)
         if image.mode not in ("L", "LA", "RGB", "RGBA"):
@@ -708,7 +708,7 @@ class _Reader:
         a, b, c, d, e, f = (float(v) for v in parameters["transform"])
         properties = parameters.get("properties")
         picture_properties = properties if isinstance(properties, dict) else {}
-        return Picture(np.ascontiguousarray(pixels), (a, b, c, d, e, f), str(parameters["crs"]), picture_properties)
+        return GeoImage(np.ascontiguousarray(pixels), (a, b, c, d, e, f), str(parameters["crs"]), picture_properties)
 
     def _remove_ours(self, root: etree._Element, ours: list[tuple[etree._Element, dict[str, str]]]) -> bool:
         """Take out our folders and styles; True where nothing of anybody else is left in the file."""
@@ -724,7 +724,7 @@ class _Reader:
                 if isinstance(elevation, int | float):
                     self.levels[level] = float(elevation)
                 document = unspell(values.get("document", "{}"))
-                part_items = self.own.setdefault(self._key(values, values["layer"]), _Own())
+                part_items = self.own.setdefault(self._key(values, values["layer"]), _OwnItems())
                 part_items.document |= document if isinstance(document, dict) else {}
             described = child(element, "description")
             if values[MARK] == "map" and described is not None:
@@ -856,7 +856,7 @@ class _Reader:
                 out[key] = part.with_document({**part.document, "attribution": [*stated[key], *extra]})
         return out
 
-    def _own_part(self, key: PartKey, part_items: _Own) -> Features:
+    def _own_part(self, key: PartKey, part_items: _OwnItems) -> Features:
         """Items of ours as they were: the exact metres where they were local, unless somebody has moved them."""
         n = len(part_items.ids)
         ids = unique_ids(part_items.ids)

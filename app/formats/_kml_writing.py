@@ -20,7 +20,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Invalid
-from app.formats import Needs, WriteContext, _image, _text
+from app.formats import LayerRequirements, WriteContext, _image, _text
 from app.formats._kml import (
     COORDINATES,
     END,
@@ -43,7 +43,7 @@ from app.model.features import Features, Properties, concatenate, unique_ids
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import LOCAL, USUAL_COLOURS, Picture, displayed
+from app.model.imagery import LOCAL, USUAL_COLOURS, GeoImage, displayed
 from app.model.layers import Layer, Layers, PartKey
 
 KML = "http://www.opengis.net/kml/2.2"
@@ -56,7 +56,7 @@ _SAME_PLACE = 1e-10
 """Degrees: a geometry that differs less from what the kept element says has not been edited (coordinates are printed
 to 1e-12)."""
 
-NEEDS = Needs(
+NEEDS = LayerRequirements(
     (
         frozenset({"objects"}),
         frozenset({"topology"}),
@@ -83,7 +83,7 @@ _COLOURS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class WrittenKml:
     """A KML file, the pictures that it refers to, and the name its one source had inside an archive, if any."""
 
     kml: bytes
@@ -101,7 +101,7 @@ class _Document:
     xml: str
 
 
-def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, taken: frozenset[str]) -> Written:
+def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, taken: frozenset[str]) -> WrittenKml:
     """All vector layers and the places of grids. with_pictures: grids' pictures are made too; taken: names in use."""
     frame = layers.frame
     documents: list[_Document] = []
@@ -126,7 +126,7 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
     ours = "".join([*datum, *folders, *overlays])
     context.drop("voxels", len(layers.of("voxels")), "KML has no place for it")
     entry = documents[0].entry if len(documents) == 1 else None
-    return Written((HEAD + _file(documents, ours, context)).encode(), pictures, entry)
+    return WrittenKml((HEAD + _file(documents, ours, context)).encode(), pictures, entry)
 
 
 def _file(documents: list[_Document], ours: str, context: WriteContext) -> str:
@@ -406,7 +406,7 @@ def _overlays(
     images: dict[str, bytes] = {}
     counts: Counter[str] = Counter()
     for key, part in layers.parts.items():
-        if not isinstance(part, OccupancyGrid | Picture):
+        if not isinstance(part, OccupancyGrid | GeoImage):
             continue
         corners = _corners(key, part, layers, context)
         if corners is None:
@@ -426,7 +426,7 @@ def _overlays(
 
 
 def _corners(
-    key: PartKey, part: OccupancyGrid | Picture, layers: Layers, context: WriteContext
+    key: PartKey, part: OccupancyGrid | GeoImage, layers: Layers, context: WriteContext
 ) -> NDArray[np.float64] | None:
     """The lower left, lower right, upper right and upper left corner of an image, (longitude, latitude); None, with
     the reason in the report, where KML has no place for it."""
@@ -455,7 +455,7 @@ def _corners(
     return None if problem else corners
 
 
-def _png(key: PartKey, part: OccupancyGrid | Picture, context: WriteContext) -> bytes:
+def _png(key: PartKey, part: OccupancyGrid | GeoImage, context: WriteContext) -> bytes:
     if isinstance(part, OccupancyGrid):
         return _image.overlay_png(part)
     if not _is_shown_as_it_is(part):
@@ -464,13 +464,13 @@ def _png(key: PartKey, part: OccupancyGrid | Picture, context: WriteContext) -> 
     return _image.encode_png(displayed(part))
 
 
-def _is_shown_as_it_is(picture: Picture) -> bool:
+def _is_shown_as_it_is(picture: GeoImage) -> bool:
     """Whether a PNG holds the picture's very pixels."""
     plain = picture.pixels.dtype == np.uint8 and picture.colours == USUAL_COLOURS.get(len(picture.colours))
     return plain and picture.nodata is None
 
 
-def _overlay(key: PartKey, part: OccupancyGrid | Picture, href: str, ring: NDArray[np.float64]) -> str:
+def _overlay(key: PartKey, part: OccupancyGrid | GeoImage, href: str, ring: NDArray[np.float64]) -> str:
     """Where an image lies: a box and its rotation (exact to the box's own flatness), and the exact corners."""
     longitude, latitude = ring.mean(axis=0).tolist()
     frame = local_frame(Datum(latitude, longitude))

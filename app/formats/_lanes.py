@@ -1,6 +1,7 @@
 """Lanes as pairs of bounds: which way bounds run, the middle between them, and bounds beside a middle.
 
-Flat arrays: n lines are one array of places in a table of points, and where each begins (``Runs``). Directions follow
+Flat arrays: n lines are one array of places in a table of points, and where each begins (``LineSet``). Directions
+follow
 Lanelet2: looking along a lane, the left bound is on the left, and both run along it.
 """
 
@@ -30,7 +31,7 @@ Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Runs:
+class LineSet:
     """n lines of two and more points. at: places of their points. first: [n + 1], where each begins in ``at``."""
 
     at: Places
@@ -51,22 +52,22 @@ class Runs:
         """[n] the last point of each line."""
         return self.at[self.first[1:] - 1]
 
-    def turned(self, mask: NDArray[np.bool_]) -> Runs:
+    def turned(self, mask: NDArray[np.bool_]) -> LineSet:
         """The same with these lines the other way round."""
         owner = self.owner
         positions = np.arange(len(self.at))
         back = self.first[owner] + self.first[owner + 1] - 1 - positions
-        return Runs(self.at[np.where(mask[owner], back, positions)], self.first)
+        return LineSet(self.at[np.where(mask[owner], back, positions)], self.first)
 
 
-def runs(lines: Sequence[Sequence[int]]) -> Runs:
+def runs(lines: Sequence[Sequence[int]]) -> LineSet:
     """From lists of places."""
     first = np.zeros(len(lines) + 1, np.intp)
     np.cumsum([len(line) for line in lines], out=first[1:])
-    return Runs(np.array([k for line in lines for k in line], np.intp), first)
+    return LineSet(np.array([k for line in lines for k in line], np.intp), first)
 
 
-def aligned(left: Runs, right: Runs, xy: Array) -> tuple[Runs, Runs]:
+def aligned(left: LineSet, right: LineSet, xy: Array) -> tuple[LineSet, LineSet]:
     """Both bounds along the lane. xy: [points, 2] in metres.
 
     Source: Lanelet2's ``geometry::align``, which its reader applies to every lanelet: a bound is turned where the
@@ -76,14 +77,14 @@ def aligned(left: Runs, right: Runs, xy: Array) -> tuple[Runs, Runs]:
     return turned, right.turned(_side(right, _middle(turned, xy), xy) <= 0)
 
 
-def _middle(lines: Runs, xy: Array) -> Array:
+def _middle(lines: LineSet, xy: Array) -> Array:
     """[n, 2] the middle one of its points; of two the mean."""
     size = np.diff(lines.first)
     inner = xy[lines.at[lines.first[:-1] + size // 2]]
     return np.where((size > 2)[:, None], inner, (xy[lines.begin] + xy[lines.end]) / 2.0)
 
 
-def _side(lines: Runs, points: Array, xy: Array) -> Array:
+def _side(lines: LineSet, points: Array, xy: Array) -> Array:
     """[n] positive where a line's point is on its left, negative on its right."""
     coordinates = xy[lines.at]
     inner = np.ones(len(lines.at), bool)
@@ -114,7 +115,7 @@ def _side(lines: Runs, points: Array, xy: Array) -> Array:
     return side
 
 
-def middles(left: Runs, right: Runs, xy: Array, places: Array) -> tuple[Array, Places]:
+def middles(left: LineSet, right: LineSet, xy: Array, places: Array) -> tuple[Array, Places]:
     """The line half-way between the bounds of n lanes: all its points [m, columns of places] and their lane [m].
 
     It bends wherever a bound bends, at the same share of the bounds' lengths in ``xy`` (metres); ``places`` are in
@@ -141,7 +142,7 @@ def middles(left: Runs, right: Runs, xy: Array, places: Array) -> tuple[Array, P
     return (sides[0] + sides[1]) / 2.0, owner
 
 
-def _ratios(lines: Runs, xy: Array) -> Array:
+def _ratios(lines: LineSet, xy: Array) -> Array:
     """Of each point, the share of its line's length that lies before it, 0 to 1."""
     owner = lines.owner
     step = np.hypot(*(xy[lines.at[1:]] - xy[lines.at[:-1]]).T)

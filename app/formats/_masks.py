@@ -10,13 +10,13 @@ from app.errors import Problem, UnreadableFile
 from app.formats import ReadContext, WriteContext, _yaml
 from app.model import masks
 from app.model.grid import UNKNOWN, OccupancyGrid
-from app.model.masks import KEEPOUT, SPEED_METRES, SPEED_PERCENT, Info
+from app.model.masks import KEEPOUT, SPEED_METRES, SPEED_PERCENT, FilterInfo
 
 SUFFIX = "_filter_info"
 
 _BY_NAME = (
-    (re.compile(r"keep_?out|no_?go|preferred", re.IGNORECASE), Info(KEEPOUT, 0.0, 1.0)),
-    (re.compile(r"speed", re.IGNORECASE), Info(SPEED_PERCENT, 100.0, -1.0)),
+    (re.compile(r"keep_?out|no_?go|preferred", re.IGNORECASE), FilterInfo(KEEPOUT, 0.0, 1.0)),
+    (re.compile(r"speed", re.IGNORECASE), FilterInfo(SPEED_PERCENT, 100.0, -1.0)),
 )
 """What a mask means that does not say so: by its name, and as Nav2's own examples have it."""
 

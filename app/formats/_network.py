@@ -158,7 +158,7 @@ class Node:
 
 
 @dataclass(slots=True)
-class Net:
+class MergedNetwork:
     """All networks of an environment as one; ids of nodes are distinct, and so are those of edges."""
 
     nodes: list[Node] = field(default_factory=list)
@@ -166,13 +166,13 @@ class Net:
     levels: list[str] = field(default_factory=list)
 
 
-def joined(layers: Layers, context: WriteContext) -> Net:
+def joined(layers: Layers, context: WriteContext) -> MergedNetwork:
     """All networks, nodes and edges in the order of their parts. MissingDatum where one is on earth without a datum.
 
     Edges find their nodes in their own part first, then in another one. What is neither a node with a point nor an
     edge between nodes is declared as dropped; ids that several networks use get a number, with a warning.
     """
-    net = Net()
+    net = MergedNetwork()
     homes: list[dict[str, int]] = []
     everywhere: dict[str, int] = {}
     taken: set[str] = set()
@@ -204,7 +204,9 @@ def joined(layers: Layers, context: WriteContext) -> Net:
     return net
 
 
-def _join_edges(net: Net, parts: Any, shapes: Any, homes: list[dict[str, int]], everywhere: dict[str, int]) -> int:
+def _join_edges(
+    net: MergedNetwork, parts: Any, shapes: Any, homes: list[dict[str, int]], everywhere: dict[str, int]
+) -> int:
     taken: set[str] = set()
     dropped_count = 0
     for (key, part), home in zip(parts.items(), homes, strict=True):
@@ -245,7 +247,7 @@ def count(items: Any) -> int:
     return len(items) if isinstance(items, list) else 0
 
 
-def only_2d(net: Net, context: WriteContext, why: str) -> None:
+def only_2d(net: MergedNetwork, context: WriteContext, why: str) -> None:
     """Declare what a flat format without levels loses."""
     context.drop("altitudes of nodes", sum(bool(n.z) for n in net.nodes), why)
     if len(set(net.levels)) > 1:

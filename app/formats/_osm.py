@@ -418,7 +418,7 @@ _DECIMAL = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?\s*", re
 
 def _events(data: bytes, limits: Limits) -> Data:
     """Event by event with lxml: any legal XML, and every odd thing that real files have."""
-    reader = _Careful(limits)
+    reader = _StrictParser(limits)
     events = etree.iterparse(
         BytesIO(data.lstrip(b"\xef\xbb\xbf \t\r\n")),
         events=("start", "end"),
@@ -447,7 +447,7 @@ def _events(data: bytes, limits: Limits) -> Data:
     return reader.finish()
 
 
-class _Careful:
+class _StrictParser:
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.root: Attributes = {}
@@ -629,7 +629,7 @@ def _pbf(data: bytes, limits: Limits) -> Data:
     """A ``.pbf`` through the OSM project's own library, which bounds each block to 32 MiB; we bound their number."""
     import osmium
 
-    out = _Careful(limits)
+    out = _StrictParser(limits)
     try:
         file = osmium.FileProcessor(osmium.io.FileBuffer(data, "pbf"))
         header = file.header
@@ -654,7 +654,7 @@ def _pbf(data: bytes, limits: Limits) -> Data:
     return out.finish()
 
 
-def _take_pbf(out: _Careful, item: Any) -> int:
+def _take_pbf(out: _StrictParser, item: Any) -> int:
     """Keep one object; roughly how many bytes it takes."""
     attributes: Attributes = {}
     if item.version:

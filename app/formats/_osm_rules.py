@@ -39,7 +39,7 @@ def check(files: Files) -> Iterator[Problem]:
         return
     if root.get("version") != "0.6":
         yield refused(f"must be 0.6, is {root.get('version')!r}", main, line=root.sourceline, where="version")
-    elements = _Found()
+    elements = _ElementScan()
     try:
         elements.take(root)
     except (TypeError, ValueError):
@@ -67,7 +67,7 @@ def check(files: Files) -> Iterator[Problem]:
 
 
 @dataclass(slots=True)
-class _Found:
+class _ElementScan:
     """What one walk through the elements found. kinds: in the order in which they stand, each run once."""
 
     ids: dict[str, list[int]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
@@ -109,7 +109,7 @@ class _Found:
                     self.long.append(i)
 
 
-def _order(elements: _Found, main: str) -> Iterator[Problem]:
+def _order(elements: _ElementScan, main: str) -> Iterator[Problem]:
     if elements.kinds != [kind for kind in KINDS if kind in elements.kinds]:
         yield doubted("types are mixed: GDAL and osmium want all nodes, then all ways, then all relations", main)
         return

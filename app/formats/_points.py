@@ -53,7 +53,7 @@ UNTURNED = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 AXES = ("x", "y", "z")
 Array = NDArray[np.float64]
-Move = tuple[float, float, float]
+Offset = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +297,7 @@ def _corner(earth: Array) -> Datum:
     return Datum(float(np.clip(south, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), float(west))
 
 
-def _fitted(low: Array, high: Array, options: ReadOptions, context: ReadContext) -> tuple[float, Move]:
+def _fitted(low: Array, high: Array, options: ReadOptions, context: ReadContext) -> tuple[float, Offset]:
     """Resolution, and what is subtracted from the points, so that their box lies in the tree."""
     candidates = RESOLUTIONS if options.resolution is None else (options.resolution,)
     shift = np.zeros(3) if options.origin is None else np.array(options.origin)
@@ -410,7 +410,7 @@ MOST = 2**25
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class CloudToWrite:
     """What is to be written. data: the uploaded file where it can be served as it is; ``cloud()`` are the points."""
 
     cloud: Callable[[], Cloud]
@@ -427,7 +427,7 @@ def source(
     frame: Frame | None,
     forms: Sequence[str],
     parsers: Mapping[str, Parse],
-) -> Source:
+) -> CloudToWrite:
     """The points behind a voxel map: those of the file it was made of, else the centres of its occupied voxels.
 
     forms: endings of the wanted format. Raises MissingLayer, NotFound, Ambiguous, or Invalid for too many points.
@@ -441,7 +441,7 @@ def source(
     if data is None or not isinstance(source_properties, Mapping):
         if frame == "source":
             raise Invalid("frame=source asks for an uploaded cloud, and this voxel map was not made of one")
-        return Source(lambda: centres(voxels, context), None, "", local=True)
+        return CloudToWrite(lambda: centres(voxels, context), None, "", local=True)
     form = str(source_properties["file"]).rpartition(".")[2]
     moved = "crs" in source_properties or "origin" in source_properties
     local = moved and (frame == "local" or (frame is None and form not in forms))
@@ -454,7 +454,7 @@ def source(
         cloud = parse(data, ReadContext(limits=_NO_LIMITS))
         return _moved(cloud, source_properties, context) if local else cloud
 
-    return Source(load, data if same_form else None, form, local)
+    return CloudToWrite(load, data if same_form else None, form, local)
 
 
 _NO_LIMITS = Limits(voxels=2**62, text_bytes=2**62, unpacked_bytes=2**62)

@@ -22,7 +22,7 @@ from app.formats import Limits
 from app.model.frame import MAX_METRES
 from app.model.gdal import CACHE, DATA_TYPES, gdal, native, opened, taken
 from app.model.geodesy import crs_bounds
-from app.model.imagery import LOCAL, Affine, Picture
+from app.model.imagery import LOCAL, Affine, GeoImage
 
 NO_TRANSFORM: Affine = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
@@ -52,7 +52,7 @@ _MEMORY_NAME = re.compile(r"/vsimem/[0-9a-f-]+/[0-9a-f-]+\.tif(?:, band \d+)?:?\
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """A decoded TIFF. transform, crs: None where it has none; properties: as ``Picture`` has them, with its tags."""
+    """A decoded TIFF. transform, crs: None where it has none; properties: as ``GeoImage`` has them, with its tags."""
 
     pixels: NDArray[Any]
     transform: Affine | None
@@ -166,7 +166,7 @@ def crs_from_wkt(text: str) -> str:
             raise UnreadableFile(f"its CRS cannot be read: {_reason(error)}") from error
 
 
-def lies_nowhere(picture: Picture) -> str | None:
+def lies_nowhere(picture: GeoImage) -> str | None:
     """Why a picture has no place, beyond the local frame or where PROJ knows none on earth; None where it has one."""
     ends = picture.outline()
     if picture.crs == LOCAL:
@@ -350,7 +350,7 @@ def fitted(points: Sequence[tuple[float, float, float, float]]) -> tuple[Affine,
 
 
 # --- writing ------------------------------------------------------------------------------------------------------
-def write_cog(picture: Picture, crs: str | None, tags: Mapping[str, str]) -> bytes:
+def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> bytes:
     """A cloud optimized GeoTIFF: tiles of 512 pixels, overviews from there on, deflate with a predictor.
 
     crs: what it is called, None for none. tags: of the whole file. The pixels are not copied: GDAL reads them where
@@ -384,13 +384,13 @@ def write_cog(picture: Picture, crs: str | None, tags: Mapping[str, str]) -> byt
         return taken(out.getbuffer())
 
 
-def _is_shade(picture: Picture) -> bool:
+def _is_shade(picture: GeoImage) -> bool:
     """Whether values between values mean something: shades and heights, not names (whole numbers of no colour)."""
     return picture.pixels.dtype.kind == "f" or picture.pixels.dtype == np.uint8
 
 
 def _describe(
-    dataset: Any, picture: Picture, colours: Sequence[str], crs: str | None, tags: Mapping[str, str], rasterio: Any
+    dataset: Any, picture: GeoImage, colours: Sequence[str], crs: str | None, tags: Mapping[str, str], rasterio: Any
 ) -> None:
     interpretations = rasterio.enums.ColorInterp
     dataset.transform = rasterio.Affine(*picture.transform)

@@ -486,7 +486,7 @@ class Body:
         return out
 
 
-class Unfolder:
+class ModelFlattener:
     """Models with all that they include as solids in one frame.
 
     served: path in the upload -> path among the objects' resources.
@@ -694,7 +694,7 @@ def placement(element: etree._Element, inside: Body) -> Matrix | None:
 class _Frames:
     """The frames of a model (or of a world) by name, each resolved once along ``relative_to``."""
 
-    def __init__(self, unfolder: Unfolder, file: str) -> None:
+    def __init__(self, unfolder: ModelFlattener, file: str) -> None:
         self.unfolder, self.file = unfolder, file
         self._said: dict[str, tuple[Pose, str, Matrix | None, etree._Element]] = {}
         self._inner: dict[str, Body] = {}

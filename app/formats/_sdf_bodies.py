@@ -55,7 +55,7 @@ Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Usual:
+class BodyDefaults:
     """What bodies get that no source tells."""
 
     wall_height: float = parameter(2.5, "height of walls that tell none", minimum=0.01, maximum=1000.0, unit="m")
@@ -152,7 +152,7 @@ def sun(name: str) -> etree._Element:
 class Bodies:
     """Makes models, collects the files they need, and tells what was made up and what was left out."""
 
-    def __init__(self, context: WriteContext, resources: Mapping[str, bytes], defaults: Usual) -> None:
+    def __init__(self, context: WriteContext, resources: Mapping[str, bytes], defaults: BodyDefaults) -> None:
         self.context, self.resources, self.usual = context, resources, defaults
         self.files: dict[str, bytes] = {}
         self.newest = (1, 4)

@@ -94,7 +94,7 @@ def needed(library: _sdf.Library, main: str) -> list[str]:
 
 
 @dataclass(slots=True)
-class Found:
+class ParsedList:
     """Objects as (name, properties), the rest of the list, and path in the upload -> path of a resource."""
 
     objects: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
@@ -102,7 +102,7 @@ class Found:
     served: dict[str, str] = field(default_factory=dict)
 
 
-def read(library: _sdf.Library, main: str, context: ReadContext) -> Found:
+def read(library: _sdf.Library, main: str, context: ReadContext) -> ParsedList:
     """A list with all it refers to. Raises UnreadableFile or TooLarge."""
     data = _yaml.load(library.files[main], context.limits)
     reader = _Reader(library, main, context)
@@ -173,8 +173,8 @@ class _Reader:
 
     def __init__(self, library: _sdf.Library, main: str, context: ReadContext) -> None:
         self.library, self.main, self.context = library, main, context
-        self.found = Found()
-        self.unfolder = _sdf.Unfolder(library, self.found.served, context)
+        self.found = ParsedList()
+        self.unfolder = _sdf.ModelFlattener(library, self.found.served, context)
         self._lists: dict[str, list[Mapping[str, Any]]] = {}
         self._count = 0
 

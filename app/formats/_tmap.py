@@ -512,7 +512,7 @@ def _edge_lines(xyz: Array, sources: NDArray[np.intp], targets: NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True)
-class _Turn:
+class _MapTransform:
     """A file's ``transformation``: a pose in the child frame, turned and shifted, is one in the local frame."""
 
     child: str
@@ -531,7 +531,7 @@ class _Turn:
         )
 
 
-def _turn(document: Mapping[str, Any]) -> _Turn | None:
+def _turn(document: Mapping[str, Any]) -> _MapTransform | None:
     """The file's transformation, where there is one that changes anything."""
     transformation = document.get("transformation")
     if (
@@ -554,7 +554,7 @@ def _turn(document: Mapping[str, Any]) -> _Turn | None:
         )
     if x == y == z == 0.0 and not shift.any():
         return None
-    return _Turn(transformation["child"], (x / length, y / length, z / length, w / length), shift)
+    return _MapTransform(transformation["child"], (x / length, y / length, z / length, w / length), shift)
 
 
 def _times(a: Sequence[float], b: Sequence[float]) -> list[float]:

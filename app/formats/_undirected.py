@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.formats import ReadContext, WriteContext
-from app.formats._network import Array, Edge, Net, edge_lines, natural, own, some
+from app.formats._network import Array, Edge, MergedNetwork, edge_lines, natural, own, some
 from app.model.features import Properties, unique_ids
 
 ONEWAY = "oneway"
@@ -76,7 +76,7 @@ def edges(
     return edge_ids, list(edge_lines(xyz, [a for a, _ in rows], [b for _, b in rows])), properties
 
 
-def lines(net: Net, context: WriteContext, name: str) -> list[Line]:
+def lines(net: MergedNetwork, context: WriteContext, name: str) -> list[Line]:
     """Directed edges as lines, in the order of their nodes' places; what lines cannot say is declared."""
     ordered = sorted(net.edges, key=lambda e: (own(e.properties, name).get("backward") is True, natural(e.id)))
     pairs: list[tuple[Edge, Edge | None]] = []

@@ -68,7 +68,7 @@ class Tagged(NamedTuple):
     value: Any
 
 
-class Plain(str):
+class PlainScalar(str):
     """A scalar without quotes as its text, for formats whose readers take it for one (``no``, ``010``); ``scalar`` says
     what else it may mean."""
 
@@ -79,7 +79,7 @@ def load(data: bytes, limits: Limits, *, tags: Sequence[str] = (), typed: bool =
     """The one document of a UTF-8 YAML file as JSON-like values; an empty file is None.
 
     tags: prefixes of the format's own tags, which collections may carry. typed: whether scalars get their meaning;
-    if not, all are texts, those without quotes ``Plain``.
+    if not, all are texts, those without quotes ``PlainScalar``.
     Values behind aliases, and equal mappings at the end of rows in flow style, are shared objects: do not change them
     in place. Raises UnreadableFile or TooLarge, with line.
     """
@@ -251,7 +251,7 @@ def _load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed
                 elif typed:
                     value = scalar(literal) if plain else literal
                 else:
-                    value = Plain(literal) if plain else literal
+                    value = PlainScalar(literal) if plain else literal
                 weight = 8 + len(literal)
             elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
                 nodes += 1
@@ -401,7 +401,7 @@ _Line = tuple[int, str | None, Any, tuple[int, bool, int, str | None]]
 else -2; key; value; (first column, dash?, column of the key, anchor) for the general case."""
 
 
-class _Flows:
+class _FlowParser:
     """Collections in flow style on one line. Equal mappings at the end of rows are one object, as behind aliases.
 
     nodes: how many were said, shared ones each time; depth: of the deepest collection.
@@ -514,7 +514,7 @@ class _Lines(dict[str, _Line]):
 
     def __init__(self, limits: Limits) -> None:
         super().__init__()
-        self.flows = _Flows(limits)
+        self.flows = _FlowParser(limits)
 
     def __missing__(self, line: str) -> _Line:
         row = _ROW.match(line)

@@ -23,8 +23,18 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _datum_rules, _fields, _yaml, register
-from app.formats._fields import ANGLE, COORDINATE, LATITUDE, LONGITUDE, Number, Words, record
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    WriteContext,
+    _datum_rules,
+    _fields,
+    _yaml,
+    register,
+)
+from app.formats._fields import ANGLE, COORDINATE, LATITUDE, LONGITUDE, Number, OneOf, record
 from app.formats._text import DEGREES
 from app.model.features import Features, features
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
@@ -62,7 +72,7 @@ _SIZE = record(xmin=COORDINATE, xmax=COORDINATE, ymin=COORDINATE, ymax=COORDINAT
 _ALTITUDE = Number(-12_000.0, 100_000.0, unit="metres")
 _HEADING = Number(-360.0, 360.0, unit="degrees")
 _ORIGIN = record("name", latitude=LATITUDE, longitude=LONGITUDE, altitude=_ALTITUDE, heading=_HEADING)
-_BOOL = Words((True, False))
+_BOOL = OneOf((True, False))
 SHAPE = record(
     datum_latitude=LATITUDE,
     datum_longitude=LONGITUDE,
@@ -419,7 +429,7 @@ register(
         read=read,
         check=_datum_rules.check,
         write=write,
-        needs=Needs(one_of=(frozenset({"location"}),), anchor="wgs84", datum=True),
+        needs=LayerRequirements(one_of=(frozenset({"location"}),), anchor="wgs84", datum=True),
         write_options=WriteOptions,
         family=NAME,
         rank=60,

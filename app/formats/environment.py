@@ -30,9 +30,9 @@ from app.errors import CannotConvert, FleetMapError, MissingLayer, Problem, Unre
 from app.formats import (
     Files,
     Format,
-    Inner,
+    LayerRequirements,
     Limits,
-    Needs,
+    NestedMap,
     ReadContext,
     WriteContext,
     _archive,
@@ -142,7 +142,7 @@ class _Writer:
 
     def made(
         self, name: str, layers: Layers, values: Mapping[str, Any] | None = None, *, derived: bool = False
-    ) -> Inner | None:
+    ) -> NestedMap | None:
         """A map by another format's writer; None, with the reason in the report, where there is none."""
         try:
             return self.make(name, layers, values or {}, derived)
@@ -150,7 +150,7 @@ class _Writer:
             self.context.warn(f"no {name} is in it: {error.detail}")
         return None
 
-    def put(self, names: Mapping[str, str], inner: Inner, *, copy: bool = False) -> str:
+    def put(self, names: Mapping[str, str], inner: NestedMap, *, copy: bool = False) -> str:
         """Add a map's files and return the path of its main file, with a number where another map has that path.
 
         Args:
@@ -362,7 +362,7 @@ class _Writer:
                 self.put(dict.fromkeys(inner.files, "world/objects.geojson"), inner)
                 self.told.update(remaining)
 
-    def family(self, name: str, parts: Mapping[PartKey, Part]) -> Inner | None:
+    def family(self, name: str, parts: Mapping[PartKey, Part]) -> NestedMap | None:
         """A map of the format that these objects came from; None where they cannot be all of it."""
         names = (name, "kmz") if name == "kml" else (name,)
         resources = {k: p for k, p in self.layers.parts.items() if k.layer == "resources" and k.name in names}
@@ -500,7 +500,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=Needs(tuple(frozenset({layer}) for layer in HELD)),
+        needs=LayerRequirements(tuple(frozenset({layer}) for layer in HELD)),
         write_options=WriteOptions,
         family=NAME,
         rank=70,

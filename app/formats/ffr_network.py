@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _yaml, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, _yaml, register
 from app.formats._fields import COORDINATE, WIDTH, record
 from app.formats._network import (
     Array,
@@ -238,7 +238,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         family=NAME,
         rank=34,
         extensions=(".ffr.yaml", ".yaml", ".yml"),

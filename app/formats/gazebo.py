@@ -35,8 +35,8 @@ from app.errors import BadUpload, Invalid, MissingLayer, NotFound, TooLarge
 from app.formats import (
     Files,
     Format,
+    LayerRequirements,
     Limits,
-    Needs,
     ReadContext,
     WriteContext,
     _sdf,
@@ -68,7 +68,7 @@ SAME_POSE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class WriteOptions(_sdf_bodies.Usual):
+class WriteOptions(_sdf_bodies.BodyDefaults):
     """Which world, and what is made of objects and grids that no world has told of."""
 
     world: str | None = parameter(
@@ -146,7 +146,9 @@ def read(files: Files, context: ReadContext) -> Layers:
         version_text = root.get("version")
         context.warn(f"SDFormat version {version_text!r} is not one of 1.4 to 1.11: read as 1.7", line=root.sourceline)
     served = _sdf.needed(library, main)
-    reader = _Reader(_sdf.Unfolder(library, served, context), main, {served[n]: files[n] for n in served}, context)
+    reader = _Reader(
+        _sdf.ModelFlattener(library, served, context), main, {served[n]: files[n] for n in served}, context
+    )
     worlds = root.findall("world")
     for k, world in enumerate(worlds):
         name = _key(main) if not k else f"{_key(main)}#{k + 1}"
@@ -179,7 +181,7 @@ def _key(main: str) -> str:
 class _Reader:
     """The objects and the rest of a file's worlds."""
 
-    unfolder: _sdf.Unfolder
+    unfolder: _sdf.ModelFlattener
     main: str
     resources: dict[str, bytes]
     context: ReadContext
@@ -464,7 +466,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Stored:
+class _StoredWorld:
     """A stored world: what it says, its objects, and where they lie."""
 
     key: str
@@ -488,7 +490,7 @@ class _Writer:
         self.resources = layers.resources()
         self.made: list[tuple[str, etree._Element]] = []
         self.taken: set[str] = set()
-        self.stored: list[_Stored] = []
+        self.stored: list[_StoredWorld] = []
         self.others: list[tuple[PartKey, Features]] = []
         self.loose: list[Feature] = []
         self._sort()
@@ -511,10 +513,10 @@ class _Writer:
                 by_world.get(str(name), self.loose).append(one)
             for name, entry in worlds.items():
                 if "sdf" in entry or by_world[name]:
-                    self.stored.append(_Stored(name, entry, by_world[name]))
+                    self.stored.append(_StoredWorld(name, entry, by_world[name]))
         self.stored.sort(key=lambda world: world.rank)
 
-    def _chosen(self) -> _Stored | None:
+    def _chosen(self) -> _StoredWorld | None:
         world_name = self.options.world
         if world_name is not None:
             matches = [w for w in self.stored if world_name in (w.key, _sdf.stem(w.key))]
@@ -573,7 +575,7 @@ class _Writer:
         world.extend([element for _, element in sorted(self.made, key=lambda row: _natural(row[0]))])
         return self._bundle(world, source_world, bodies)
 
-    def _frame(self, source_world: _Stored | None) -> etree._Element:
+    def _frame(self, source_world: _StoredWorld | None) -> etree._Element:
         """The world's element with all that is no object."""
         if source_world is not None and "sdf" in source_world.entry:
             world = _element(str(source_world.entry["sdf"]), ("world",))
@@ -648,7 +650,7 @@ class _Writer:
             self.made.append((name, _sdf_bodies.sun(name)))
             self.context.fill("sun", "directional light", "no world tells of a light", "sun")
 
-    def _place(self, world: etree._Element, source_world: _Stored | None) -> None:
+    def _place(self, world: etree._Element, source_world: _StoredWorld | None) -> None:
         """The datum as spherical coordinates; what the stored world says stays where it means the same."""
         datum = self.layers.datum
         old_coordinates = world.find("spherical_coordinates")
@@ -675,7 +677,7 @@ class _Writer:
         _sdf.child(coordinates, "elevation", number(datum.altitude))
         _sdf.child(coordinates, "heading_deg", number(-datum.heading, DEGREES))
 
-    def _version(self, source_world: _Stored | None) -> str:
+    def _version(self, source_world: _StoredWorld | None) -> str:
         source_version = str(source_world.entry.get("version") or "") if source_world is not None else ""
         valid_version = source_version if source_version in _sdf.VERSIONS else None
         if self.options.version is not None:
@@ -685,7 +687,7 @@ class _Writer:
         return source_version or "1.7"
 
     def _bundle(
-        self, world: etree._Element, source_world: _Stored | None, bodies: _sdf_bodies.Bodies
+        self, world: etree._Element, source_world: _StoredWorld | None, bodies: _sdf_bodies.Bodies
     ) -> dict[str, bytes]:
         version = self._version(source_world)
         if bodies.newest > (_sdf.version_of(version) or (1, 7)):
@@ -766,7 +768,7 @@ register(
         write=write,
         write_options=WriteOptions,
         choose=choose,
-        needs=Needs(
+        needs=LayerRequirements(
             one_of=(frozenset({"objects"}), frozenset({"occupancy"})),
             anchor="local",
             also=frozenset({"resources", "occupancy"}),

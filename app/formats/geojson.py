@@ -31,7 +31,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _json, register
 from app.formats._text import DEGREES, METRES
 from app.model.features import MAX_ID, NO_GEOMETRY, Features, Properties, unique_ids
 from app.model.frame import GROUND, MAX_METRES, Datum, Level
@@ -401,10 +401,10 @@ class _Reader:
 
 # --- geometries --------------------------------------------------------------------------------------------------
 
-Refuse = Callable[[int, str], NoReturn]
+RaiseUnreadable = Callable[[int, str], NoReturn]
 
 
-def _geometries(raw: Sequence[Any], refuse: Refuse) -> tuple[NDArray[np.object_], dict[int, Any]]:
+def _geometries(raw: Sequence[Any], refuse: RaiseUnreadable) -> tuple[NDArray[np.object_], dict[int, Any]]:
     """Shapely geometries of GeoJSON ones, and by place those whose text says more than the shape."""
     out = np.empty(len(raw), object)
     odd: dict[int, Any] = {}
@@ -433,7 +433,7 @@ def _geometries(raw: Sequence[Any], refuse: Refuse) -> tuple[NDArray[np.object_]
     else:
         single += plain["LineString"]
     for k in sorted(single):
-        one = _One()
+        one = _GeometryParser()
         try:
             out[k] = one.shape(raw[k])
         except (ValueError, shapely.errors.GEOSException) as error:
@@ -452,7 +452,7 @@ def _flat(rows: list[Any]) -> bool:
     )
 
 
-class _One:
+class _GeometryParser:
     """One GeoJSON geometry -> shapely. odd: the text says something that the shape does not."""
 
     def __init__(self) -> None:
@@ -664,7 +664,7 @@ class _Writer:
 def _same_shape(odd: dict[str, Any], shape: Any) -> bool:
     """Whether an uploaded geometry still is what the item looks like."""
     try:
-        return bool(shapely.equals_identical(_One().shape(odd), shape))
+        return bool(shapely.equals_identical(_GeometryParser().shape(odd), shape))
     except (ValueError, shapely.errors.GEOSException, RecursionError):
         return False
 
@@ -748,7 +748,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=Needs(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
+        needs=LayerRequirements(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
         family=FAMILY,
         marks_blocked=True,
         drawing=True,

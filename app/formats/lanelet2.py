@@ -43,13 +43,24 @@ import numpy as np
 import shapely
 
 from app.errors import Invalid, MissingDatum, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _lanes, _osm_text, _yaml, register
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    WriteContext,
+    _fields,
+    _lanes,
+    _osm_text,
+    _yaml,
+    register,
+)
 from app.formats._lanes import Arm, Array, Border
-from app.formats._network import AMONG_PARTS, Edge, Net, joined, own
+from app.formats._network import AMONG_PARTS, Edge, MergedNetwork, joined, own
 from app.formats._osm import INT64, Data, Tags, Way, parse
 from app.formats._osm_text import NOTHING, as_texts, attribute_text, element_id, integers
 from app.formats._text import number
-from app.model.features import NO_GEOMETRY, Compact, Features, Properties, from_columns, unique_ids
+from app.model.features import NO_GEOMETRY, Features, Properties, SharedKeyDicts, from_columns, unique_ids
 from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Anchor, Datum
 from app.model.geodesy import local_frame
 from app.model.layers import NETWORK, Layers, Part, PartKey
@@ -61,8 +72,8 @@ PROJECTOR = "map_projector_info.yaml"
 _PROJECTORS = ("Local", "local", "MGRS", "LocalCartesian", "LocalCartesianUTM", "TransverseMercator")
 PROJECTOR_SHAPE = _fields.record(
     "mgrs_grid",
-    projector_type=_fields.Words(_PROJECTORS),
-    vertical_datum=_fields.Words(("WGS84", "EGM2008")),
+    projector_type=_fields.OneOf(_PROJECTORS),
+    vertical_datum=_fields.OneOf(("WGS84", "EGM2008")),
     map_origin=_fields.record(latitude=_fields.LATITUDE, longitude=_fields.LONGITUDE, altitude=_fields.COORDINATE),
     scale_factor=_fields.Number(0.0, 10.0, above=True),
 )
@@ -130,7 +141,7 @@ class Lane:
 
 
 @dataclass(slots=True)
-class Places:
+class PointTable:
     """Where points are. row: node id -> row of ``xyz``, [n, 3] as they are anchored, z NaN where none is said."""
 
     row: dict[int, int]
@@ -155,9 +166,9 @@ class Places:
         return xy
 
 
-def network(lanes: Sequence[Lane], places: Places, document: Properties) -> Features:
+def network(lanes: Sequence[Lane], places: PointTable, document: Properties) -> Features:
     """Nodes and directed edges of lanelets, all of whose points have a place."""
-    marks, compact = _Ends(), Compact()
+    marks, compact = _JoinedEnds(), SharedKeyDicts()
     rows: list[tuple[Lane, tuple[int, int], tuple[int, int], bool]] = []
     ids: list[str] = []
     geometry: list[Any] = []
@@ -227,7 +238,7 @@ def _bounds(lanes: Sequence[Lane]) -> tuple[list[list[int]], list[list[int]]]:
 
 
 def _middles(
-    lanes: Sequence[Lane], left: _lanes.Runs, right: _lanes.Runs, places: Places, xy: Array
+    lanes: Sequence[Lane], left: _lanes.LineSet, right: _lanes.LineSet, places: PointTable, xy: Array
 ) -> tuple[list[Any], list[float | None]]:
     """Of each lane its middle as a line, and its width in metres, None where the bounds touch."""
     high = ~np.isnan(places.xyz[:, 2])
@@ -260,7 +271,7 @@ def _middles(
     return out, widths
 
 
-class _Ends:
+class _JoinedEnds:
     """Which ends of lanes are one node. An end is its (left, right) points, looking along the lane; on a lane that may
     be used both ways it is also (right, left)."""
 
@@ -483,7 +494,7 @@ class _Reader:
                 context.warn(f"{times} {text}")
         self.xyz = xyz
         self.known: dict[int, dict[str, Any]] = {}
-        self.compact = Compact()
+        self.compact = SharedKeyDicts()
         self.located = {i: k for i, k in row.items() if not absent[k]}
 
     def network(self) -> Features:
@@ -595,10 +606,10 @@ class _Reader:
 
 def _table(
     located: Mapping[int, int], xyz: Array, anchor: Anchor, names: dict[str, int], labels: dict[str, str]
-) -> Places:
+) -> PointTable:
     """Only points with a place, so that nothing else can be meant."""
     rows = list(located.values())
-    return Places({i: k for k, i in enumerate(located)}, xyz[rows].reshape(-1, 3), anchor, names, labels)
+    return PointTable({i: k for k, i in enumerate(located)}, xyz[rows].reshape(-1, 3), anchor, names, labels)
 
 
 def _properties(source_members: dict[str, Any], tags: Tags, otherwise: str) -> dict[str, Any]:
@@ -635,7 +646,7 @@ class _Level:
 
 
 @dataclass(slots=True)
-class _New:
+class _NewLanelet:
     """A lanelet to be made: its middle [k, 3] in metres, the edge along it, and the edge back, if it is two-way."""
 
     middle: Array
@@ -856,7 +867,7 @@ class _Writer:
             for i, source_members in relations
         )
         lanes, broken = lanes_of(rows, ways, row)
-        table = Places(row, np.array(xyz, np.float64).reshape(-1, 3), "local" if local else "wgs84", names, labels)
+        table = PointTable(row, np.array(xyz, np.float64).reshape(-1, 3), "local" if local else "wgs84", names, labels)
         drawn = network(lanes, table, {})
         out = self.compared(lanes, drawn, networks)
         # A lanelet with a redrawn bound is written as it is drawn now; its edges stay with it.
@@ -969,7 +980,7 @@ class _Writer:
         self.bounds(net, new, centres)
         self.tell(net, new)
 
-    def tell(self, net: Net, new: Sequence[_New]) -> None:
+    def tell(self, net: MergedNetwork, new: Sequence[_NewLanelet]) -> None:
         """What new lanelets were given, and what they could not take."""
         if new:
             why = "the edges of the network say no more"
@@ -986,7 +997,7 @@ class _Writer:
         if len(set(net.levels)) > 1:
             self.context.drop("levels of nodes", len(net.nodes), "Lanelet2 knows no levels: all networks are joined")
 
-    def new_lanelets(self, net: Net) -> list[_New]:
+    def new_lanelets(self, net: MergedNetwork) -> list[_NewLanelet]:
         """One for each edge, one for both where an edge has a like one on the way back."""
         waiting: dict[tuple[int, int], list[Edge]] = {}
         for edge in net.edges:
@@ -1018,12 +1029,12 @@ class _Writer:
                         done.add(id(other))
                         break
             width = _positive(edge.properties.get("width")) or self.options.width
-            out.append(_New(middle, width / 2.0, edge, back))
+            out.append(_NewLanelet(middle, width / 2.0, edge, back))
         self.context.drop("edges from a node to itself", loops, "a lanelet does not end at the border where it begins")
         self.context.drop("edges without length", without, "a lanelet needs bounds along its way")
         return out
 
-    def node_points(self, net: Net, used: set[int]) -> dict[int, int]:
+    def node_points(self, net: MergedNetwork, used: set[int]) -> dict[int, int]:
         """A point for each node of the network; node number -> its id in the file. Nodes of lanelets that are written
         as they came need none unless a new lanelet begins there."""
         out = {}
@@ -1066,7 +1077,7 @@ class _Writer:
         self.points[new] = _Point((x, y, z), True, point_tags, stored=False)
         return new
 
-    def bounds(self, net: Net, new: Sequence[_New], centres: Mapping[int, int]) -> None:
+    def bounds(self, net: MergedNetwork, new: Sequence[_NewLanelet], centres: Mapping[int, int]) -> None:
         """Bounds, centrelines and relations of the new lanelets."""
         arms: dict[int, list[Arm]] = {}
         for k, lane in enumerate(new):
@@ -1123,7 +1134,7 @@ class _Writer:
                 "turns are too sharp for bounds to be shared"
             )
 
-    def stored_border(self, net: Net, node: int) -> tuple[Border, tuple[int, int]] | None:
+    def stored_border(self, net: MergedNetwork, node: int) -> tuple[Border, tuple[int, int]] | None:
         """The two points of a node of stored lanelets, in metres, where it is still there."""
         at = net.nodes[node]
         pair = integers(own(at.properties, NAME).get("points"))
@@ -1149,7 +1160,7 @@ class _Writer:
         return x, y
 
     def sides(
-        self, k: int, lane: _New, joins: dict[tuple[int, bool], tuple[int, bool]], borders: Mapping[int, Border]
+        self, k: int, lane: _NewLanelet, joins: dict[tuple[int, bool], tuple[int, bool]], borders: Mapping[int, Border]
     ) -> tuple[Array, Array, bool]:
         """(left, right, whether they are closer than asked for). Ends that a border would spoil leave ``joins``."""
         half = lane.half
@@ -1176,7 +1187,9 @@ class _Writer:
             joins.pop((k, far), None)
         return *_lanes.beside(lane.middle[:, :2], half), True
 
-    def emit(self, net: Net, lane: _New, sides: Sequence[list[int]], centres: Mapping[int, int]) -> None:
+    def emit(
+        self, net: MergedNetwork, lane: _NewLanelet, sides: Sequence[list[int]], centres: Mapping[int, int]
+    ) -> None:
         edge = lane.edge
         middle = [centres[edge.source]]
         middle += [self.new_point(x, y, z) for x, y, z in lane.middle[1:-1].tolist()]
@@ -1330,7 +1343,7 @@ def _same_road(a: Edge, b: Edge) -> bool:
     return all(a.properties.get(w) == b.properties.get(w) for w in keys) and a.level == b.level
 
 
-def _middle_of(edge: Edge, net: Net) -> Array | None:
+def _middle_of(edge: Edge, net: MergedNetwork) -> Array | None:
     """[k, 3] from node to node, metres, no point twice in a row; z NaN in two dimensions; None without a length."""
     a, b = net.nodes[edge.source], net.nodes[edge.target]
     inner = np.empty((0, 3))
@@ -1364,7 +1377,9 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="wgs84", also=frozenset({"objects"}), own=True),
+        needs=LayerRequirements(
+            one_of=(frozenset({"topology"}),), anchor="wgs84", also=frozenset({"objects"}), own=True
+        ),
         companions=companions,
         write_options=WriteOptions,
         family=NAME,

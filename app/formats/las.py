@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _las, _points, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _las, _points, register
 from app.formats._clouds import PARSERS
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
@@ -81,7 +81,7 @@ register(
         detect=_las.detect,
         read=read,
         write=write,
-        needs=Needs((frozenset({"voxels"}),), also=frozenset({"resources"})),
+        needs=LayerRequirements((frozenset({"voxels"}),), also=frozenset({"resources"})),
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".las", ".laz"),

@@ -28,8 +28,18 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _json, _lif_rules, register
-from app.formats._fields import ANGLE, COORDINATE, NOT_NEGATIVE, SPEED, Number, Words, record
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    WriteContext,
+    _fields,
+    _json,
+    _lif_rules,
+    register,
+)
+from app.formats._fields import ANGLE, COORDINATE, NOT_NEGATIVE, SPEED, Number, OneOf, record
 from app.formats._network import (
     AMONG_PARTS,
     SAME_ANGLE,
@@ -77,8 +87,8 @@ ORDER = _json.ranks(
 LISTS = frozenset({"nodes", "edges", "stations"})
 _ACTION = record(
     "actionType actionDescription actionParameters",
-    requirementType=Words(("REQUIRED", "CONDITIONAL", "OPTIONAL")),
-    blockingType=Words(("NONE", "SOFT", "HARD")),
+    requirementType=OneOf(("REQUIRED", "CONDITIONAL", "OPTIONAL")),
+    blockingType=OneOf(("NONE", "SOFT", "HARD")),
 )
 _TRAJECTORY = record(
     degree=Number(1.0, 1000.0),
@@ -97,7 +107,7 @@ _EDGE = record(
             "vehicleTypeId rotationAllowed rotationAtStartNodeAllowed rotationAtEndNodeAllowed loadRestriction "
             "reentryAllowed",
             vehicleOrientation=Number(-1e4, 1e4, usual=(-360.0, 360.0), hint="it is beyond a full turn"),
-            orientationType=Words(("GLOBAL", "TANGENTIAL")),
+            orientationType=OneOf(("GLOBAL", "TANGENTIAL")),
             maxSpeed=SPEED,
             maxRotationSpeed=Number(0.0, 1000.0, unit="rad/s"),
             minHeight=COORDINATE,
@@ -813,7 +823,7 @@ register(
         check=_lif_rules.check,
         lacks=lacks,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,
         family=NAME,
         titled=True,

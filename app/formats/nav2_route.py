@@ -30,13 +30,23 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _json, _nav2_route_rules, register
-from app.formats._fields import NOT_NEGATIVE, SPEED, Number, Words, record
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    WriteContext,
+    _fields,
+    _json,
+    _nav2_route_rules,
+    register,
+)
+from app.formats._fields import NOT_NEGATIVE, SPEED, Number, OneOf, record
 from app.formats._network import (
     AMONG_PARTS,
     Array,
     Edge,
-    Net,
+    MergedNetwork,
     Node,
     count,
     edge_lines,
@@ -92,14 +102,14 @@ _METADATA = record(
 )
 _FEATURE = record(
     is_open=True,
-    type=Words(("Feature",)),
+    type=OneOf(("Feature",)),
     properties=record(
         "id startid endid overridable frame operations graph_id",
         metadata=_METADATA,
         cost=Number(0.0, 1e9, or_other=True),
     ),
 )
-SHAPE = record(is_open=True, type=Words(("FeatureCollection",)), features=[_FEATURE])
+SHAPE = record(is_open=True, type=OneOf(("FeatureCollection",)), features=[_FEATURE])
 """What a graph holds. Source: nav2_route, GeoJsonGraphFileLoader; members beside these are GeoJSON's or QGIS'."""
 
 CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
@@ -394,7 +404,7 @@ class _Writer:
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.context = context
         self.document = known_document(layers, NAME)
-        self.net: Net = joined(layers, context)
+        self.net: MergedNetwork = joined(layers, context)
         if not self.net.nodes or not self.net.edges:
             noun = "no node" if not self.net.nodes else "no edge between its nodes"
             raise CannotConvert(f"the network has {noun}; the route server needs both: supply a network with edges")
@@ -593,7 +603,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,
         family=NAME,
         check=_nav2_route_rules.check,

@@ -27,13 +27,23 @@ import numpy as np
 import shapely
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _navgraph_rules, _yaml, register
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    WriteContext,
+    _fields,
+    _navgraph_rules,
+    _yaml,
+    register,
+)
 from app.formats._fields import ANGLE, COORDINATE, Number, Record, record
 from app.formats._network import (
     AMONG_PARTS,
     Array,
     Edge,
-    Net,
+    MergedNetwork,
     Node,
     checked_name,
     count,
@@ -112,7 +122,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     top = _yaml.load(data, context.limits, tags=TAGS, typed=False)
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
         raise UnreadableFile("there is no list of nodes: not a navgraph", [Problem("no list", where="nodes")])
-    nodes = [_Read(item, k, context) for k, item in enumerate(top["nodes"])]
+    nodes = [_ParsedNode(item, k, context) for k, item in enumerate(top["nodes"])]
     _fields.check(top, SHAPE, context)
     names = [node.name for node in nodes]
     ids = unique_ids(map(identifier, names))
@@ -141,7 +151,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     return Layers({PartKey("topology", context.level, NETWORK): part})
 
 
-class _Read:
+class _ParsedNode:
     """One node of the file."""
 
     def __init__(self, item: Any, k: int, context: ReadContext) -> None:
@@ -204,7 +214,7 @@ def _name(value: Any, location: str) -> str:
 
 def _plain(value: Any, location: str) -> Any:
     """A value as JSON-like data; scalars without quotes get their meaning."""
-    if isinstance(value, _yaml.Plain):
+    if isinstance(value, _yaml.PlainScalar):
         try:
             return _yaml.scalar(str.__str__(value))
         except ValueError as error:
@@ -350,7 +360,7 @@ class _Writer:
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.context = context
         self.document = known_document(layers, NAME)
-        self.net: Net = joined(layers, context)
+        self.net: MergedNetwork = joined(layers, context)
         self.names = [self._name_of(node) for node in self.net.nodes]
         self.lost: Counter[str] = Counter()
 
@@ -619,7 +629,7 @@ register(
         read=read,
         check=_navgraph_rules.check,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,
         family=NAME,
         titled=True,

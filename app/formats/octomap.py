@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import NotFound, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, Parts, ReadContext, WriteContext, _octomap_rules, register
+from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, WriteContext, _octomap_rules, register
 from app.formats._select import file_stem, the_one
 from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
@@ -536,7 +536,7 @@ register(
         read=read,
         check=_octomap_rules.check,
         write=write,
-        needs=Needs((frozenset({"voxels"}),)),
+        needs=LayerRequirements((frozenset({"voxels"}),)),
         write_options=WriteOptions,
         extensions=(".bt", ".ot"),
         choose=choose,

@@ -38,8 +38,19 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Invalid, MissingLayer
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _openrmf_rules, _rmf, _yaml, register
-from app.formats._fields import ANGLE, ANY, COORDINATE, LENGTH, NOT_NEGATIVE, SPEED, Number, Typed, Words, record
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    WriteContext,
+    _fields,
+    _openrmf_rules,
+    _rmf,
+    _yaml,
+    register,
+)
+from app.formats._fields import ANGLE, ANY, COORDINATE, LENGTH, NOT_NEGATIVE, SPEED, Number, OneOf, Typed, record
 from app.formats._network import own
 from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, Storey, index, listing, mapping, number, refuse, value_of
 from app.formats._rmf_images import companions_of, images, stored
@@ -93,9 +104,9 @@ _EARTH_TURN = 180.0 / 128.0
 
 _LANE = record(
     "mutex demo_mock_floor_name demo_mock_lift_name dock_name",
-    bidirectional=Typed(Words((True, False))),
+    bidirectional=Typed(OneOf((True, False))),
     graph_idx=Typed(Number(0, 1000)),
-    orientation=Typed(Words(("", "forward", "backward"))),
+    orientation=Typed(OneOf(("", "forward", "backward"))),
     speed_limit=Typed(SPEED),
     width=Typed(NOT_NEGATIVE),
 )
@@ -111,7 +122,7 @@ _DOOR = record(
     motion_degrees=Typed(Number(-360.0, 360.0, unit="degrees")),
     motion_direction=Typed(Number(-1, 1)),
     right_left_ratio=Typed(NOT_NEGATIVE),
-    type=Typed(Words(("hinged", "double_hinged", "sliding", "double_sliding", "telescope", "double_telescope"))),
+    type=Typed(OneOf(("hinged", "double_hinged", "sliding", "double_sliding", "telescope", "double_telescope"))),
 )
 _VERTEX = record(
     "is_charger is_holding_point is_parking_spot is_passthrough_point is_cleaning_zone dock_name mutex lift_cabin "
@@ -1324,7 +1335,7 @@ register(
         read=read,
         check=_openrmf_rules.check,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         companions=companions_of(_FILENAME),
         family=NAME,
         titled=True,

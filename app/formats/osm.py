@@ -46,7 +46,18 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _osm_rules, _osm_text, _xml, register
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    Limits,
+    ReadContext,
+    WriteContext,
+    _osm_rules,
+    _osm_text,
+    _xml,
+    register,
+)
 from app.formats._osm import INT64, Data, Tags, Way, is_pbf, parse, unpack
 from app.formats._osm_text import NOTHING, Node, as_texts, attribute_text, element_id, integers, plain
 from app.formats._text import DEGREES, numbers
@@ -1222,7 +1233,7 @@ register(
         read=read,
         check=_osm_rules.check,
         write=write,
-        needs=Needs(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
+        needs=LayerRequirements(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
         family=FAMILY,
         rank=20,
         version=3,

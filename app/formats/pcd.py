@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _pcd, _points, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _pcd, _points, register
 from app.formats._clouds import PARSERS
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
@@ -65,7 +65,7 @@ register(
         detect=_pcd.detect,
         read=read,
         write=write,
-        needs=Needs((frozenset({"voxels"}),), also=frozenset({"resources"})),
+        needs=LayerRequirements((frozenset({"voxels"}),), also=frozenset({"resources"})),
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".pcd",),

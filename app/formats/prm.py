@@ -28,11 +28,22 @@ from typing import Any
 import numpy as np
 
 from app.errors import FleetMapError, Problem, UnreadableFile
-from app.formats import BAD_INPUT, Files, Format, Needs, ReadContext, WriteContext, _fields, _image, _yaml, register
+from app.formats import (
+    BAD_INPUT,
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    WriteContext,
+    _fields,
+    _image,
+    _yaml,
+    register,
+)
 from app.formats._fields import NOT_NEGATIVE, Number, record
 from app.formats._network import (
     Array,
-    Net,
+    MergedNetwork,
     checked_name,
     identifier,
     is_name,
@@ -371,20 +382,20 @@ def _plain(value: float) -> float:
     return int(value) if float(value).is_integer() else value
 
 
-def _sorted(net: Net) -> Net:
+def _sorted(net: MergedNetwork) -> MergedNetwork:
     """The same with nodes in the order of their ids."""
     order = sorted(range(len(net.nodes)), key=lambda k: natural(net.nodes[k].id))
     new_index = {old: new for new, old in enumerate(order)}
     moved = [
         type(e)(e.id, new_index[e.source], new_index[e.target], e.properties, e.geometry, e.level) for e in net.edges
     ]
-    return Net([net.nodes[k] for k in order], moved, net.levels)
+    return MergedNetwork([net.nodes[k] for k in order], moved, net.levels)
 
 
 _WHOLE_NUMBER = re.compile(r"(?:0|[1-9][0-9]{0,17})\Z", re.ASCII)
 
 
-def _ids(net: Net) -> list[Any]:
+def _ids(net: MergedNetwork) -> list[Any]:
     """The ids as the file says them: whole numbers and a roadmap's own texts; the others get free numbers."""
     out: list[Any] = []
     for node in net.nodes:
@@ -461,7 +472,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"occupancy"})),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"occupancy"})),
         looks_at=looks_at,
         read_options=ReadOptions,
         write_options=WriteOptions,

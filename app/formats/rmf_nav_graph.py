@@ -34,7 +34,7 @@ from app.errors import MissingLayer
 from app.formats import (
     Files,
     Format,
-    Needs,
+    LayerRequirements,
     ReadContext,
     WriteContext,
     _fields,
@@ -43,7 +43,7 @@ from app.formats import (
     _yaml,
     register,
 )
-from app.formats._fields import ANGLE, ANY, COORDINATE, SPEED, WIDTH, Number, Words, record
+from app.formats._fields import ANGLE, ANY, COORDINATE, SPEED, WIDTH, Number, OneOf, record
 from app.formats._network import own
 from app.formats._rmf import (
     BUILDING,
@@ -60,7 +60,16 @@ from app.formats._rmf import (
     value_of,
 )
 from app.formats._text import METRES, numbers
-from app.model.features import Compact, Features, Properties, features, from_columns, points, segments, unique_ids
+from app.model.features import (
+    Features,
+    Properties,
+    SharedKeyDicts,
+    features,
+    from_columns,
+    points,
+    segments,
+    unique_ids,
+)
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
 
@@ -85,7 +94,7 @@ _VERTEX = record(
 )
 _LANE = record(
     "dock_name mutex door_name is_bidirectional demo_mock_floor_name demo_mock_lift_name",
-    orientation_constraint=Words(("forward", "backward")),
+    orientation_constraint=OneOf(("forward", "backward")),
     speed_limit=SPEED,
 )
 SHAPE = record(
@@ -202,7 +211,7 @@ def _level(level: _Level, graph: int, members: Mapping[str, Any], location: str,
         level.nodes_say[node_index]["graphs"][str(graph)] = k
         places.append(node_index)
     shared: dict[str, dict[str, Any]] = {}
-    compact = Compact()
+    compact = SharedKeyDicts()
     for k, row in enumerate(listing(members.get("lanes"), f"{location}.lanes")):
         at = f"{location}.lanes[{k}]"
         if not isinstance(row, list) or len(row) < 2:
@@ -284,7 +293,7 @@ def _lift(levels: Mapping[str, _Level], name: str, members: Any, source_properti
 def _network(name: str, level: _Level, taken: set[str]) -> Features:
     level.nodes.clear()
     properties: list[Properties] = []
-    compact = Compact()
+    compact = SharedKeyDicts()
     names = []
     for k, source_properties in enumerate(level.nodes_say):
         called = source_properties["parameters"].get("name")
@@ -368,7 +377,7 @@ class _Edge:
 
 
 @dataclass(slots=True)
-class _Storey:
+class _LevelWriter:
     """A level being written. at: float64 [n, 2] metres of its nodes; edges by graph."""
 
     name: str
@@ -513,7 +522,7 @@ class _Writer:
         names = {key.level for key in self.layers.vector("topology")}
         return frozenset(name for name in names if low <= elevations.get(name, 0.0) <= high)
 
-    def _storeys(self) -> list[_Storey]:
+    def _storeys(self) -> list[_LevelWriter]:
         by_level: dict[str, list[Features]] = {}
         for key, part in self.layers.vector("topology").items():
             if len(part) or NAME in part.document or BUILDING in part.document:
@@ -537,12 +546,12 @@ class _Writer:
             scale = mapping(documents.get(BUILDING), BUILDING).get("transform")
             ratio = scale[0] if isinstance(scale, list) and scale else None
             factor = float(ratio) ** 2 if isinstance(ratio, (int, float)) else 1.0
-            storey = _Storey(level, ids, nodes, np.concatenate(at), edges, document, PARALLEL * factor)
+            storey = _LevelWriter(level, ids, nodes, np.concatenate(at), edges, document, PARALLEL * factor)
             storey.lifts = self._inside(storey)
             out.append(storey)
         return out
 
-    def _inside(self, storey: _Storey) -> list[str | None]:
+    def _inside(self, storey: _LevelWriter) -> list[str | None]:
         """The first lift whose shaft each node lies in."""
         out: list[str | None] = [None] * len(storey.ids)
         for lift in reversed(self.lifts):
@@ -622,7 +631,7 @@ class _Writer:
             self.context.warn(problem, file=f"{graph}.yaml", where="levels")
         return out.getvalue()
 
-    def _level(self, storey: _Storey, graph: int, names: Counter[str]) -> Iterator[str]:
+    def _level(self, storey: _LevelWriter, graph: int, names: Counter[str]) -> Iterator[str]:
         """The lines of a level in a graph; names: how often vertices have each."""
         edges = storey.edges.get(graph, [])
         graphs = [own(p, NAME).get("graphs") for p in storey.nodes]
@@ -636,7 +645,7 @@ class _Writer:
         extra_members = mapping(mapping(storey.document.get("level"), "level").get(str(graph)), "level")
         yield _yaml.mapping(extra_members, 4) if extra_members else ""
 
-    def _vertices(self, storey: _Storey, order: Sequence[int], names: Counter[str]) -> Iterator[str]:
+    def _vertices(self, storey: _LevelWriter, order: Sequence[int], names: Counter[str]) -> Iterator[str]:
         texts = list(map(_yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
         for n, k in enumerate(order):
             options = {**self._vertex(storey, k), **self.robots.at(storey.name, storey.ids[k])}
@@ -646,7 +655,7 @@ class _Writer:
             yield f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(options)}{more}]\n"
 
     def _lanes(
-        self, storey: _Storey, graph: int, edges: Sequence[_Edge], new_index: Mapping[int, int]
+        self, storey: _LevelWriter, graph: int, edges: Sequence[_Edge], new_index: Mapping[int, int]
     ) -> Iterator[str]:
         crossed = self._crossed(storey, edges)
         blocked = {(e.source, e.target) for e in edges if e.p.get("blocked") is True}
@@ -668,7 +677,7 @@ class _Writer:
                 problem = "a lane joins vertices that do not exist: fleet adapters will refuse the graph"
                 self.context.warn(problem, file=f"{graph}.yaml", where=f"levels.{storey.name}.lanes")
 
-    def _vertex(self, storey: _Storey, k: int) -> dict[str, Any]:
+    def _vertex(self, storey: _LevelWriter, k: int) -> dict[str, Any]:
         p = storey.nodes[k]
         if NAME in p:
             options = dict(mapping(own(p, NAME).get("parameters"), "parameters"))
@@ -688,7 +697,7 @@ class _Writer:
             options["lift"] = storey.lifts[k]
         return options
 
-    def _lane(self, storey: _Storey, e: _Edge, door: str | None) -> dict[str, Any]:
+    def _lane(self, storey: _LevelWriter, e: _Edge, door: str | None) -> dict[str, Any]:
         limit = _rmf.limit(e.p)
         if NAME in e.p:
             options = dict(mapping(own(e.p, NAME).get("parameters"), "parameters"))
@@ -722,7 +731,7 @@ class _Writer:
             options["is_bidirectional"] = False
         return options
 
-    def _crossed(self, storey: _Storey, edges: Sequence[_Edge]) -> list[str | None]:
+    def _crossed(self, storey: _LevelWriter, edges: Sequence[_Edge]) -> list[str | None]:
         """The door that each edge leads through; of several the last."""
         out: list[str | None] = [None] * len(edges)
         doors = [d for d in self.doors if d.level == storey.name]
@@ -854,7 +863,7 @@ register(
         check=_rmf_nav_graph_rules.check,
         lacks=lacks,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
         family=NAME,
         titled=True,
         rank=30,

@@ -26,7 +26,18 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.formats import Files, Format, Needs, ReadContext, _json, _rmf, _rmf_site, _rmf_site_rules, _ron, register
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    _json,
+    _rmf,
+    _rmf_site,
+    _rmf_site_rules,
+    _ron,
+    register,
+)
 from app.formats._network import number
 from app.formats._rmf import BUILDING, NAV_GRAPH, Array, mapping, refuse
 from app.formats._rmf_images import companions_of, images
@@ -887,7 +898,7 @@ register(
         read=read,
         check=_rmf_site_rules.check,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         companions=companions_of(re.compile(rb'\b(?:Local|Remote)"?\s*[:(]\s*"([^"\n]{1,500})"')),
         family=BUILDING,
         rank=45,

@@ -24,12 +24,24 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Limits, Needs, Parts, ReadContext, WriteContext, _image, _raster, _xml, register
+from app.formats import (
+    Files,
+    Format,
+    LayerRequirements,
+    Limits,
+    Parts,
+    ReadContext,
+    WriteContext,
+    _image,
+    _raster,
+    _xml,
+    register,
+)
 from app.formats._select import file_stem, the_one
 from app.formats._text import DEGREES, METRES
 from app.model.frame import MAX_METRES, is_writable
 from app.model.geodesy import WGS84
-from app.model.imagery import LOCAL, USUAL_COLOURS, Affine, Picture, displayed, placed
+from app.model.imagery import LOCAL, USUAL_COLOURS, Affine, GeoImage, displayed, placed
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resampled
 from app.parameters import parameter
@@ -196,7 +208,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     file_crs = raster.crs or _sidecar_crs(files, context)
     transform, crs = _place(replace(raster, crs=file_crs), image, world, files, options, context)
     try:
-        picture = Picture(raster.pixels, transform, crs, raster.properties)
+        picture = GeoImage(raster.pixels, transform, crs, raster.properties)
     except Invalid as error:
         file = world if world is not None and raster.transform is None else image
         raise UnreadableFile(f"{file}: {error.detail}", [Problem(error.detail, file)]) from error
@@ -391,7 +403,7 @@ def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
     return None
 
 
-def _check_place(picture: Picture, image: str) -> None:
+def _check_place(picture: GeoImage, image: str) -> None:
     """Refuse what lies nowhere: beyond the local frame, or where PROJ knows no place on earth."""
     reason = _raster.lies_nowhere(picture)
     if reason is not None:
@@ -406,7 +418,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``satellite.tif``, or ``satellite.png`` with its world file. Raises MissingLayer, NotFound, Ambiguous,
     MissingDatum, or Invalid for a grid that cannot be."""
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    pictures = {k: p for k, p in layers.of("imagery").items() if isinstance(p, Picture)}
+    pictures = {k: p for k, p in layers.of("imagery").items() if isinstance(p, GeoImage)}
     key = choose(sorted(pictures), options)[0]
     picture = pictures[key]
     crs = {"source": picture.crs, "local": LOCAL, "wgs84": WGS84}[options.crs]
@@ -459,7 +471,7 @@ def by_file(name: str) -> dict[str, str]:
     return {}
 
 
-def _tags(picture: Picture) -> dict[str, str]:
+def _tags(picture: GeoImage) -> dict[str, str]:
     source_properties = picture.properties.get(NAME)
     tags = source_properties.get("tags") if isinstance(source_properties, Mapping) else None
     return {str(k): str(v) for k, v in tags.items()} if isinstance(tags, Mapping) else {}
@@ -478,7 +490,7 @@ def _without_statistics(properties: Mapping[str, Any]) -> dict[str, Any]:
     return {**properties, "bands": bands} if bands else dict(properties)
 
 
-def _write_png(picture: Picture, crs: str | None, stem: str, context: WriteContext) -> dict[str, bytes]:
+def _write_png(picture: GeoImage, crs: str | None, stem: str, context: WriteContext) -> dict[str, bytes]:
     height, width, count = picture.pixels.shape
     pixels = displayed(picture)
     if picture.pixels.dtype != np.uint8:
@@ -528,7 +540,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=Needs((frozenset({"imagery"}),)),
+        needs=LayerRequirements((frozenset({"imagery"}),)),
         companions=companions,
         read_options=ReadOptions,
         write_options=WriteOptions,

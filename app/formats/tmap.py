@@ -8,7 +8,7 @@ of an edge: ``edge_id``, ``node``, ``action``, ``top_vel``, ``map_2d``, ``inflat
 
 from __future__ import annotations
 
-from app.formats import Format, Needs, WriteContext, _tmap, register
+from app.formats import Format, LayerRequirements, WriteContext, _tmap, register
 from app.model.layers import Layers
 
 FILE = "map.tmap"
@@ -35,7 +35,7 @@ register(
         detect=detect,
         read=_tmap.read,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=_tmap.ListOptions,
         family=_tmap.NAME,
         titled=True,

@@ -5,7 +5,7 @@ See ``app.formats._tmap``. The older list (``tmap``) is read too where a sender 
 
 from __future__ import annotations
 
-from app.formats import Format, Needs, WriteContext, _tmap, _tmap2_rules, register
+from app.formats import Format, LayerRequirements, WriteContext, _tmap, _tmap2_rules, register
 from app.model.layers import Layers
 
 FILE = "network.tmap2.yaml"
@@ -38,7 +38,7 @@ register(
         read=_tmap.read,
         check=_tmap2_rules.check,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=_tmap.WriteOptions,
         family=_tmap.NAME,
         titled=True,

@@ -19,7 +19,7 @@ import numpy as np
 import shapely
 
 from app.errors import MissingDatum, TooLarge
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _text, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _text, register
 from app.formats._network import (
     checked_name,
     identifier,
@@ -157,7 +157,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=Needs(one_of=(frozenset({"topology"}),)),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),)),
         family=NAME,
         extensions=(".csv",),
     )

@@ -1,7 +1,7 @@
 """Generators: layers made up from parameters and a seed, for sites that are not mapped yet or do not exist.
 
 A generator is one module with one function under ``@generates``; its parameters are a frozen dataclass. The same seed
-and parameters give the same layers on every machine: all chance comes from ``Source``, and what went through a
+and parameters give the same layers on every machine: all chance comes from ``RandomSource``, and what went through a
 transcendental function is rounded before it is kept.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from app import parameters
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, MissingLayer, NotFound, Problem
 from app.model.frame import Datum
 from app.model.layers import Layer, Layers, PartKey, is_empty
@@ -32,7 +32,7 @@ MAX_OBJECTS = 200_000
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class RandomSource:
     """Where all chance of one generation comes from: streams by name, so that one part's draws shift no other's."""
 
     seed: int
@@ -44,7 +44,7 @@ class Source:
         return np.random.Generator(np.random.PCG64(int.from_bytes(digest[:16], "little")))
 
 
-Function = Callable[[Layers, Any, Source, Notes], Layers]
+Function = Callable[[Layers, Any, RandomSource, DerivationNotes], Layers]
 """(what is there, parameters, chance, notes) -> the new parts. Pure but for the notes.
 
 What is there: the parts of the layers that it needs or looks at, with datum and levels. Parts of the result take the
@@ -149,7 +149,7 @@ def check(name: str, seed: int, values: Mapping[str, Any]) -> tuple[Generator, A
     return generator, parameters.parse(generator.parameters, values, f"parameter of {name}")
 
 
-def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: Notes) -> Layers:
+def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: DerivationNotes) -> Layers:
     """What the generator makes: only new parts, with the datum and the levels of the whole.
 
     Raises NotFound, Invalid, MissingLayer (with what it works on), CannotGenerate.
@@ -165,7 +165,7 @@ def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: N
             f"{name} works on {' or '.join(sorted(maker.changes))}, and there is none: upload a map or generate one "
             "first"
         )
-    generated_layers = maker.function(given, options, Source(seed, name), notes)
+    generated_layers = maker.function(given, options, RandomSource(seed, name), notes)
     fresh = {k: p for k, p in generated_layers.parts.items() if given.parts.get(k) is not p and not is_empty(p)}
     if not fresh:
         raise CannotGenerate(f"{name} made nothing with these parameters")

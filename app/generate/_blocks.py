@@ -220,7 +220,7 @@ def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
         if rules is None or shape.land.area < SMALLEST:
             _end(town, shape, shape.name if shape.name in OPEN else "garden")
             continue
-        names = _Measures(grammar.constants, shape)
+        names = _ShapeVariables(grammar.constants, shape)
         rule = _chosen(rules, names, chance)
         if rule is None:
             _end(town, shape, "garden")
@@ -243,7 +243,7 @@ def _end(town: Town, shape: _Shape, use: str, storeys: int = 0) -> None:
         town.lots.append(Lot(shape.land, use, storeys))
 
 
-class _Measures(dict[str, float]):
+class _ShapeVariables(dict[str, float]):
     """What expressions know of a shape: constants, and its measures once they are asked for."""
 
     def __init__(self, constants: Mapping[str, float], shape: _Shape) -> None:

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate
-from app.generate import Source
+from app.generate import RandomSource
 from app.generate._site import SLACK, Site, SiteOptions, angle, mm, refused
-from app.generate._site_frame import Place, placed
+from app.generate._site_frame import SiteFrame, placed
 from app.model.frame import GROUND, Level
 from app.model.layers import Layers
 
@@ -92,7 +92,7 @@ class Building:
     """A building being drawn into a site."""
 
     site: Site
-    place: Place
+    place: SiteFrame
     measures: Storeys
     radius: float
     rooms: list[Room] = field(default_factory=list)
@@ -384,7 +384,7 @@ def build(
     site: Site,
     measures: Storeys,
     radius: float,
-    source: Source,
+    source: RandomSource,
     kinds: Kinds,
     node_of: Callable[[Room], tuple[float, float]],
 ) -> Building:
@@ -567,8 +567,8 @@ def raised(
     given: Layers,
     options: SiteOptions,
     measures: Storeys,
-    source: Source,
-    notes: Notes,
+    source: RandomSource,
+    notes: DerivationNotes,
     kinds: Kinds,
     furnish: Callable[[Furniture, Room, np.random.Generator], None] | None,
     charged: Callable[[int, Room], bool],

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.occupancy_to_topology import Parameters, network
 from app.errors import CannotConvert, CannotGenerate
 from app.generate import MAX_CELLS, MAX_OBJECTS
@@ -35,7 +35,7 @@ LONG = 400
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class CellStyle:
     """What occupied cells are: a kind, its height in metres and its colour in the picture."""
 
     kind: str
@@ -44,7 +44,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class GridFrame:
     """Where a grid lies: its lower left corner in metres, metres a cell, cells along x and y."""
 
     x: float
@@ -60,7 +60,7 @@ class Place:
         return shapely.box(self.x, self.y, round(right, 3), round(top, 3))
 
 
-def placed(site: Site, width: float, depth: float, resolution: float, *, step: int = 1) -> Place:
+def placed(site: Site, width: float, depth: float, resolution: float, *, step: int = 1) -> GridFrame:
     """The grid of a site: around its fence where the environment has one, else width × depth metres from the origin.
 
     step: the sides are whole numbers of so many cells. Raises CannotGenerate before anything is made: for too many
@@ -77,17 +77,17 @@ def placed(site: Site, width: float, depth: float, resolution: float, *, step: i
     low_x, low_y, high_x, high_y = site.bounded(shapely.box(0.0, 0.0, width, depth)).bounds
     if not site.is_given:
         columns, rows = (max(1, round(v / size)) for v in (width, depth))
-        frame = Place(0.0, 0.0, resolution, columns * step, rows * step)
+        frame = GridFrame(0.0, 0.0, resolution, columns * step, rows * step)
         site.fence = frame.box
         return frame
     x, y = (math.floor(v / resolution + 1e-6) for v in (low_x, low_y))
     columns, rows = (math.ceil((v - o * resolution) / size - 1e-6) for v, o in ((high_x, x), (high_y, y)))
     if columns * rows * step * step > MAX_CELLS:
         raise refused("resolution", f"the fence would hold more than {MAX_CELLS} cells of {resolution:g} m")
-    return Place(round(x * resolution, 3), round(y * resolution, 3), resolution, columns * step, rows * step)
+    return GridFrame(round(x * resolution, 3), round(y * resolution, 3), resolution, columns * step, rows * step)
 
 
-def stand(site: Site, place: Place, occupied: Bool, seen: Look) -> None:
+def stand(site: Site, place: GridFrame, occupied: Bool, seen: CellStyle) -> None:
     """Put an object for each piece of occupied cells (joined by their sides), which all look the same."""
     pieces = _pieces(occupied)
     if len(pieces) > MAX_OBJECTS:
@@ -120,7 +120,7 @@ def stand(site: Site, place: Place, occupied: Bool, seen: Look) -> None:
         site.put(i, seen.kind, area, shapes=[solid], pose=pose, colour=seen.colour, **words)
 
 
-def finished(site: Site, options: SiteOptions, notes: Notes, *, ground: str) -> Layers:
+def finished(site: Site, options: SiteOptions, notes: DerivationNotes, *, ground: str) -> Layers:
     """The site's layers with the network of its grid: the largest piece of what its robot can reach."""
     layers = site.finish(ground=ground)
     grid = layers.parts[PartKey("occupancy", GROUND, MAP)]
@@ -133,9 +133,9 @@ def finished(site: Site, options: SiteOptions, notes: Notes, *, ground: str) -> 
     return Layers(dict(sorted(parts.items())), layers.datum, layers.levels)
 
 
-def ways_of(grid: OccupancyGrid, radius: float, notes: Notes) -> Features | None:
+def ways_of(grid: OccupancyGrid, radius: float, notes: DerivationNotes) -> Features | None:
     """The network of a grid's free space, one piece of it; None, with a warning, where a robot finds no way."""
-    network_notes = Notes()
+    network_notes = DerivationNotes()
     spacing = max(1.5, 25 * grid.resolution)
     try:
         topology = network(grid, Parameters(robot_radius=radius, spacing=spacing), network_notes, "the grid")
@@ -146,7 +146,7 @@ def ways_of(grid: OccupancyGrid, radius: float, notes: Notes) -> Features | None
     return _largest(topology, notes)
 
 
-def _largest(network: Features, notes: Notes) -> Features:
+def _largest(network: Features, notes: DerivationNotes) -> Features:
     """The largest piece of a network, by its nodes."""
     place = network.index()
     parent = list(range(len(network)))
@@ -197,10 +197,10 @@ def _mask(areas: list[Any], shape: tuple[int, int]) -> Bool:
     return np.asarray(features.rasterize([(area, 1) for area in areas], shape, dtype=np.uint8) > 0)
 
 
-LOOKS: Mapping[str, Look] = {
-    "wall": Look("wall", 2.5, "wall"),
-    "rack": Look("rack", 2.0, "shelf"),
-    "furniture": Look("furniture", 0.8, "furniture"),
-    "obstacle": Look("obstacle", 1.5, "goods"),
-    "rock": Look("rock", 2.5, "wall"),
+LOOKS: Mapping[str, CellStyle] = {
+    "wall": CellStyle("wall", 2.5, "wall"),
+    "rack": CellStyle("rack", 2.0, "shelf"),
+    "furniture": CellStyle("furniture", 0.8, "furniture"),
+    "obstacle": CellStyle("obstacle", 1.5, "goods"),
+    "rock": CellStyle("rock", 2.5, "wall"),
 }

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import CannotGenerate, Problem
-from app.generate import Source, _lsystem
+from app.generate import RandomSource, _lsystem
 
 Array = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ class Plant:
         return out
 
 
-def grown(species: str, count: int, source: Source) -> list[Plant]:
+def grown(species: str, count: int, source: RandomSource) -> list[Plant]:
     """So many different plants of a species of ``SPECIES``; the same for the same source."""
     plant_species = SPECIES[species]
     system = _lsystem.parse(plant_species.rules)

@@ -19,9 +19,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes, _raster
+from app.derive import DerivationNotes, _raster
 from app.derive._obstacles import fences
-from app.derive._raster import Frame
+from app.derive._raster import RasterFrame
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotConvert, CannotGenerate, Invalid, Problem
 from app.generate import MAX_CELLS, MAX_OBJECTS
@@ -29,7 +29,7 @@ from app.model import solids
 from app.model.features import Features, Properties, features
 from app.model.frame import GROUND, Datum, Level
 from app.model.grid import FREE, UNKNOWN, OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import MAP, NETWORK, SITE, ZONES, Layers, Part, PartKey, Resources
 from app.parameters import parameter
 
@@ -179,7 +179,7 @@ class Site:
         self,
         given: Layers,
         options: SiteOptions,
-        notes: Notes,
+        notes: DerivationNotes,
         *,
         levels: Sequence[Level] = (Level(),),
         coloured: bool = False,
@@ -420,7 +420,7 @@ class Site:
             why = f"{RESOLUTIONS[0]} m would be more than {EASY} cells; a finer one can be asked for"
             self.notes.fill("resolution", resolution, why)
         grid_parameters = Parameters(height=self.options.height, resolution=resolution)
-        grid_notes = Notes()
+        grid_notes = DerivationNotes()
         grid_parts = {k: p for k, p in parts.items() if k.layer != "location"}
         for key, part in parts.items():
             if isinstance(part, Features) and key.layer == "objects":
@@ -499,11 +499,11 @@ class Site:
             out |= dict(zip(level_edges, clearance(grid, lines).tolist(), strict=True))
         return out
 
-    def _picture(self, level: str, ground: str) -> Picture:
+    def _picture(self, level: str, ground: str) -> GeoImage:
         """The level from above."""
         box = self.fence.bounds
         resolution = next((r for r in RESOLUTIONS if _cells(box, r) <= EASY), RESOLUTIONS[-1])
-        frame = Frame.around(box, resolution)
+        frame = RasterFrame.around(box, resolution)
         index = np.full((frame.height, frame.width), _NUMBER[ground], np.uint8)
         for rows in (self._ground.get(level, []), self._bodies.get(level, [])):
             for number, shapes in _runs(rows):
@@ -511,7 +511,7 @@ class Site:
         table = np.array(list(COLOURS.values()), np.uint8)
         left, bottom = frame.origin
         top = round(bottom + frame.height * resolution, 9)
-        return Picture(table[index[::-1]], (resolution, 0.0, left, 0.0, -resolution, top))
+        return GeoImage(table[index[::-1]], (resolution, 0.0, left, 0.0, -resolution, top))
 
 
 # --- the grid ---------------------------------------------------------------------------------------------------------
@@ -543,7 +543,7 @@ def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArra
 
     blocked = np.pad(grid.cells != FREE, 1, constant_values=True)
     away = cv2.distanceTransform((~blocked).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    frame = Frame((grid.origin[0], grid.origin[1]), grid.resolution, grid.width, grid.height)
+    frame = RasterFrame((grid.origin[0], grid.origin[1]), grid.resolution, grid.width, grid.height)
     at, owner = shapely.get_coordinates(np.array(lines, object), return_index=True)
     cells = frame.of(at)
     good = np.ones(len(lines), bool)
@@ -588,7 +588,7 @@ def _cells(box: Sequence[float], resolution: float) -> float:
 # --- small things -----------------------------------------------------------------------------------------------------
 
 
-def _datum(given: Layers, options: SiteOptions, notes: Notes) -> Datum:
+def _datum(given: Layers, options: SiteOptions, notes: DerivationNotes) -> Datum:
     """The environment's datum, else the one asked for, else DATUM."""
     option_datum = None if options.datum is None else Datum(options.datum[0], options.datum[1])
     if given.datum is not None:

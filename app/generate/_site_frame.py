@@ -14,7 +14,7 @@ from app.generate._site import Site, angle, mm
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class SiteFrame:
     """The frame that a site was drawn in: its origin in local metres and its turn. sine, cosine: of the turn, rounded,
     so that every machine puts everything at the same place."""
 
@@ -39,7 +39,7 @@ class Place:
         return shapely.transform(geometry, moved)
 
 
-def placed(site: Site, width: float, depth: float, margin: float, room: float = math.inf) -> Place:
+def placed(site: Site, width: float, depth: float, margin: float, room: float = math.inf) -> SiteFrame:
     """Bound the site to a rectangle of this size and a margin around it, or put it into the fence that is given.
 
     room: metres beside a robot at the narrowest (``Site.bounded``). The drawn rectangle reaches from (0, 0) to (width,
@@ -49,14 +49,14 @@ def placed(site: Site, width: float, depth: float, margin: float, room: float = 
     outline = shapely.box(-margin, -margin, width + margin, depth + margin)
     fence = site.bounded(outline, room=room)
     if not site.is_given:
-        return Place()
+        return SiteFrame()
     shapely.prepare(fence)
     for yaw in _turns(fence):
         s, c = round(math.sin(yaw), 12), round(math.cos(yaw), 12)
         for middle in _middles(fence):
             x = middle[0] - (c * width - s * depth) / 2
             y = middle[1] - (s * width + c * depth) / 2
-            place = Place(mm(x), mm(y), angle(yaw), s, c)
+            place = SiteFrame(mm(x), mm(y), angle(yaw), s, c)
             if shapely.contains(fence, place.of(outline)):
                 return place
     need = f"{width + 2 * margin:.1f} × {depth + 2 * margin:.1f} m"

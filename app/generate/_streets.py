@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.generate._blocks import Street
 from app.generate._site import MOST_NODES, Site
@@ -227,7 +227,9 @@ def _before(streets: Streets, junction: int) -> float:
 # --- sidewalks --------------------------------------------------------------------------------------------------------
 
 
-def sidewalks(site: Site, streets: Streets, blocks: Sequence[Any], edge: Any, speed: float, notes: Notes) -> None:
+def sidewalks(
+    site: Site, streets: Streets, blocks: Sequence[Any], edge: Any, speed: float, notes: DerivationNotes
+) -> None:
     """Ways around blocks and inside the town's edge (a polygon, or None), and crossings between them."""
     areas = [shapely.buffer(block, streets.walk / 2, join_style="mitre", mitre_limit=2.0) for block in blocks]
     rings = [a.exterior for a in areas if a.geom_type == "Polygon"]
@@ -361,7 +363,7 @@ def _around(site: Site, loop: Loop, speed: float) -> None:
 # --- a stop -----------------------------------------------------------------------------------------------------------
 
 
-def stop(site: Site, streets: Streets, roads: Sequence[Sequence[tuple[str, Any]]], notes: Notes) -> None:
+def stop(site: Site, streets: Streets, roads: Sequence[Sequence[tuple[str, Any]]], notes: DerivationNotes) -> None:
     """A way between a sidewalk and the lane that begins next to it: where robots are set down."""
     walks = [(name, at) for loop in streets.loops for _, name, at in loop.stops]
     lanes_ = [(name, lane) for pair in roads for name, lane in pair]

@@ -16,10 +16,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate
-from app.generate import MAX_OBJECTS, Source, _automata, _cells, generates
-from app.generate._cells import LOOKS, Look, Place
+from app.generate import MAX_OBJECTS, RandomSource, _automata, _cells, generates
+from app.generate._cells import LOOKS, CellStyle, GridFrame
 from app.generate._site import Site, SiteOptions, angle, disc, mm, refused
 from app.model.frame import GROUND
 from app.model.layers import Layers
@@ -31,7 +31,7 @@ RULE = re.compile(r"B([0-8]*)/S([0-8]*)", re.ASCII)
 
 RESOLUTION = 0.05
 
-CLUTTER = Look("obstacle", 1.2, "goods")
+CLUTTER = CellStyle("obstacle", 1.2, "goods")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,19 +88,19 @@ class ForestOptions(SiteOptions):
 
 
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=CaveOptions, also={"location"})
-def cave(given: Layers, options: CaveOptions, source: Source, notes: Notes) -> Layers:
+def cave(given: Layers, options: CaveOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A cave: halls and passages in rock, grown by a cellular automaton."""
     return _grown(given, options, source, notes, LOOKS["rock"], LOOKS["rock"], ground="gravel")
 
 
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=HallOptions, also={"location"})
-def cluttered_hall(given: Layers, options: HallOptions, source: Source, notes: Notes) -> Layers:
+def cluttered_hall(given: Layers, options: HallOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A hall full of clutter that a cellular automaton heaped up."""
     return _grown(given, options, source, notes, CLUTTER, LOOKS["wall"], ground="floor")
 
 
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=ForestOptions, also={"location"})
-def forest(given: Layers, options: ForestOptions, source: Source, notes: Notes) -> Layers:
+def forest(given: Layers, options: ForestOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A forest: trees with trunks and crowns, and clearings where a cellular automaton leaves some."""
     for name in ("trunk", "tree_height"):
         low, high = getattr(options, name)
@@ -122,7 +122,14 @@ def forest(given: Layers, options: ForestOptions, source: Source, notes: Notes) 
 
 
 def _grown(
-    given: Layers, options: CaveOptions, source: Source, notes: Notes, look: Look, border: Look, *, ground: str
+    given: Layers,
+    options: CaveOptions,
+    source: RandomSource,
+    notes: DerivationNotes,
+    look: CellStyle,
+    border: CellStyle,
+    *,
+    ground: str,
 ) -> Layers:
     """A closed place of occupied cells whose free space is one piece."""
     resolution = options.resolution or _fine(options)
@@ -132,7 +139,7 @@ def _grown(
     born, stays = _rule(options.rule)
     site = Site(given, options, notes)
     place = _cells.placed(site, options.width, options.depth, resolution, step=step)
-    coarse = Place(place.x, place.y, options.cell, place.columns // step, place.rows // step)
+    coarse = GridFrame(place.x, place.y, options.cell, place.columns // step, place.rows // step)
     if min(coarse.rows, coarse.columns) < 5:
         raise refused("cell", f"{coarse.columns} × {coarse.rows} cells are too few: at least 5 × 5 are needed")
     if coarse.rows * coarse.columns * max(options.iterations, 1) > MOST_STEPS:
@@ -191,7 +198,7 @@ def _rule(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return born, stays
 
 
-def _within(fence: Any, place: Place) -> Bool:
+def _within(fence: Any, place: GridFrame) -> Bool:
     """Which cells lie inside of a fence as a whole, but those at its border."""
     inner = shapely.buffer(fence, -place.resolution, join_style="mitre")
     x = place.x + (np.arange(place.columns) + 0.5) * place.resolution
@@ -200,7 +207,7 @@ def _within(fence: Any, place: Place) -> Bool:
     return np.asarray(shapely.contains_xy(inner, *np.meshgrid(x, y)), bool)
 
 
-def _trees(site: Site, alive: Bool, box: tuple[float, ...], options: ForestOptions, source: Source) -> None:
+def _trees(site: Site, alive: Bool, box: tuple[float, ...], options: ForestOptions, source: RandomSource) -> None:
     draw = source.stream("trees").random((*alive.shape, 5))
     rows, columns = np.nonzero(alive)
     floor = site.elevation(GROUND)

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive._select_grids import called, chosen, grey_warning
 from app.errors import CannotGenerate
-from app.generate import MAX_CELLS, Source, _evidence, _wfc, generates
+from app.generate import MAX_CELLS, RandomSource, _evidence, _wfc, generates
 from app.generate._site import refused
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey
 from app.model.layers import Layers, Part, PartKey
@@ -59,7 +59,7 @@ class Options:
 
 
 @generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=3)
-def complete_grid(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+def complete_grid(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A grid's unknown cells as far as they are sure: walls that go on straight, free cells between free ones.
 
     Known cells stay as they are. Every window that was made up stands somewhere in the known part where that can be;
@@ -78,7 +78,9 @@ def complete_grid(given: Layers, options: Options, source: Source, notes: Notes)
     return Layers(parts, given.datum, given.levels)
 
 
-def _completed(grid: OccupancyGrid, options: Options, source: Source, notes: Notes, key: PartKey) -> OccupancyGrid:
+def _completed(
+    grid: OccupancyGrid, options: Options, source: RandomSource, notes: DerivationNotes, key: PartKey
+) -> OccupancyGrid:
     name = called(key)
     if grid.cells.size > MAX_CELLS:
         raise CannotGenerate(f"{name} has {grid.cells.size} cells, the limit is {MAX_CELLS}")
@@ -131,8 +133,8 @@ def _fill(
     target: Bool,
     counts: NDArray[np.int64],
     options: Options,
-    source: Source,
-    notes: Notes,
+    source: RandomSource,
+    notes: DerivationNotes,
     key: PartKey,
 ) -> None:
     """Make up the wanted cells, in place. What is not free stays unknown unless all is to be made up."""
@@ -153,8 +155,8 @@ def _filled(
     target: Bool,
     counts: NDArray[np.int64],
     options: Options,
-    source: Source,
-    notes: Notes,
+    source: RandomSource,
+    notes: DerivationNotes,
     key: PartKey,
 ) -> NDArray[np.int64]:
     """0 and 1 for each cell of a window of the grid, -1 where nothing was made."""

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from app.derive import Notes
-from app.generate import Source, _field, _trees, generates
+from app.derive import DerivationNotes
+from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import FieldOptions, Row
 from app.generate._site import Site, disc, mm, refused
 from app.model.layers import Layers
@@ -38,7 +38,7 @@ class CropRows(FieldOptions):
 
 
 @generates({"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=CropRows, also={"location"})
-def crop_rows(given: Layers, options: CropRows, source: Source, notes: Notes) -> Layers:
+def crop_rows(given: Layers, options: CropRows, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A field of crops: beds of several rows of plants, wheel tracks between them, headlands, and a yard."""
     site = Site(given, options, notes, coloured=True)
     width = (options.rows_per_bed - 1) * options.row_spacing

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.derive import Notes
-from app.generate import Source, _building, generates
+from app.derive import DerivationNotes
+from app.generate import RandomSource, _building, generates
 from app.generate._building import Furniture, Room, Storeys
 from app.generate._site import SiteOptions
 from app.model.layers import Layers
@@ -37,7 +37,7 @@ class Options(SiteOptions):
     also=frozenset({"location"}),
     parameters=Options,
 )
-def hospital(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+def hospital(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A hospital ward: rooms with beds, a nurse station and a corridor; several wards are joined by a lift."""
     min_width, max_width = options.room_width
     lift = options.levels > 1

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from app.derive import Notes
-from app.generate import Source, _field, _trees, generates
+from app.derive import DerivationNotes
+from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import FieldOptions
 from app.generate._site import Site, refused
 from app.model.layers import Layers
@@ -32,7 +32,7 @@ class Orchard(FieldOptions):
     parameters=Orchard,
     also={"location"},
 )
-def orchard(given: Layers, options: Orchard, source: Source, notes: Notes) -> Layers:
+def orchard(given: Layers, options: Orchard, source: RandomSource, notes: DerivationNotes) -> Layers:
     """An orchard: rows of trees with crowns, headlands, a yard with charging docks, and a network of its aisles."""
     if options.crown_diameter < options.trunk_diameter:
         raise refused("crown_diameter", "a crown is no thinner than its trunk")

@@ -22,11 +22,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters as Slice
 from app.derive.objects_to_occupancy import objects_to_occupancy
 from app.errors import BadUpload, CannotConvert, CannotGenerate, Invalid, Problem
-from app.generate import MAX_CELLS, MAX_OBJECTS, Source, generates
+from app.generate import MAX_CELLS, MAX_OBJECTS, RandomSource, generates
 from app.model import masks, solids
 from app.model.features import Features, features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, as_seen, unknown_grey
@@ -105,7 +105,7 @@ class Perturbation:
 
 
 @dataclass(slots=True)
-class _Thing:
+class _Movable:
     """One object, or piece of a grid. at: its middle. body: the ground it covers (metres). row: its row, or -1.
 
     moved: (dx, dy, turn); None: it stays for good. gone: whether it is missing.
@@ -144,7 +144,7 @@ class _Change:
     also={"resources", "location"},
     parameters=Perturbation,
 )
-def perturbation(given: Layers, options: Perturbation, source: Source, notes: Notes) -> Layers:
+def perturbation(given: Layers, options: Perturbation, source: RandomSource, notes: DerivationNotes) -> Layers:
     """The environment disturbed: things shifted, missing and new, noise on its grids, a network that still fits.
 
     Objects stay in their family and keep their ids; new ones are of the family ``perturbation``. Grids keep their
@@ -192,7 +192,9 @@ def perturbation(given: Layers, options: Perturbation, source: Source, notes: No
 class _Level:
     """One level on its way."""
 
-    def __init__(self, given: Layers, options: Perturbation, source: Source, notes: Notes, level: str) -> None:
+    def __init__(
+        self, given: Layers, options: Perturbation, source: RandomSource, notes: DerivationNotes, level: str
+    ) -> None:
         self.given, self.options, self.source, self.notes, self.level = given, options, source, notes, level
         self.parts: dict[PartKey, Features] = {k: p for k, p in given.vector("objects", level).items() if len(p)}
         self.stored = given.grids(level)
@@ -235,10 +237,10 @@ class _Level:
         return out
 
     # --- objects -----------------------------------------------------------------------------------------------------
-    def _things(self) -> list[_Thing]:
+    def _things(self) -> list[_Movable]:
         """Everything with a body, those that may move first told apart from those that stay."""
         solid_reader = solids.Solids(self.given.resources())
-        out: list[_Thing] = []
+        out: list[_Movable] = []
         for key, part in self.parts.items():
             metres = part.in_local(self.given.frame)
             for k, (p, geometry) in enumerate(zip(part.properties, metres, strict=True)):
@@ -256,13 +258,13 @@ class _Level:
                 middle = ((x0 + x1) / 2, (y0 + y1) / 2) if pose is None else solids.pose_of(p)[:2]
                 woven = isinstance(p.get("osm"), dict) and shapely.get_type_id(geometry) != 0  # its nodes would stay
                 stays = str(p.get("kind")) in STAYS or math.hypot(x1 - x0, y1 - y0) > self.options.largest or woven
-                thing = _Thing((key, k), (float(middle[0]), float(middle[1])), body)
+                thing = _Movable((key, k), (float(middle[0]), float(middle[1])), body)
                 if stays:
                     thing.moved = None
                 out.append(thing)
         return out
 
-    def _objects(self, things: list[_Thing], main: OccupancyGrid | None) -> tuple[_Change, dict[PartKey, Part]]:
+    def _objects(self, things: list[_Movable], main: OccupancyGrid | None) -> tuple[_Change, dict[PartKey, Part]]:
         """What changes of the obstacles, and the parts of objects that do."""
         loose = [t for t in things if t.moved is not None]
         rows = _rows(np.array([t.at for t in loose]).reshape(-1, 2))
@@ -292,14 +294,14 @@ class _Level:
         merged = {**self.parts, **out}
         return self._sliced(merged, main), out
 
-    def _told(self, things: Sequence[_Thing]) -> list[str]:
+    def _told(self, things: Sequence[_Movable]) -> list[str]:
         removed_count = sum(t.gone for t in things)
         moved = sum(t.changed for t in things) - removed_count
         rows = len({t.row for t in things if t.row >= 0 and t.moved is not None})
         phrases = [f"{moved} things moved" + (f" ({rows} rows)" if rows else "")] if moved else []
         return phrases + ([f"{removed_count} gone"] if removed_count else [])
 
-    def _shaken(self, loose: list[_Thing]) -> None:
+    def _shaken(self, loose: list[_Movable]) -> None:
         """Draw what goes, and how far what stays is moved."""
         s, options = self.options.severity, self.options
         go = self.draw("missing").random(len(loose)) < min(options.missing * s, 1.0)
@@ -340,14 +342,16 @@ class _Level:
         level_parts = {k: p for k, p in parts.items() if k.layer in ("resources", "location") or k.level == self.level}
         try:
             sliced_layers = objects_to_occupancy(
-                Layers(level_parts, self.given.datum, self.given.levels), slice_parameters or Slice(), Notes()
+                Layers(level_parts, self.given.datum, self.given.levels), slice_parameters or Slice(), DerivationNotes()
             )
         except CannotConvert:
             return None
         return sliced_layers.grids(self.level).get(PartKey("occupancy", self.level, MAP))
 
     # --- new obstacles -----------------------------------------------------------------------------------------------
-    def _obstacles(self, things: Sequence[_Thing], main: OccupancyGrid | None) -> list[tuple[str, Any, dict[str, Any]]]:
+    def _obstacles(
+        self, things: Sequence[_Movable], main: OccupancyGrid | None
+    ) -> list[tuple[str, Any, dict[str, Any]]]:
         """New objects where it is free."""
         rng = self.draw("obstacles")
         bodies = [t.now() for t in things if t.moved is not None and not t.gone]  # the grid shows all the others
@@ -430,7 +434,7 @@ class _Level:
         loose = []
         for k in pieces.tolist():
             x, y, w, h, _ = (int(v) for v in stats[k])
-            loose.append(_Thing(k, ((x + w / 2) * size, (y + h / 2) * size), None))
+            loose.append(_Movable(k, ((x + w / 2) * size, (y + h / 2) * size), None))
         for t, row in zip(loose, _rows(np.array([t.at for t in loose]).reshape(-1, 2)).tolist(), strict=True):
             t.row = row
         self._shaken(loose)
@@ -594,7 +598,7 @@ class _Level:
 
 
 # --- the network as a whole -------------------------------------------------------------------------------------------
-def _without_lost(given: Layers, parts: dict[PartKey, Part], notes: Notes) -> dict[PartKey, Part]:
+def _without_lost(given: Layers, parts: dict[PartKey, Part], notes: DerivationNotes) -> dict[PartKey, Part]:
     """Without edges whose nodes are gone, on whatever level they are; with a word on what hangs together no more."""
     before = given.vector("topology")
     after: dict[PartKey, Features] = {}
@@ -657,7 +661,7 @@ def _moved(shape: Any, around: tuple[float, float], by: tuple[float, float, floa
     return shapely.transform(shape, placed, include_z=bool(shapely.has_z(shape)))
 
 
-def _changed(part: Features, things: dict[int, _Thing], given: Layers) -> Features:
+def _changed(part: Features, things: dict[int, _Movable], given: Layers) -> Features:
     """A part with its objects where they are now, and without those that are gone."""
     metres = part.in_local(given.frame).copy()
     geometry = part.geometry.copy()
@@ -730,7 +734,7 @@ def _rows(at: Array) -> NDArray[np.int64]:
     return np.where(count[row] >= ROW, numbers[row], -1)
 
 
-def _apart(things: Sequence[_Thing]) -> int:
+def _apart(things: Sequence[_Movable]) -> int:
     """Put back what has come to stand in others and did not before: how many things."""
     present_things = [t for t in things if not t.gone]
     before = np.array([t.body for t in present_things], object)

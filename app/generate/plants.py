@@ -7,9 +7,9 @@ from typing import Literal
 
 import shapely
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import Invalid, Problem
-from app.generate import Source, _lsystem, _plants, generates
+from app.generate import RandomSource, _lsystem, _plants, generates
 from app.generate._site import Site, SiteOptions, disc, refused
 from app.generate._site_frame import placed
 from app.model.layers import Layers
@@ -63,7 +63,7 @@ class Options(SiteOptions):
     also=frozenset({"location"}),
     parameters=Options,
 )
-def plants(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+def plants(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A stand of plants from L-systems: apple trees, vines, bushes, pines, or by rules of your own."""
     grown = _grown(options, source)
     largest = 1.0 + options.variation
@@ -116,7 +116,7 @@ def plants(given: Layers, options: Options, source: Source, notes: Notes) -> Lay
     return site.finish(ground="meadow")
 
 
-def _grown(options: Options, source: Source) -> list[_plants.Plant]:
+def _grown(options: Options, source: RandomSource) -> list[_plants.Plant]:
     """The plants that stand here. Invalid and CannotGenerate say what is wrong with rules."""
     name: str = options.species if options.rules is None else "own"
     if options.rules is None:

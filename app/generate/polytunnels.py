@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from app.derive import Notes
-from app.generate import Source, _field, _trees, generates
+from app.derive import DerivationNotes
+from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Line, Row
 from app.generate._site import Site, angle, mm, refused, rgb
 from app.model.layers import Layers
@@ -44,7 +44,7 @@ class Polytunnels(FieldOptions):
 @generates(
     {"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=Polytunnels, also={"location"}
 )
-def polytunnels(given: Layers, options: Polytunnels, source: Source, notes: Notes) -> Layers:
+def polytunnels(given: Layers, options: Polytunnels, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Polytunnels: hoops and covers over rows of tables with strawberries, aisles between them, and a yard."""
     if options.tunnel_height <= options.side_height:
         raise refused("tunnel_height", "must be above side_height")

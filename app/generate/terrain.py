@@ -17,9 +17,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate
-from app.generate import MAX_OBJECTS, Source, _cells, generates
+from app.generate import MAX_OBJECTS, RandomSource, _cells, generates
 from app.generate._noise import Fractal, noise2, noise3
 from app.generate._site import Site, SiteOptions, disc, mm, refused
 from app.model import masks
@@ -71,7 +71,7 @@ class Options(SiteOptions):
 @generates(
     {"location", "objects", "occupancy", "topology", "imagery", "resources"}, parameters=Options, also={"location"}
 )
-def terrain(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+def terrain(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Hilly ground with woods: a height map for Gazebo, trees, and a grid of what the slopes cost."""
     site = Site(given, options, notes)
     box = site.bounded(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
@@ -111,7 +111,7 @@ def terrain(given: Layers, options: Options, source: Source, notes: Notes) -> La
     return Layers(dict(sorted(parts.items())), layers.datum, layers.levels)
 
 
-def _heights(x: Array, y: Array, options: Options, source: Source) -> Array:
+def _heights(x: Array, y: Array, options: Options, source: RandomSource) -> Array:
     """Heights from 0 (the lowest place) to 1, row 0 at the smallest y."""
     fractal = Fractal(options.noise, options.feature, options.octaves, options.persistence, options.lacunarity)
     field = noise3(x, y, np.array([options.epoch]), fractal, source.stream("ground"))[0]
@@ -122,7 +122,7 @@ def _heights(x: Array, y: Array, options: Options, source: Source) -> Array:
 
 
 def _trees(
-    site: Site, ground: tuple[Array, Array, Array], shape: tuple[int, int], options: Options, source: Source
+    site: Site, ground: tuple[Array, Array, Array], shape: tuple[int, int], options: Options, source: RandomSource
 ) -> int:
     """A tree in each place of a coarse raster where the vegetation's noise is among the densest; how many."""
     rows, columns = shape
@@ -178,7 +178,7 @@ def _trees(
     return count
 
 
-def _posts(site: Site, ground: tuple[Array, Array, Array], notes: Notes) -> None:
+def _posts(site: Site, ground: tuple[Array, Array, Array], notes: DerivationNotes) -> None:
     """A post at each corner of bare ground: without anything that stands there is nothing to find one's place by."""
     inner = shapely.buffer(site.fence, -POST, join_style="mitre")
     if inner.is_empty or inner.geom_type != "Polygon":
@@ -238,7 +238,7 @@ def _costs(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
     """Nav2's keepout mask: 0 where it is flat, 100 where it is too steep or something stands, between in proportion."""
     cells = np.where(steep >= 1.0, OCCUPIED, np.floor(np.minimum(steep, 1.0) * 99.0)).astype(np.uint8)
     cells = np.where(grid.cells == FREE, cells, grid.cells).astype(np.uint8)
-    properties = {masks.NAME: {"params": masks.params("costs", masks.Info(masks.KEEPOUT, 0.0, 1.0))}}
+    properties = {masks.NAME: {"params": masks.params("costs", masks.FilterInfo(masks.KEEPOUT, 0.0, 1.0))}}
     return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=properties)
 
 
@@ -246,7 +246,7 @@ def _speed(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
     """Nav2's speed mask: percent of the robot's speed; 0, no limit, where it is nobody's business."""
     percent = np.maximum(np.rint(100.0 * (1.0 - np.minimum(steep, 1.0))), SLOWEST).astype(np.uint8)
     cells = np.where(grid.cells == UNKNOWN, 0, percent).astype(np.uint8)
-    info = masks.Info(masks.SPEED_PERCENT, 0.0, 1.0)
+    info = masks.FilterInfo(masks.SPEED_PERCENT, 0.0, 1.0)
     properties = {masks.NAME: {"params": masks.params("speed", info)}}
     return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=properties)
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, Problem
-from app.generate import Source, _blocks, _plants, _streets, generates
+from app.generate import RandomSource, _blocks, _plants, _streets, generates
 from app.generate._blocks import Lot
 from app.generate._site import SLACK, Site, SiteOptions, angle, disc, mm, refused
 from app.model.layers import Layers
@@ -80,7 +80,7 @@ class Options(SiteOptions):
     also=frozenset({"location"}),
     parameters=Options,
 )
-def town(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+def town(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A town quarter: streets with lanes, sidewalks and crossings, blocks, lots and buildings by a rule grammar."""
     constants = {
         name: float(getattr(options, name)) for name in ("main", "street", "block", "lot", "setback", "storeys")
@@ -248,7 +248,7 @@ def _roof(ridge: float) -> Any:
     return np.array(faces, np.float64)
 
 
-def _lamps(site: Site, streets: _streets.Streets, need: float, notes: Notes) -> None:
+def _lamps(site: Site, streets: _streets.Streets, need: float, notes: DerivationNotes) -> None:
     """Lamps at the kerb, where a robot still passes beside them."""
     off = streets.walk / 2 - 0.25
     if off - LAMP[0] < need:
@@ -273,7 +273,7 @@ def _lamps(site: Site, streets: _streets.Streets, need: float, notes: Notes) -> 
             site.post(f"lamp_{count}", "pole", (mm(at.x), mm(at.y)), *LAMP, colour="metal", name=f"Lamp {count}")
 
 
-def _green(site: Site, lots: Sequence[Lot], source: Source) -> None:
+def _green(site: Site, lots: Sequence[Lot], source: RandomSource) -> None:
     """Trees in parks, bushes and a tree in gardens, benches on squares."""
     chance = source.stream("green")
     kinds = {name: _plants.grown(name, count, source) for name, count in (("apple", 3), ("pine", 2), ("bush", 2))}

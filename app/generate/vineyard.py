@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from app.derive import Notes
-from app.generate import Source, _field, _trees, generates
+from app.derive import DerivationNotes
+from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Row
 from app.generate._site import Site, mm, rectangle, refused, rgb
 from app.model.layers import Layers
@@ -32,7 +32,7 @@ class Vineyard(FieldOptions):
 
 
 @generates({"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=Vineyard, also={"location"})
-def vineyard(given: Layers, options: Vineyard, source: Source, notes: Notes) -> Layers:
+def vineyard(given: Layers, options: Vineyard, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A vineyard: vines on trellises with posts and wires that no robot may pass, headlands, and a yard."""
     if options.canopy_top <= options.canopy_base:
         raise refused("canopy_top", "must be above canopy_base")

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.derive import Notes
-from app.generate import Source, _field, _trees, generates
+from app.derive import DerivationNotes
+from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Line, Row
 from app.generate._site import SLACK, Site, mm, rectangle, refused
 from app.model.layers import Layers
@@ -61,7 +61,7 @@ class Warehouse(FieldOptions):
 @generates(
     {"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=Warehouse, also={"location"}
 )
-def warehouse(given: Layers, options: Warehouse, source: Source, notes: Notes) -> Layers:
+def warehouse(given: Layers, options: Warehouse, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A warehouse: a hall with racks and pallets, aisles (one-way on request), loading docks, chargers and parking."""
     site = Site(given, options, notes, coloured=True)
     lines = [Line("row", k, f"A{k}") for k in range(1, (options.racks or _field.MOST_ROWS) + 1)]

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Problem
-from app.generate import Source, _cells, _wfc, generates
-from app.generate._cells import LOOKS, Look
+from app.generate import RandomSource, _cells, _wfc, generates
+from app.generate._cells import LOOKS, CellStyle
 from app.generate._site import Site, SiteOptions, refused
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, as_seen
 from app.model.layers import Layers
@@ -46,7 +46,7 @@ Rectangles = tuple[tuple[float, float, float, float], ...]
 class Sample:
     """A place to learn from: rectangles (x, y, width, depth in metres) of what stands there."""
 
-    look: Look
+    look: CellStyle
     rectangles: Rectangles
 
     def cells(self, resolution: float) -> U8:
@@ -122,7 +122,7 @@ class Options(SiteOptions):
     also={"location", "occupancy"},
     version=2,
 )
-def wave_function_collapse(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+def wave_function_collapse(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Wave-function collapse: a place every window of which stands in a sample.
 
     Raises CannotGenerate for a sample that is not there, too large or too varied, for fixed places that contradict it,
@@ -194,7 +194,7 @@ def _pattern(options: Options) -> int:
     return 1
 
 
-def _sample(given: Layers, options: Options, notes: Notes) -> tuple[U8, Bool, float, Look]:
+def _sample(given: Layers, options: Options, notes: DerivationNotes) -> tuple[U8, Bool, float, CellStyle]:
     """(cells of 0 and 100, which of them are known, metres a cell, what its obstacles are)."""
     grids = {key.name: grid for key, grid in reversed(given.grids().items())}
     if options.sample in SAMPLES and options.sample not in grids:
@@ -225,7 +225,7 @@ def binary(grid: OccupancyGrid) -> tuple[U8, Bool]:
     return np.where(occupied, OCCUPIED, FREE).astype(np.uint8), known_cells
 
 
-def _whole(cells: U8, known_cells: Bool, tile: int, notes: Notes) -> tuple[U8, Bool]:
+def _whole(cells: U8, known_cells: Bool, tile: int, notes: DerivationNotes) -> tuple[U8, Bool]:
     """A sample of whole tiles."""
     rows, columns = (n // tile * tile for n in cells.shape)
     lost = cells.size - rows * columns

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from app import derive
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.ingest.prepare import open_store
 from app.model import alignment
@@ -81,7 +81,7 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
     loaded = store.load(base, sorted({key, *target_keys}))
     grid = loaded.parts[key]
     assert isinstance(grid, OccupancyGrid)
-    notes = Notes()
+    notes = DerivationNotes()
     if request.pairs:
         fit, report = _by_points(request, notes)
     else:
@@ -128,7 +128,7 @@ def told_before(version: Version, request: AlignmentRequest) -> dict[str, Any] |
     return None
 
 
-def _by_points(request: AlignmentRequest, notes: Notes) -> tuple[alignment.Fit, dict[str, Any]]:
+def _by_points(request: AlignmentRequest, notes: DerivationNotes) -> tuple[alignment.Fit, dict[str, Any]]:
     fit, disagreeing, scale = alignment.of_pairs(
         np.array(request.pairs, np.float64).reshape(-1, 2, 2), near=request.near
     )
@@ -139,7 +139,7 @@ def _by_points(request: AlignmentRequest, notes: Notes) -> tuple[alignment.Fit, 
     return fit, {"disagreeing": disagreeing, "scale": round(scale, 6)}
 
 
-def _seen(loaded: Layers, request: AlignmentRequest, target: PartKey, notes: Notes) -> OccupancyGrid:
+def _seen(loaded: Layers, request: AlignmentRequest, target: PartKey, notes: DerivationNotes) -> OccupancyGrid:
     """The layer as the grid that a derivation makes of it."""
     step = derive.all_derivations()[WAYS[request.layer]].step()
     unknown = request.values.keys() - derive.takes(step.name)

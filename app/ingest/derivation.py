@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app import derive, parameters
-from app.derive import Notes, Step
+from app.derive import DerivationNotes, Step
 from app.errors import CannotDerive, Conflict, Invalid, MissingLayer, NotFound, Problem
 from app.ingest.prepare import open_store
 from app.model.layers import MAP, Layer, Layers, PartKey, is_empty
@@ -67,7 +67,7 @@ def prepare_derivation(
         }
         # Not only the layers that are needed: a derivation may look at others where they are there (a fence).
         loaded = store.load(base, sorted(used))
-        notes = Notes()
+        notes = DerivationNotes()
         try:
             layers = Layers(loaded.parts, base.datum, base.levels)
             chain = derive.with_values(steps, request.values)

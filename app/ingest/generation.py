@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app import generate
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import Conflict, Problem
 from app.ingest.prepare import open_store
 from app.model.layers import Layers, PartKey
@@ -41,7 +41,7 @@ def prepare_generation(
         used = {k: e for k, e in used.items() if not _made_up(e)}
     loaded = store.load(base, sorted(used))
     given = Layers(loaded.parts, base.datum, base.levels)
-    notes = Notes()
+    notes = DerivationNotes()
     generated_layers = generate.run(order.generator, order.seed, order.values, given, notes)
     existing_parts = {e.key: e for e in base.parts if e.count > 0}
     _check_free(order, generator, generated_layers, existing_parts)

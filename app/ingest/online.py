@@ -40,7 +40,7 @@ from app.errors import (
 from app.formats import Limits
 from app.ingest.prepare import open_store
 from app.model.geodesy import WGS84, between
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Layers, PartKey
 from app.parameters import describe, parameter
 from app.store.changes import Changes, Prepared, Provenance, Replace
@@ -486,7 +486,7 @@ def prepare_picture(
 
 def put_together(
     mosaic: Mosaic, answers: Iterable[bytes | None], attribution: tuple[str, ...], limits: Limits
-) -> tuple[Picture, int]:
+) -> tuple[GeoImage, int]:
     """(the picture, how many of its parts the provider does not have). CannotDerive where it has none."""
     pixels = np.zeros((mosaic.height, mosaic.width, 4), np.uint8)
     missing = 0
@@ -503,7 +503,7 @@ def put_together(
         raise CannotDerive("the imagery provider has no picture of this place at this resolution", step=METHOD)
     properties = {"attribution": list(attribution)} if attribution else {}
     image = pixels if (pixels[..., 3] < 255).any() else np.ascontiguousarray(pixels[..., :3])
-    return Picture(image, mosaic.transform, MERCATOR, properties), missing
+    return GeoImage(image, mosaic.transform, MERCATOR, properties), missing
 
 
 def _decoded(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.uint8]:
@@ -515,7 +515,7 @@ def _decoded(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.uint
         (part,) = upload_reader.read({name: data}, hints, EnvironmentContext(), limits).layers(None).parts.values()
     except (BadUpload, ValueError) as error:
         raise CannotDerive(f"the imagery provider sends a picture that cannot be read: {error}", step=METHOD) from error
-    assert isinstance(part, Picture)
+    assert isinstance(part, GeoImage)
     height, width, bands = part.pixels.shape
     if (height, width) != (block.height, block.width) or part.pixels.dtype != np.uint8:
         raise CannotDerive(

@@ -22,7 +22,7 @@ from app.ingest.match import OWN_IDS, match_ids
 from app.model.features import Features, merge_documents
 from app.model.frame import Datum, Level
 from app.model.grid import UNKNOWN, OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Part, PartKey, Resources, cloud_name, join_levels
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Put, Replace
 from app.store.store import Store
@@ -289,7 +289,7 @@ def _rename_documents(part: Features, family: str, names: Mapping[str, str]) -> 
 
 
 def _attribution(part: Part) -> list[str]:
-    if isinstance(part, Picture):
+    if isinstance(part, GeoImage):
         return list(part.attribution)
     stated = part.document.get("attribution", ()) if isinstance(part, Features) else ()
     return [str(line) for line in stated]

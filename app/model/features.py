@@ -241,7 +241,7 @@ def alike(*keys: str) -> dict[str, Any]:
     return vars(holder)
 
 
-class Compact:
+class SharedKeyDicts:
     """Mappings -> the same ones in less memory: those with the same keys share their table of keys (``alike``)."""
 
     MOST = 256

@@ -32,7 +32,7 @@ CLEAR = ("alpha", "mask")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class GeoImage:
     """Pixels and where they lie.
 
     pixels: [height, width, bands], row 0 on top. transform: (a, b, c, d, e, f) with x = a·column + b·row + c and
@@ -100,7 +100,7 @@ def placed(transform: Affine, column: NDArray[np.float64], row: NDArray[np.float
     return np.column_stack([a * column + b * row + c, d * column + e * row + f])
 
 
-def displayed(picture: Picture) -> NDArray[np.uint8]:
+def displayed(picture: GeoImage) -> NDArray[np.uint8]:
     """A picture as screens show it: uint8 [height, width, 1…4] (grey, grey + alpha, RGB, RGBA).
 
     8-bit values stay as they are (the picture's own pixels, where nothing has to be changed); others are stretched, so
@@ -158,7 +158,7 @@ def _known(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.bool_
     return valid
 
 
-def _range(picture: Picture, shown: list[int], rows: int) -> tuple[float, float]:
+def _range(picture: GeoImage, shown: list[int], rows: int) -> tuple[float, float]:
     """The least and the greatest value that is shown."""
     low, high = math.inf, -math.inf
     for y in range(0, len(picture.pixels), rows):
@@ -181,7 +181,7 @@ def _opacity(values: NDArray[Any], colour: str) -> NDArray[np.uint8]:
     return np.round(shares * 255.0).astype(np.uint8)
 
 
-def _palette(picture: Picture) -> NDArray[np.uint8] | None:
+def _palette(picture: GeoImage) -> NDArray[np.uint8] | None:
     """RGBA [256, 4] of the values, where the picture has a palette of that size."""
     palette = picture.properties.get("palette")
     if "palette" not in picture.colours or not isinstance(palette, list | tuple) or picture.pixels.dtype != np.uint8:

@@ -11,7 +11,7 @@ from app.model.features import Features
 from app.model.frame import GROUND, Datum, Level, is_writable
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.names import bad_name
 from app.model.voxels import VoxelMap
 
@@ -50,7 +50,7 @@ class Resources:
                 raise Invalid(f"a resource cannot be called {path[:80]!r}: the name {reason}")
 
 
-Part = Features | OccupancyGrid | VoxelMap | Picture | Resources
+Part = Features | OccupancyGrid | VoxelMap | GeoImage | Resources
 
 PART_TYPES: Mapping[Layer, type] = {
     "location": Features,
@@ -59,7 +59,7 @@ PART_TYPES: Mapping[Layer, type] = {
     "zones": Features,
     "occupancy": OccupancyGrid,
     "voxels": VoxelMap,
-    "imagery": Picture,
+    "imagery": GeoImage,
     "resources": Resources,
 }
 

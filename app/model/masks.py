@@ -29,7 +29,7 @@ DEEPEST = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Info:
+class FilterInfo:
     """What a mask's cells mean: value = base + multiplier * cell."""
 
     type: int
@@ -41,7 +41,7 @@ class Info:
         return {"type": self.type, "base": self.base, "multiplier": self.multiplier}
 
 
-def params(name: str, info: Info) -> dict[str, Any]:
+def params(name: str, info: FilterInfo) -> dict[str, Any]:
     """The parameter file of a mask that has none: of its filter info server and its map server. name: of the grid."""
     word = re.sub(r"[^A-Za-z0-9_]", "_", name)
     topic = f"/{word}_filter_mask"

@@ -102,7 +102,7 @@ def load_mesh(data: bytes, name: str, max_faces: int = MOST_FACES) -> tuple[Arra
     return mesh.vertices, mesh.faces
 
 
-_Read = tuple[Array, Faces, NDArray[np.int64], tuple[tuple[str, ...], ...]]
+_ParsedMesh = tuple[Array, Faces, NDArray[np.int64], tuple[tuple[str, ...], ...]]
 
 
 def _refuse(name: str, reason: str) -> NoReturn:
@@ -135,7 +135,7 @@ _STL_VERTEX = re.compile(rb"vertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 _STL_FACET = re.compile(rb"^\s*facet\b", re.IGNORECASE | re.MULTILINE)
 
 
-def _stl(data: bytes, max_faces: int) -> _Read:
+def _stl(data: bytes, max_faces: int) -> _ParsedMesh:
     """Binary where the count in its head fits its size (also behind a head that starts with ``solid``), else text."""
     count = int.from_bytes(data[80:_STL_HEAD], "little") if len(data) >= _STL_HEAD else -1
     fits = _STL_HEAD + count * _STL_FACE.itemsize
@@ -165,7 +165,7 @@ def _is_text(data: bytes) -> bool:
 # --- OBJ -------------------------------------------------------------------------------------------------------------
 
 
-def _obj(data: bytes, max_faces: int) -> _Read:
+def _obj(data: bytes, max_faces: int) -> _ParsedMesh:
     """``v`` and ``f`` lines; ``o`` and ``g`` name the parts. Indexes count from 1, negative ones from the end."""
     text = data.decode("utf-8", "replace").replace("\\\n", " ").replace("\\\r\n", " ")
     rows: list[str] = []
@@ -215,7 +215,7 @@ def _fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[Faces, 
 # --- COLLADA ---------------------------------------------------------------------------------------------------------
 
 
-def _dae(data: bytes, max_faces: int) -> _Read:
+def _dae(data: bytes, max_faces: int) -> _ParsedMesh:
     """The triangles of the scene, or of all geometries where there is no scene."""
     check_prolog(data)
     # Real number arrays are longer than libxml2's usual bound for a text; without a DOCTYPE there is nothing to unfold.
@@ -298,7 +298,7 @@ class _Scene:
                         self._place(skin[0], placement @ skin[1], named)
             stack += reversed(further)
 
-    def result(self) -> _Read:
+    def result(self) -> _ParsedMesh:
         """Everything placed, in metres."""
         if not self.faces:
             raise ValueError("its scene shows no triangles")
@@ -487,5 +487,5 @@ def _rotation(axis_angle: Array) -> Array:
     return np.asarray(np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * (k @ k), np.float64)
 
 
-_READERS: Mapping[str, Callable[[bytes, int], _Read]] = {".stl": _stl, ".obj": _obj, ".dae": _dae}
+_READERS: Mapping[str, Callable[[bytes, int], _ParsedMesh]] = {".stl": _stl, ".obj": _obj, ".dae": _dae}
 """By the ending of the file's name."""

@@ -18,7 +18,7 @@ from app.errors import Invalid, MissingDatum
 from app.model.frame import MAX_METRES
 from app.model.gdal import gdal, native, opened
 from app.model.geodesy import WGS84, LocalFrame, between
-from app.model.imagery import CLEAR, LOCAL, Affine, Picture, placed
+from app.model.imagery import CLEAR, LOCAL, Affine, GeoImage, placed
 
 Method = Literal["nearest", "bilinear", "cubic"]
 TOLERANCE = 1e-4
@@ -33,14 +33,14 @@ _NO_CRS = "EPSG:3857"
 
 
 def resampled(
-    picture: Picture,
+    picture: GeoImage,
     frame: LocalFrame | None = None,
     *,
     crs: str = LOCAL,
     resolution: float | None = None,
     method: Method | None = None,
     most_pixels: int = MOST_PIXELS,
-) -> Picture:
+) -> GeoImage:
     """The picture on a grid of ``crs`` (``local``: metres of ``frame``; else a name that PROJ knows).
 
     The grid's rows run along x, its columns against y, its pixels are squares of ``resolution`` (metres or degrees of
@@ -127,7 +127,7 @@ def _unturned(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
 
 
 def _warped(
-    picture: Picture,
+    picture: GeoImage,
     method: Method | None,
     shape: tuple[int, int],
     transform: Affine,
@@ -189,6 +189,6 @@ def _opaque(band: NDArray[Any], colour: str) -> float:
     return float(np.iinfo(band.dtype).max) if band.dtype.kind in "iu" else 1.0
 
 
-def to_wgs84(picture: Picture, frame: LocalFrame | None = None, **options: Any) -> Picture:
+def to_wgs84(picture: GeoImage, frame: LocalFrame | None = None, **options: Any) -> GeoImage:
     """``resampled`` on a grid of longitude and latitude."""
     return resampled(picture, frame, crs=WGS84, **options)

@@ -23,7 +23,7 @@ from app.errors import Damaged, Invalid, MissingDatum, NotFound
 from app.model.features import Features
 from app.model.geodesy import LocalFrame, crs_bounds
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Part, Resources
 from app.model.voxels import VoxelMap
 from app.store import tree
@@ -233,7 +233,7 @@ def compose(draft: ChunkStage, part: Part, base: PartRoot | None, base_digest: s
         return _compose_grid(draft, part, base)
     if isinstance(part, VoxelMap):
         return _compose_voxels(draft, part)
-    if isinstance(part, Picture):
+    if isinstance(part, GeoImage):
         return _compose_picture(draft, part, base)
     return _compose_resources(draft, part)
 
@@ -313,7 +313,7 @@ def _compose_grid(draft: ChunkStage, part: OccupancyGrid, base: PartRoot | None)
     return EncodedPart(name, int(part.cells.size), {"local": _around(part.corners()), "wgs84": None})
 
 
-def _compose_picture(draft: ChunkStage, part: Picture, base: PartRoot | None) -> EncodedPart:
+def _compose_picture(draft: ChunkStage, part: GeoImage, base: PartRoot | None) -> EncodedPart:
     pixels = part.pixels
     header = {
         "height": pixels.shape[0],
@@ -878,12 +878,12 @@ def _load_grid(draft: ChunkStage, root: PartRoot) -> OccupancyGrid:
     )
 
 
-def _load_picture(draft: ChunkStage, root: PartRoot) -> Picture:
+def _load_picture(draft: ChunkStage, root: PartRoot) -> GeoImage:
     h = root.header
     pixels = np.empty((h["height"], h["width"], h["bands"]), np.dtype(h["dtype"]) if h["dtype"] != "b1" else np.bool_)
     _load_tiles(draft, root, pixels)
     a, b, c, d, e, f = h["transform"]
-    return Picture(pixels, (a, b, c, d, e, f), h["crs"], h["properties"])
+    return GeoImage(pixels, (a, b, c, d, e, f), h["crs"], h["properties"])
 
 
 def voxel_leaf(raw: bytes, colour: bool) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any] | None]:

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from PIL import Image
 
-from app.formats import Group, ReadContext, WriteContext, get_format, read, write
+from app.formats import FileGroup, ReadContext, WriteContext, get_format, read, write
 from app.formats.satellite import WriteOptions
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
 
@@ -18,14 +18,14 @@ DATUM = {"latitude": 53.2686, "longitude": -0.5245}
 
 
 def geotiff(pixels: np.ndarray, crs: str = "EPSG:32630", **properties: object) -> bytes:
-    picture = Picture(pixels, (0.5, 0.0, 665000.0, 0.0, -0.5, 5905000.0), crs, properties)
+    picture = GeoImage(pixels, (0.5, 0.0, 665000.0, 0.0, -0.5, 5905000.0), crs, properties)
     context = WriteContext(options=WriteOptions())
     return write(get_format("satellite"), Layers({PartKey("imagery"): picture}), context)["satellite.tif"]
 
 
-def picture_of(data: bytes) -> Picture:
-    (part,) = read(Group(get_format("satellite"), "a.tif", {"a.tif": data}), ReadContext()).parts.values()
-    assert isinstance(part, Picture)
+def picture_of(data: bytes) -> GeoImage:
+    (part,) = read(FileGroup(get_format("satellite"), "a.tif", {"a.tif": data}), ReadContext()).parts.values()
+    assert isinstance(part, GeoImage)
     return part
 
 

@@ -25,7 +25,7 @@ from app.formats import Limits
 from app.ingest import online
 from app.ingest.online import Fetcher, Provider, put_together, sheet
 from app.model.geodesy import WGS84, between
-from app.model.imagery import Picture, placed
+from app.model.imagery import GeoImage, placed
 from tests.api.conftest import Api, running, settings_for
 
 FENCE = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>fence</name><Polygon><outerBoundaryIs>
@@ -193,14 +193,14 @@ def tiles(at: Misbehaving, **more: Any) -> Provider:
     return Provider(at.url + "/tiles/{z}/{x}/{y}.png?key={token}", "xyz", SECRET, ("© Somebody",), **more)
 
 
-def fetched(provider: Provider, resolution: float = 0.5) -> tuple[Picture, int]:
+def fetched(provider: Provider, resolution: float = 0.5) -> tuple[GeoImage, int]:
     mosaic = sheet(provider, BOX, resolution)
     return put_together(
         mosaic, Fetcher(provider, sleep=lambda _: None).fetch(mosaic.blocks), provider.attribution, Limits()
     )
 
 
-def check(picture: Picture) -> None:
+def check(picture: GeoImage) -> None:
     """Every pixel shows the place that the transform says, and the box is covered with no more than a pixel around."""
     height, width = picture.pixels.shape[:2]
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)

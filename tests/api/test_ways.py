@@ -10,7 +10,7 @@ import pytest
 
 from app import derive
 from app.convert.files import offline
-from app.derive import Notes, derives
+from app.derive import DerivationNotes, derives
 from app.errors import CannotConvert, CannotDerive, Invalid, MissingLayer
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 from app.model.layers import Layers, PartKey
@@ -43,7 +43,7 @@ def blank(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(derive, "_registry", {k: d for k, d in derivations.items() if d.gives != "occupancy"})
 
     @derives(gives="occupancy", needs={"objects"}, parameters=Blank, cost=5.0)
-    def blank_grid(layers: Layers, parameters: Blank, notes: Notes) -> Layers:
+    def blank_grid(layers: Layers, parameters: Blank, notes: DerivationNotes) -> Layers:
         """A free square."""
         notes.warn("it is blank")
         notes.drop("objects", 1, "a blank grid shows none")
@@ -52,7 +52,7 @@ def blank(monkeypatch: pytest.MonkeyPatch) -> None:
         return Layers({PartKey("occupancy"): OccupancyGrid(cells, 0.5)}, layers.datum, layers.levels)
 
     @derives(gives="occupancy", needs={"objects"}, parameters=Nothing, cost=1.0)
-    def never(layers: Layers, parameters: Nothing, notes: Notes) -> Layers:
+    def never(layers: Layers, parameters: Nothing, notes: DerivationNotes) -> Layers:
         """A derivation that finds nothing."""
         raise CannotConvert("there is nothing red among the objects")
 

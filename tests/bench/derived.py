@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 
 from app import derive
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.model.features import features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, NETWORK, SITE, Layers, PartKey
@@ -134,7 +134,7 @@ def measure(name: str) -> dict[str, Any]:
 def run(case: Case, scale: float) -> Layers:
     """Derive it once."""
     derivation = derive.all_derivations()[case.step]
-    return derivation.function(case.make(scale), derivation.parameters(**case.parameters), Notes())
+    return derivation.function(case.make(scale), derivation.parameters(**case.parameters), DerivationNotes())
 
 
 def _child(name: str) -> None:
@@ -144,7 +144,7 @@ def _child(name: str) -> None:
     layers, options = case.make(1.0), derivation.parameters(**case.parameters)
     reset()
     start = time.perf_counter()
-    derived_layers = derivation.function(layers, options, Notes())
+    derived_layers = derivation.function(layers, options, DerivationNotes())
     spent = time.perf_counter() - start
     (part,) = derived_layers.parts.values()
     size = part.cells.size if isinstance(part, OccupancyGrid) else len(part)  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import CannotGenerate
-from app.generate import Source, _automata, _kernels_noise, _kernels_wfc, _wfc
+from app.generate import RandomSource, _automata, _kernels_noise, _kernels_wfc, _wfc
 from app.generate.wave_function_collapse import SAMPLES
 from app.model.grid import OCCUPIED
 
@@ -59,7 +59,7 @@ def collapse() -> list[dict[str, Any]]:
             model = _wfc.learn(sample, tile=1, pattern=PATTERN, symmetry="none")
             try:
                 fixed = np.full((side, side), -1)
-                tiles = _wfc.collapsed(model, (side, side), fixed, Source(seed, "bench").stream, joined=True)
+                tiles = _wfc.collapsed(model, (side, side), fixed, RandomSource(seed, "bench").stream, joined=True)
             except CannotGenerate:
                 failed += 1
                 continue

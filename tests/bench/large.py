@@ -201,7 +201,7 @@ def photo(end: str, noise: float) -> Callable[[float], dict[str, bytes]]:
     """An aerial picture of 8000 × 8000 pixels, red, green and blue: fields, and noise of this width on every pixel."""
 
     def make(scale: float) -> dict[str, bytes]:
-        from app.model.imagery import Picture
+        from app.model.imagery import GeoImage
 
         dice = np.random.default_rng(SEED)
         side = max(8, round(PIXELS**0.5 * scale**0.5))
@@ -211,7 +211,7 @@ def photo(end: str, noise: float) -> Callable[[float], dict[str, bytes]]:
             shade = (np.sin(x / 70) + np.cos(y / 90)) * 60 + 120
             grain = dice.integers(0, 256, (side, 3)) if noise >= 256 else dice.normal(0, noise, (side, 3))
             pixels[y] = grain if noise >= 256 else np.clip(shade[:, None] + np.array([0, 10, 20]) + grain, 0, 255)
-        picture = Picture(pixels, (0.1, 0.0, 665000.0, 0.0, -0.1, 5905000.0), "EPSG:32630")
+        picture = GeoImage(pixels, (0.1, 0.0, 665000.0, 0.0, -0.1, 5905000.0), "EPSG:32630")
         fmt = formats.get_format("satellite")
         options = formats.write_options(fmt, {"file_type": end})
         return formats.write(fmt, Layers({PartKey("imagery"): picture}), formats.WriteContext(options=options))

@@ -15,7 +15,7 @@ import pytest
 from app.cli import client as clients
 from app.cli.client import Client, LocalFile
 from app.cli.output_files import inside, unpack
-from app.cli.problems import Refused
+from app.cli.problems import RequestFailed
 from app.errors import Invalid
 
 Answer = tuple[int, dict[str, str], bytes] | None
@@ -110,14 +110,14 @@ def test_an_upload_whose_answer_is_lost_is_sent_again_under_the_same_key(talk: T
 
 def test_a_lost_answer_is_told_in_the_end(talk: Talk, tmp_path: Path) -> None:
     client, script = talk(None)
-    with pytest.raises(Refused, match="no answer from"):
+    with pytest.raises(RequestFailed, match="no answer from"):
         client.upload("/environments/e/versions", [local(tmp_path, "a", b"1")], {})
     assert len(script.asked) == clients.TRIES
 
 
 def test_what_must_not_happen_twice_is_asked_once(talk: Talk) -> None:
     client, script = talk(None)
-    with pytest.raises(Refused, match="no answer"):
+    with pytest.raises(RequestFailed, match="no answer"):
         client.post("/environments", {"name": "farm"})
     assert len(script.asked) == 1
 
@@ -153,17 +153,17 @@ def test_a_job_that_fails_tells_its_problem(talk: Talk) -> None:
         reply(202, {"id": "7"}, Location="/api/v1/jobs/7"),
         reply(200, {"id": "7", "state": "failed", "progress": 0.1, "problem": problem}),
     )
-    with pytest.raises(Refused, match="there is no network"), client.download("/x"):
+    with pytest.raises(RequestFailed, match="there is no network"), client.download("/x"):
         pass
 
 
 def test_a_missing_token_gets_a_hint(talk: Talk) -> None:
     client, script = talk(reply(401, {"title": "Token needed", "detail": "give a token"}, "application/problem+json"))
-    with pytest.raises(Refused) as caught:
+    with pytest.raises(RequestFailed) as caught:
         client.get("/formats")
     assert "FLEETMAP_TOKEN" in caught.value.hint
     client, script = talk(reply(401, {"detail": "x"}, "application/problem+json"), token="secret-token")
-    with pytest.raises(Refused) as caught:
+    with pytest.raises(RequestFailed) as caught:
         client.get("/formats")
     assert "another" in caught.value.hint
     assert script.asked[-1][2]["Authorization"] == "Bearer secret-token"
@@ -172,7 +172,7 @@ def test_a_missing_token_gets_a_hint(talk: Talk) -> None:
 def test_a_missing_environment_gets_a_hint(talk: Talk) -> None:
     problem = {"title": "Not found", "detail": "there is no environment 'x'"}
     client, _ = talk(reply(404, problem, "application/problem+json"), reply(200, [{"name": "other"}]))
-    with pytest.raises(Refused) as caught:
+    with pytest.raises(RequestFailed) as caught:
         client.get("/environments/x")
     assert caught.value.hint == "`fleetmap environment list` lists all."
 
@@ -181,20 +181,20 @@ def test_missing_environment_proposes_the_nearest_one_the_token_sees(talk: Talk)
     problem = {"title": "Not found", "detail": "there is no environment 'fram-7'"}
     names = reply(200, [{"name": name} for name in ("orchard", "farm-7")])
     client, _ = talk(reply(404, problem, "application/problem+json"), names)
-    with pytest.raises(Refused) as caught:
+    with pytest.raises(RequestFailed) as caught:
         client.get("/environments/fram-7/versions/latest")
     assert caught.value.hint.startswith("Did you mean farm-7?")
     client, _ = talk(reply(404, problem, "application/problem+json"))
-    with pytest.raises(Refused, match="no environment 'fram-7'"):
+    with pytest.raises(RequestFailed, match="no environment 'fram-7'"):
         client.get("/environments/fram-7")  # the list is refused as well: the first error is told
 
 
 def test_another_kind_of_server_is_recognised(talk: Talk) -> None:
     client, _ = talk(reply(200, b"<html>", "text/html"))
-    with pytest.raises(Refused, match="no JSON"):
+    with pytest.raises(RequestFailed, match="no JSON"):
         client.get("/formats")
     client, _ = talk(reply(404, b"<html>", "text/html"))
-    with pytest.raises(Refused, match="answered 404"):
+    with pytest.raises(RequestFailed, match="answered 404"):
         client.get("/formats")
 
 

@@ -17,7 +17,7 @@ def put(root: Path, *names: str) -> None:
         path.write_text(name)
 
 
-def names(content: folder.Folder) -> list[str]:
+def names(content: folder.UploadFolder) -> list[str]:
     return [f.name for f in content.files]
 
 

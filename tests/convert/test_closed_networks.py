@@ -30,9 +30,9 @@ NETWORKS = (
 )
 
 
-def groups_in(folder: Path, name: str) -> list[formats.Group]:
+def groups_in(folder: Path, name: str) -> list[formats.FileGroup]:
     """The maps of a format below a folder, folder by folder."""
-    out: list[formats.Group] = []
+    out: list[formats.FileGroup] = []
     for place in [folder, *sorted(p for p in folder.rglob("*") if p.is_dir())]:
         files = {f.name: f.read_bytes() for f in sorted(place.iterdir()) if f.is_file()}
         if files:
@@ -40,7 +40,7 @@ def groups_in(folder: Path, name: str) -> list[formats.Group]:
     return out
 
 
-def read(group: formats.Group) -> Layers:
+def read(group: formats.FileGroup) -> Layers:
     layers = formats.read(group, ReadContext(frame=local_frame(DATUM)))
     return layers if layers.datum is not None else replace(layers, datum=DATUM)
 

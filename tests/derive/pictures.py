@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 
 SIZE = 0.1
 WIDTH, HEIGHT = 60.0, 40.0
@@ -39,10 +39,10 @@ def farm(noise: float = 3.0) -> NDArray[np.uint8]:
     return np.clip(np.round(shaken), 0, 255).astype(np.uint8)
 
 
-def local(pixels: NDArray[Any], size: float = SIZE, **properties: Any) -> Picture:
+def local(pixels: NDArray[Any], size: float = SIZE, **properties: Any) -> GeoImage:
     """A picture whose lower left corner is the local origin."""
     shaped = pixels if pixels.ndim == 3 else pixels[..., None]
-    return Picture(shaped, (size, 0.0, 0.0, 0.0, -size, len(shaped) * size), properties=properties)
+    return GeoImage(shaped, (size, 0.0, 0.0, 0.0, -size, len(shaped) * size), properties=properties)
 
 
 def plan() -> NDArray[np.uint8]:

@@ -12,7 +12,7 @@ import pytest
 import shapely
 
 from app import derive, upload_reader
-from app.derive import Notes, run
+from app.derive import DerivationNotes, run
 from app.derive.imagery_to_objects import Parameters as ObjectParameters
 from app.derive.imagery_to_objects import imagery_to_objects
 from app.derive.imagery_to_occupancy import Parameters, imagery_to_occupancy
@@ -26,7 +26,7 @@ from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import MAP, Layers, PartKey, Resources
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.derive.pictures import BRANCH, BUILDING, CROWN, PATH, PATH_WIDTH, TREES, farm, local, plan
@@ -35,20 +35,24 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 DATUM = Datum(53.0, -0.5)
 
 
-def layers(picture: Picture, *, name: str = "satellite", datum: Datum | None = None, **more: Picture) -> Layers:
+def layers(picture: GeoImage, *, name: str = "satellite", datum: Datum | None = None, **more: GeoImage) -> Layers:
     images = {PartKey("imagery", "ground", n): p for n, p in {name: picture, **more}.items()}
     return Layers(dict(images), datum)
 
 
-def objects(content: Layers, notes: Notes | None = None, **options: Any) -> Features:
-    derived_layers = imagery_to_objects(content, ObjectParameters(**options), notes if notes is not None else Notes())
+def objects(content: Layers, notes: DerivationNotes | None = None, **options: Any) -> Features:
+    derived_layers = imagery_to_objects(
+        content, ObjectParameters(**options), notes if notes is not None else DerivationNotes()
+    )
     (part,) = derived_layers.parts.values()
     assert isinstance(part, Features)
     return part
 
 
-def grid(content: Layers, notes: Notes | None = None, level: str = "ground", **options: Any) -> OccupancyGrid:
-    derived_layers = imagery_to_occupancy(content, Parameters(**options), notes if notes is not None else Notes())
+def grid(content: Layers, notes: DerivationNotes | None = None, level: str = "ground", **options: Any) -> OccupancyGrid:
+    derived_layers = imagery_to_occupancy(
+        content, Parameters(**options), notes if notes is not None else DerivationNotes()
+    )
     part = derived_layers.parts[PartKey("occupancy", level, MAP)]
     assert isinstance(part, OccupancyGrid)
     return part
@@ -68,7 +72,7 @@ def overlap(a: Any, b: Any) -> float:
 
 
 def test_a_farm_is_told_apart() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     part = objects(layers(local(farm())), notes)
     assert part.local.all()
     trees = of(part, "tree")
@@ -126,7 +130,7 @@ def test_a_farm_as_a_grid() -> None:
     assert (coarse.resolution, coarse.width) == (0.5, 120)
     assert at(coarse, 41, 29) == OCCUPIED
     # The same through objects.
-    notes = Notes()
+    notes = DerivationNotes()
     both = Layers({**content.parts, **imagery_to_objects(content, ObjectParameters(), notes).parts})
     derived_layers = objects_to_occupancy(both, Rasterised(resolution=0.1, padding=0.0), notes)
     (rasterised,) = derived_layers.grids().values()
@@ -150,18 +154,18 @@ def test_the_same_picture_gives_the_same_cells_and_a_seed_is_used() -> None:
 
 
 def test_small_things_are_left_out() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     part = objects(layers(local(farm())), notes, minimum_area=15.0)
     assert not of(part, "tree")
     assert len(of(part, "building")) == 1
     assert any(d["what"] == "spots" and d["count"] >= len(TREES) for d in notes.dropped)
 
 
-def on_earth() -> Picture:
+def on_earth() -> GeoImage:
     frame = local_frame(DATUM)
     corner, far = frame.to_wgs84(np.array([[0.0, 40.0], [60.0, 0.0]]))
     a, e = (far - corner) / [600, 400]
-    return Picture(farm(), (float(a), 0.0, float(corner[0]), 0.0, float(e), float(corner[1])), "EPSG:4326")
+    return GeoImage(farm(), (float(a), 0.0, float(corner[0]), 0.0, float(e), float(corner[1])), "EPSG:4326")
 
 
 def test_pictures_on_earth_give_objects_on_earth() -> None:
@@ -178,7 +182,7 @@ def test_pictures_on_earth_give_objects_on_earth() -> None:
 
 
 def test_vegetation_by_index() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     part = objects(layers(local(farm())), notes, segmentation="index")
     assert set(Counter(f.properties["kind"] for f in part)) == {"tree", "field"}
     assert len(of(part, "tree")) == len(TREES)
@@ -197,12 +201,12 @@ def test_a_near_infrared_band_gives_the_ndvi() -> None:
     labelled = local(pixels, bands=[*bands, {"colour": "undefined", "description": "NIR"}])
     unsaid = local(pixels, bands=[*bands, {"colour": "undefined"}])
     for content, options in ((layers(labelled), {}), (layers(unsaid), {"near_infrared": 4})):
-        notes = Notes()
+        notes = DerivationNotes()
         part = objects(content, notes, segmentation="index", **options)
         assert "NDVI" in notes.template[0]["why"]
         reach = shapely.total_bounds(part.geometry)
         assert reach[2] == pytest.approx(30.0, abs=0.5)
-    notes = Notes()
+    notes = DerivationNotes()
     green = objects(layers(unsaid), notes, segmentation="index")
     assert shapely.total_bounds(green.geometry)[2] == pytest.approx(60.0, abs=0.5)
     untagged = local(pixels, bands=[{"colour": c} for c in ("grey", *["undefined"] * 3)])
@@ -214,7 +218,7 @@ def test_a_near_infrared_band_gives_the_ndvi() -> None:
 
 
 def test_a_plan_has_walls_rooms_and_an_outside() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     g = grid(layers(local(plan(), 0.02), name="house"), notes)
     assert (g.resolution, g.origin) == (0.05, (0.0, 0.0, 0.0))
     assert (at(g, 2.1, 6), at(g, 7.05, 3), at(g, 7.05, 9)) == (OCCUPIED, OCCUPIED, OCCUPIED)
@@ -235,7 +239,7 @@ def test_a_plan_has_walls_rooms_and_an_outside() -> None:
 
 def test_a_turned_plan_lies_where_its_transform_says() -> None:
     c, s = 0.02 * np.cos(0.5), 0.02 * np.sin(0.5)
-    turned = Picture(plan()[..., None], (c, s, 100.0, s, -c, 50.0))
+    turned = GeoImage(plan()[..., None], (c, s, 100.0, s, -c, 50.0))
     g = grid(layers(turned))
 
     def cell_at(x: float, y: float) -> int:
@@ -324,7 +328,7 @@ def png(pixels: Any) -> bytes:
 
 
 def test_a_buildings_drawing_is_a_picture() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     derived_layers = resources_to_imagery(building({"plan.png": png(plan())}), Drawings(), notes)
     g = grid(derived_layers, level="L1")
     assert (at(g, 2.1, 6), at(g, 4, 6), at(g, 1, 6)) == (OCCUPIED, FREE, UNKNOWN)
@@ -338,7 +342,7 @@ def test_drawings_that_cannot_be_read() -> None:
         ({"plan.png": png(plan())[:200]}, "cannot be read"),
         ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "too many"),
     ):
-        notes = Notes()
+        notes = DerivationNotes()
         with pytest.raises(MissingLayer, match="floor plan"):
             resources_to_imagery(building(files), Drawings(), notes)
         assert says in notes.warnings[0].problem
@@ -363,7 +367,7 @@ def test_plans_of_real_buildings_have_their_walls(folder: str, levels: int) -> N
     if not (DATA / "openrmf_building" / folder).is_dir():
         pytest.skip("the real maps are not here")
     content = real(folder)
-    derived_layers = resources_to_imagery(content, Drawings(), Notes())
+    derived_layers = resources_to_imagery(content, Drawings(), DerivationNotes())
     assert len(derived_layers.parts) == levels
     for key in derived_layers.parts:
         g = grid(Layers({key: derived_layers.parts[key]}), level=key.level)
@@ -400,8 +404,8 @@ def test_a_plan_that_a_robot_made_agrees_with_its_map() -> None:
     assert pixels.shape == true.cells.shape
     x, y, _ = true.origin
     size = true.resolution
-    lain = Picture(pixels[..., None], (size, 0.0, x, 0.0, -size, y + len(pixels) * size))
-    notes = Notes()
+    lain = GeoImage(pixels[..., None], (size, 0.0, x, 0.0, -size, y + len(pixels) * size))
+    notes = DerivationNotes()
     derived_grid = grid(layers(lain), notes, minimum_area=0.0)
     assert any("205" in w.problem for w in notes.warnings)
     near = (

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
-from app.derive import Notes, _onnx
+from app.derive import DerivationNotes, _onnx
 from app.derive.imagery_to_objects import Parameters, imagery_to_objects
 from app.derive.imagery_to_occupancy import Parameters as GridParameters
 from app.derive.imagery_to_occupancy import imagery_to_occupancy
@@ -90,9 +90,9 @@ def content(width: int = SIDE, height: int = SIDE, red: Any = None) -> Layers:
     return Layers({PartKey("imagery", "ground", "satellite"): local(pixels, 1.0)})
 
 
-def detect(layers: Layers, notes: Notes | None = None, **more: Any) -> dict[str, Any]:
+def detect(layers: Layers, notes: DerivationNotes | None = None, **more: Any) -> dict[str, Any]:
     options = Parameters(segmentation="model", model="tiny", resolution=1.0, **more)
-    derived_layers = imagery_to_objects(layers, options, notes if notes is not None else Notes())
+    derived_layers = imagery_to_objects(layers, options, notes if notes is not None else DerivationNotes())
     (part,) = derived_layers.parts.values()
     assert isinstance(part, Features)
     return {f.properties["kind"]: (f.geometry, f.properties["confidence"]) for f in part}
@@ -109,7 +109,7 @@ ROWS = np.array([HOUSE, TWICE, TREE, CAR, UNSURE]).T
 
 def test_boxes_become_objects_and_cells(folder: Path) -> None:
     put(folder, model(ROWS))
-    notes = Notes()
+    notes = DerivationNotes()
     things = detect(content(), notes)
     assert set(things) == {"building", "tree"}
     assert things["building"][0].equals(shapely.box(10, 64 - 25, 30, 64 - 15)), "y points upward"
@@ -118,10 +118,12 @@ def test_boxes_become_objects_and_cells(folder: Path) -> None:
     assert [d["count"] for d in notes.dropped if d["what"] == "things"] == [1]
     # Where the model sees nothing is unknown, so a map of obstacles alone has no free cell.
     with pytest.raises(CannotConvert, match="nothing that is free"):
-        imagery_to_occupancy(content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), Notes())
+        imagery_to_occupancy(
+            content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), DerivationNotes()
+        )
     put(folder, model(ROWS), ("building", "field", None))
     derived_layers = imagery_to_occupancy(
-        content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), Notes()
+        content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), DerivationNotes()
     )
     (grid,) = derived_layers.parts.values()
     assert isinstance(grid, OccupancyGrid)
@@ -189,9 +191,9 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
         with pytest.raises(NotFound, match="there are: tiny"):
             _onnx.supplied(name)
     with pytest.raises(Invalid, match="name one"):
-        imagery_to_objects(content(), Parameters(segmentation="model"), Notes())
+        imagery_to_objects(content(), Parameters(segmentation="model"), DerivationNotes())
     with pytest.raises(Invalid, match="belongs to segmentation=model"):
-        imagery_to_objects(content(), Parameters(model="tiny", segmentation="colour"), Notes())
+        imagery_to_objects(content(), Parameters(model="tiny", segmentation="colour"), DerivationNotes())
     real = importlib.import_module
 
     def absent(name: str, *more: Any) -> Any:

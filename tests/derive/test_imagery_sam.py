@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import shapely
 
-from app.derive import Notes, _onnx
+from app.derive import DerivationNotes, _onnx
 from app.derive.imagery_to_objects import Parameters, imagery_to_objects
 from app.derive.imagery_to_occupancy import Parameters as GridParameters
 from app.derive.imagery_to_occupancy import imagery_to_occupancy
@@ -61,11 +61,13 @@ def content(image: np.ndarray[Any, np.dtype[np.uint8]]) -> Layers:
     return Layers({PartKey("imagery", "ground", "satellite"): local(image, 0.5)})
 
 
-def detect(layers: Layers, notes: Notes | None = None, **more: Any) -> dict[str, list[tuple[Any, dict[str, Any]]]]:
+def detect(
+    layers: Layers, notes: DerivationNotes | None = None, **more: Any
+) -> dict[str, list[tuple[Any, dict[str, Any]]]]:
     # Squares of the embedding that hold two colours are things, too: small ones.
     usual = {"segmentation": "model", "model": "sam", "resolution": 0.5, "minimum_area": 5.0}
     options = Parameters(**{**usual, **more})
-    derived_layers = imagery_to_objects(layers, options, notes if notes is not None else Notes())
+    derived_layers = imagery_to_objects(layers, options, notes if notes is not None else DerivationNotes())
     (part,) = derived_layers.parts.values()
     assert isinstance(part, Features)
     out: dict[str, list[tuple[Any, dict[str, Any]]]] = {}
@@ -108,7 +110,7 @@ def check(things: dict[str, list[tuple[Any, dict[str, Any]]]], height: int = 64)
 )
 def test_things_are_cut_out_and_told_by_colour(folder: Path, how: dict[str, dict[str, Any]]) -> None:
     put(folder, tiny_sam.encoder(SIDE, **how.get("encoder", {})), tiny_sam.decoder(SIDE, **how.get("decoder", {})))
-    notes = Notes()
+    notes = DerivationNotes()
     things = detect(content(yard()), notes, stability=0.7)
     check(things)
     properties = things["building"][0][1]
@@ -121,7 +123,7 @@ def test_things_are_cut_out_and_told_by_colour(folder: Path, how: dict[str, dict
 def test_cells_of_what_is_not_known_stay_unknown(folder: Path) -> None:
     put(folder)
     how = GridParameters(segmentation="model", model="sam", resolution=0.5, minimum_area=5.0)
-    (grid,) = imagery_to_occupancy(content(yard()), how, Notes()).parts.values()
+    (grid,) = imagery_to_occupancy(content(yard()), how, DerivationNotes()).parts.values()
     assert isinstance(grid, OccupancyGrid)
     cells = grid.cells[::-1]
     assert [cells[14, 16], cells[TREE[1], TREE[0]], cells[44, 42], cells[60, 4]] == [OCCUPIED, OCCUPIED, UNKNOWN, FREE]
@@ -163,7 +165,7 @@ def test_one_point_finds_one_thing(folder: Path) -> None:
 
 def test_grey_pictures_have_no_kinds(folder: Path) -> None:
     put(folder)
-    notes = Notes()
+    notes = DerivationNotes()
     grey = cv2.cvtColor(yard(), cv2.COLOR_RGB2GRAY)
     assert set(detect(content(grey), notes)) == {"area"}
     assert any("0 are told" in w.problem for w in notes.warnings)
@@ -254,7 +256,7 @@ def test_each_pixel_is_told_across_tiles(folder: Path) -> None:
     image = np.full((80, 150, 3), (0, 255, 0), np.uint8)
     image[20:40, 10:140] = (255, 0, 0)
     image[60:70, 60:80] = (0, 0, 255)
-    notes = Notes()
+    notes = DerivationNotes()
     things = detect(content(image), notes, model="pixels", minimum_area=None)
     assert {kind: len(of) for kind, of in things.items()} == {"building": 1, "field": 1}
     assert alike(things["building"][0][0], box((10, 20, 140, 40), 80)) > 0.98
@@ -289,7 +291,7 @@ def test_usual_mean_and_wrong_words(folder: Path) -> None:
     with pytest.raises(Invalid, match="points: belongs to models of the Segment-Anything family, and pixels is none"):
         detect(content(image), model="pixels", points=8)
     with pytest.raises(Invalid, match="stability: belongs to segmentation=model"):
-        imagery_to_objects(content(image), Parameters(stability=0.5, segmentation="colour"), Notes())
+        imagery_to_objects(content(image), Parameters(stability=0.5, segmentation="colour"), DerivationNotes())
 
 
 def test_through_the_server(folder: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from app import derive
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.location_to_occupancy import Parameters, location_to_occupancy
 from app.errors import CannotConvert, MissingLayer
 from app.model.features import features
@@ -19,10 +19,10 @@ from app.model.layers import MAP, SITE, Layers, PartKey
 DATUM = Datum(52.0, 10.0)
 
 
-def blank(fence: Any, anchor: Any = "local", notes: Notes | None = None, **options: Any) -> OccupancyGrid:
+def blank(fence: Any, anchor: Any = "local", notes: DerivationNotes | None = None, **options: Any) -> OccupancyGrid:
     part = features([("fence", fence, {"kind": "fence"})], anchor)
     derived_layers = location_to_occupancy(
-        Layers({PartKey("location", "ground", SITE): part}, DATUM), Parameters(**options), notes or Notes()
+        Layers({PartKey("location", "ground", SITE): part}, DATUM), Parameters(**options), notes or DerivationNotes()
     )
     grid = derived_layers.parts[PartKey("occupancy", "ground", MAP)]
     assert isinstance(grid, OccupancyGrid)
@@ -30,7 +30,7 @@ def blank(fence: Any, anchor: Any = "local", notes: Notes | None = None, **optio
 
 
 def test_free_inside_unknown_outside() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     g = blank(shapely.Polygon([(-1, -1), (3, -1), (-1, 3)]), notes=notes, resolution=0.1)
     assert (g.origin, g.width, g.height, g.resolution) == ((-1, -1, 0), 40, 40, 0.1)
     assert g.counts() == {"occupied": 0, "free": 780, "unknown": 820, "other": 0}
@@ -46,7 +46,7 @@ def test_a_fence_on_earth() -> None:
 
 
 def test_large_fences_get_coarser_cells_and_absurd_ones_are_refused() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     assert blank(shapely.box(0, 0, 2000, 2000), notes=notes).resolution == 0.5
     assert notes.template[0]["value"] == 0.5
     with pytest.raises(CannotConvert, match="resolution of at least"):
@@ -58,7 +58,7 @@ def test_large_fences_get_coarser_cells_and_absurd_ones_are_refused() -> None:
 def test_without_a_fence_there_is_none() -> None:
     for layers in (Layers({}, DATUM), Layers({PartKey("location", "ground", SITE): features([], "local")}, DATUM)):
         with pytest.raises(MissingLayer, match="needs a fence"):
-            location_to_occupancy(layers, Parameters(), Notes())
+            location_to_occupancy(layers, Parameters(), DerivationNotes())
     with pytest.raises(MissingLayer, match="needs a fence"):
         blank(shapely.Point(0, 0))
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app import derive, parameters, upload_reader
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.location_to_occupancy import Parameters as BlankParameters
 from app.derive.location_to_occupancy import location_to_occupancy
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
@@ -51,10 +51,15 @@ def layers(part: Features, *, level: str = "ground", **more: Any) -> Layers:
 
 
 def grid(
-    content: Layers, notes: Notes | None = None, level: str = "ground", *, outside_free: bool = True, **options: Any
+    content: Layers,
+    notes: DerivationNotes | None = None,
+    level: str = "ground",
+    *,
+    outside_free: bool = True,
+    **options: Any,
 ) -> OccupancyGrid:
     chosen = Parameters(outside_free=outside_free, **options)
-    derived_layers = objects_to_occupancy(content, chosen, notes if notes is not None else Notes())
+    derived_layers = objects_to_occupancy(content, chosen, notes if notes is not None else DerivationNotes())
     part = derived_layers.parts[PartKey("occupancy", level, MAP)]
     assert isinstance(part, OccupancyGrid)
     assert part.origin[2] == 0
@@ -140,7 +145,7 @@ def test_walls_doors_floors_and_holes_of_a_building() -> None:
         (shapely.LineString([(5, 1), (5, 5)]), {"kind": "measurement"}),
         (shapely.Point(6, 3), {"kind": "fiducial"}),
     ]
-    notes = Notes()
+    notes = DerivationNotes()
     g = grid(layers(objects(*rows)), notes)
     assert (at(g, 2, 3), at(g, 11 - 0.2, 3), at(g, -0.5, -0.5)) == (0, 255, 255)
     assert (at(g, 5, 0.02), at(g, 5, -0.02), at(g, 4.2, 3), at(g, 4.3, 3), at(g, 8.5, 4.5)) == (100, 100, 100, 0, 100)
@@ -160,7 +165,7 @@ def test_a_fence_says_how_far_the_site_reaches() -> None:
     assert list(g.origin) == [0, 0, 0]
     assert (g.width, g.height) == (200, 200)
     assert (at(g, 1.5, 1.5), at(g, 3, 3), at(g, 9, 9)) == (100, 0, 255)
-    notes = Notes()
+    notes = DerivationNotes()
     grid(layers(objects((shapely.box(50, 50, 51, 51), {"kind": "building"})), fence=fence), notes)
     assert "outside the fence" in notes.warnings[0].problem
     floor = (shapely.box(0, 0, 3, 3), {"kind": "floor"})
@@ -169,7 +174,7 @@ def test_a_fence_says_how_far_the_site_reaches() -> None:
 
 
 def test_a_fence_on_earth_without_a_datum_is_told_and_left() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     content = layers(
         objects((shapely.box(1, 1, 2, 2), {"kind": "wall"})), fence=shapely.box(9, 51, 10, 52), anchor="wgs84"
     )
@@ -250,7 +255,7 @@ def test_multipolygons_are_put_together_from_their_ways() -> None:
         ("r1", None, {"kind": "building", "osm": {"members": members, "tags": tags}}),
     ]
     content = Layers({PartKey("objects", "ground", "osm"): features(rows, "local")})
-    notes = Notes()
+    notes = DerivationNotes()
     g = grid(content, notes)
     assert occupied(g) == pytest.approx(12)
     assert (at(g, 2, 2), at(g, 4.6, 2), at(g, 4.8, 2)) == (255, 255, 0), "the absent way may be anywhere near"
@@ -273,7 +278,7 @@ def test_ground_of_an_area_that_is_not_complete_is_unknown() -> None:
         ("w5", shapely.box(-9, -9, -8, -8), {"kind": "building"}),
     ]
     content = Layers({PartKey("objects", "ground", "osm"): features(rows, "local")})
-    notes = Notes()
+    notes = DerivationNotes()
     g = grid(content, notes, padding=10.0)
     assert (at(g, 6, 2), at(g, 0.2, 5.8), at(g, 8.4, 3)) == (255, 255, 255)
     assert (at(g, -1.5, 3), at(g, 10, 3), at(g, 4, -2.3)) == (0, 0, 0)
@@ -292,7 +297,7 @@ def test_resolution_inflation_and_padding() -> None:
 def test_a_town_gets_coarser_cells_and_absurd_wishes_are_refused() -> None:
     house = (shapely.box(0, 0, 10, 10), {"kind": "building"})
     town = layers(objects(house, (shapely.box(3000, 3000, 3010, 3010), {"kind": "wall"})))
-    notes = Notes()
+    notes = DerivationNotes()
     g = grid(town, notes)
     assert g.resolution == 1.0
     assert notes.template[0]["what"] == "resolution"
@@ -327,7 +332,7 @@ def test_ground_that_nothing_encloses_is_unknown() -> None:
     """Without floor and fence only what walls close off from the border is free."""
     ring = [[[-3, -3], [3, -3], [3, 3], [-3, 3]], [[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]]]
     room = (None, {"kind": "model", "shapes": [{"type": "polyline", "points": ring, "height": 2}]})
-    notes = Notes()
+    notes = DerivationNotes()
     g = grid(layers(objects(room)), notes, outside_free=False)
     assert (at(g, 0, 0), at(g, -3.5, 0), at(g, 2.75, 0)) == (0, 255, 100)
     assert [(t["value"], t["option"]) for t in notes.template] == [("unknown", "outside_free")]
@@ -365,7 +370,7 @@ def test_ground_around_a_solid_that_cannot_be_read_is_unknown(lost: dict[str, An
     ]
     fence = shapely.box(0, -20, 50, 20)
     files = {"bad.stl": b"", "cloud.xyz": b"0 0 0"}
-    notes = Notes()
+    notes = DerivationNotes()
     g = grid(layers(objects(*rows), fence=fence, files=files), notes)
     assert (at(g, 10, 0), at(g, 13, 0), at(g, 13, 4.9), at(g, 13, 5.2)) == (100, 255, 255, 0)
     assert (at(g, 30, 9.8), at(g, 30, 10.2)) == (255, 0), "what an object says of its size counts"
@@ -389,10 +394,10 @@ def test_solids_that_cannot_be_read_refuse_a_grid_of_guesses() -> None:
             grid(layers(objects(*rows), **dict(more)), outside_free=False)
         assert "model://house/walls.dae" in caught.value.problems[0].problem
     with pytest.raises(MissingLayer, match=r"known to have a body.*walls\.dae"):
-        objects_to_voxels(layers(objects((None, lost))), VoxelParameters(), Notes())
+        objects_to_voxels(layers(objects((None, lost))), VoxelParameters(), DerivationNotes())
     content = layers(objects((None, lost)), fence=shapely.box(-9, -9, 9, 9))
     with pytest.raises(MissingLayer, match=r"a blank grid.*walls\.dae"):
-        location_to_occupancy(content, BlankParameters(), Notes())
+        location_to_occupancy(content, BlankParameters(), DerivationNotes())
 
 
 def test_no_grid_is_made_of_the_voxels_of_objects() -> None:
@@ -408,7 +413,7 @@ def test_what_cannot_be_read_is_left_out_and_told() -> None:
         (None, {"kind": "model", "shapes": [BOX, mesh]}),
         (None, {"kind": "model", "shapes": [{"type": "mesh", "file": "flat.stl"}]}),
     ]
-    notes = Notes()
+    notes = DerivationNotes()
     flat = stl(((5, 5, 0), (5, 5, 0), (5, 5, 0)), ((6, 6, 0), (6, 6, 1), (7, 6, 0)))
     g = grid(layers(objects(*rows), files={"bad.stl": b"", "flat.stl": flat}), notes, surroundings=0.5)
     assert at(g, 0, 0) == 100
@@ -424,7 +429,7 @@ def test_bodies_without_files_are_told_apart_from_marks() -> None:
         (shapely.Point(0, 0), {"kind": "model", "name": "Sun", "gazebo": {"sdf": "<include/>"}}),
         (shapely.Point(0, 0), {"kind": "light"}),
     ]
-    notes = Notes()
+    notes = DerivationNotes()
     grid(layers(objects(*rows)), notes)
     assert {d["what"]: d["why"] for d in notes.dropped} == {
         "objects light": "nothing in a robot's way",
@@ -460,7 +465,7 @@ def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None
         ),
         anchor=anchor,
     )
-    notes = Notes()
+    notes = DerivationNotes()
     content = layers(part, fence=FENCE, datum=DATUM)
     g = grid(content, notes, surroundings=2.0)
     for x in (0, 5, -5):
@@ -480,24 +485,24 @@ def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None
 def test_objects_of_unknown_extent_leave_the_other_ground_free() -> None:
     """Also where they are all that there is, on a floor and on the blank grid of a fence."""
     chair = (shapely.Point(0, 0), {"kind": "model"})
-    notes = Notes()
+    notes = DerivationNotes()
     g = grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes)
     assert (at(g, 0.6, 0), at(g, 0.8, 0)) == (255, 0)
     assert any("is free but the ground around objects of unknown extent" in w.problem for w in notes.warnings)
     content = layers(objects(chair), fence=FENCE)
     with pytest.raises(MissingLayer, match="upload the files of their models"):
         grid(content)
-    notes = Notes()
+    notes = DerivationNotes()
     blank = location_to_occupancy(content, BlankParameters(), notes).grids()[PartKey("occupancy", "ground", MAP)]
     assert (at(blank, 0.6, 0), at(blank, 0.8, 0)) == (255, 0)
     assert "1 object has an unknown extent" in notes.warnings[0].problem
-    notes = Notes()
+    notes = DerivationNotes()
     assert not grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes, unknown_radius=100.0).counts()["free"]
     assert "or ask with a smaller unknown_radius" in notes.warnings[-1].problem
 
 
 def test_object_without_a_place_is_warned_of() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     rows: list[Any] = [WALL, (None, {"kind": "building", "name": "barn"}), (None, {"kind": "model"})]
     grid(layers(objects(*rows)), notes)
     (warning,) = notes.warnings
@@ -527,7 +532,7 @@ def test_a_mesh_that_stands_everywhere_is_limited(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(CannotConvert, match="more than 100 triangles"):
         grid(layers(objects(*[(None, {"kind": "model", "shapes": [BOX]})] * 9)))
     monkeypatch.setattr(solids, "MOST_TRIANGLES", 20)
-    notes = Notes()
+    notes = DerivationNotes()
     one = (None, {"kind": "model", "shapes": [BOX]})
     grid(layers(objects(one, (None, {"kind": "model", "shapes": [BOX, BOX]}))), notes, surroundings=1.0)
     assert "more than 20 triangles" in notes.warnings[0].problem
@@ -600,7 +605,7 @@ def test_whatever_objects_say_is_a_grid_or_a_clear_problem(rows: list[Any]) -> N
     else:
         assert at(derived_grid, 0.5, 0.5) == 100
     try:
-        objects_to_voxels(content, VoxelParameters(resolution=0.5), Notes())
+        objects_to_voxels(content, VoxelParameters(resolution=0.5), DerivationNotes())
     except CannotConvert as error:
         assert "coarser resolution" in error.detail or "resolution of at least" in error.detail
 

@@ -22,7 +22,7 @@ def objects(geometry: Any, kind: str = "path", name: str = "a") -> Features:
 
 
 def network(layers: Layers, **options: Any) -> dict[str, Features]:
-    derived_layers = objects_to_topology(layers, Parameters(**options), derive.Notes())
+    derived_layers = objects_to_topology(layers, Parameters(**options), derive.DerivationNotes())
     assert {k.layer for k in derived_layers.parts} == {"topology"}
     assert {k.name for k in derived_layers.parts} == {NETWORK}
     return {k.level: p for k, p in derived_layers.parts.items() if isinstance(p, Features)}

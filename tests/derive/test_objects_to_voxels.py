@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.objects_to_voxels import Parameters, objects_to_voxels
 from app.errors import CannotConvert, MissingLayer
 from app.model.frame import Level
@@ -19,8 +19,8 @@ from app.model.voxels import VoxelMap
 from tests.derive.test_objects_to_occupancy import BOX, layers, objects
 
 
-def voxels(content: Layers, notes: Notes | None = None, **options: Any) -> VoxelMap:
-    derived_layers = objects_to_voxels(content, Parameters(**options), notes or Notes())
+def voxels(content: Layers, notes: DerivationNotes | None = None, **options: Any) -> VoxelMap:
+    derived_layers = objects_to_voxels(content, Parameters(**options), notes or DerivationNotes())
     part = derived_layers.parts[PartKey("voxels", "ground", MAP)]
     assert isinstance(part, VoxelMap)
     assert part.occupied.all()
@@ -63,7 +63,7 @@ def test_footprints_are_extruded_from_their_base_to_their_top() -> None:
         (shapely.box(9, 9, 10, 10), {"kind": "hole"}),
         (shapely.box(-9, -9, -8, -8), {"kind": "floor"}),
     ]
-    notes = Notes()
+    notes = DerivationNotes()
     v = voxels(layers(objects(*rows)), notes, extrude=3.0)
     assert v.voxel_counts()["occupied"] == 10 * 10 * 10 + 22 * 30  # the wall is half its thickness longer on each end
     assert v.bounds() == (0.0, 0.0, 0.0, 7.1, 1.0, 3.0)
@@ -103,7 +103,7 @@ def test_limits_come_before_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CannotConvert, match="coarser resolution, or filled=false"):
         voxels(model(big), resolution=0.1)
     assert time.process_time() - start < 20
-    notes = Notes()
+    notes = DerivationNotes()
     assert voxels(model(big), notes).resolution == 10.0
     assert notes.template == [{"what": "resolution", "value": 10.0, "why": "0.1 m would be too many voxels"}]
     from app.derive import objects_to_voxels as module

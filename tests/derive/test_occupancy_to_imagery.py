@@ -13,14 +13,14 @@ import shapely
 from app import derive
 from app.convert.recipe import recipe
 from app.convert.worker import from_layers
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive import occupancy_to_imagery as plan
 from app.errors import Ambiguous, CannotConvert, MissingLayer
 from app.formats import get_format
 from app.model.features import features
 from app.model.frame import GROUND, Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.imagery import Picture, placed
+from app.model.imagery import GeoImage, placed
 from app.model.layers import Layer, Layers, PartKey
 from app.store.values import PartEntry, Provenance, Version
 
@@ -35,10 +35,10 @@ def room(width: int = 40, height: int = 20) -> Any:
     return cells
 
 
-def drawn(layers: Layers, notes: Notes | None = None, **values: Any) -> Picture:
-    derived_layers = plan.occupancy_to_imagery(layers, plan.Parameters(**values), notes or Notes())
+def drawn(layers: Layers, notes: DerivationNotes | None = None, **values: Any) -> GeoImage:
+    derived_layers = plan.occupancy_to_imagery(layers, plan.Parameters(**values), notes or DerivationNotes())
     (picture,) = derived_layers.parts.values()
-    assert isinstance(picture, Picture)
+    assert isinstance(picture, GeoImage)
     return picture
 
 
@@ -107,7 +107,7 @@ def test_objects_and_edges_are_drawn_over_the_cells() -> None:
 
 def test_places_on_earth_without_a_datum_are_left_out_and_told() -> None:
     house = [("house", shapely.box(5.0, 52.0, 5.1, 52.1), {"kind": "building"})]
-    notes = Notes()
+    notes = DerivationNotes()
     layers = Layers({GRID: OccupancyGrid(room(), 0.1), PartKey("objects"): features(house, "wgs84")})
     drawn(layers, notes)
     assert notes.dropped[0]["count"] == 1

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from app import derive, formats, parameters, upload_reader
 from app.convert import recipe
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive import _figures as known_figures
 from app.derive.objects_to_occupancy import Parameters as GridParameters
 from app.derive.objects_to_occupancy import objects_to_occupancy
@@ -39,8 +39,8 @@ def grid(
     return OccupancyGrid(np.array(cells, np.uint8), resolution, origin, **more)
 
 
-def find_objects(g: OccupancyGrid, notes: Notes | None = None, **values: Any) -> Features:
-    used_notes = notes if notes is not None else Notes()
+def find_objects(g: OccupancyGrid, notes: DerivationNotes | None = None, **values: Any) -> Features:
+    used_notes = notes if notes is not None else DerivationNotes()
     derived_layers = occupancy_to_objects(Layers({PartKey("occupancy"): g}), Parameters(**values), used_notes)
     assert set(derived_layers.parts) == {PartKey("objects", "ground", NAME)}
     part = derived_layers.parts[PartKey("objects", "ground", NAME)]
@@ -201,12 +201,12 @@ def test_a_rim_around_free_cells_is_a_room() -> None:
 def test_specks_are_left_out_and_said() -> None:
     cells = scene().cells.copy()
     cells[100, 5], cells[120, 5], cells[140, 5] = OCCUPIED, OCCUPIED, OCCUPIED
-    notes = Notes()
+    notes = DerivationNotes()
     f = find_objects(grid(cells), notes)
     assert f.ids == find_objects(scene()).ids
     assert [(d["what"], d["count"]) for d in notes.dropped] == [("specks", 3)]
     assert len(find_objects(grid(cells), minimum_size=0.0)) == len(f) + 3
-    notes = Notes()
+    notes = DerivationNotes()
     few = find_objects(grid(cells), notes, minimum_size=1.0)
     # Of the discs none is a metre across, of the others all are.
     assert kinds(few) == {"furniture": len(BOXES), "wall": len(WALLS)}
@@ -214,7 +214,7 @@ def test_specks_are_left_out_and_said() -> None:
 
 
 def test_what_is_made_up_is_said() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     find_objects(scene(), notes, context="orchard")
     assert {(t["what"], t["value"]) for t in notes.template} == {
         ("height of tree", 3.0),
@@ -223,7 +223,7 @@ def test_what_is_made_up_is_said() -> None:
     }
     assert len(notes.warnings) == 1
     assert "orchard" in notes.warnings[0].problem
-    notes = Notes()
+    notes = DerivationNotes()
     f = find_objects(scene(), notes, height=1.75)
     assert [(t["what"], t["value"]) for t in notes.template] == [("height", 1.75)]
     assert {p["height"] for p in f.properties} == {1.75}
@@ -306,19 +306,19 @@ def test_which_grid_and_levels() -> None:
     parts = {PartKey("occupancy", "ground", n): g for n in ("keepout", MAP)}
     parts[PartKey("occupancy", "L2", "only")] = g
     layers = Layers(dict(parts), levels=(Level(), Level("L2", 4.0)))
-    derived_parts = occupancy_to_objects(layers, Parameters(), Notes()).parts
+    derived_parts = occupancy_to_objects(layers, Parameters(), DerivationNotes()).parts
     assert {k.level for k in derived_parts} == {"ground", "L2"}
     upper = derived_parts[PartKey("objects", "L2", NAME)]
     assert isinstance(upper, Features)
     assert {p["pose"][2] for p in upper.properties} == {4.0}
-    assert {k.level for k in occupancy_to_objects(layers, Parameters(grid="only"), Notes()).parts} == {"L2"}
+    assert {k.level for k in occupancy_to_objects(layers, Parameters(grid="only"), DerivationNotes()).parts} == {"L2"}
     with pytest.raises(NotFound, match="keepout, map, only"):
-        occupancy_to_objects(layers, Parameters(grid="nogo"), Notes())
+        occupancy_to_objects(layers, Parameters(grid="nogo"), DerivationNotes())
     parts[PartKey("occupancy", "L2", "second")] = g
     with pytest.raises(Ambiguous, match="only, second"):
-        occupancy_to_objects(Layers(dict(parts), levels=layers.levels), Parameters(), Notes())
+        occupancy_to_objects(Layers(dict(parts), levels=layers.levels), Parameters(), DerivationNotes())
     with pytest.raises(MissingLayer, match="masks alone tell no obstacles"):
-        occupancy_to_objects(Layers({PartKey("occupancy", "ground", "keepout"): g}), Parameters(), Notes())
+        occupancy_to_objects(Layers({PartKey("occupancy", "ground", "keepout"): g}), Parameters(), DerivationNotes())
 
 
 def test_parameters_are_checked_and_the_planner_prefers_all_other_ways() -> None:
@@ -379,8 +379,8 @@ def test_the_nine_pillars_of_turtlebot3_world(shared: Path) -> None:
 def test_the_objects_of_real_maps_stand_where_the_map_is_occupied(shared: Path, folder: str) -> None:
     layers = load(shared / "data" / folder)
     (g,) = layers.grids().values()
-    derived_layers = occupancy_to_objects(layers, Parameters(), Notes())
-    back = objects_to_occupancy(derived_layers, GridParameters(resolution=g.resolution), Notes())
+    derived_layers = occupancy_to_objects(layers, Parameters(), DerivationNotes())
+    back = objects_to_occupancy(derived_layers, GridParameters(resolution=g.resolution), DerivationNotes())
     (again,) = back.grids().values()
 
     def occupied(one: OccupancyGrid) -> Array:
@@ -396,7 +396,7 @@ def test_the_objects_of_real_maps_stand_where_the_map_is_occupied(shared: Path, 
 
 def test_the_same_grid_gives_the_same_objects(shared: Path) -> None:
     layers = load(shared / "data/occupancy_grid/turtlebot3_map_office_raw")
-    a, b = (occupancy_to_objects(layers, Parameters(), Notes()).vector("objects") for _ in range(2))
+    a, b = (occupancy_to_objects(layers, Parameters(), DerivationNotes()).vector("objects") for _ in range(2))
     for one, other in zip(a.values(), b.values(), strict=True):
         assert one.ids == other.ids
         assert one.properties == other.properties
@@ -404,7 +404,7 @@ def test_the_same_grid_gives_the_same_objects(shared: Path) -> None:
 
 
 def test_a_gazebo_world_of_the_objects_has_their_cylinders_and_boxes() -> None:
-    derived_layers = occupancy_to_objects(Layers({PartKey("occupancy"): scene()}), Parameters(), Notes())
+    derived_layers = occupancy_to_objects(Layers({PartKey("occupancy"): scene()}), Parameters(), DerivationNotes())
     gazebo = formats.get_format("gazebo")
     files = gazebo.write(derived_layers, formats.WriteContext(title="scene", options=gazebo.write_options()))
     world = etree.fromstring(files["world.sdf"])

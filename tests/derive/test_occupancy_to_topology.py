@@ -17,11 +17,11 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from app import derive, formats, parameters
-from app.derive import Notes, occupancy_to_imagery, occupancy_to_voxels, voxels_to_occupancy
+from app.derive import DerivationNotes, occupancy_to_imagery, occupancy_to_voxels, voxels_to_occupancy
 from app.derive.occupancy_to_topology import Parameters, network, occupancy_to_topology
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound
 from app.formats import Limits, ReadContext, WriteContext
-from app.generate import Source, complete_grid
+from app.generate import RandomSource, complete_grid
 from app.model.features import Features
 from app.model.frame import GROUND, Level
 from app.model.grid import (
@@ -34,7 +34,7 @@ from app.model.grid import (
     unknown_grey,
     without_unknown_grey,
 )
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import MAP, NETWORK, Layers, PartKey
 from app.upload_reader import EnvironmentContext, UploadHints, read
 
@@ -68,7 +68,7 @@ def rooms(seed: int = 0, size: int = 120) -> NDArray[np.uint8]:
 
 
 def derived(g: OccupancyGrid, **values: Any) -> Features:
-    derived_layers = occupancy_to_topology(Layers({PartKey("occupancy"): g}), Parameters(**values), Notes())
+    derived_layers = occupancy_to_topology(Layers({PartKey("occupancy"): g}), Parameters(**values), DerivationNotes())
     assert set(derived_layers.parts) == {PartKey("topology", "ground", NETWORK)}
     part = derived_layers.parts[PartKey("topology", "ground", NETWORK)]
     assert isinstance(part, Features)
@@ -210,12 +210,12 @@ def test_islands_go_but_never_all() -> None:
 
 
 def test_what_is_left_out_is_said() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     layers = Layers({PartKey("occupancy"): grid(rooms(2))})
     occupancy_to_topology(layers, Parameters(island=6.0), notes)
     assert [(d["what"], d["count"]) for d in notes.dropped] == [("places", 1)]
     assert not notes.warnings
-    notes = Notes()
+    notes = DerivationNotes()
     occupancy_to_topology(layers, Parameters(island=0.0), notes)
     assert [w.problem[:26] for w in notes.warnings] == ["the network is in 2 pieces"]
     assert not notes.dropped
@@ -394,23 +394,23 @@ def test_which_grid() -> None:
     parts = {PartKey("occupancy", "ground", n): g for n in ("keepout", "map")}
     parts[PartKey("occupancy", "L2", "only")] = g
     layers = Layers(dict(parts), levels=(Level(), Level("L2", 4.0)))
-    assert {k.level for k in occupancy_to_topology(layers, Parameters(), Notes()).parts} == {"ground", "L2"}
-    assert {k.level for k in occupancy_to_topology(layers, Parameters(grid="only"), Notes()).parts} == {"L2"}
+    assert {k.level for k in occupancy_to_topology(layers, Parameters(), DerivationNotes()).parts} == {"ground", "L2"}
+    assert {k.level for k in occupancy_to_topology(layers, Parameters(grid="only"), DerivationNotes()).parts} == {"L2"}
     with pytest.raises(NotFound, match="keepout, map, only"):
-        occupancy_to_topology(layers, Parameters(grid="nogo"), Notes())
+        occupancy_to_topology(layers, Parameters(grid="nogo"), DerivationNotes())
     parts[PartKey("occupancy", "L2", "second")] = g
     with pytest.raises(Ambiguous, match="only, second"):
-        occupancy_to_topology(Layers(dict(parts), levels=layers.levels), Parameters(), Notes())
+        occupancy_to_topology(Layers(dict(parts), levels=layers.levels), Parameters(), DerivationNotes())
 
 
 def test_masks_are_no_maps_unless_named() -> None:
     g = grid(rooms())
     mask = Layers({PartKey("occupancy", "ground", "keepout"): g})
     with pytest.raises(MissingLayer, match="masks alone"):
-        occupancy_to_topology(mask, Parameters(), Notes())
-    assert occupancy_to_topology(mask, Parameters(grid="keepout"), Notes()).parts
+        occupancy_to_topology(mask, Parameters(), DerivationNotes())
+    assert occupancy_to_topology(mask, Parameters(grid="keepout"), DerivationNotes()).parts
     both = Layers({**mask.parts, PartKey("occupancy", "ground", "floor"): grid(rooms(1))})
-    (network,) = occupancy_to_topology(both, Parameters(), Notes()).parts.values()
+    (network,) = occupancy_to_topology(both, Parameters(), DerivationNotes()).parts.values()
     assert isinstance(network, Features)
     assert network.ids == derived(grid(rooms(1))).ids
 
@@ -530,13 +530,13 @@ def test_no_way_leads_where_the_grey_of_unknown_is_called_free() -> None:
     files = seen_in_part(0.25)
     ((key, grid),) = formats.read(formats.group(files)[0][0], ReadContext()).grids().items()
     assert int((grid.cells == FREE).sum()) == 7200 - 154, "what Nav2 makes of the file stays"
-    notes = Notes()
+    notes = DerivationNotes()
     derived_network = network(grid, Parameters(), notes, "the map")
     assert shapely.total_bounds(derived_network.geometry)[2] < 5.6
     (warning,) = [w.problem for w in notes.warnings if "grey 205" in w.problem]
     assert "4546 cells" in warning
     assert "unknown_grey=free takes them as free" in warning
-    notes = Notes()
+    notes = DerivationNotes()
     derived_network = network(grid, Parameters(unknown_grey="free"), notes, "the map")
     assert shapely.total_bounds(derived_network.geometry)[2] > 8
     assert "ways may lead where nobody has been" in notes.warnings[0].problem
@@ -571,11 +571,13 @@ def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
     layers = Layers({key: grid})
     free = int((cells[30:90, 30:90] == FREE).sum())
 
-    notes = Notes()
+    notes = DerivationNotes()
     tall = occupancy_to_voxels.Parameters(height=0.05, free=True)
     voxels = occupancy_to_voxels.occupancy_to_voxels(layers, tall, notes)
     ((_, back),) = (
-        voxels_to_occupancy.voxels_to_occupancy(voxels, voxels_to_occupancy.Parameters(), Notes()).grids().items()
+        voxels_to_occupancy.voxels_to_occupancy(voxels, voxels_to_occupancy.Parameters(), DerivationNotes())
+        .grids()
+        .items()
     )
     assert back.counts()["free"] == free
     assert "taken as unknown" in notes.warnings[0].problem
@@ -583,11 +585,13 @@ def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
     (picture,) = occupancy_to_imagery.occupancy_to_imagery(
         layers, occupancy_to_imagery.Parameters(), notes
     ).parts.values()
-    assert isinstance(picture, Picture)
+    assert isinstance(picture, GeoImage)
     assert ((picture.pixels[::-1, :, 3] == 0) == (grey & (cells != OCCUPIED) | (cells == UNKNOWN))).all()
 
     ((_, full_grid),) = (
-        complete_grid.complete_grid(layers, complete_grid.Options(confidence=0.0), Source(1, "complete_grid"), notes)
+        complete_grid.complete_grid(
+            layers, complete_grid.Options(confidence=0.0), RandomSource(1, "complete_grid"), notes
+        )
         .grids()
         .items()
     )

@@ -19,7 +19,7 @@ from app.derive.occupancy_to_voxels import Parameters, occupancy_to_voxels
 from app.derive.voxels_to_occupancy import Parameters as Back
 from app.derive.voxels_to_occupancy import voxels_to_occupancy
 from app.errors import CannotConvert, MissingLayer
-from app.formats import Group, ReadContext, get_format
+from app.formats import FileGroup, ReadContext, get_format
 from app.model.frame import Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, PartKey
@@ -30,7 +30,7 @@ MAP = PartKey("occupancy")
 
 def extrude(grid: OccupancyGrid, *, elevation: float = 0.0, **more: Any) -> VoxelMap:
     layers = Layers({MAP: grid}, levels=(Level("ground", elevation),))
-    voxels = occupancy_to_voxels(layers, Parameters(**more), derive.Notes()).parts[PartKey("voxels")]
+    voxels = occupancy_to_voxels(layers, Parameters(**more), derive.DerivationNotes()).parts[PartKey("voxels")]
     assert isinstance(voxels, VoxelMap)
     return voxels
 
@@ -102,7 +102,7 @@ def test_turned_and_shifted_cells_occupy_what_they_reach_into(origin: tuple[floa
 def test_real_maps_there_and_back(shared: Path, name: str) -> None:
     files = {p.name: p.read_bytes() for p in (shared / "data" / name).iterdir()}
     main = next(n for n in sorted(files) if n.endswith(".yaml"))
-    layers = formats.read(Group(get_format("occupancy_grid"), main, files), ReadContext(grid="map"))
+    layers = formats.read(FileGroup(get_format("occupancy_grid"), main, files), ReadContext(grid="map"))
     grid = layers.parts[MAP]
     assert isinstance(grid, OccupancyGrid)
     voxels = extrude(grid, height=1.0)
@@ -110,7 +110,7 @@ def test_real_maps_there_and_back(shared: Path, name: str) -> None:
     tall = round(1.0 / grid.resolution)
     assert voxels.voxel_counts() == {"occupied": counts["occupied"] * tall, "free": counts["free"] * tall}
     assert len(voxels) < (counts["occupied"] + counts["free"]) * tall / 3, "large leaves where all is free"
-    back = voxels_to_occupancy(Layers({PartKey("voxels"): voxels}), Back(), derive.Notes()).parts[MAP]
+    back = voxels_to_occupancy(Layers({PartKey("voxels"): voxels}), Back(), derive.DerivationNotes()).parts[MAP]
     assert isinstance(back, OccupancyGrid)
     rows, columns = np.nonzero(grid.cells != UNKNOWN)
     crop = grid.cells[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
@@ -132,7 +132,7 @@ def test_which_grids_are_extruded() -> None:
         ("ground", "map"), ("ground", "other"), ("ground", "keepout"), ("L2", "lab"), ("L2", "speed"),
     )}  # fmt: skip
     levels = (Level(), Level("L2", 4.0))
-    derived_layers = occupancy_to_voxels(Layers(named, levels=levels), Parameters(height=0.5), derive.Notes())
+    derived_layers = occupancy_to_voxels(Layers(named, levels=levels), Parameters(height=0.5), derive.DerivationNotes())
     assert {(k.level, k.name) for k in derived_layers.parts} == {("ground", "map"), ("L2", "lab")}
     part = derived_layers.parts[PartKey("voxels", "L2", "lab")]
     assert isinstance(part, VoxelMap)
@@ -142,8 +142,8 @@ def test_which_grids_are_extruded() -> None:
 def test_grids_without_content_are_no_voxels() -> None:
     for layers in (Layers(), Layers({MAP: grid_of([[UNKNOWN, UNKNOWN]])}), Layers({PartKey("occupancy", name="keepout"): grid_of([[OCCUPIED]])})):  # fmt: skip  # noqa: E501
         with pytest.raises(MissingLayer, match="upload"):
-            occupancy_to_voxels(layers, Parameters(), derive.Notes())
-    notes = derive.Notes()
+            occupancy_to_voxels(layers, Parameters(), derive.DerivationNotes())
+    notes = derive.DerivationNotes()
     occupancy_to_voxels(Layers({MAP: grid_of([[FREE]])}), Parameters(), notes)
     assert any("no occupied cell" in w.problem for w in notes.warnings)
     extrude(grid_of([[OCCUPIED]]))

@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.derive import _raster
-from app.derive._raster import Frame, Spans
+from app.derive._raster import RasterFrame, Spans
 from app.errors import CannotConvert
 from app.model import solids
 
-FRAME = Frame((-1.0, -2.0), 0.25, 20, 24)
+FRAME = RasterFrame((-1.0, -2.0), 0.25, 20, 24)
 
 
-def cells(spans: Iterable[Spans], frame: Frame = FRAME, layers: int = 1) -> Any:
+def cells(spans: Iterable[Spans], frame: RasterFrame = FRAME, layers: int = 1) -> Any:
     """bool [layers, height, width]."""
     out = np.zeros((layers, frame.height, frame.width), bool)
     for part in spans:
@@ -29,7 +29,7 @@ def cells(spans: Iterable[Spans], frame: Frame = FRAME, layers: int = 1) -> Any:
     return out
 
 
-def boxes(frame: Frame = FRAME) -> Any:
+def boxes(frame: RasterFrame = FRAME) -> Any:
     x, y = np.meshgrid(np.arange(frame.width), np.arange(frame.height))
     low_x, low_y = frame.origin[0] + x * frame.resolution, frame.origin[1] + y * frame.resolution
     return shapely.box(low_x, low_y, low_x + frame.resolution, low_y + frame.resolution)
@@ -166,9 +166,9 @@ def test_collections_count_with_all_they_hold() -> None:
 
 
 def test_frames_lie_on_whole_cells() -> None:
-    frame = Frame.around((0.3, -0.31, 0.9, 0.6), 0.1)
+    frame = RasterFrame.around((0.3, -0.31, 0.9, 0.6), 0.1)
     assert (frame.origin, frame.width, frame.height) == ((0.3, -0.4), 6, 10)
-    assert Frame.around((1.0, 1.0, 1.0, 1.0), 0.5).cells == 1
+    assert RasterFrame.around((1.0, 1.0, 1.0, 1.0), 0.5).cells == 1
     assert _raster.limited(frame, 60, 10) is frame
     for maximum, longest in ((59, 100), (1000, 9)):
         with pytest.raises(CannotConvert, match="resolution of at least"):
@@ -202,7 +202,7 @@ def test_many_triangles_are_quick() -> None:
     random = np.random.default_rng(2)
     middle = random.uniform([0, 0, 0], [100, 100, 2], (300_000, 1, 3))
     triangles = middle + random.normal(0, 0.1, (300_000, 3, 3))
-    frame = Frame((0.0, 0.0), 0.05, 2000, 2000)
+    frame = RasterFrame((0.0, 0.0), 0.05, 2000, 2000)
     grid = np.zeros((2000, 2000), np.uint8)
     start = time.process_time()
     _raster.paint(grid, _raster.surfaces(triangles, frame, np.array([[0.2, 1.0]])), 100)
@@ -212,7 +212,7 @@ def test_many_triangles_are_quick() -> None:
 
 @pytest.mark.parametrize("noise", [1e-16, 1e-15, -1e-15, 4e-15])
 def test_level_line_on_a_boundary_touches_whole_rows_in_spite_of_rounding(noise: float) -> None:
-    frame = Frame((0.0, 0.0), 1.0, 20, 10)
+    frame = RasterFrame((0.0, 0.0), 1.0, 20, 10)
     edge = np.array([[[1.5, 5.0 - noise], [18.5, 5.0 + noise]]])
     rows, columns = np.nonzero(cells(_raster.lines(edge, frame), frame)[0])
     for row in set(rows.tolist()):

@@ -17,7 +17,7 @@ from scipy import ndimage
 from skimage.measure import euler_number, label
 from skimage.morphology import skeletonize
 
-from app.derive import Notes, _skeleton
+from app.derive import DerivationNotes, _skeleton
 from app.derive import _kernels_skeleton as kernels
 from app.derive import _kernels_space as space_kernels
 from app.derive import _kernels_voronoi as voronoi_kernels
@@ -287,7 +287,7 @@ def test_hostile_shapes_end_quickly() -> None:
         for radius in (0.0, 0.01, 3.0):
             grid = OccupancyGrid(cells.astype(np.uint8), 0.05)
             try:
-                network(grid, Parameters(robot_radius=radius), Notes(), "it")
+                network(grid, Parameters(robot_radius=radius), DerivationNotes(), "it")
             except CannotConvert:
                 assert radius > 0.04
 

@@ -10,7 +10,7 @@ import pytest
 import shapely
 
 from app import derive
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.topology_to_occupancy import Parameters, topology_to_occupancy
 from app.errors import CannotConvert, MissingDatum, MissingLayer
 from app.formats import ReadContext, group, read
@@ -27,8 +27,8 @@ def edge(i: str, line: list[tuple[float, float]], **more: Any) -> tuple[str, Any
     return i, shapely.LineString(line), {"kind": "edge", "source": "a", "target": "b", **more}
 
 
-def grid(layers: Layers, notes: Notes | None = None, **options: Any) -> OccupancyGrid:
-    derived_layers = topology_to_occupancy(layers, Parameters(**options), notes or Notes())
+def grid(layers: Layers, notes: DerivationNotes | None = None, **options: Any) -> OccupancyGrid:
+    derived_layers = topology_to_occupancy(layers, Parameters(**options), notes or DerivationNotes())
     part = derived_layers.parts[PartKey("occupancy", "ground", MAP)]
     assert isinstance(part, OccupancyGrid)
     return part
@@ -48,7 +48,7 @@ def layers(*rows: Any, objects: Any = (), fence: Any = None) -> Layers:
 
 
 def test_free_as_wide_as_the_edges_are() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     network = layers(edge("wide", [(0, 0), (10, 0)], width=4), edge("thin", [(10, 0), (10, 9)]))
     g = grid(network, notes, resolution=0.1)
     assert at(g, 5, 1.9) == at(g, 5, -1.9) == FREE
@@ -86,7 +86,7 @@ def test_objects_stand_in_the_way_but_not_in_passages() -> None:
 
 
 def test_stairs_and_fences() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     both = layers(
         edge("way", [(0, 0), (10, 0)]), edge("steps", [(10, 0), (10, 10)], stairs=True), fence=shapely.box(-1, -5, 5, 5)
     )

@@ -17,7 +17,7 @@ from app import derive, formats
 from app.convert.files import offline
 from app.derive.voxels_to_occupancy import Parameters, voxels_to_occupancy
 from app.errors import CannotConvert, MissingLayer
-from app.formats import Group, ReadContext, get_format
+from app.formats import FileGroup, ReadContext, get_format
 from app.model.frame import Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, PartKey
@@ -34,7 +34,7 @@ REAL = [
 
 
 def tree(path: Path) -> VoxelMap:
-    layers = formats.read(Group(get_format("octomap"), "map.bt", {"map.bt": path.read_bytes()}), ReadContext())
+    layers = formats.read(FileGroup(get_format("octomap"), "map.bt", {"map.bt": path.read_bytes()}), ReadContext())
     (part,) = layers.parts.values()
     assert isinstance(part, VoxelMap)
     return part
@@ -47,8 +47,8 @@ def leaves(*rows: tuple[int, int, float], resolution: float = 0.5) -> VoxelMap:
     return VoxelMap(resolution, np.array(depth, np.uint8), np.array(code, np.uint64), np.array(odds, np.float32))
 
 
-def project(voxels: VoxelMap, *, elevation: float = 0.0, **more: Any) -> tuple[OccupancyGrid, derive.Notes]:
-    notes = derive.Notes()
+def project(voxels: VoxelMap, *, elevation: float = 0.0, **more: Any) -> tuple[OccupancyGrid, derive.DerivationNotes]:
+    notes = derive.DerivationNotes()
     layers = Layers({PartKey("voxels"): voxels}, levels=(Level("ground", elevation),))
     derived_layers = voxels_to_occupancy(layers, Parameters(**more), notes)
     grid = derived_layers.parts[PartKey("occupancy")]
@@ -193,7 +193,7 @@ def test_no_voxels_no_grid() -> None:
     none = VoxelMap(0.1, np.empty(0, np.uint8), np.empty(0, np.uint64), np.empty(0, np.float32))
     for layers in (Layers(), Layers({PartKey("voxels"): none})):
         with pytest.raises(MissingLayer, match="hold no voxels"):
-            voxels_to_occupancy(layers, Parameters(), derive.Notes())
+            voxels_to_occupancy(layers, Parameters(), derive.DerivationNotes())
 
 
 def test_large_leaves_cost_no_more_than_small_ones() -> None:

@@ -13,7 +13,7 @@ import pytest
 import shapely
 
 from app import upload_reader
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.derive.objects_to_voxels import Parameters as VoxelParameters
 from app.derive.objects_to_voxels import objects_to_voxels
@@ -61,7 +61,7 @@ def world(data: Path, pair: str) -> Layers:
 
 
 def sliced(content: Layers, **options: Any) -> OccupancyGrid:
-    derived_layers = objects_to_occupancy(content, Parameters(**options), Notes())
+    derived_layers = objects_to_occupancy(content, Parameters(**options), DerivationNotes())
     grid = derived_layers.parts[PartKey("occupancy", "ground", MAP)]
     assert isinstance(grid, OccupancyGrid)
     return grid
@@ -131,7 +131,7 @@ def test_surfaces_are_where_trimesh_cuts_them(shared: Path, pair: str) -> None:
 
 def test_the_warehouse_as_voxels(shared: Path) -> None:
     content = world(shared / "data", "aws_small_warehouse")
-    voxels = objects_to_voxels(content, VoxelParameters(), Notes()).parts[PartKey("voxels", "ground", MAP)]
+    voxels = objects_to_voxels(content, VoxelParameters(), DerivationNotes()).parts[PartKey("voxels", "ground", MAP)]
     assert isinstance(voxels, VoxelMap)
     assert voxels.resolution == 0.1
     box = voxels.bounds()
@@ -154,7 +154,7 @@ def test_of_several_worlds_one_is_cut(shared: Path) -> None:
     root = shared / "data/gazebo_sdf/aws_small_warehouse"
     files = [p for p in root.rglob("*") if p.is_file() and "maps" not in p.parts]
     content = read({p.relative_to(root).as_posix(): p.read_bytes() for p in files})
-    notes = Notes()
+    notes = DerivationNotes()
     objects_to_occupancy(content, Parameters(), notes)
     assert any("world=" in w.problem and "no_roof" in w.problem for w in notes.warnings)
     roof = sliced(content, band=(9.5, 10.5), world="small_warehouse")

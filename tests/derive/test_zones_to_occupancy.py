@@ -15,7 +15,7 @@ import yaml
 
 from app import derive
 from app.convert.files import offline
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.zones_to_occupancy import Parameters, zones_to_occupancy
 from app.errors import CannotConvert, MissingDatum, MissingLayer, NotFound
 from app.model.features import features
@@ -34,8 +34,8 @@ def zones(*rows: tuple[Any, dict[str, Any]], anchor: Any = "local", **more: Any)
     return Layers({ZONES: part, **more.pop("parts", {})}, **more)
 
 
-def derive_masks(layers: Layers, **values: Any) -> tuple[Layers, Notes]:
-    notes = Notes()
+def derive_masks(layers: Layers, **values: Any) -> tuple[Layers, DerivationNotes]:
+    notes = DerivationNotes()
     return zones_to_occupancy(layers, Parameters(**values), notes), notes
 
 

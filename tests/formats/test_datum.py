@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from app import formats
 from app.errors import BadUpload, UnreadableFile
-from app.formats import Group, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame
@@ -45,7 +45,7 @@ navsat_transform_node:
 def read(data: bytes | str, **context: Any) -> tuple[Layers, ReadContext]:
     read_context = ReadContext(main="datum.yaml", **context)
     content = data.encode() if isinstance(data, str) else data
-    return formats.read(Group(FORMAT, "datum.yaml", {"datum.yaml": content}), read_context), read_context
+    return formats.read(FileGroup(FORMAT, "datum.yaml", {"datum.yaml": content}), read_context), read_context
 
 
 def write(layers: Layers) -> tuple[bytes, WriteContext]:

@@ -27,7 +27,7 @@ from app.formats.environment import MAIN, detect
 from app.model.features import Features, features, from_columns
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Layers, Part, PartKey, Resources
 from app.model.templates import NO_TEMPLATES
 from app.model.voxels import VoxelMap
@@ -441,7 +441,7 @@ def test_bad_packages_are_refused_with_file_and_reason() -> None:
 
 def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> None:
     rows = [("7", shapely.Point(1 / 3, 2 / 3, 0.1), {"kind": "node", "note": [1, 1.0, None], "name": "Größe"})]
-    picture = Picture(np.arange(24, dtype=np.uint16).reshape(2, 4, 3), (0.1, 0, 0, 0, -0.1, 0), properties={"a": 1})
+    picture = GeoImage(np.arange(24, dtype=np.uint16).reshape(2, 4, 3), (0.1, 0, 0, 0, -0.1, 0), properties={"a": 1})
     voxels = VoxelMap(0.1, np.array([16], np.uint8), np.array([7], np.uint64), np.array([0.5], np.float32))
     parts: dict[PartKey, Part] = {
         PartKey("topology", "2", "network"): features(rows, "local", {"site": {"x": [0.1]}}),

@@ -13,7 +13,7 @@ import yaml
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload
-from app.formats import Group, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.layers import Layers, PartKey
 
@@ -25,7 +25,7 @@ NETWORK = PartKey("topology", "ground", "network")
 
 def read(data: bytes, name: str = "network.ffr.yaml") -> tuple[Features, ReadContext]:
     context = ReadContext(main=name)
-    part = formats.read(Group(FORMAT, name, {name: data}), context).parts[NETWORK]
+    part = formats.read(FileGroup(FORMAT, name, {name: data}), context).parts[NETWORK]
     assert isinstance(part, Features)
     return part, context
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from app import formats
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, geojson
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, geojson
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
@@ -38,7 +38,7 @@ def read(data: bytes | str | dict[str, Any], context: ReadContext | None = None,
         data = json.dumps(data)
     raw = data.encode() if isinstance(data, str) else data
     fmt = formats.get_format("geojson")
-    return formats.read(Group(fmt, "a.geojson", {"a.geojson": raw}), context or ReadContext(**options))
+    return formats.read(FileGroup(fmt, "a.geojson", {"a.geojson": raw}), context or ReadContext(**options))
 
 
 def write(layers: Layers, context: WriteContext | None = None) -> bytes:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from app.errors import BadUpload, MissingDatum, UnreadableFile
-from app.formats import Group, ReadContext, WriteContext, get_format, read, write
+from app.formats import FileGroup, ReadContext, WriteContext, get_format, read, write
 from app.formats._kml import parse_coordinates
 from app.model.features import NO_GEOMETRY, Features, concatenate, features, from_columns, merge_documents
 from app.model.frame import GROUND, Datum, Level
@@ -33,7 +33,7 @@ DATUM = Datum(50.0, 7.0, 60.0, 33.0)
 
 def load(data: bytes, name: str = "a.kml", **context: Any) -> tuple[Layers, ReadContext]:
     read_context = ReadContext(**context)
-    return read(Group(get_format("kml"), name, {name: data}), read_context), read_context
+    return read(FileGroup(get_format("kml"), name, {name: data}), read_context), read_context
 
 
 def save(layers: Layers, **context: Any) -> bytes:
@@ -774,7 +774,7 @@ def test_tmap2_to_kml_and_back(shared, same):
     tmap2 = get_format("tmap2")
     for path in files:
         data = {path.name: path.read_bytes()}
-        layers = read(Group(tmap2, path.name, data), ReadContext())
+        layers = read(FileGroup(tmap2, path.name, data), ReadContext())
         placed = Layers(layers.parts, DATUM, layers.levels)
         again, _ = load(save(placed))
         equal(placed, again)

@@ -19,7 +19,7 @@ from lxml import etree
 from app.convert.files import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats import (
-    Group,
+    FileGroup,
     Limits,
     ReadContext,
     WriteContext,
@@ -33,7 +33,7 @@ from app.formats import (
 from app.model.features import Features
 from app.model.frame import GROUND, Datum, Level
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import MAP, Layers, PartKey, Resources
 
 SAMPLES = Path(__file__).parents[1] / "samples" / "kmz"
@@ -48,7 +48,7 @@ DRAWING = (
 
 
 def load(data: bytes, name: str = "a.kmz", **context: Any) -> Layers:
-    return read(Group(get_format("kmz"), name, {name: data}), ReadContext(**context))
+    return read(FileGroup(get_format("kmz"), name, {name: data}), ReadContext(**context))
 
 
 def save(layers: Layers) -> bytes:
@@ -213,10 +213,10 @@ def test_another_reader_reads_what_we_write(tmp_path):
     assert "Yard" in done.stdout
 
 
-def a_picture(bands: int = 3, **more: Any) -> Picture:
+def a_picture(bands: int = 3, **more: Any) -> GeoImage:
     pixels = np.random.default_rng(bands).integers(0, 255, (4, 6, bands), np.uint8)
     c, s = 0.5 * math.cos(0.3), 0.5 * math.sin(0.3)
-    return Picture(pixels, **{"transform": (c, s, 10.0, s, -c, 20.0), **more})
+    return GeoImage(pixels, **{"transform": (c, s, 10.0, s, -c, 20.0), **more})
 
 
 EARTH = {"crs": "EPSG:32632", "transform": (0.5, 0.0, 356000.0, 0.0, -0.5, 5540000.0)}
@@ -233,7 +233,7 @@ def test_pictures_come_back_from_kmz_at_the_same_place(bands: int, place: dict[s
     again = load(data).parts
     assert list(again) == [key]
     image = again[key]
-    assert isinstance(image, Picture)
+    assert isinstance(image, GeoImage)
     assert (image.pixels == picture.pixels).all()
     assert (image.transform, image.crs, image.properties) == (picture.transform, picture.crs, picture.properties)
 
@@ -269,7 +269,7 @@ def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
     assert (item.format.name, sorted(item.files), rest) == ("kml", ["a/aerial.png", "a/map.kml"], [])
     assert list(read(item, ReadContext()).parts) == [key]
     context = ReadContext()
-    assert not read(Group(fmt, "map.kml", {"map.kml": files["map.kml"]}), context).parts
+    assert not read(FileGroup(fmt, "map.kml", {"map.kml": files["map.kml"]}), context).parts
     assert "'aerial.png' is not in the upload" in context.warnings[0].problem
 
 
@@ -284,7 +284,7 @@ def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
     ],
     ids=["no datum", "off earth", "antimeridian", "polar", "no such CRS"],
 )
-def test_pictures_without_a_place_are_dropped_and_told(picture: Picture, datum: Datum | None, reason: str) -> None:
+def test_pictures_without_a_place_are_dropped_and_told(picture: GeoImage, datum: Datum | None, reason: str) -> None:
     context = WriteContext()
     data = write(get_format("kmz"), Layers({PartKey("imagery", name="p"): picture}, datum), context)["map.kmz"]
     assert list(_archive.unpack(data, Limits())) == ["doc.kml"]
@@ -296,11 +296,11 @@ def test_pictures_without_a_place_are_dropped_and_told(picture: Picture, datum: 
 
 def test_values_that_an_overlay_cannot_show_are_told() -> None:
     context = WriteContext()
-    heights = Picture(np.arange(24, dtype=np.float32).reshape(4, 6, 1), **EARTH, properties={"nodata": 3})
+    heights = GeoImage(np.arange(24, dtype=np.float32).reshape(4, 6, 1), **EARTH, properties={"nodata": 3})
     data = write(get_format("kmz"), Layers({PartKey("imagery", name="dem"): heights}), context)["map.kmz"]
     assert [d["what"] for d in context.dropped] == ["imagery ground/dem: pixel values"]
     image = load(data).parts[PartKey("imagery", name="dem")]
-    assert isinstance(image, Picture)
+    assert isinstance(image, GeoImage)
     assert (image.pixels.shape, image.transform) == ((4, 6, 2), EARTH["transform"])
 
 

@@ -20,7 +20,7 @@ from lxml import etree
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, _osm, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, _osm, get_format
 from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, speed_of, two_way
 from app.model.features import Features, features
 from app.model.frame import Datum
@@ -42,7 +42,7 @@ def read(files: bytes | dict[str, bytes], **context: Any) -> tuple[Layers, ReadC
     contents = {"map.osm": files} if isinstance(files, bytes) else files
     main = next(n for n in contents if n.endswith(".osm"))
     read_context = ReadContext(main=main, **context)
-    return formats.read(Group(FORMAT, main, contents), read_context), read_context
+    return formats.read(FileGroup(FORMAT, main, contents), read_context), read_context
 
 
 def write(layers: Layers, **context: Any) -> tuple[dict[str, bytes], WriteContext]:

@@ -18,7 +18,7 @@ from pyproj import CRS, Transformer
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, get_format
+from app.formats import FileGroup, Limits, ReadContext, get_format
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, PartKey
@@ -37,7 +37,7 @@ POINTS = struct.unpack_from("<I", SPIRAL, 96)[0]
 
 def read(data: bytes, options: dict[str, str] | None = None, **more: Any) -> tuple[VoxelMap, ReadContext, Layers]:
     context = ReadContext(options=formats.read_options(FORMAT, options or {}), **more)
-    layers = formats.read(Group(FORMAT, "map.las", {"map.las": data}), context)
+    layers = formats.read(FileGroup(FORMAT, "map.las", {"map.las": data}), context)
     voxels = layers.parts[PartKey("voxels")]
     assert isinstance(voxels, VoxelMap)
     return voxels, context, layers

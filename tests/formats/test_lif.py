@@ -15,7 +15,7 @@ import shapely
 from app import formats
 from app.convert.files import offline
 from app.errors import CannotConvert, MissingDatum, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format
 from app.formats.lif import WriteOptions
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
@@ -32,7 +32,7 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 def read(data: Any, **context: Any) -> tuple[Layers, ReadContext]:
     content = data if isinstance(data, bytes) else json.dumps(data).encode()
     read_context = ReadContext(main="layout.lif.json", **context)
-    return formats.read(Group(FORMAT, "layout.lif.json", {"layout.lif.json": content}), read_context), read_context
+    return formats.read(FileGroup(FORMAT, "layout.lif.json", {"layout.lif.json": content}), read_context), read_context
 
 
 def write(part: Features | Layers, **context: Any) -> tuple[bytes, WriteContext]:
@@ -310,7 +310,7 @@ def test_tmap2_to_lif_and_back(shared: Path) -> None:
     lif_data = offline({"network.tmap2.yaml": data}, "lif").files["layout.lif.json"]
     top = check(lif_data)
     tmap2 = get_format("tmap2")
-    group = Group(tmap2, "n.tmap2.yaml", {"n.tmap2.yaml": data})
+    group = FileGroup(tmap2, "n.tmap2.yaml", {"n.tmap2.yaml": data})
     part = formats.read(group, ReadContext(main="n.tmap2.yaml")).parts[NETWORK]
     assert isinstance(part, Features)
     nodes = {i: (g.x, g.y) for i, g in zip(part.ids, part.geometry, strict=True) if g.geom_type == "Point"}
@@ -329,7 +329,7 @@ def test_through_our_geojson_nothing_is_lost(same: Same) -> None:
     geojson_data = formats.write(get_format("geojson"), layers, WriteContext())["map.geojson"]
     assert formats.detect("map.geojson", geojson_data) is get_format("geojson")
     context = ReadContext(main="map.geojson")
-    again = formats.read(Group(get_format("geojson"), "map.geojson", {"map.geojson": geojson_data}), context)
+    again = formats.read(FileGroup(get_format("geojson"), "map.geojson", {"map.geojson": geojson_data}), context)
     assert same("lif", {"a.json": data}, {"b.json": write(again)[0]}) == []
 
 

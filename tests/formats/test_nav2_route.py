@@ -15,7 +15,7 @@ import shapely
 from app import formats
 from app.convert.files import offline
 from app.errors import CannotConvert, MissingDatum, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey
@@ -30,7 +30,7 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 def read(data: Any, **context: Any) -> tuple[Features, ReadContext]:
     content = data if isinstance(data, bytes) else json.dumps(data).encode()
     read_context = ReadContext(main="graph.geojson", **context)
-    part = formats.read(Group(FORMAT, "graph.geojson", {"graph.geojson": content}), read_context).parts[NETWORK]
+    part = formats.read(FileGroup(FORMAT, "graph.geojson", {"graph.geojson": content}), read_context).parts[NETWORK]
     assert isinstance(part, Features)
     return part, read_context
 
@@ -322,7 +322,7 @@ def test_tmap2_to_route_graph_and_back(shared: Path) -> None:
     server = RouteServer(offline({"network.tmap2.yaml": data}, "nav2_route").files["graph.geojson"])
     names = {m["name"]: server.nodes[n] for (k, n), m in server.metadata.items() if k == "node"}
     part = formats.read(
-        Group(get_format("tmap2"), "n.tmap2.yaml", {"n.tmap2.yaml": data}), ReadContext(main="n.tmap2.yaml")
+        FileGroup(get_format("tmap2"), "n.tmap2.yaml", {"n.tmap2.yaml": data}), ReadContext(main="n.tmap2.yaml")
     ).parts[NETWORK]
     assert isinstance(part, Features)
     places = {i: (g.x, g.y) for i, g in zip(part.ids, part.geometry, strict=True) if g.geom_type == "Point"}
@@ -496,7 +496,7 @@ def test_words_of_other_types_stay_where_they_are() -> None:
 
 def test_nothing_is_read_that_nobody_wants() -> None:
     context = ReadContext(main="g.json", wanted=frozenset({"voxels"}))
-    assert formats.read(Group(FORMAT, "g.json", {"g.json": b"{}"}), context).parts == {}
+    assert formats.read(FileGroup(FORMAT, "g.json", {"g.json": b"{}"}), context).parts == {}
 
 
 def test_detection() -> None:

@@ -17,7 +17,7 @@ import yaml
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, UnreadableFile
-from app.formats import Group, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.formats._yaml import Tagged, load
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
@@ -35,7 +35,7 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 def read(data: bytes | str, **context: Any) -> tuple[Features, ReadContext]:
     content = data.encode() if isinstance(data, str) else data
     read_context = ReadContext(main="navgraph.yaml", **context)
-    part = formats.read(Group(FORMAT, "navgraph.yaml", {"navgraph.yaml": content}), read_context).parts[NETWORK]
+    part = formats.read(FileGroup(FORMAT, "navgraph.yaml", {"navgraph.yaml": content}), read_context).parts[NETWORK]
     assert isinstance(part, Features)
     return part, read_context
 
@@ -464,7 +464,7 @@ def test_a_repeated_name_is_served_as_it_was() -> None:
 
 def test_nothing_is_read_that_nobody_wants() -> None:
     context = ReadContext(main="n.yaml", wanted=frozenset({"occupancy"}))
-    assert formats.read(Group(FORMAT, "n.yaml", {"n.yaml": graph().encode()}), context).parts == {}
+    assert formats.read(FileGroup(FORMAT, "n.yaml", {"n.yaml": graph().encode()}), context).parts == {}
 
 
 @pytest.mark.parametrize(

@@ -748,7 +748,7 @@ def test_any_bytes_are_refused_or_read(data: bytes, after: bool) -> None:
     FORMAT.detect("map.yaml", files["map.yaml"])
     list(FORMAT.companions("map.yaml", files["map.yaml"], sorted(files)))
     context = ReadContext(limits=Limits(pixels=1000))
-    group = formats.Group(FORMAT, "map.yaml", files)
+    group = formats.FileGroup(FORMAT, "map.yaml", files)
     try:
         formats.read(group, context)
     except BadUpload:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from app import formats
 from app.errors import Ambiguous, BadUpload, Invalid, MissingLayer, NotFound, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, get_format, octomap
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format, octomap
 from app.formats.octomap import WriteOptions
 from app.model.layers import Layers, PartKey
 from app.model.voxels import DEPTH, HALF, VoxelMap, coarser, cut, morton, pruned
@@ -39,7 +39,7 @@ def header(kind: str, size: int, res: str = "0.1", name: str = "OcTree") -> byte
 
 def read(data: bytes, name: str = "a.bt", **more: Any) -> tuple[VoxelMap, ReadContext]:
     context = ReadContext(**more)
-    layers = formats.read(Group(get_format("octomap"), name, {name: data}), context)
+    layers = formats.read(FileGroup(get_format("octomap"), name, {name: data}), context)
     (part,) = layers.parts.values()
     assert isinstance(part, VoxelMap)
     return part, context

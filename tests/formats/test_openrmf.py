@@ -16,7 +16,7 @@ import yaml
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingLayer, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
@@ -37,7 +37,7 @@ def read(files: dict[str, bytes] | str, **context: Any) -> tuple[Layers, ReadCon
     given = {"a.building.yaml": files.encode()} if isinstance(files, str) else files
     read_context = ReadContext(**context)
     main = next(n for n in given if n.endswith(".building.yaml"))
-    return formats.read(Group(FORMAT, main, given), read_context), read_context
+    return formats.read(FileGroup(FORMAT, main, given), read_context), read_context
 
 
 def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], dict[str, bytes], WriteContext]:

@@ -22,7 +22,7 @@ from lxml import etree
 
 from app import formats
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, _osm, osm
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, _osm, osm
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
@@ -35,7 +35,7 @@ TOPOLOGY, OBJECTS = PartKey("topology", "ground", NETWORK), PartKey("objects", "
 
 def read(data: bytes, context: ReadContext | None = None, **options: Any) -> Layers:
     fmt = formats.get_format("osm")
-    return formats.read(Group(fmt, "map.osm", {"map.osm": data}), context or ReadContext(**options))
+    return formats.read(FileGroup(fmt, "map.osm", {"map.osm": data}), context or ReadContext(**options))
 
 
 def write(layers: Layers, context: WriteContext | None = None) -> bytes:
@@ -857,7 +857,7 @@ def test_an_edge_from_a_node_to_itself_survives(source: str) -> None:
     fmt = formats.get_format(source)
     files = formats.write(fmt, Layers({TOPOLOGY: features(rows, "local")}, datum), WriteContext())
     main = next(iter(files))
-    uploaded = formats.read(Group(fmt, main, files), ReadContext(main=main))
+    uploaded = formats.read(FileGroup(fmt, main, files), ReadContext(main=main))
     served = write(Layers(uploaded.parts, datum))
     again = network(read(served))
     assert sorted(a == b for a, b in again.edges()) == [False, False, True]

@@ -14,7 +14,7 @@ import pytest
 from app import formats
 from app.convert.files import offline
 from app.errors import Invalid, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, _lzf, get_format
+from app.formats import FileGroup, Limits, ReadContext, _lzf, get_format
 from app.formats._pcd import parse
 from app.model.layers import Layers, PartKey
 from app.model.voxels import HALF, VoxelMap
@@ -28,7 +28,7 @@ KINDS = ["ascii", "binary", "binary_compressed"]
 
 def read(data: bytes, options: dict[str, str] | None = None, **more: Any) -> tuple[VoxelMap, ReadContext, Layers]:
     context = ReadContext(options=formats.read_options(FORMAT, options or {}), **more)
-    layers = formats.read(Group(FORMAT, "map.pcd", {"map.pcd": data}), context)
+    layers = formats.read(FileGroup(FORMAT, "map.pcd", {"map.pcd": data}), context)
     voxels = layers.parts[PartKey("voxels")]
     assert isinstance(voxels, VoxelMap)
     return voxels, context, layers

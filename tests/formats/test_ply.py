@@ -15,7 +15,7 @@ import trimesh
 from app import formats
 from app.convert.files import offline
 from app.errors import TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, get_format
+from app.formats import FileGroup, Limits, ReadContext, get_format
 from app.formats._ply import parse
 from app.model.layers import PartKey
 from app.model.voxels import VoxelMap
@@ -31,7 +31,7 @@ KINDS = ["ascii", "binary_little_endian", "binary_big_endian"]
 
 def read(data: bytes, **more: Any) -> tuple[VoxelMap, ReadContext]:
     context = ReadContext(**more)
-    layers = formats.read(Group(FORMAT, "map.ply", {"map.ply": data}), context)
+    layers = formats.read(FileGroup(FORMAT, "map.ply", {"map.ply": data}), context)
     voxels = layers.parts[PartKey("voxels")]
     assert isinstance(voxels, VoxelMap)
     return voxels, context
@@ -166,7 +166,7 @@ def test_centres_of_voxels_as_a_cloud() -> None:
     shelf = (SAMPLES / "octomap" / "shelf.ot").read_bytes()
     converted = offline({"shelf.ot": shelf}, "ply")
     mesh = vertices(converted.files["map.ply"])
-    voxels = formats.read(Group(get_format("octomap"), "a.ot", {"a.ot": shelf}), ReadContext()).parts[
+    voxels = formats.read(FileGroup(get_format("octomap"), "a.ot", {"a.ot": shelf}), ReadContext()).parts[
         PartKey("voxels", name="a")
     ]
     assert isinstance(voxels, VoxelMap)

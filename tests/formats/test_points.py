@@ -15,7 +15,7 @@ import pytest
 from app import formats
 from app.convert.files import offline
 from app.errors import Ambiguous, Invalid, MissingLayer, NotFound
-from app.formats import Group, ReadContext, WriteContext, _lzf, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, _lzf, get_format
 from app.model.layers import Layers, PartKey
 from app.model.voxels import VoxelMap, coarser, cut, expanded, morton
 from tests.api.conftest import Api, api  # noqa: F401  fixture
@@ -32,7 +32,7 @@ SHED = (SAMPLES / "octomap" / "shed.bt").read_bytes()
 def layers_of(name: str, data: bytes, **more: str) -> Layers:
     fmt = get_format(name.rpartition(".")[2])
     context = ReadContext(options=formats.read_options(fmt, more))
-    return formats.read(Group(fmt, name, {name: data}), context)
+    return formats.read(FileGroup(fmt, name, {name: data}), context)
 
 
 def written(layers: Layers, to: str, **options: str) -> tuple[bytes, WriteContext]:
@@ -124,7 +124,7 @@ def test_centres_fall_into_the_voxels_they_came_from(shared: Path) -> None:
     """octomap → pcd → voxels of the same resolution: the same occupied ones."""
     path = shared / "data/octomap/geb079/geb079.bt"
     pcd_data = offline({"geb.bt": path.read_bytes()}, "pcd").files["map.pcd"]
-    voxels = formats.read(Group(get_format("octomap"), "a.bt", {"a.bt": path.read_bytes()}), ReadContext())
+    voxels = formats.read(FileGroup(get_format("octomap"), "a.bt", {"a.bt": path.read_bytes()}), ReadContext())
     (before,) = voxels.parts.values()
     assert isinstance(before, VoxelMap)
     after = layers_of("map.pcd", pcd_data, resolution="0.08").parts[PartKey("voxels")]

@@ -15,7 +15,7 @@ import yaml
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, Invalid, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
@@ -208,5 +208,5 @@ def test_beside_a_tmap2_in_a_template_the_roadmap_is_set_aside() -> None:
 )
 def test_what_is_wrong_is_named(text: str, where: str) -> None:
     with pytest.raises(BadUpload) as caught:
-        formats.read(Group(FORMAT, "prm.yaml", {**MEADOW, "prm.yaml": text.encode()}), ReadContext())
+        formats.read(FileGroup(FORMAT, "prm.yaml", {**MEADOW, "prm.yaml": text.encode()}), ReadContext())
     assert [p.where for p in caught.value.problems] == [where]

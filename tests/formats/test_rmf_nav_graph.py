@@ -16,7 +16,7 @@ import yaml
 from app import formats
 from app.convert.files import offline
 from app.errors import MissingLayer, UnreadableFile
-from app.formats import Group, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.layers import Layers, PartKey
 from app.upload_reader import UploadHints
@@ -34,7 +34,7 @@ def sample(kind: str, name: str) -> dict[str, bytes]:
 def read(files: dict[str, bytes] | str) -> tuple[Layers, ReadContext]:
     given = {"0.yaml": files.encode()} if isinstance(files, str) else files
     context = ReadContext()
-    return formats.read(Group(FORMAT, next(iter(given)), given), context), context
+    return formats.read(FileGroup(FORMAT, next(iter(given)), given), context), context
 
 
 def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], WriteContext]:

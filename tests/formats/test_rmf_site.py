@@ -17,7 +17,7 @@ import yaml
 from app import formats
 from app.convert.files import offline
 from app.errors import MissingLayer, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, _ron, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, _ron, get_format
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
@@ -50,7 +50,7 @@ def ward(**changes: Any) -> dict[str, bytes]:
 
 def read(files: dict[str, bytes], **context: Any) -> tuple[Layers, ReadContext]:
     read_context = ReadContext(**context)
-    return formats.read(Group(FORMAT, next(iter(files)), files), read_context), read_context
+    return formats.read(FileGroup(FORMAT, next(iter(files)), files), read_context), read_context
 
 
 def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], dict[str, bytes], WriteContext]:

@@ -24,7 +24,7 @@ from app.convert import worker
 from app.convert.files import offline
 from app.convert.recipe import DerivationChain
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Limits, Needs, WriteContext
+from app.formats import Files, Format, LayerRequirements, Limits, WriteContext
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
 from app.upload_reader import UploadHints, unpack
@@ -108,7 +108,7 @@ def test_findings_stand_in_the_report_once_at_their_level() -> None:
         yield Problem("told by both", "main", None, None, "warning")
         yield Problem("new", "main", None, None, "warning")
 
-    fmt = replace(with_check(check), write=write, needs=Needs((frozenset(),)))
+    fmt = replace(with_check(check), write=write, needs=LayerRequirements((frozenset(),)))
     context = WriteContext()
     formats.write(fmt, Layers(), context)
     assert [(p.problem, p.level) for p in context.warnings] == [

@@ -20,11 +20,11 @@ from PIL import Image
 
 from app import formats, upload_reader
 from app.errors import Ambiguous, Invalid, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, _raster, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, _raster, get_format
 from app.formats.satellite import ReadOptions, WriteOptions, by_file, detect
 from app.model.frame import Datum
 from app.model.geodesy import crs_bounds
-from app.model.imagery import Picture, placed
+from app.model.imagery import GeoImage, placed
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resampled
 from app.upload_reader import EnvironmentContext, UploadHints
@@ -37,23 +37,23 @@ UTM = "EPSG:32630"
 HERE = Datum(53.2686, -0.5245)
 
 
-def read(files: dict[str, bytes], main: str | None = None, **more: Any) -> tuple[Picture, ReadContext]:
+def read(files: dict[str, bytes], main: str | None = None, **more: Any) -> tuple[GeoImage, ReadContext]:
     options = more.pop("options", {})
     context = ReadContext(options=ReadOptions(**options), **more)
     main = main or next(iter(files))
-    layers = formats.read(Group(get_format("satellite"), main, files), context)
+    layers = formats.read(FileGroup(get_format("satellite"), main, files), context)
     (part,) = layers.parts.values()
-    assert isinstance(part, Picture)
+    assert isinstance(part, GeoImage)
     return part, context
 
 
-def written(picture: Picture, datum: Datum | None = None, **options: Any) -> tuple[dict[str, bytes], WriteContext]:
+def written(picture: GeoImage, datum: Datum | None = None, **options: Any) -> tuple[dict[str, bytes], WriteContext]:
     context = WriteContext(options=WriteOptions(**options))
     layers = Layers({PartKey("imagery", name="a"): picture}, datum)
     return formats.write(get_format("satellite"), layers, context), context
 
 
-def tif(picture: Picture, **options: Any) -> bytes:
+def tif(picture: GeoImage, **options: Any) -> bytes:
     return written(picture, **options)[0]["satellite.tif"]
 
 
@@ -64,9 +64,9 @@ def image(shape: tuple[int, ...] = (3, 4, 3), kind: str = "PNG", seed: int = 1) 
     return out.getvalue()
 
 
-def utm(shape: tuple[int, ...] = (3, 4, 3), kind: Any = np.uint8, **properties: Any) -> Picture:
+def utm(shape: tuple[int, ...] = (3, 4, 3), kind: Any = np.uint8, **properties: Any) -> GeoImage:
     values = np.arange(math.prod(shape)).reshape(shape) % 250
-    return Picture(values.astype(kind), (0.5, 0.0, 665000.0, 0.0, -0.5, 5905000.0), UTM, properties)
+    return GeoImage(values.astype(kind), (0.5, 0.0, 665000.0, 0.0, -0.5, 5905000.0), UTM, properties)
 
 
 def sample(name: str) -> dict[str, bytes]:
@@ -75,7 +75,7 @@ def sample(name: str) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in sorted(folder, key=lambda p: p != path)}
 
 
-def same_properties(a: Picture, b: Picture) -> bool:
+def same_properties(a: GeoImage, b: GeoImage) -> bool:
     return json.dumps(dict(a.properties), sort_keys=True) == json.dumps(dict(b.properties), sort_keys=True)
 
 
@@ -198,7 +198,7 @@ def test_what_a_tiff_says_besides_pixels_comes_back() -> None:
     tags = {"TIFFTAG_COPYRIGHT": "© A. Survey", "TIFFTAG_DATETIME": "2024:05:01 10:00:00", "AREA_OR_POINT": "Point"}
     values = np.arange(24, dtype=np.int16).reshape(2, 4, 3)
     values[..., 2] = [[255, 0, 255, 255], [0, 255, 255, 255]]
-    picture = Picture(
+    picture = GeoImage(
         values,
         (2.0, 0.0, 500000.0, 0.0, -2.0, 370000.0),
         "EPSG:27700",
@@ -254,7 +254,7 @@ def test_a_palette_comes_back_and_is_shown_in_colour() -> None:
     ids=["degrees", "mercator", "british", "own"],
 )
 def test_a_crs_comes_back(crs: str) -> None:
-    picture = Picture(np.zeros((2, 2, 1), np.uint8), (1e-5, 0.0, -0.5, 0.0, -1e-5, 53.2), crs)
+    picture = GeoImage(np.zeros((2, 2, 1), np.uint8), (1e-5, 0.0, -0.5, 0.0, -1e-5, 53.2), crs)
     back, context = read({"a.tif": tif(picture)})
     assert crs_bounds(back.crs, back.outline()) == pytest.approx(crs_bounds(crs, picture.outline()), abs=1e-11)
     assert context.warnings == []
@@ -268,7 +268,7 @@ def test_a_crs_comes_back(crs: str) -> None:
     [(0.05, 0.0, -3.0, 0.0, -0.05, 7.0), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), (0.04, 0.03, 1.0, 0.03, -0.04, 2.0)],
 )
 def test_local_metres_come_back_without_a_doubt(transform: Any) -> None:
-    picture = Picture(np.ones((2, 3, 1), np.uint8), transform)
+    picture = GeoImage(np.ones((2, 3, 1), np.uint8), transform)
     data = tif(picture)
     assert detect("a.tif", data)
     back, context = read({"a.tif": data})
@@ -276,7 +276,7 @@ def test_local_metres_come_back_without_a_doubt(transform: Any) -> None:
 
 
 def test_a_tiff_without_a_crs_takes_the_option() -> None:
-    data = without_tag(tif(Picture(np.ones((2, 3, 1), np.uint8), (2.0, 0.0, 5e5, 0.0, -2.0, 4e5))))
+    data = without_tag(tif(GeoImage(np.ones((2, 3, 1), np.uint8), (2.0, 0.0, 5e5, 0.0, -2.0, 4e5))))
     assert read({"a.tif": data})[0].crs == "local"
     picture, context = read({"a.tif": data}, options={"crs": "epsg:27700"})
     assert picture.crs == "EPSG:27700"
@@ -358,7 +358,7 @@ def test_a_geotiff_is_believed_before_its_world_file() -> None:
     files = {"a.tif": tif(utm()), "a.tfw": b"9 0 0 -9 9 9"}
     upload_bundle = upload_reader.read(files, UploadHints(), EnvironmentContext(), LIMITS)
     (picture,) = upload_bundle.parts.values()
-    assert isinstance(picture, Picture)
+    assert isinstance(picture, GeoImage)
     assert picture.transform == utm().transform
     assert [w.file for w in upload_bundle.warnings] == ["a.tfw"]
     assert upload_bundle.files["a.tfw"].used
@@ -396,7 +396,7 @@ def test_a_crs_stands_beside_the_picture() -> None:
         files = {"a.png": image(), "a.pgw": world, name: body}
         upload_bundle = upload_reader.read(files, UploadHints(), EnvironmentContext(), LIMITS)
         (picture,) = upload_bundle.parts.values()
-        assert isinstance(picture, Picture)
+        assert isinstance(picture, GeoImage)
         assert picture.crs == UTM
         assert upload_bundle.warnings == []
         assert all(use.used for use in upload_bundle.files.values())
@@ -530,7 +530,7 @@ def test_what_says_where_it_lies_is_not_moved_by_options() -> None:
 # --- writing ------------------------------------------------------------------------------------------------------
 def test_a_cog_has_tiles_and_overviews_and_gdal_takes_it(tmp_path: Path) -> None:
     pixels = np.random.default_rng(3).integers(0, 255, (1500, 1100, 3), dtype=np.uint8)
-    picture = Picture(pixels, (0.25, 0.0, 665000.0, 0.0, -0.25, 5905000.0), UTM)
+    picture = GeoImage(pixels, (0.25, 0.0, 665000.0, 0.0, -0.25, 5905000.0), UTM)
     data = tif(picture)
     assert data == tif(picture), "no clock in it"
     (tmp_path / "a.tif").write_bytes(data)
@@ -555,7 +555,7 @@ def test_credits_are_written_and_read() -> None:
 
 
 def test_png_with_world_file_as_gdal_reads_it(tmp_path: Path) -> None:
-    turned = Picture(utm().pixels, (0.4, 0.3, 665000.0, 0.3, -0.4, 5905000.0), UTM)
+    turned = GeoImage(utm().pixels, (0.4, 0.3, 665000.0, 0.3, -0.4, 5905000.0), UTM)
     files, context = written(turned, file_type="png")
     assert sorted(files) == ["satellite.pgw", "satellite.png", "satellite.png.aux.xml"]
     assert context.dropped == []
@@ -573,7 +573,7 @@ def test_png_with_world_file_as_gdal_reads_it(tmp_path: Path) -> None:
 
 def test_png_of_floats_declares_what_is_lost() -> None:
     values = np.array([[[10.0], [20.0]], [[15.0], [-9999.0]]], np.float32)
-    picture = Picture(values, utm().transform, UTM, {"nodata": -9999.0})
+    picture = GeoImage(values, utm().transform, UTM, {"nodata": -9999.0})
     files, context = written(picture, file_type="png")
     shown = np.asarray(Image.open(io.BytesIO(files["satellite.png"])))
     assert shown.tolist() == [[[0, 255], [255, 255]], [[128, 255], [0, 0]]]

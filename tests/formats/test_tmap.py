@@ -15,7 +15,7 @@ import yaml
 from app import formats
 from app.convert.files import offline
 from app.errors import UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.layers import Layers, PartKey
 from app.upload_reader import EnvironmentContext, UploadHints
@@ -35,7 +35,7 @@ EDGE_KEYS = {"edge_id", "node", "action", "top_vel", "map_2d", "inflation_radius
 
 def read(data: bytes, name: str = "map.tmap") -> tuple[Layers, ReadContext]:
     context = ReadContext(main=name)
-    return formats.read(Group(FORMAT, name, {name: data}), context), context
+    return formats.read(FileGroup(FORMAT, name, {name: data}), context), context
 
 
 def write(layers: Layers, **options: Any) -> tuple[bytes, WriteContext]:
@@ -160,7 +160,7 @@ def test_to_tmap2_and_back_nothing_is_lost() -> None:
 
 def test_a_tmap2_as_a_list_keeps_what_items_say_and_declares_what_the_top_said() -> None:
     data = (SAMPLES / "tmap2" / "orchard.tmap2.yaml").read_bytes()
-    layers = formats.read(Group(get_format("tmap2"), "n.tmap2.yaml", {"n.tmap2.yaml": data}), ReadContext())
+    layers = formats.read(FileGroup(get_format("tmap2"), "n.tmap2.yaml", {"n.tmap2.yaml": data}), ReadContext())
     served, context = write(layers)
     assert len(load_v1(served)) == len(yaml.safe_load(data)["nodes"])
     assert any("transformation" in d["why"] for d in context.dropped)

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from app import formats
 from app.errors import BadUpload, Invalid, MissingDatum, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, _tmap, get_format
+from app.formats import FileGroup, Limits, ReadContext, WriteContext, _tmap, get_format
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey
@@ -36,7 +36,7 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 def read(data: bytes | str, name: str = "network.tmap2.yaml", **context: Any) -> tuple[Layers, ReadContext]:
     content = data.encode() if isinstance(data, str) else data
     read_context = ReadContext(main=name, **context)
-    return formats.read(Group(FORMAT, name, {name: content}), read_context), read_context
+    return formats.read(FileGroup(FORMAT, name, {name: content}), read_context), read_context
 
 
 def write(layers: Layers, **context: Any) -> tuple[bytes, WriteContext]:

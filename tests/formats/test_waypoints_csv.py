@@ -9,7 +9,7 @@ import shapely
 
 from app import formats
 from app.errors import MissingDatum, UnreadableFile
-from app.formats import Group, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
@@ -20,7 +20,9 @@ NETWORK = PartKey("topology", "ground", "network")
 
 def read(text: str) -> tuple[Features, ReadContext]:
     context = ReadContext(main="w.csv")
-    return formats.read(Group(FORMAT, "w.csv", {"w.csv": text.encode()}), context).vector("topology")[NETWORK], context
+    return formats.read(FileGroup(FORMAT, "w.csv", {"w.csv": text.encode()}), context).vector("topology")[
+        NETWORK
+    ], context
 
 
 def write(layers: Layers) -> tuple[str, WriteContext]:

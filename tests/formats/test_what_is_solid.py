@@ -14,7 +14,7 @@ from lxml import etree
 
 from app import formats, upload_reader
 from app.convert import worker
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotConvert
 from app.formats import Limits
@@ -72,7 +72,7 @@ def written(layers: Layers, to: str, **options: Any) -> dict[str, bytes]:
 
 def cut(layers: Layers, **options: Any) -> dict[str, OccupancyGrid]:
     """The derived grid of each level."""
-    derived_layers = objects_to_occupancy(layers, Parameters(outside_free=True, **options), Notes())
+    derived_layers = objects_to_occupancy(layers, Parameters(outside_free=True, **options), DerivationNotes())
     return {key.level: grid for key, grid in derived_layers.grids().items()}
 
 

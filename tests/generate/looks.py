@@ -17,13 +17,13 @@ import shapely
 
 from app import formats, generate
 from app.convert.files import written
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
-from app.formats import Group, ReadContext
+from app.formats import FileGroup, ReadContext
 from app.generate import _site
 from app.model.features import Features
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Layers, Resources
 from app.store.values import Provenance
 from tests.api.conftest import Api
@@ -31,9 +31,9 @@ from tests.api.conftest import Api
 CAME = Provenance("generated")
 
 
-def make(name: str, seed: int = 7, given: Layers | None = None, **values: Any) -> tuple[Layers, Notes]:
+def make(name: str, seed: int = 7, given: Layers | None = None, **values: Any) -> tuple[Layers, DerivationNotes]:
     """A site and what its generator said."""
-    notes = Notes()
+    notes = DerivationNotes()
     before = given or Layers()
     new_layers = generate.run(name, seed, values, before, notes)
     return Layers({**before.parts, **new_layers.parts}, new_layers.datum, new_layers.levels), notes
@@ -53,7 +53,7 @@ def digest(layers: Layers) -> str:
             for path, data in sorted(part.files.items()):
                 out.update(path.encode() + data)
         else:
-            assert isinstance(part, Picture)
+            assert isinstance(part, GeoImage)
     return out.hexdigest()
 
 
@@ -87,11 +87,13 @@ def agrees_with_itself(layers: Layers, radius: float, height: float = 0.2) -> No
 def world(layers: Layers, height: float) -> None:
     """The world as Gazebo gets it, cut above each level's floor, is the level's grid."""
     files = written(layers, "gazebo", {}, CAME).files
-    read = formats.read(Group(formats.get_format("gazebo"), "world.sdf", files), ReadContext())
+    read = formats.read(FileGroup(formats.get_format("gazebo"), "world.sdf", files), ReadContext())
     fence = {k: p for k, p in layers.parts.items() if k.layer == "location"}
     for key, grid in layers.grids().items():
         cut = Parameters(height=round(layers.elevation(key.level) + height, 3), resolution=grid.resolution)
-        (again,) = objects_to_occupancy(Layers({**read.parts, **fence}, layers.datum), cut, Notes()).grids().values()
+        (again,) = (
+            objects_to_occupancy(Layers({**read.parts, **fence}, layers.datum), cut, DerivationNotes()).grids().values()
+        )
         assert again.cells.shape == grid.cells.shape
         ours, theirs = grid.cells == OCCUPIED, again.cells == OCCUPIED
         assert (ours == theirs).mean() >= 0.99

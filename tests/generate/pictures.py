@@ -9,9 +9,9 @@ import shapely
 from PIL import Image, ImageDraw
 
 from app import generate
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.model.features import Features
-from app.model.imagery import Picture, displayed
+from app.model.imagery import GeoImage, displayed
 from app.model.layers import Layers
 
 SHEET = Path(__file__).resolve().parents[2] / "docs" / "images" / "sites.png"
@@ -28,9 +28,9 @@ def sites() -> list[str]:
 
 def tile(name: str) -> Image.Image:
     """A site from above, its lowest level, with the network's edges."""
-    layers = generate.run(name, SEED, {}, Layers(), Notes())
+    layers = generate.run(name, SEED, {}, Layers(), DerivationNotes())
     key, picture = next(iter(layers.of("imagery").items()))
-    assert isinstance(picture, Picture)
+    assert isinstance(picture, GeoImage)
     image = Image.fromarray(np.ascontiguousarray(displayed(picture)[..., :3]))
     scale = min(TILE[0] / image.width, TILE[1] / image.height)
     image = image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.BOX)

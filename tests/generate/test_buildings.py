@@ -11,7 +11,7 @@ import yaml
 
 from app.convert.files import written
 from app.errors import CannotGenerate, Invalid
-from app.formats import Group, ReadContext, get_format, read
+from app.formats import FileGroup, ReadContext, get_format, read
 from app.model.features import features
 from app.model.frame import GROUND, Datum, Level
 from app.model.layers import Layers, PartKey
@@ -69,7 +69,7 @@ def test_open_rmf_reads_walls_doors_and_the_lift(office: Layers) -> None:
     assert {d["name"][1] for d in doors} == {"entrance_door", *(f"{name}_door" for name in rooms)}
     chargers = [row for row in building["levels"]["ground"]["vertices"] if len(row) > 4 and "is_charger" in row[4]]
     assert [row[3] for row in chargers] == ["dock_1", "dock_2"]
-    back = read(Group(get_format("openrmf"), "building.yaml", files), ReadContext())
+    back = read(FileGroup(get_format("openrmf"), "building.yaml", files), ReadContext())
     for level in ("ground", "L2"):
         walls = office.vector("objects", level)[PartKey("objects", level, "openrmf")].of_kind("wall", "door", "floor")
         again = back.vector("objects", level)[PartKey("objects", level, "openrmf")].of_kind("wall", "door", "floor")

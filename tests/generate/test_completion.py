@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from app import formats, generate
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.formats import ReadContext
 from app.model.frame import GROUND
@@ -112,7 +112,7 @@ def measured(grid: OccupancyGrid, seed: int = 3) -> Measure:
             continue
         cut = OccupancyGrid(np.where(hole, UNKNOWN, grid.cells).astype(np.uint8), grid.resolution)
         try:
-            result = generate.run("complete_grid", 7, {}, Layers({KEY: cut}), Notes()).grids()[KEY].cells
+            result = generate.run("complete_grid", 7, {}, Layers({KEY: cut}), DerivationNotes()).grids()[KEY].cells
         except CannotGenerate:
             result = cut.cells
         assert (result == grid.cells)[valid & ~hole].all(), "known cells stay"
@@ -142,16 +142,16 @@ def room() -> NDArray[np.uint8]:
     return cells
 
 
-def complete(cells: NDArray[np.uint8], notes: Notes | None = None, **values: float) -> NDArray[np.uint8]:
+def complete(cells: NDArray[np.uint8], notes: DerivationNotes | None = None, **values: float) -> NDArray[np.uint8]:
     given = Layers({KEY: OccupancyGrid(cells, 0.05)})
-    return generate.run("complete_grid", 7, values, given, notes or Notes()).grids()[KEY].cells
+    return generate.run("complete_grid", 7, values, given, notes or DerivationNotes()).grids()[KEY].cells
 
 
 def test_a_wall_goes_on_and_nothing_beyond_the_walls_becomes_free() -> None:
     cells = room()
     hole = np.s_[30:70, 50:90]
     cells[hole] = UNKNOWN
-    notes = Notes()
+    notes = DerivationNotes()
     result = complete(cells, notes)
     assert (result[30:70, 69:71] == OCCUPIED).all()
     assert (result[hole] == OCCUPIED).sum() == 80

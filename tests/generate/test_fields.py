@@ -258,7 +258,7 @@ def test_a_fence_that_holds_nothing_is_told() -> None:
         small = features([("f", shapely.box(0, 0, *size), {"kind": "fence"})], "local")
         for name in SMALL:
             with pytest.raises(CannotGenerate, match=f"{why}|the fence holds no row"):
-                generate.run(name, 1, {}, Layers({key: small}, HERE), looks.Notes())
+                generate.run(name, 1, {}, Layers({key: small}, HERE), looks.DerivationNotes())
 
 
 def test_large_fields_take_cells_that_still_show_the_ways() -> None:

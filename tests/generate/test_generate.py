@@ -11,10 +11,10 @@ import pytest
 import shapely
 
 from app import generate
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Conflict, Invalid, MissingLayer, NotFound
 from app.formats import Limits
-from app.generate import Source, generates
+from app.generate import RandomSource, generates
 from app.ingest import GenerationRequest, Ingest
 from app.model.features import Features
 from app.model.frame import GROUND, Datum
@@ -52,7 +52,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(generate, "_registry", dict(generate._registry))
 
     @generates({"objects", "location"}, parameters=Posts)
-    def some_posts(given: Layers, options: Posts, source: Source, notes: Notes) -> Layers:
+    def some_posts(given: Layers, options: Posts, source: RandomSource, notes: DerivationNotes) -> Layers:
         """Posts here and there."""
         places = np.round(9 * source.stream("posts").random((options.count, 2)), 3).tolist()
         notes.fill("datum", "52, 5", "none was given")
@@ -60,7 +60,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
         return Layers(parts, Datum(52.0, 5.0), given.levels)
 
     @generates({"objects"}, parameters=Posts, needs={"objects"})
-    def fewer(given: Layers, options: Posts, source: Source, notes: Notes) -> Layers:
+    def fewer(given: Layers, options: Posts, source: RandomSource, notes: DerivationNotes) -> Layers:
         """Only some of the posts."""
         (key, part), *_ = given.vector("objects").items()
         return Layers({key: part.take(np.arange(options.count))}, given.datum, given.levels)
@@ -85,10 +85,10 @@ def order(name: str = "some_posts", seed: int = 7, replace: bool = False, **valu
 
 
 def test_streams_are_the_same_everywhere_and_independent() -> None:
-    first = Source(7, "orchard").stream("trees").random(3)
-    assert first.tolist() == Source(7, "orchard").stream("trees").random(3).tolist()
-    assert Source(7, "orchard").stream("trees").integers(0, 2**32, 2).tolist() == NUMBERS
-    for other in (Source(8, "orchard").stream("trees"), Source(7, "orchard").stream("stones")):
+    first = RandomSource(7, "orchard").stream("trees").random(3)
+    assert first.tolist() == RandomSource(7, "orchard").stream("trees").random(3).tolist()
+    assert RandomSource(7, "orchard").stream("trees").integers(0, 2**32, 2).tolist() == NUMBERS
+    for other in (RandomSource(8, "orchard").stream("trees"), RandomSource(7, "orchard").stream("stones")):
         assert other.random(3).tolist() != first.tolist()
 
 

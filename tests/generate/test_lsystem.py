@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from app.errors import CannotGenerate, Invalid
-from app.generate import Source, _expressions, _lsystem, _plants
+from app.generate import RandomSource, _expressions, _lsystem, _plants
 from app.generate._lsystem import draw, expand, parse
 from app.model.meshes import read_mesh
 
-DICE = Source(7, "plants")
+DICE = RandomSource(7, "plants")
 
 
 def dice(name: str = "x") -> np.random.Generator:

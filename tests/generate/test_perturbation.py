@@ -16,7 +16,7 @@ import yaml
 from PIL import Image
 
 from app import generate
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, MissingLayer
 from app.generate import _site
 from app.generate._site import Site, SiteOptions
@@ -33,16 +33,16 @@ ALONE = {**STILL, "shift": 0.0, "turn": 0.0, "row_shift": 0.0, "missing": 0.0, "
 """Nothing at all."""
 
 
-def disturbed(given: Layers, seed: int = 7, **values: Any) -> tuple[Layers, Layers, Notes]:
+def disturbed(given: Layers, seed: int = 7, **values: Any) -> tuple[Layers, Layers, DerivationNotes]:
     """(the environment after it, what was made, what was said)"""
-    notes = Notes()
+    notes = DerivationNotes()
     new_layers = generate.run("perturbation", seed, values, given, notes)
     return Layers({**given.parts, **new_layers.parts}, new_layers.datum, new_layers.levels), new_layers, notes
 
 
 def orchard() -> Layers:
     """Four rows of nine posts, 3 m apart, 2 m in the row, with a way between two of them."""
-    site = Site(Layers(), SiteOptions(resolution=0.05), Notes())
+    site = Site(Layers(), SiteOptions(resolution=0.05), DerivationNotes())
     site.bounded(shapely.box(-3, -3, 20, 13))
     for row in range(4):
         for k in range(9):

@@ -9,10 +9,10 @@ import pytest
 import shapely
 
 from app import formats
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotGenerate, Invalid
-from app.formats import Group, ReadContext, WriteContext
+from app.formats import FileGroup, ReadContext, WriteContext
 from app.generate import _site
 from app.generate._site import COLOURS, Site, SiteOptions
 from app.generate._trees import crown_mesh
@@ -21,16 +21,16 @@ from app.model.features import Features, features
 from app.model.frame import GROUND, Datum, Level
 from app.model.geodesy import local_frame
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Layers, PartKey
 
 HERE = Datum(53.2686, -0.5245, heading=20.0)
 GRID = PartKey("occupancy", GROUND, "map")
 
 
-def yard(notes: Notes | None = None, given: Layers | None = None, **options: Any) -> Site:
+def yard(notes: DerivationNotes | None = None, given: Layers | None = None, **options: Any) -> Site:
     """Twenty by ten metres with a shed of 4 × 2 m in the middle of its upper half."""
-    site = Site(given or Layers(), SiteOptions(**options), notes or Notes())
+    site = Site(given or Layers(), SiteOptions(**options), notes or DerivationNotes())
     site.bounded(shapely.box(0, 0, 20, 10))
     site.box("shed", "building", (10, 7), (4, 2, 3), colour="roof", name="Shed")
     return site
@@ -60,10 +60,10 @@ def test_the_grid_is_the_slice_of_the_written_world() -> None:
     assert grid.counts()["occupied"] == pytest.approx((8 + 0.04 * np.pi) / 0.05**2, rel=0.02)
     files = formats.write(formats.get_format("gazebo"), layers, WriteContext(title="yard"))
     assert b"walls_map" not in files["world.sdf"], "the objects are the walls"
-    world = formats.read(Group(formats.get_format("gazebo"), "world.sdf", files), ReadContext())
+    world = formats.read(FileGroup(formats.get_format("gazebo"), "world.sdf", files), ReadContext())
     fence = {k: p for k, p in layers.parts.items() if k.layer == "location"}
     again = objects_to_occupancy(
-        Layers({**world.parts, **fence}, layers.datum), Parameters(height=0.2, resolution=0.05), Notes()
+        Layers({**world.parts, **fence}, layers.datum), Parameters(height=0.2, resolution=0.05), DerivationNotes()
     )
     assert (grid_of(again).cells == grid.cells).mean() >= 0.99
 
@@ -87,7 +87,7 @@ def test_solids_that_do_not_reach_the_slice_are_not_looked_at() -> None:
 
 
 def test_free_space_is_one_piece_and_the_rest_is_told() -> None:
-    notes = Notes()
+    notes = DerivationNotes()
     site = yard(notes)
     for k, (x, y, w, h) in enumerate(((3, 2, 2, 0.2), (3, 4, 2, 0.2), (2, 3, 0.2, 2.2), (4, 3, 0.2, 2.2))):
         site.box(f"wall{k}", "wall", (x, y), (w, h, 1))
@@ -164,7 +164,7 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
     )
     fence = features([("small", ring[0], {"kind": "fence"}), ("big", ring[1], {"kind": "fence"})], "wgs84")
     key = PartKey("location", GROUND, "site")
-    notes = Notes()
+    notes = DerivationNotes()
     given = Layers({key: fence}, HERE)
     site = yard(notes, given)
     assert site.is_given
@@ -177,7 +177,7 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
     assert notes.template == []
     with pytest.raises(Invalid, match="has a datum already"):
         yard(given=given, datum=(52.0, 5.0))
-    notes = Notes()
+    notes = DerivationNotes()
     assert yard(notes).finish().datum == _site.DATUM
     assert [t["what"] for t in notes.template] == ["datum"]
     assert yard(datum=(52.0, 5.0)).finish().datum == Datum(52.0, 5.0)
@@ -187,19 +187,19 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
 
 
 def test_sizes_are_told_before_work_starts() -> None:
-    site = Site(Layers(), SiteOptions(resolution=0.01), Notes())
+    site = Site(Layers(), SiteOptions(resolution=0.01), DerivationNotes())
     with pytest.raises(CannotGenerate, match="resolution: 100 × 100 m on 1 levels would be more than"):
         site.bounded(shapely.box(0, 0, 100, 100))
-    site = Site(Layers(), SiteOptions(), Notes())
+    site = Site(Layers(), SiteOptions(), DerivationNotes())
     with pytest.raises(CannotGenerate, match="coarser"):
         site.bounded(shapely.box(0, 0, 1e6, 1e6))
-    notes = Notes()
+    notes = DerivationNotes()
     site = Site(Layers(), SiteOptions(datum=(52.0, 5.0)), notes)
     site.bounded(shapely.box(0, 0, 300, 200))
     site.box("shed", "building", (10, 10), (4, 4, 3))
     assert grid_of(site.finish()).resolution == 0.2
     assert [t["what"] for t in notes.template] == ["resolution"]
-    site = Site(Layers(), SiteOptions(height=2.9), Notes())
+    site = Site(Layers(), SiteOptions(height=2.9), DerivationNotes())
     site.bounded(shapely.box(0, 0, 20, 10))
     site.box("kerb", "wall", (10, 7), (4, 2, 1))
     with pytest.raises(CannotGenerate, match="no stored object stands in a robot's way at 2"):
@@ -212,7 +212,7 @@ def test_the_picture_shows_what_stands_where() -> None:
     site.post("tree", "tree", (4, 6), 0.2, 4.0, colour="crown", seen=_site.disc(4, 6, 1.5))
     layers = site.finish(ground="meadow")
     picture = layers.parts[PartKey("imagery", GROUND, "satellite")]
-    assert isinstance(picture, Picture)
+    assert isinstance(picture, GeoImage)
     a, b, left, d, e, top = picture.transform
     assert (a, b, left, d, e, top) == (0.05, 0.0, 0.0, 0.0, -0.05, 10.0)
     for x, y, colour in ((10, 7, "roof"), (4, 6, "crown"), (4, 7.3, "crown"), (10, 1, "path"), (1, 9, "meadow")):
@@ -223,7 +223,7 @@ def test_the_picture_shows_what_stands_where() -> None:
 
 def test_levels_have_grids_and_pictures_of_their_own() -> None:
     levels = (Level(), Level("L2", 4.0))
-    site = Site(Layers(), SiteOptions(), Notes(), levels=levels)
+    site = Site(Layers(), SiteOptions(), DerivationNotes(), levels=levels)
     site.bounded(shapely.box(0, 0, 20, 10))
     site.box("desk", "furniture", (5, 5), (2, 1, 0.8))
     site.box("desk2", "furniture", (15, 5), (2, 1, 0.8), level="L2")

@@ -18,7 +18,7 @@ from PIL import Image
 from app.cli import run
 from app.convert.files import written
 from app.errors import CannotGenerate, Invalid
-from app.generate import Source, _kernels_noise, _noise
+from app.generate import RandomSource, _kernels_noise, _noise
 from app.model import solids
 from app.model.features import features
 from app.model.frame import Datum
@@ -108,7 +108,7 @@ def test_noise_is_what_its_definition_says(kernel: str, reference: Any) -> None:
 
 @pytest.mark.parametrize("kind", ["perlin", "simplex"])
 def test_octaves_stay_in_range_and_are_smooth(kind: Any) -> None:
-    draw = Source(7, "noise").stream
+    draw = RandomSource(7, "noise").stream
     x = np.arange(0.0, 60.0, 0.05)
     plain = _noise.noise2(x, x[:200], _noise.Fractal(kind, 4.0, 1), draw("a"))
     assert 0.6 < np.abs(plain).max() <= 1.0
@@ -127,8 +127,8 @@ def test_the_same_seed_gives_the_same_noise_everywhere() -> None:
     x = np.linspace(-9.0, 11.0, 64)
     for kind in ("perlin", "simplex"):
         fractal = _noise.Fractal(kind, 3.0, 5)  # type: ignore[arg-type]
-        out.update(_noise.noise2(x, x, fractal, Source(7, "n").stream("a")).tobytes())
-        out.update(_noise.noise3(x, x[:5], x[:3], fractal, Source(7, "n").stream("b")).tobytes())
+        out.update(_noise.noise2(x, x, fractal, RandomSource(7, "n").stream("a")).tobytes())
+        out.update(_noise.noise3(x, x[:5], x[:3], fractal, RandomSource(7, "n").stream("b")).tobytes())
     assert out.hexdigest()[:16] == NOISE
 
 

@@ -12,7 +12,7 @@ import shapely
 
 from app.convert.files import written
 from app.errors import CannotGenerate, Invalid
-from app.generate import Source, _blocks, _streets
+from app.generate import RandomSource, _blocks, _streets
 from app.model.features import features
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layers, PartKey
@@ -24,7 +24,7 @@ SQUARE = shapely.box(0, 0, 100, 60)
 
 
 def grown(rules: str, area: Any = SQUARE, seed: int = 7, **constants: float) -> _blocks.Town:
-    return _blocks.grow(_blocks.parse(rules, constants), area, Source(seed, "town").stream("rules"))
+    return _blocks.grow(_blocks.parse(rules, constants), area, RandomSource(seed, "town").stream("rules"))
 
 
 def test_a_town_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Path) -> None:

@@ -15,9 +15,9 @@ from PIL import Image
 
 from app import generate
 from app.cli import run
-from app.derive import Notes
+from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, MissingLayer
-from app.generate import Source, _wfc
+from app.generate import RandomSource, _wfc
 from app.generate.wave_function_collapse import SAMPLES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, PartKey
@@ -26,7 +26,7 @@ from tests.generate import looks
 
 NAME = "wave_function_collapse"
 GRID = PartKey("occupancy")
-DRAW = Source(7, "tests").stream
+DRAW = RandomSource(7, "tests").stream
 CELLS = "133544c3d3efcb5f"
 COMPLETED = "db80781a61463687"
 U8 = NDArray[np.uint8]
@@ -114,7 +114,7 @@ def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
     expected = pairs(sample)
     for seed in range(4):
         started = time.process_time()
-        out = collapse(sample, 200, 5, Source(seed, "tests").stream)
+        out = collapse(sample, 200, 5, RandomSource(seed, "tests").stream)
         assert time.process_time() - started < 5.0
         assert abs((out == OCCUPIED).mean() - (sample == OCCUPIED).mean()) <= SHARE
         assert np.abs(np.array(pairs(out)) - expected).max() <= SHARE
@@ -141,7 +141,7 @@ def test_free_space_is_joined_where_that_is_asked() -> None:
 
     counts = []
     for seed in range(3):
-        draw = Source(seed, "rooms").stream
+        draw = RandomSource(seed, "rooms").stream
         counts.append(free_pieces(collapse(rooms(), 60, 3, draw)))
         joined = collapse(rooms(), 60, 3, draw, joined=True)
         assert free_pieces(joined) == 1
@@ -162,8 +162,8 @@ def test_a_sample_that_contradicts_itself_is_told() -> None:
 
 
 def test_the_same_seed_gives_the_same_cells_everywhere() -> None:
-    out = collapse(SAMPLES["warehouse"].cells(0.1), 60, 4, Source(7, "hash").stream, joined=True)
-    free = collapse(rooms(), 40, 3, Source(7, "hash").stream, scan=False)
+    out = collapse(SAMPLES["warehouse"].cells(0.1), 60, 4, RandomSource(7, "hash").stream, joined=True)
+    free = collapse(rooms(), 40, 3, RandomSource(7, "hash").stream, scan=False)
     assert hashlib.sha256(out.tobytes() + free.tobytes()).hexdigest()[:16] == CELLS
 
 
@@ -238,8 +238,8 @@ def holed() -> tuple[U8, U8]:
     return complete, cells
 
 
-def completed(cells: U8, seed: int = 7, **values: Any) -> tuple[U8, Notes]:
-    notes = Notes()
+def completed(cells: U8, seed: int = 7, **values: Any) -> tuple[U8, DerivationNotes]:
+    notes = DerivationNotes()
     given = Layers({GRID: OccupancyGrid(cells, 0.05, properties={"kept": 1})})
     out = generate.run("complete_grid", seed, values, given, notes).grids()[GRID]
     assert out.properties == {"kept": 1}
@@ -298,7 +298,7 @@ def test_what_cannot_be_completed_is_told(cells: U8, values: dict[str, Any], why
 
 def test_without_a_grid_there_is_nothing_to_complete() -> None:
     with pytest.raises(MissingLayer, match="complete_grid works on occupancy"):
-        generate.run("complete_grid", 7, {}, Layers(), Notes())
+        generate.run("complete_grid", 7, {}, Layers(), DerivationNotes())
 
 
 def test_over_http(api: Api) -> None:

@@ -16,11 +16,11 @@ import shapely
 from numpy.typing import NDArray
 
 from app import derive, formats
-from app.derive import Notes, imagery_to_objects, imagery_to_occupancy, occupancy_to_objects
+from app.derive import DerivationNotes, imagery_to_objects, imagery_to_occupancy, occupancy_to_objects
 from app.errors import FleetMapError
 from app.model.features import Features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api, api, fresh
 
@@ -182,7 +182,7 @@ def test_a_picture_without_a_place_is_refused_with_a_way_out(api: Api, fresh: Ca
         assert answer.json()["detail"]
 
 
-def pictures(seed: int) -> Picture:
+def pictures(seed: int) -> GeoImage:
     """A picture of any kind: of noise, of one colour, of blocks; of any type, number of bands, place and size."""
     rng = np.random.default_rng(seed)
     height, width = (int(v) for v in rng.integers(1, 90, 2))
@@ -213,7 +213,7 @@ def pictures(seed: int) -> Picture:
         more["palette"] = rng.integers(0, 256, (int(rng.integers(1, 257)), 4)).tolist()
     a, b, c, d, e, f = (rng.normal(0, 1, 6) * 10.0 ** rng.integers(-3, 3)).tolist()
     transform = (a, b, c, d, e, f) if seed % 3 == 0 else (0.5, 0.0, c, 0.0, -0.5, f)
-    return Picture(pixels, transform, "local", properties=more)
+    return GeoImage(pixels, transform, "local", properties=more)
 
 
 ODD: list[dict[str, Any]] = [
@@ -235,7 +235,7 @@ def test_any_picture_gives_something_or_a_clear_problem(seed: int) -> None:
     for module in (imagery_to_objects, imagery_to_occupancy):
         function = getattr(module, module.__name__.rpartition(".")[2])
         try:
-            derived_layers = function(layers, module.Parameters(**ODD[seed % len(ODD)]), Notes())
+            derived_layers = function(layers, module.Parameters(**ODD[seed % len(ODD)]), DerivationNotes())
         except FleetMapError as error:
             assert error.detail
             continue
@@ -284,7 +284,7 @@ def test_any_grid_gives_objects_or_a_clear_problem(seed: int) -> None:
     layers = Layers({PartKey("occupancy"): grid})
     try:
         derived_layers = occupancy_to_objects.occupancy_to_objects(
-            layers, occupancy_to_objects.Parameters(**HARD[seed % len(HARD)]), Notes()
+            layers, occupancy_to_objects.Parameters(**HARD[seed % len(HARD)]), DerivationNotes()
         )
     except FleetMapError as error:
         assert error.detail

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from app import formats
-from app.formats import Group, ReadContext, WriteContext
+from app.formats import FileGroup, ReadContext, WriteContext
 from app.model import bends
 from app.model.features import Features, features
 from app.model.frame import GROUND, Datum
@@ -167,7 +167,7 @@ def test_no_written_edge_leads_through_a_house(name: str) -> None:
     lines = [shapely.LineString([at[p["source"]], at[p["target"]]]) for p in part.properties if p["kind"] == "edge"]
     assert len(lines) == 9 if name not in ("openrmf", "prm", "ffr_network") else len(lines) >= 9
     assert not shapely.intersects(lines, HOUSE).any()
-    again = formats.read(Group(fmt, next(iter(files)), files), ReadContext())
+    again = formats.read(FileGroup(fmt, next(iter(files)), files), ReadContext())
     assert formats.write(fmt, again, WriteContext()) == files
 
 
@@ -179,7 +179,7 @@ NAMED = [name for name in STRAIGHT if name != "prm" and formats.get_format(name)
 def test_an_upload_of_what_was_written_has_its_bends(name: str) -> None:
     fmt = formats.get_format(name)
     files = formats.write(fmt, both(), WriteContext())
-    again = part_of(formats.read(Group(fmt, next(iter(files)), files), ReadContext()))
+    again = part_of(formats.read(FileGroup(fmt, next(iter(files)), files), ReadContext()))
     lines = [g for g, p in zip(again.geometry, again.properties, strict=True) if p["kind"] == "edge"]
     assert sorted(map(shapely.get_num_coordinates, lines)) == [2, 5, 5]
     assert len(again) == len(part_of(both()))

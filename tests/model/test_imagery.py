@@ -12,7 +12,7 @@ from pyproj import Transformer
 from app.errors import Invalid, MissingDatum
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
-from app.model.imagery import Picture, displayed, placed
+from app.model.imagery import GeoImage, displayed, placed
 from app.model.resampling import resampled, to_wgs84
 
 UTM = "EPSG:32630"
@@ -21,13 +21,13 @@ EAST, NORTH = 665050.0, 5904950.0
 """A place near the datum in UTM zone 30."""
 
 
-def numbered(shape: tuple[int, int] = (60, 80), crs: str = UTM, transform: Any = None, **properties: Any) -> Picture:
+def numbered(shape: tuple[int, int] = (60, 80), crs: str = UTM, transform: Any = None, **properties: Any) -> GeoImage:
     """Every pixel another number."""
     values = np.arange(shape[0] * shape[1], dtype=np.int32).reshape(*shape, 1) + 1
-    return Picture(values, transform or (0.5, 0.0, EAST, 0.0, -0.5, NORTH), crs, properties)
+    return GeoImage(values, transform or (0.5, 0.0, EAST, 0.0, -0.5, NORTH), crs, properties)
 
 
-def truth(image: Picture, source: Picture, to_source: Any) -> tuple[np.ndarray, np.ndarray]:
+def truth(image: GeoImage, source: GeoImage, to_source: Any) -> tuple[np.ndarray, np.ndarray]:
     """For every pixel of the result: the value that stands there by PROJ alone, and how near to a pixel's edge."""
     height, width = image.pixels.shape[:2]
     rows, columns = (v.ravel() + 0.5 for v in np.mgrid[0:height, 0:width])
@@ -95,7 +95,7 @@ def test_a_plane_stays_a_plane() -> None:
     """Heights that rise evenly: between pixels they are what the plane says, to a millimetre."""
     rows, columns = np.mgrid[0:60, 0:80] + 0.5
     heights = (0.25 * columns - 0.125 * rows)[..., None]
-    source = Picture(heights, (0.5, 0.0, EAST, 0.0, -0.5, NORTH), UTM)
+    source = GeoImage(heights, (0.5, 0.0, EAST, 0.0, -0.5, NORTH), UTM)
     frame = local_frame(HERE)
     image = resampled(source, frame)
     assert image.properties["nodata"] == "nan"
@@ -111,7 +111,7 @@ def test_a_plane_stays_a_plane() -> None:
 
 @pytest.mark.parametrize(("kind", "band"), [(np.uint8, "alpha"), (np.uint16, "mask"), (np.int8, "mask")])
 def test_outside_is_said_by_a_further_band(kind: Any, band: str) -> None:
-    source = Picture(np.full((40, 40, 3), 100, kind), (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM)
+    source = GeoImage(np.full((40, 40, 3), 100, kind), (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM)
     image = resampled(source, local_frame(HERE))
     assert image.colours == ("red", "green", "blue", band)
     opaque = image.pixels[..., 3] != 0
@@ -137,7 +137,7 @@ def test_a_turned_plan_is_set_upright_without_a_datum() -> None:
 def test_palettes_are_never_mixed() -> None:
     values = (np.arange(1600).reshape(40, 40, 1) % 2 * 200).astype(np.uint8)
     properties = {"bands": [{"colour": "palette"}], "palette": [[k, 0, 0, 255] for k in range(256)], "nodata": 7}
-    image = resampled(Picture(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(HERE))
+    image = resampled(GeoImage(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(HERE))
     assert set(np.unique(image.pixels)) == {0, 7, 200}
 
 
@@ -160,13 +160,13 @@ SQUARE = (1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
 
 def shown(values: Any, kind: Any = np.uint8, **properties: Any) -> list[Any]:
     pixels = np.array(values, kind)
-    return displayed(Picture(pixels, SQUARE, "local", properties)).tolist()
+    return displayed(GeoImage(pixels, SQUARE, "local", properties)).tolist()
 
 
 def test_bytes_are_shown_as_they_are() -> None:
     for bands in (1, 2, 3, 4):
         pixels = np.random.default_rng(bands).integers(0, 255, (700, 900, bands), dtype=np.uint8)
-        assert np.array_equal(displayed(Picture(pixels, SQUARE)), pixels)
+        assert np.array_equal(displayed(GeoImage(pixels, SQUARE)), pixels)
 
 
 def test_other_types_are_stretched() -> None:

@@ -26,7 +26,7 @@ from app.model.features import (
 )
 from app.model.frame import MAX_METRES, Datum, Level, is_writable
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import LAYERS, PART_TYPES, Layers, PartKey, Resources, is_empty, join_levels
 from app.model.voxels import VoxelMap, gather, morton, spread
 
@@ -346,9 +346,9 @@ def test_voxels_cannot_be_changed() -> None:
 )
 def test_a_picture_lies_somewhere(bad: dict[str, Any]) -> None:
     good: dict[str, Any] = {"pixels": np.zeros((2, 3, 1), np.uint8), "transform": (1, 0, 0, 0, -1, 0)}
-    Picture(**good)
+    GeoImage(**good)
     with pytest.raises(Invalid):
-        Picture(**{**good, **bad})
+        GeoImage(**{**good, **bad})
 
 
 # --- all together -------------------------------------------------------------------------------------------------

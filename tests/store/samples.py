@@ -11,7 +11,7 @@ import shapely
 from app.model.features import Features, features, from_columns, points
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import GeoImage
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
 from app.model.voxels import VoxelMap
 from app.store.changes import Changes, Operation, Replace
@@ -93,10 +93,10 @@ def voxels(n: int = 5000, seed: int = 0) -> VoxelMap:
     )
 
 
-def picture(seed: int = 0, dtype: Any = np.uint8) -> Picture:
+def picture(seed: int = 0, dtype: Any = np.uint8) -> GeoImage:
     """Three bands, larger than a tile."""
     pixels = (np.random.default_rng(seed).random((300, 270, 3)) * 200).astype(dtype)
-    return Picture(pixels, (0.1, 0.0, -5.0, 0.0, -0.1, 20.0), "local", {"png": {"dpi": 72}})
+    return GeoImage(pixels, (0.1, 0.0, -5.0, 0.0, -0.1, 20.0), "local", {"png": {"dpi": 72}})
 
 
 def everything() -> dict[PartKey, Part]:
