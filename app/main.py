@@ -60,7 +60,7 @@ from app.api.auth import Authenticator
 from app.api.connections import ConnectionLimits, Connections, fit_open_files
 from app.api.deltas import Deltas
 from app.api.dependencies import ApiOptions, Services, Writability
-from app.api.jobs import BEAT_SECONDS, ConversionJobs
+from app.api.jobs import HEARTBEAT_SECONDS, ConversionJobs
 from app.api.maps import FleetMapApp, ResponseCache
 from app.api.metrics import Metrics
 from app.api.middleware import Guard
@@ -115,13 +115,13 @@ def create_app(settings: Settings) -> FleetMapApp:
         services.fleet.start()
         threading.Thread(target=_prepare, args=(services,), daemon=True).start()
         publishing = [p for p in (ros2_of(settings, services), relay_of(settings, services)) if p is not None]
-        app.hot = services.hot
+        app.response_cache = services.response_cache
         scrub = scrub_of(settings, services)
         ticker = asyncio.create_task(_tick(services))
         try:
             yield
         finally:
-            app.hot = None
+            app.response_cache = None
             ticker.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await ticker
@@ -341,8 +341,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         ingest=Ingest(store, run, settings.limits, provider_of(settings)),
         maps=service,
         access=access,
-        work=ConversionJobs(store, service, settings.job_seconds, count),
-        hot=ResponseCache(settings.memory_cache_bytes, access, metrics, store.generation),
+        jobs=ConversionJobs(store, service, settings.job_seconds, count),
+        response_cache=ResponseCache(settings.memory_cache_bytes, access, metrics, store.generation),
         intake=intake,
         metrics=metrics,
         keys=keys,
@@ -400,8 +400,8 @@ def relay_of(settings: Settings, services: Services) -> Relay | None:
     options = _bus_options(settings)
     zenoh_bus = Bus(
         options,
-        ask=partial(events.ask, services, options.max_reply_bytes),
-        explain=problems.body_of,
+        ask=partial(events.answer_zenoh_query, services, options.max_reply_bytes),
+        explain=problems.problem_body,
         on_status=services.fleet.heard,
         on_alive=services.fleet.alive,
     )
@@ -420,8 +420,8 @@ def ros2_of(settings: Settings, services: Services) -> Ros2Publisher | None:
         _bus_options(settings),
         settings.data_dir,
         generation=services.store.generation,
-        look=partial(ros2.standing, services, chosen, settings.ros2_channel),
-        fetch=partial(ros2.content, services, settings.ros2_derive),
+        look=partial(ros2.channel_versions, services, chosen, settings.ros2_channel),
+        fetch=partial(ros2.topic_content, services, settings.ros2_derive),
     )
     publishing.start()
     return publishing
@@ -461,7 +461,7 @@ def close_services(services: Services) -> None:
     services.fleet.close()
     services.pool.close()
     services.spare.close()
-    services.work.close()
+    services.jobs.close()
     services.intake.close()
     services.store.close()
 
@@ -517,15 +517,15 @@ async def _tick(services: Services) -> None:
         await asyncio.sleep(TICK_SECONDS)
         beat += TICK_SECONDS
         try:
-            services.hot.count()
+            services.response_cache.flush_counters()
             newest = _note_time(newest)
             await run_in_threadpool(services.store.end_expired_tokens)
             await run_in_threadpool(services.store.apply_due, datetime.now(UTC))
             await run_in_threadpool(services.store.advance_rollouts, datetime.now(UTC), decide)
             await run_in_threadpool(services.store.end_due_overlays, datetime.now(UTC))
-            if beat >= BEAT_SECONDS:
+            if beat >= HEARTBEAT_SECONDS:
                 beat = 0.0
-                await run_in_threadpool(services.work.beat)
+                await run_in_threadpool(services.jobs.send_heartbeats)
             if datetime.now(UTC) >= collect:
                 collect = datetime.now(UTC) + COLLECT_EVERY
                 await run_in_threadpool(services.store.collect, COLLECT_GRACE)

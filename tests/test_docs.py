@@ -14,7 +14,7 @@ import pytest
 from typer.main import get_command
 
 from app import derive, generate
-from app.api.problems import STATUS, status_of
+from app.api.problems import STATUS, problem_status
 from app.cli.commands import ALIASES, build
 from app.config import Settings
 from app.event_types import EVENT_TYPES
@@ -173,7 +173,7 @@ def test_every_metric_is_documented(pages: Mapping[str, str]) -> None:
 
 def test_every_problem_is_documented(pages: Mapping[str, str]) -> None:
     for cls, (status, title) in STATUS.items():
-        _, _, kind = status_of(cls.__new__(cls))
+        _, _, kind = problem_status(cls.__new__(cls))
         row = pages["reference/errors.html"].partition(f" {kind} ")[2][:80]
         assert row.split()[0] == str(status), kind
         assert title in row, kind

@@ -9,8 +9,16 @@ from starlette.responses import Response
 
 from app.api.auth import Editor
 from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import AlignmentBody, AlignmentOut, EnvironmentPath, IdempotencyKey, IfMatch, OntoBody, told
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import (
+    AlignmentBody,
+    AlignmentOut,
+    EnvironmentPath,
+    IdempotencyKey,
+    IfMatch,
+    OntoBody,
+    problem_responses,
+)
 from app.errors import Invalid, Problem
 from app.ingest import AlignmentRequest
 
@@ -21,7 +29,7 @@ router = APIRouter(tags=["alignments"], route_class=StrictRoute)
     "/environments/{env}/alignments",
     status_code=201,
     responses={
-        **told(AlignmentOut, 400, 404, 409, 412, 415, 422, 503, ok=201, description="A new version"),
+        **problem_responses(AlignmentOut, 400, 404, 409, 412, 415, 422, 503, ok=201, description="A new version"),
         200: {"model": AlignmentOut, "description": "A dry run, or nothing changed."},
     },
     summary="Lay a grid onto another map",
@@ -61,6 +69,6 @@ def create_alignment(
     )
     version = outcome.version
     if version is None or outcome.status == "unchanged":
-        return answer(outcome.body)
+        return json_response(outcome.body)
     headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    return answer(outcome.body, 201, headers)
+    return json_response(outcome.body, 201, headers)

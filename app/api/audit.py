@@ -9,8 +9,8 @@ from starlette.responses import Response
 
 from app.api.auth import ServerAdmin
 from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, page
-from app.api.schemas import AuditOut, Limit, told
+from app.api.responses import StrictRoute, page_response
+from app.api.schemas import AuditOut, Limit, problem_responses
 from app.errors import Invalid
 from app.store.audit import AuditEntry
 from app.store.values import rfc3339
@@ -18,7 +18,7 @@ from app.store.values import rfc3339
 router = APIRouter(prefix="/audit", tags=["audit"], route_class=StrictRoute)
 
 
-@router.get("", responses=told(list[AuditOut]), summary="Who changed what, from where")
+@router.get("", responses=problem_responses(list[AuditOut]), summary="Who changed what, from where")
 def list_audit(
     request: Request,
     services: ServicesDep,
@@ -40,7 +40,7 @@ def list_audit(
     before = None if cursor is None else int(cursor)
     entries = services.store.audit(environment=environment, token_id=token_id, before=before, limit=limit + 1)
     more = str(entries[limit - 1].id) if len(entries) > limit else None
-    return page(request, [as_dict(entry) for entry in entries[:limit]], more)
+    return page_response(request, [as_dict(entry) for entry in entries[:limit]], more)
 
 
 def as_dict(entry: AuditEntry) -> dict[str, object]:

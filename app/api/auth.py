@@ -37,7 +37,7 @@ FRESH_SECONDS = 1.0
 """How long a token is believed without asking the store: one revoked by another process lives that much longer."""
 
 WINDOW_SECONDS = 60.0
-MAX_KNOWN = 4096
+MAX_CACHED_TOKENS = 4096
 MAX_SOURCES = 10_000
 MAX_TOKEN = 512
 
@@ -59,30 +59,30 @@ class Principal:
     expires: datetime | None = None
 
     @classmethod
-    def of(cls, token: Token) -> Principal:
+    def from_token(cls, token: Token) -> Principal:
         """Who holds this token."""
         return cls(token.id, token.name, token.role, token.environments, token.robot, token.expires)
 
-    def can(self, need: RequiredRole) -> bool:
+    def has_role(self, need: RequiredRole) -> bool:
         """Whether the role allows it."""
         return self.role in _CAN[need]
 
-    def may_enter(self, environment: str) -> bool:
+    def can_access(self, environment: str) -> bool:
         """Whether the token reaches this environment."""
         return self.environments is None or fnmatchcase(environment, self.environments)
 
-    def demand(self, need: RequiredRole) -> None:
+    def require_role(self, need: RequiredRole) -> None:
         """Denied unless the role allows it."""
-        if not self.can(need):
+        if not self.has_role(need):
             takes = " or ".join(sorted(_CAN[need]))
             raise Denied(f"this call takes a token with the role {takes}; yours is {self.role}")
 
-    def enter(self, environment: str) -> None:
+    def require_environment(self, environment: str) -> None:
         """Denied unless the token reaches this environment."""
-        if not self.may_enter(environment):
+        if not self.can_access(environment):
             raise Denied(f"your token is limited to the environments {self.environments}")
 
-    def demand_everywhere(self) -> None:
+    def require_all_environments(self) -> None:
         """Denied for tokens that are limited to some environments."""
         if self.environments is not None:
             raise Denied(f"this call takes a token for all environments; yours is limited to {self.environments}")
@@ -97,14 +97,14 @@ def is_open(path: str) -> bool:
     return path in OPEN or path.startswith("/docs/")
 
 
-def environment_of(path: str) -> str | None:
+def environment_in_path(path: str) -> str | None:
     """The environment that an address speaks of."""
     match = _ENVIRONMENT.fullmatch(path)
     return match[1] if match else None
 
 
 class Authenticator:
-    """Tokens, looked up in the store and believed for a second. forgotten: how often one was revoked here."""
+    """Tokens, looked up in the store and believed for a second. is_invalidated: how often one was revoked here."""
 
     def __init__(
         self,
@@ -114,56 +114,56 @@ class Authenticator:
         insecure: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._find, self._failures, self._clock = find, failures, clock
+        self._find_token, self._failures, self._clock = find, failures, clock
         self.insecure = insecure
-        self._known: OrderedDict[bytes, tuple[Principal, float]] = OrderedDict()
+        self._cache: OrderedDict[bytes, tuple[Principal, float]] = OrderedDict()
         self._sources: OrderedDict[str, deque[float]] = OrderedDict()
         self._lock = threading.Lock()
-        self.forgotten = 0
+        self.is_invalidated = 0
 
-    def known(self, header: bytes | None) -> Principal | None:
+    def cached_principal(self, header: bytes | None) -> Principal | None:
         """Who sent this Authorization header, if it was checked less than a second ago. Never blocks."""
         if self.insecure:
             return ANONYMOUS_ADMIN
         if header is None:
             return None
-        entry = self._known.get(hashlib.sha256(header).digest())
+        entry = self._cache.get(hashlib.sha256(header).digest())
         return entry[0] if entry is not None and self._clock() < entry[1] else None
 
-    def check(self, header: bytes | None, client: str | None) -> Principal:
+    def authenticate(self, header: bytes | None, client: str | None) -> Principal:
         """Who sent this header. Asks the store, so call it from a thread.
 
         A valid token is accepted also from an address that sent too many wrong ones: many robots share an address.
 
         Raises Unauthenticated; Throttled for a wrong token after too many from the client's address.
         """
-        cached = self.known(header)
+        cached = self.cached_principal(header)
         if cached is not None:
             return cached
         if header is None:
             raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
-        forgotten = self.forgotten
-        token = self._find(_token(header)) if _token(header) else None
+        forgotten = self.is_invalidated
+        token = self._find_token(_token(header)) if _token(header) else None
         if token is None or (token.expires is not None and token.expires <= datetime.now(UTC)):
             self.note_failure(client)
             raise Unauthenticated("the token is unknown or has expired: ask an administrator for a new one")
-        principal = Principal.of(token)
+        principal = Principal.from_token(token)
         with self._lock:
-            if forgotten == self.forgotten:  # else it may have been revoked while it was looked up
-                self._known[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)
-            while len(self._known) > MAX_KNOWN:
-                self._known.popitem(last=False)
+            if forgotten == self.is_invalidated:  # else it may have been revoked while it was looked up
+                self._cache[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)
+            while len(self._cache) > MAX_CACHED_TOKENS:
+                self._cache.popitem(last=False)
         return principal
 
-    def forget(self) -> None:
+    def invalidate(self) -> None:
         """Ask the store again for every token: one was revoked."""
         with self._lock:
-            self.forgotten += 1
-            self._known.clear()
+            self.is_invalidated += 1
+            self._cache.clear()
 
     def note_failure(self, client: str | None) -> None:
         """Count a wrong token or signature; Throttled after too many from this address within a minute."""
-        source = source_of(client)
+        source = client_source(client)
         with self._lock:
             now = self._clock()
             times = self._sources.setdefault(source, deque(maxlen=self._failures))
@@ -192,7 +192,7 @@ def _token(header: bytes) -> str:
         return ""
 
 
-def source_of(client: str | None) -> str:
+def client_source(client: str | None) -> str:
     """What counts as one source: an IPv4 address (also one mapped into IPv6), the /64 of an IPv6 one."""
     try:
         address = ipaddress.ip_address(client or "")
@@ -223,9 +223,9 @@ class RequireRole:
         principal: Any = request.scope.get("state", {}).get("principal")
         if not isinstance(principal, Principal):
             raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
-        principal.demand(self.need)
+        principal.require_role(self.need)
         if self.everywhere:
-            principal.demand_everywhere()
+            principal.require_all_environments()
         return principal
 
 

@@ -16,9 +16,9 @@ from app.api.auth import Viewer
 from app.api.caching import none_match
 from app.api.dependencies import Services, ServicesDep
 from app.api.layers import Crs, feature_collection
-from app.api.maps import number_of
-from app.api.responses import StrictRoute, answer, json_bytes
-from app.api.schemas import VERSION, DeltaOut, EnvironmentPath, VersionPath, told
+from app.api.maps import parse_version_ref
+from app.api.responses import StrictRoute, json_bytes, json_response
+from app.api.schemas import VERSION, DeltaOut, EnvironmentPath, VersionPath, problem_responses
 from app.errors import MissingDatum
 from app.model.features import Features
 from app.model.frame import Anchor
@@ -35,7 +35,7 @@ router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"],
 
 @router.get(
     "/delta",
-    responses={**told(DeltaOut, 404, 422), 304: {"description": "The client has it"}},
+    responses={**problem_responses(DeltaOut, 404, 422), 304: {"description": "The client has it"}},
     summary="What changed in meaning since a version",
 )
 def get_delta(
@@ -57,7 +57,7 @@ def get_delta(
     of the grid, row 0 at the bottom, `data` row by row, 0…100 and -1 for unknown. `whole`: the grid's frame is another
     one (or most of a large grid changed): fetch it. `other`: parts that have no delta: fetch what is made of them.
     """
-    new, old = services.store.version(env, number_of(v)), services.store.version(env, number_of(since))
+    new, old = services.store.version(env, parse_version_ref(v)), services.store.version(env, parse_version_ref(since))
     anchor: Anchor = crs or ("wgs84" if new.datum else "local")
     seed = json_bytes(["delta", old.root, new.root, old.number, new.number, anchor, env])
     headers = {
@@ -78,15 +78,15 @@ def get_delta(
         "levels": {"changed": delta.levels, "value": [[level.name, level.elevation] for level in new.levels]},
         "layers": _layers(services, new, delta, anchor),
         "grids": [_grid(services, new, change) for change in delta.grids],
-        "other": [_named(key) for key in delta.other],
+        "other": [_part_names(key) for key in delta.other],
     }
-    return answer(body, headers=headers)
+    return json_response(body, headers=headers)
 
 
 def _layers(services: Services, new: Version, delta: Delta, crs: Anchor) -> dict[str, Any]:
     changes = list(delta.features)
     if delta.datum:
-        changes = _everything(services, new, changes)
+        changes = _all_features(services, new, changes)
     frame = local_frame(new.datum) if new.datum else None
     puts: dict[str, list[tuple[PartKey, Features]]] = {}
     deleted: dict[str, list[dict[str, str]]] = {}
@@ -109,7 +109,7 @@ def _layers(services: Services, new: Version, delta: Delta, crs: Anchor) -> dict
     }
 
 
-def _everything(services: Services, new: Version, changes: Sequence[FeatureDelta]) -> list[FeatureDelta]:
+def _all_features(services: Services, new: Version, changes: Sequence[FeatureDelta]) -> list[FeatureDelta]:
     """All features are put, since in the frame that is answered in each may have moved."""
     out = {change.key: change for change in changes}
     for entry in new.parts:
@@ -146,5 +146,5 @@ def _update(rectangle: ChangedCells) -> dict[str, Any]:
     return {"x": rectangle.column, "y": rectangle.row, "width": width, "height": height, "data": data}
 
 
-def _named(key: PartKey) -> dict[str, str]:
+def _part_names(key: PartKey) -> dict[str, str]:
     return {"layer": key.layer, "level": key.level, "name": key.name}

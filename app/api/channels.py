@@ -15,12 +15,12 @@ from app import fleet
 from app.api.auth import Editor, Viewer
 from app.api.caching import none_match
 from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, answer, json_bytes
-from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, told
+from app.api.responses import StrictRoute, json_bytes, json_response
+from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, problem_responses
 from app.errors import Invalid, Problem
 from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
 
-CLOCKS_DIFFER = timedelta(seconds=60)
+MAX_CLOCK_SKEW = timedelta(seconds=60)
 """A time that is past by less may lie ahead by the clock of whoever asks: the channel moves at once."""
 
 router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=StrictRoute)
@@ -58,11 +58,11 @@ def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> 
     return out
 
 
-def _one(services: Services, env: str, channel: Channel) -> dict[str, Any]:
+def _channel_as_json(services: Services, env: str, channel: Channel) -> dict[str, Any]:
     return as_dict(channel, services.store.robots(env), datetime.now(UTC))
 
 
-@router.get("", responses=told(list[ChannelOut], 404), summary="All channels")
+@router.get("", responses=problem_responses(list[ChannelOut], 404), summary="All channels")
 async def list_channels(
     env: EnvironmentPath,
     request: Request,
@@ -78,25 +78,29 @@ async def list_channels(
     `failed` make up the `total`; `ready` have what is planned.
     """
     if robots:  # a look of one's own: what robots say is no commit that others' looks would be too old for
-        headers, data = await run_in_threadpool(_listed, services, env, request, robots)
+        headers, data = await run_in_threadpool(_list_response, services, env, request, robots)
     else:
-        headers, data = await services.hot.shared(request, _listed, services, env, request, robots)
+        headers, data = await services.response_cache.run_shared(
+            request, _list_response, services, env, request, robots
+        )
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
     return Response(data, 200, headers, "application/json")
 
 
-def _listed(services: Services, env: str, request: Request, robots: bool) -> tuple[dict[str, str], bytes]:
-    generation, now = services.hot.generation(), datetime.now(UTC)
+def _list_response(services: Services, env: str, request: Request, robots: bool) -> tuple[dict[str, str], bytes]:
+    generation, now = services.response_cache.generation(), datetime.now(UTC)
     fleet_of = services.store.robots(env) if robots else None
     data = json_bytes([as_dict(channel, fleet_of, now) for channel in services.store.channels(env)])
     headers = {"etag": f'"{hashlib.sha256(data).hexdigest()[:40]}"', "cache-control": "no-cache"}
     if not robots:  # this is what robots ask for, all of them at once
-        services.hot.keep(request, env, headers, data, generation)
+        services.response_cache.store_response(request, env, headers, data, generation)
     return headers, data
 
 
-@router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")
+@router.put(
+    "/{channel}", responses=problem_responses(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it"
+)
 def move_channel(
     env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, services: ServicesDep, principal: Editor
 ) -> Response:
@@ -111,30 +115,30 @@ def move_channel(
         raise Invalid("latest moves by itself: choose another channel", [Problem("not to be moved", where="channel")])
     if body.activate_at is not None:
         if body.activate_at.tzinfo is None:
-            raise _refused("activate_at needs a zone, like 2030-01-31T06:00:00Z")
-        if body.activate_at <= datetime.now(UTC) - CLOCKS_DIFFER:
-            raise _refused("activate_at is in the past: leave it out to move now")
+            raise _invalid_body_error("activate_at needs a zone, like 2030-01-31T06:00:00Z")
+        if body.activate_at <= datetime.now(UTC) - MAX_CLOCK_SKEW:
+            raise _invalid_body_error("activate_at is in the past: leave it out to move now")
     rollout = _rollout(body) if body.rollout is not None else None
     version = services.store.version(env, body.version).number
     moved = services.store.set_channel(
         env, channel, version, author=principal.name, activate_at=body.activate_at, rollout=rollout
     )
-    return answer(_one(services, env, moved))
+    return json_response(_channel_as_json(services, env, moved))
 
 
 def _rollout(body: ChannelBody) -> Rollout:
     request, now = body.rollout, datetime.now(UTC)
     assert request is not None
     if request.ready is None and request.failed is None:
-        raise _refused("a rollout takes ready, failed, or both", "body.rollout")
+        raise _invalid_body_error("a rollout takes ready, failed, or both", "body.rollout")
     if request.deadline is not None:
         location = "body.rollout.deadline"
         if request.ready is None:
-            raise _refused("deadline limits the waiting for robots: it needs ready", location)
+            raise _invalid_body_error("deadline limits the waiting for robots: it needs ready", location)
         if request.deadline.tzinfo is None:
-            raise _refused("deadline needs a zone, like 2030-01-31T06:00:00Z", location)
+            raise _invalid_body_error("deadline needs a zone, like 2030-01-31T06:00:00Z", location)
         if request.deadline <= (body.activate_at or now):
-            raise _refused("deadline must lie in the future, and after activate_at", location)
+            raise _invalid_body_error("deadline must lie in the future, and after activate_at", location)
     return Rollout(
         version=0,
         root="",
@@ -146,11 +150,13 @@ def _rollout(body: ChannelBody) -> Rollout:
     )
 
 
-def _refused(detail: str, location: str = "body.activate_at") -> Invalid:
+def _invalid_body_error(detail: str, location: str = "body.activate_at") -> Invalid:
     return Invalid(detail, [Problem(detail, where=location)])
 
 
-@router.delete("/{channel}/planned", status_code=204, responses=told(None, 404), summary="Cancel what is planned")
+@router.delete(
+    "/{channel}/planned", status_code=204, responses=problem_responses(None, 404), summary="Cancel what is planned"
+)
 def cancel_planned(env: EnvironmentPath, channel: ChannelPath, services: ServicesDep, principal: Editor) -> Response:
     """The channel stays where it is."""
     services.store.cancel_planned(env, channel, principal.name)

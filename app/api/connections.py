@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from app.api.auth import is_loopback, source_of
+from app.api.auth import client_source, is_loopback
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class Connection(Protocol):
     def is_idle(self) -> bool:
         """Whether no request is under way."""
 
-    def give_way(self) -> None:
+    def close_idle(self) -> None:
         """Close at once."""
 
 
@@ -85,7 +85,7 @@ class Connections:
 
     def open(self, connection: Connection, address: str | None) -> bool:
         """Register a new connection; others give way where need be. False: there is no place for it."""
-        source = source_of(address)
+        source = client_source(address)
         connections = self._unproven_of.get(source, {})
         if len(connections) >= self.limits.per_address and not is_loopback(source):
             self._displace(next(iter(connections)))
@@ -134,7 +134,7 @@ class Connections:
 
     def _displace(self, connection: Connection) -> None:
         self._remove(connection)
-        connection.give_way()
+        connection.close_idle()
         self._warn("the oldest connections without a token give way: there are too many")
 
     def _warn(self, event: str) -> None:

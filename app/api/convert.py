@@ -15,12 +15,12 @@ from app import formats, parameters
 from app.api.auth import Editor
 from app.api.caching import content_disposition
 from app.api.dependencies import Services, ServicesDep
-from app.api.environments import datum_of, numbers
+from app.api.environments import numbers, parse_datum
 from app.api.problems import UnsupportedMedia
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import DatumBody, told
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import DatumBody, problem_responses
 from app.api.uploads import UploadForm
-from app.api.versions import check_names, format_named, truth
+from app.api.versions import check_names, parse_format_name, truth
 from app.convert.files import Converted
 from app.convert.worker import media_type, zipped
 from app.errors import Invalid, Problem
@@ -69,7 +69,7 @@ _BODY: dict[str, Any] = {
     "/convert",
     response_class=Response,
     responses={
-        **told(None, 400, 404, 409, 413, 415, 422, 503),
+        **problem_responses(None, 400, 404, 409, 413, 415, 422, 503),
         200: {
             "description": "The file, or a zip of several",
             "content": {"application/octet-stream": {}, "application/zip": {}, "application/json": {}},
@@ -83,19 +83,19 @@ async def convert(request: Request, services: ServicesDep, _: Editor) -> Respons
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media != "multipart/form-data":
         raise UnsupportedMedia("send the files as multipart/form-data")
-    async with services.intake.take(request) as form:
+    async with services.intake.receive(request) as form:
         return await run_in_threadpool(_convert, services, form)
 
 
 def _convert(services: Services, form: UploadForm) -> Response:
     fields = dict(form.fields)
-    to = format_named(fields.pop("to", ""), "to")
+    to = parse_format_name(fields.pop("to", ""), "to")
     if to is None:
         raise Invalid("say in the field 'to' which format is wanted", [Problem("missing", where="to")])
     fmt = formats.get_format(to)
     check_names(form.files)
     layer = drawn_layer(fields.pop("layer", "") or None)
-    source = format_named(fields.pop("format", ""), "format")
+    source = parse_format_name(fields.pop("format", ""), "format")
     level = fields.pop("level", "") or GROUND
     Level(level)
     datum = _datum(fields.pop("datum", ""))
@@ -122,7 +122,7 @@ def _answer(done: Converted, to: str, only_report: bool) -> Response:
             {"name": name, "size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
             for name, data in done.files.items()
         ]
-        return answer({**done.report, "files": files}, headers=headers)
+        return json_response({**done.report, "files": files}, headers=headers)
     if len(done.files) == 1:
         name, data = next(iter(done.files.items()))
         kind = media_type(fmt, name)
@@ -137,7 +137,7 @@ def _datum(text: str) -> Datum | None:
         return None
     if text.lstrip().startswith("{"):
         try:
-            return datum_of(DatumBody.model_validate(orjson.loads(text)))
+            return parse_datum(DatumBody.model_validate(orjson.loads(text)))
         except (orjson.JSONDecodeError, ValidationError):
             raise Invalid(
                 'datum must be LAT,LON or {"latitude": …, "longitude": …, "altitude"?, "heading"?} in degrees',

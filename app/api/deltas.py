@@ -35,7 +35,7 @@ class Deltas:
 
     def __init__(self, cache: Cache, room: int = 64 * 2**20) -> None:
         self._cache, self._room, self._size = cache, room, 0
-        self._known: OrderedDict[tuple[str, str], bytes | None] = OrderedDict()
+        self._cached: OrderedDict[tuple[str, str], bytes | None] = OrderedDict()
         self._running: SingleFlight[tuple[str, str], bytes | None] = SingleFlight()
         self._lock = threading.Lock()
 
@@ -44,9 +44,9 @@ class Deltas:
         delta is not smaller than the file."""
         key = (old, new)
         with self._lock:
-            if key in self._known:
-                self._known.move_to_end(key)
-                return self._known[key]
+            if key in self._cached:
+                self._cached.move_to_end(key)
+                return self._cached[key]
         return await self._running.run(key, self._between, key, body)
 
     def _between(self, key: tuple[str, str], body: bytes | CachedFile) -> bytes | None:
@@ -55,10 +55,10 @@ class Deltas:
             return None  # not remembered: it may be made (again) at any moment, and anybody can ask for any hash
         delta = _smaller(before, body if isinstance(body, bytes) else body.read(), bytes.fromhex(key[0]))
         with self._lock:
-            self._known[key] = delta
+            self._cached[key] = delta
             self._size += len(delta or b"") + 200
-            while self._size > self._room and len(self._known) > 1:
-                _, dropped = self._known.popitem(last=False)
+            while self._size > self._room and len(self._cached) > 1:
+                _, dropped = self._cached.popitem(last=False)
                 self._size -= len(dropped or b"") + 200
         return delta
 
@@ -83,7 +83,7 @@ def compress(before: bytes, after: bytes, digest: bytes) -> bytes:
     return MAGIC + digest + zstd.compress(after, options=options, zstd_dict=dictionary.as_prefix)
 
 
-def wanted(headers: Mapping[str, str]) -> str | None:
+def offered_dictionary(headers: Mapping[str, str]) -> str | None:
     """The SHA-256 (hex) of the file that a client offers as dictionary, if it takes ``dcz``."""
     header = headers.get("available-dictionary")
     if header is None:

@@ -101,8 +101,8 @@ class Services:
     ingest: Ingest
     maps: Maps
     access: Authenticator
-    work: ConversionJobs
-    hot: ResponseCache
+    jobs: ConversionJobs
+    response_cache: ResponseCache
     intake: UploadSpool
     metrics: Metrics
     keys: Keys

@@ -10,9 +10,17 @@ from starlette.responses import Response
 from app import derive, parameters
 from app.api.auth import Editor, Viewer
 from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import DerivationBody, DerivationOut, EnvironmentPath, IdempotencyKey, IfMatch, VersionOut, told
-from app.api.versions import told_as
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import (
+    DerivationBody,
+    DerivationOut,
+    EnvironmentPath,
+    IdempotencyKey,
+    IfMatch,
+    VersionOut,
+    problem_responses,
+)
+from app.api.versions import commit_response
 from app.catalogue import describe_derivations
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import DerivationRequest, online
@@ -33,17 +41,17 @@ def as_online() -> dict[str, Any]:
     }
 
 
-@router.get("/derivations", responses=told(list[DerivationOut]), summary="All derivations")
+@router.get("/derivations", responses=problem_responses(list[DerivationOut]), summary="All derivations")
 def list_derivations(services: ServicesDep, _: Viewer) -> Response:
     """What can be computed from what. Maps use them by themselves; their parameters go into a map's query."""
-    return answer(describe_derivations() + ([as_online()] if services.ingest.provider is not None else []))
+    return json_response(describe_derivations() + ([as_online()] if services.ingest.provider is not None else []))
 
 
 @router.post(
     "/environments/{env}/derivations",
     status_code=201,
     responses={
-        **told(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
+        **problem_responses(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
         200: {"model": VersionOut, "description": "Nothing changed: the head."},
     },
     summary="Compute a layer and commit it",
@@ -72,4 +80,4 @@ def create_derivation(
         if body.method in derive.all_derivations():
             raise
         raise Invalid(error.detail, [Problem("no such derivation", where="body.method")]) from None
-    return told_as(outcome)
+    return commit_response(outcome)

@@ -15,9 +15,9 @@ from starlette.responses import Response
 
 from app.api.auth import Viewer
 from app.api.dependencies import Services, ServicesDep
-from app.api.maps import number_of
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import VERSION, DiffOut, EnvironmentPath, told
+from app.api.maps import parse_version_ref
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import VERSION, DiffOut, EnvironmentPath, problem_responses
 from app.errors import Invalid
 from app.model.features import Features, features
 from app.model.frame import Anchor
@@ -42,7 +42,7 @@ FREED, BLOCKED, OTHER = (120, 200, 140), (225, 120, 120), (240, 205, 120)
 @router.get(
     "/diff",
     responses={
-        **told(DiffOut, 404),
+        **problem_responses(DiffOut, 404),
         200: {"model": DiffOut, "description": "What differs", "content": {"image/png": {}}},
     },
     summary="What differs between two versions",
@@ -65,9 +65,9 @@ def diff(
     ] = "json",
 ) -> Response:
     """By layer: ids added, changed (with the fields) and deleted; for grids how many cells were freed and blocked."""
-    new = services.store.version(env, number_of(to or "latest"))
+    new = services.store.version(env, parse_version_ref(to or "latest"))
     if from_ is not None:
-        old = services.store.version(env, number_of(from_))
+        old = services.store.version(env, parse_version_ref(from_))
     else:
         if new.parent is None:
             raise Invalid("version 0 has no parent to compare with: say 'from'")
@@ -75,7 +75,7 @@ def diff(
     if render == "png":
         return Response(_picture(services, old, new), media_type="image/png")
     layers = services.store.diff(old, new)
-    return answer({"from": old.number, "to": new.number, "layers": layers})
+    return json_response({"from": old.number, "to": new.number, "layers": layers})
 
 
 def _picture(services: Services, old: Version, new: Version) -> bytes:
@@ -84,8 +84,8 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
     groups: list[tuple[tuple[int, int, int], Features]] = []
     for changed in delta.features:
         deleted, was = (
-            _of(services, old, changed.key, changed.deleted),
-            _of(services, old, changed.key, changed.put.ids),
+            _select_features(services, old, changed.key, changed.deleted),
+            _select_features(services, old, changed.key, changed.put.ids),
         )
         old_ids = set(was.ids)
         moved = changed.put.take([k for k, i in enumerate(changed.put.ids) if i in old_ids])
@@ -98,7 +98,7 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
     degrees = frame is None and not grids and all(features.needs_datum for _, features in groups if len(features))
     drawn = [(colour, _shapes(features, frame, degrees)) for colour, features in groups]
     boxes = [shapely.total_bounds(shapes) for _, shapes in drawn if len(shapes)]
-    boxes += [_changed_box(a, b) for _, a, b in grids]
+    boxes += [_box_of_changes(a, b) for _, a, b in grids]
     boxes = [b for b in boxes if np.isfinite(b).all()]
     if not boxes:
         image = Image.new("RGB", (256, 64), "white")
@@ -119,7 +119,7 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
     return _png(image)
 
 
-def _of(services: Services, version: Version, key: PartKey, ids: tuple[str, ...]) -> Features:
+def _select_features(services: Services, version: Version, key: PartKey, ids: tuple[str, ...]) -> Features:
     """Those of the features that the version has."""
     return services.store.get(version, key, ids) if version.part(key) is not None else features((), "local")
 
@@ -148,7 +148,7 @@ def _grids(
     return out[0], out[1]
 
 
-def _same_frame(a: OccupancyGrid | None, b: OccupancyGrid | None) -> bool:
+def _is_same_frame(a: OccupancyGrid | None, b: OccupancyGrid | None) -> bool:
     return (
         a is not None
         and b is not None
@@ -158,9 +158,9 @@ def _same_frame(a: OccupancyGrid | None, b: OccupancyGrid | None) -> bool:
     )
 
 
-def _changed_box(a: OccupancyGrid | None, b: OccupancyGrid | None) -> NDArray[np.float64]:
+def _box_of_changes(a: OccupancyGrid | None, b: OccupancyGrid | None) -> NDArray[np.float64]:
     """Around the changed cells of a grid, or around both grids where their frames differ: [x0, y0, x1, y1]."""
-    if a is not None and b is not None and _same_frame(a, b):
+    if a is not None and b is not None and _is_same_frame(a, b):
         rows, columns = np.nonzero(a.cells != b.cells)
         if not len(rows):
             return np.full(4, np.nan)
@@ -228,7 +228,7 @@ class _Viewport:
         values = shown.cells[v[inside], u[inside]].astype(np.int64)
         grey = np.where(values > 100, 225, 250 - values)
         colours = np.repeat(grey[:, None], 3, axis=1).astype(np.uint8)
-        if a is not None and b is not None and _same_frame(a, b):
+        if a is not None and b is not None and _is_same_frame(a, b):
             was = a.cells[v[inside], u[inside]].astype(np.int64)
             differ = was != values
             for mask, colour in (

@@ -9,7 +9,7 @@ from starlette.responses import Response
 
 from app.api.auth import Admin, Editor, Principal, Viewer
 from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, answer, page, path_of
+from app.api.responses import StrictRoute, api_path, json_response, page_response
 from app.api.schemas import (
     RESERVED,
     Cursor,
@@ -20,7 +20,7 @@ from app.api.schemas import (
     EnvironmentPath,
     IfMatch,
     Limit,
-    told,
+    problem_responses,
 )
 from app.errors import Conflict, Gone, Invalid, NotFound, Problem
 from app.ingest.service import check_if_match
@@ -75,7 +75,7 @@ def numbers(text: str, parameter: str, names: str) -> tuple[float, ...]:
     return values
 
 
-def box_of(text: str, parameter: str = "bbox") -> Box:
+def parse_box(text: str, parameter: str = "bbox") -> Box:
     """West, south, east, north in degrees; west > east crosses the antimeridian."""
     west, south, east, north = numbers(text, parameter, "W,S,E,N")
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
@@ -86,7 +86,7 @@ def box_of(text: str, parameter: str = "bbox") -> Box:
     return west, south, east, north
 
 
-def position_of(text: str, parameter: str = "contains") -> tuple[float, float]:
+def parse_position(text: str, parameter: str = "contains") -> tuple[float, float]:
     """Latitude and longitude in degrees."""
     latitude, longitude = numbers(text, parameter, "LAT,LON")
     if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
@@ -97,7 +97,7 @@ def position_of(text: str, parameter: str = "contains") -> tuple[float, float]:
     return latitude, longitude
 
 
-def datum_of(body: DatumBody) -> Datum:
+def parse_datum(body: DatumBody) -> Datum:
     """The datum of a request."""
     return Datum(body.latitude, body.longitude, body.altitude, body.heading)
 
@@ -106,7 +106,7 @@ def _headers(environment: Environment) -> dict[str, str]:
     return {"etag": f'"{environment.head}"'}
 
 
-@router.get("", responses=told(list[EnvironmentOut]), summary="List environments")
+@router.get("", responses=problem_responses(list[EnvironmentOut]), summary="List environments")
 def list_environments(
     request: Request,
     services: ServicesDep,
@@ -135,8 +135,8 @@ def list_environments(
     cursor: Cursor = None,
 ) -> Response:
     """Environments by name, or the best match first with `contains`; those that the token reaches."""
-    position = None if contains is None else position_of(contains)
-    box = box_of(bbox) if bbox is not None else None
+    position = None if contains is None else parse_position(contains)
+    box = parse_box(bbox) if bbox is not None else None
     if position is not None:
         hits, following = services.store.locate(
             *position,
@@ -147,28 +147,28 @@ def list_environments(
             allowed=principal.environments,
             deleted=deleted,
         )
-        return page(request, [as_dict(e, match) for e, match in hits], following)
+        return page_response(request, [as_dict(e, match) for e, match in hits], following)
     items, following = services.store.environments(
         q=q or None, bbox=box, limit=limit, cursor=cursor, allowed=principal.environments, deleted=deleted
     )
-    return page(request, [as_dict(e) for e in items], following)
+    return page_response(request, [as_dict(e) for e in items], following)
 
 
 @router.post(
     "",
     status_code=201,
-    responses=told(EnvironmentOut, 400, 404, 409, 415, ok=201, description="Made"),
+    responses=problem_responses(EnvironmentOut, 400, 404, 409, 415, ok=201, description="Made"),
     summary="Make an environment",
 )
 def create_environment(body: EnvironmentBody, services: ServicesDep, principal: Admin) -> Response:
     """Empty (version 0), with a datum (version 1), or with the content of another one (version 1)."""
-    principal.enter(body.name)
+    principal.require_environment(body.name)
     _check_name(body.name)
     clone = None
     if body.clone is not None:
         if body.datum is not None:
             raise Invalid("a clone has the datum of what it is cloned from: give datum or clone, and PATCH it later")
-        principal.enter(body.clone.environment)
+        principal.require_environment(body.clone.environment)
         clone = services.store.version(body.clone.environment, body.clone.version)
     about(environment=body.name, target=f"environment {body.name}")
     environment = services.store.create_environment(
@@ -177,23 +177,25 @@ def create_environment(body: EnvironmentBody, services: ServicesDep, principal: 
         description=body.description,
         tags=tuple(body.tags),
         author=principal.name,
-        datum=datum_of(body.datum) if body.datum else None,
+        datum=parse_datum(body.datum) if body.datum else None,
         clone=clone,
     )
-    return answer(
-        as_dict(environment), 201, {"location": path_of("environments", environment.name), **_headers(environment)}
+    return json_response(
+        as_dict(environment), 201, {"location": api_path("environments", environment.name), **_headers(environment)}
     )
 
 
-@router.get("/{env}", responses=told(EnvironmentOut, 404), summary="One environment")
+@router.get("/{env}", responses=problem_responses(EnvironmentOut, 404), summary="One environment")
 def get_environment(env: EnvironmentPath, services: ServicesDep, _: Viewer) -> Response:
     """The environment as it is now; its `ETag` is the head's number, for `If-Match`."""
     environment = services.store.environment(env)
-    return answer(as_dict(environment), headers=_headers(environment))
+    return json_response(as_dict(environment), headers=_headers(environment))
 
 
 @router.patch(
-    "/{env}", responses=told(EnvironmentOut, 400, 404, 409, 412, 415), summary="Describe, rename, or set the datum"
+    "/{env}",
+    responses=problem_responses(EnvironmentOut, 400, 404, 409, 412, 415),
+    summary="Describe, rename, or set the datum",
 )
 def update_environment(
     env: EnvironmentPath, body: EnvironmentPatch, services: ServicesDep, principal: Editor, if_match: IfMatch = None
@@ -203,14 +205,14 @@ def update_environment(
     if not given:
         raise Invalid("there is nothing to change: give at least one of name, title, description, tags, datum")
     if set(given) != {"datum"}:
-        principal.demand("admin")
+        principal.require_role("admin")
     if if_match is not None:
         check_if_match(if_match, services.store.version(env))
     if body.name is not None and body.name != env:
         _check_free(services, body.name, principal)
     warnings: list[Any] = []
     if body.datum is not None:
-        outcome = services.ingest.set_datum(env, datum_of(body.datum), author=principal.name, if_match=if_match)
+        outcome = services.ingest.set_datum(env, parse_datum(body.datum), author=principal.name, if_match=if_match)
         warnings = outcome.body.get("warnings", []) if outcome.status == "created" else []
     if set(given) != {"datum"}:
         environment = services.store.update_environment(
@@ -223,25 +225,25 @@ def update_environment(
         )
     else:
         environment = services.store.environment(env)
-    headers = {**_headers(environment), "content-location": path_of("environments", environment.name)}
-    return answer({**as_dict(environment), **({"warnings": warnings} if warnings else {})}, headers=headers)
+    headers = {**_headers(environment), "content-location": api_path("environments", environment.name)}
+    return json_response({**as_dict(environment), **({"warnings": warnings} if warnings else {})}, headers=headers)
 
 
-@router.delete("/{env}", status_code=204, responses=told(None, 404), summary="Delete an environment")
+@router.delete("/{env}", status_code=204, responses=problem_responses(None, 404), summary="Delete an environment")
 def delete_environment(env: EnvironmentPath, services: ServicesDep, principal: Admin) -> Response:
     """It can be restored until it is purged; its name stays taken until then."""
     services.store.delete_environment(env, principal.name)
     return Response(status_code=204)
 
 
-@router.post("/{env}/restore", responses=told(EnvironmentOut, 404, 409), summary="Undo a deletion")
+@router.post("/{env}/restore", responses=problem_responses(EnvironmentOut, 404, 409), summary="Undo a deletion")
 def restore_environment(env: EnvironmentPath, services: ServicesDep, principal: Admin) -> Response:
     """A deleted environment comes back with all its versions and channels."""
     environment = services.store.restore_environment(env, principal.name)
-    return answer(as_dict(environment), headers=_headers(environment))
+    return json_response(as_dict(environment), headers=_headers(environment))
 
 
-@router.post("/{env}/purge", status_code=204, responses=told(None, 404, 409), summary="Remove for good")
+@router.post("/{env}/purge", status_code=204, responses=problem_responses(None, 404, 409), summary="Remove for good")
 def purge_environment(env: EnvironmentPath, services: ServicesDep, _: Admin) -> Response:
     """Removes a deleted environment with all its versions for good; only then its name is free again."""
     services.store.purge_environment(env)
@@ -255,7 +257,7 @@ def _check_name(name: str) -> None:
 
 def _check_free(services: Services, name: str, principal: Principal) -> None:
     """Before anything else of a PATCH is done: the new name can be had."""
-    principal.enter(name)
+    principal.require_environment(name)
     _check_name(name)
     try:
         services.store.environment(name, deleted=True)

@@ -20,12 +20,12 @@ from starlette.responses import Response, StreamingResponse
 
 from app.api.auth import Authenticator, Principal, Viewer
 from app.api.dependencies import Services, ServicesDep
-from app.api.environments import as_dict, position_of
-from app.api.maps import closure_mode, number_of
+from app.api.environments import as_dict, parse_position
+from app.api.maps import closure_mode, parse_version_ref
 from app.api.problems import Throttled
 from app.api.protocol import ON_STOP
 from app.api.responses import StrictRoute
-from app.api.schemas import told
+from app.api.schemas import problem_responses
 from app.api.single_flight import SingleFlight
 from app.convert.cache import CachedFile
 from app.convert.maps import file_of
@@ -34,7 +34,7 @@ from app.events import messages
 from app.events.bus import DeferredReply, Reply
 from app.store.values import Event
 
-LOOK_SECONDS = 0.02
+COMMIT_POLL_SECONDS = 0.02
 """How often a stream looks at the host's generation number."""
 
 POLL_SECONDS = 1.0
@@ -65,8 +65,8 @@ class EventFeed:
     """Who listens at this moment: all wait for one look at the store."""
 
     def __init__(self, services: Services) -> None:
-        self._here = services
-        self._looks: SingleFlight[tuple[str | None, int, int], list[StreamEvent]] = SingleFlight()
+        self._services = services
+        self._poll_task: SingleFlight[tuple[str | None, int, int], list[StreamEvent]] = SingleFlight()
         self._checks: SingleFlight[tuple[bytes | None, str | None, int], Principal] = SingleFlight()
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
@@ -76,7 +76,7 @@ class EventFeed:
     async def wait(self, seconds: float) -> None:
         """Until something was committed, at most this long."""
         if self._task is None or self._task.done():
-            self._task = asyncio.create_task(self._look())
+            self._task = asyncio.create_task(self._read_counter())
         changed = self._changed
         try:
             async with asyncio.timeout(seconds):
@@ -86,33 +86,33 @@ class EventFeed:
 
     async def events(self, environment: str | None, start: int) -> list[StreamEvent]:
         """The next events after a place; all who stand there share a look. NotFound, Unavailable."""
-        key = (environment, start, self._here.store.generation())
-        return await self._looks.run(key, self._read, environment, start)
+        key = (environment, start, self._services.store.generation())
+        return await self._poll_task.run(key, self._read, environment, start)
 
     def _read(self, environment: str | None, start: int) -> list[StreamEvent]:
         out = []
-        for event in self._here.store.events(environment, start, PAGE):
+        for event in self._services.store.events(environment, start, PAGE):
             number = event.sequence if environment is not None else event.position
             out.append(StreamEvent(number, event.environment, _line(event, number)))
         return out
 
     async def check(self, header: bytes | None, client: str | None) -> None:
         """Look a token up: Unauthenticated, Throttled, Unavailable."""
-        key = (header, client, self._here.store.generation())
-        await self._checks.run(key, self._here.access.check, header, client)
+        key = (header, client, self._services.store.generation())
+        await self._checks.run(key, self._services.access.authenticate, header, client)
 
-    def end(self) -> None:
+    def close(self) -> None:
         """The server stops: streams end, and begin again where it is back."""
         self.ending = True
         self._changed.set()
 
-    async def _look(self) -> None:
-        seen = self._here.store.generation()
+    async def _read_counter(self) -> None:
+        seen = self._services.store.generation()
         last = 0.0
         while self.streams:
-            await asyncio.sleep(LOOK_SECONDS)
-            last += LOOK_SECONDS
-            now = self._here.store.generation()
+            await asyncio.sleep(COMMIT_POLL_SECONDS)
+            last += COMMIT_POLL_SECONDS
+            now = self._services.store.generation()
             if now != seen or last > POLL_SECONDS:
                 seen, last = now, 0.0
                 self._changed.set()
@@ -123,7 +123,7 @@ class EventFeed:
     "/events",
     response_class=Response,
     responses={
-        **told(None, 404, 503),
+        **problem_responses(None, 404, 503),
         200: {"description": "A stream that does not end", "content": {"text/event-stream": {}}},
     },
     summary="Events as they happen",
@@ -144,29 +144,29 @@ async def stream_events(
 ) -> Response:
     """Server-sent events: `event` is the type, `data` the JSON, `id` what to resume from."""
     if environment is not None:
-        principal.enter(environment)
+        principal.require_environment(environment)
     start = since
     if last_event_id is not None and last_event_id.strip():
         text = last_event_id.strip()
         if not (text.isascii() and text.isdigit() and len(text) <= 18):
             raise Invalid("Last-Event-ID is a number from an event's id", [Problem("not a number", where="id")])
         start = int(text)
-    start = await run_in_threadpool(_begin, services, environment, start)  # NotFound comes before the stream
+    start = await run_in_threadpool(_start_position, services, environment, start)  # NotFound comes before the stream
     feed: EventFeed = request.app.state.feed
     if feed.streams >= STREAMS:
         raise Unavailable("too many streams of events are open: close some, or poll with follow=false")
     headers = {"cache-control": "no-store", "x-accel-buffering": "no", "x-content-type-options": "nosniff"}
     state = request.scope["state"]
     if state.get("head"):
-        return StreamingResponse(_nothing(), media_type="text/event-stream", headers=headers)
-    state[ON_STOP] = feed.end
+        return StreamingResponse(_empty_stream(), media_type="text/event-stream", headers=headers)
+    state[ON_STOP] = feed.close
     client = request.client.host if request.client else None
     bearer = _StreamAuth(services.access, feed, principal, request.headers.get("authorization"), client)
     stream = _stream(feed, bearer, environment, start, follow=follow)
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
-def _begin(services: Services, environment: str | None, start: int | None) -> int:
+def _start_position(services: Services, environment: str | None, start: int | None) -> int:
     """Where a stream begins; without a start with what happens from now on.
 
     NotFound for an environment that is not there, unless its end is still to be told. Invalid for a place that the log
@@ -185,7 +185,7 @@ def _begin(services: Services, environment: str | None, start: int | None) -> in
     return newest if start is None else start
 
 
-async def _nothing() -> AsyncIterator[bytes]:
+async def _empty_stream() -> AsyncIterator[bytes]:
     """What is left of a stream whose head alone is asked for."""
     lines: tuple[bytes, ...] = ()
     for line in lines:
@@ -198,25 +198,25 @@ class _StreamAuth:
     def __init__(
         self, access: Authenticator, feed: EventFeed, principal: Principal, header: str | None, client: str | None
     ) -> None:
-        self.who = principal
+        self.principal = principal
         self._access, self._feed, self._client = access, feed, client
         self._header = None if header is None else header.encode("latin-1")
-        self._forgotten, self._checked = access.forgotten, time.monotonic()
+        self._invalidated_at, self._checked = access.is_invalidated, time.monotonic()
 
-    async def stands(self) -> bool:
+    async def is_valid(self) -> bool:
         """Raises Unavailable where that cannot be known at this moment."""
         if self._access.insecure:
             return True
-        if self.who.expires is not None and self.who.expires <= datetime.now(UTC):
+        if self.principal.expires is not None and self.principal.expires <= datetime.now(UTC):
             return False
-        forgotten, now = self._access.forgotten, time.monotonic()
-        if forgotten == self._forgotten and now - self._checked < RECHECK_SECONDS:
+        forgotten, now = self._access.is_invalidated, time.monotonic()
+        if forgotten == self._invalidated_at and now - self._checked < RECHECK_SECONDS:
             return True
         try:
             await self._feed.check(self._header, self._client)
         except (Unauthenticated, Throttled):
             return False
-        self._forgotten, self._checked = forgotten, now
+        self._invalidated_at, self._checked = forgotten, now
         return True
 
 
@@ -231,7 +231,7 @@ async def _stream(
         while True:
             try:
                 page = await feed.events(environment, start)
-                if not await bearer.stands():
+                if not await bearer.is_valid():
                     return
             except Unavailable:  # the log is still there when the database is back
                 yield b": the database is away\n\n"
@@ -243,7 +243,7 @@ async def _stream(
                 return  # purged: whoever asks again is told so
             for event in page:
                 start = event.number
-                if bearer.who.may_enter(event.environment):  # it may have had another name then
+                if bearer.principal.can_access(event.environment):  # it may have had another name then
                     yield event.line
             if page:
                 quiet = 0.0
@@ -264,7 +264,7 @@ def _line(event: Event, number: int) -> bytes:
     return b"id: %d\nevent: %s\ndata: %s\n\n" % (number, str(event.body["type"]).encode(), orjson.dumps(event.body))
 
 
-def ask(
+def answer_zenoh_query(
     services: Services, max_bytes: int, environment: str, rest: str, parameters: Mapping[str, str]
 ) -> Reply | DeferredReply:
     """What HTTP answers at ``/environments/{environment}/versions/{rest}``: ``{v}/version``, ``{v}/maps/{format}/…``;
@@ -276,7 +276,7 @@ def ask(
         return _locate(services, parameters)
     pieces = rest.split("/")
     if pieces[1:] == ["version"]:
-        version = services.store.version(environment, number_of(pieces[0]))
+        version = services.store.version(environment, parse_version_ref(pieces[0]))
         _no_parameters(parameters)
         return Reply(orjson.dumps(version.as_dict()), "application/json")
     if len(pieces) < 3 or pieces[1] != "maps":
@@ -286,13 +286,15 @@ def ask(
     if derive not in ("true", "false"):
         raise Invalid("derive must be true or false", [Problem("true or false", where="derive")])
     mode = closure_mode(values.pop("closures", None))
-    version, _ = services.store.standing(environment, number_of(pieces[0]), mode)
+    version, _ = services.store.standing(environment, parse_version_ref(pieces[0]), mode)
     name, file = pieces[2], "/".join(pieces[3:]) or None
     recipe = services.maps.recipe(version, name, values, derive=derive == "true", file=file)
     cached_map = services.maps.ready(recipe)
     if cached_map is not None:
-        return _answer_of(file_of(recipe, cached_map, file), max_bytes)
-    return lambda: _answer_of(services.maps.fetch(version, name, values, derive=derive == "true", file=file), max_bytes)
+        return _reply_from(file_of(recipe, cached_map, file), max_bytes)
+    return lambda: _reply_from(
+        services.maps.fetch(version, name, values, derive=derive == "true", file=file), max_bytes
+    )
 
 
 def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
@@ -304,11 +306,11 @@ def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
             "a position needs lat and lon in degrees and nothing else: server/where?lat=53.2687;lon=-0.5244",
             [Problem("lat and lon", where="parameters")],
         )
-    hits, _ = services.store.locate(*position_of(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
+    hits, _ = services.store.locate(*parse_position(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
     return Reply(orjson.dumps([as_dict(environment, match) for environment, match in hits]), "application/json")
 
 
-def _answer_of(file: CachedFile, max_bytes: int) -> Reply:
+def _reply_from(file: CachedFile, max_bytes: int) -> Reply:
     if file.size > max_bytes:
         raise TooLarge(f"the map has {file.size} bytes, more than is sent over Zenoh ({max_bytes}): fetch it over HTTP")
     return Reply(file.read(), file.media_type)

@@ -8,26 +8,34 @@ from starlette.responses import Response
 from app import generate
 from app.api.auth import Editor, Viewer
 from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import EnvironmentPath, GenerationBody, GeneratorOut, IdempotencyKey, IfMatch, VersionOut, told
-from app.api.versions import told_as
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import (
+    EnvironmentPath,
+    GenerationBody,
+    GeneratorOut,
+    IdempotencyKey,
+    IfMatch,
+    VersionOut,
+    problem_responses,
+)
+from app.api.versions import commit_response
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import GenerationRequest
 
 router = APIRouter(tags=["generations"], route_class=StrictRoute)
 
 
-@router.get("/generators", responses=told(list[GeneratorOut]), summary="All generators")
+@router.get("/generators", responses=problem_responses(list[GeneratorOut]), summary="All generators")
 def list_generators(_: Viewer) -> Response:
     """What can be made up, and with which parameters."""
-    return answer([generator.as_dict() for generator in generate.all_generators().values()])
+    return json_response([generator.as_dict() for generator in generate.all_generators().values()])
 
 
 @router.post(
     "/environments/{env}/generations",
     status_code=201,
     responses={
-        **told(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
+        **problem_responses(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
         200: {"model": VersionOut, "description": "Nothing changed: the head."},
     },
     summary="Make up a site and commit it",
@@ -53,4 +61,4 @@ def create_generation(
         if body.generator in generate.all_generators():
             raise
         raise Invalid(error.detail, [Problem("no such generator", where="body.generator")]) from None
-    return told_as(outcome)
+    return commit_response(outcome)

@@ -13,8 +13,8 @@ from starlette.responses import Response
 from app.api.auth import ServerViewer
 from app.api.dependencies import Services, ServicesDep
 from app.api.metrics import CONTENT_TYPE
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import told
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import problem_responses
 from app.errors import Unavailable
 from app.events import ros2
 from app.events.relay import state_of
@@ -30,7 +30,7 @@ _ANY = ("0.0.0.0", "[::]", "*")  # noqa: S104  nothing is bound here
 _LOOPBACK = ("127.0.0.1", "[::1]", "localhost")
 
 
-def router_for(advertised: str, listen: str, host: str) -> str:
+def advertised_router(advertised: str, listen: str, host: str) -> str:
     """Endpoints of the router for who has reached this server under ``host``, separated by commas; may be empty.
 
     A router on a loopback address is told only to who has come over one, unless the operator says so.
@@ -56,10 +56,10 @@ def router_for(advertised: str, listen: str, host: str) -> str:
 @router.get("/healthz", summary="Alive")
 async def healthz() -> Response:
     """Answers as long as the process does, whatever the database and the conversions do."""
-    return answer({"status": "ok"})
+    return json_response({"status": "ok"})
 
 
-@router.get("/readyz", responses=told(None, 422, 503), summary="Ready")
+@router.get("/readyz", responses=problem_responses(None, 422, 503), summary="Ready")
 async def readyz(
     request: Request,
     for_: Literal["reads", "writes"] = Query(
@@ -88,7 +88,7 @@ async def readyz(
     events = state_of(services.options.data_dir, services.options.zenoh_mode)
     if services.options.zenoh_mode != "off":
         options = services.options
-        endpoint = router_for(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
+        endpoint = advertised_router(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
         events = {**events, "prefix": options.zenoh_prefix, **({"connect": endpoint} if endpoint else {})}
     topics = {"ros2": ros2.state_of(services.options.data_dir)} if services.options.ros2 else {}
     state = {
@@ -99,7 +99,7 @@ async def readyz(
         "writes": refusal or "ok",
         "cache": services.maps.cache.problem or "ok",
     }
-    return answer({**state, "events": events, **topics})
+    return json_response({**state, "events": events, **topics})
 
 
 @router.get(
@@ -110,7 +110,7 @@ async def readyz(
 )
 async def metrics(services: ServicesDep, _: ServerViewer) -> Response:
     """Requests, conversions, cache hits, heads. Takes a token for all environments."""
-    services.hot.count()
+    services.response_cache.flush_counters()
     response = Response(await run_in_threadpool(services.metrics.render, services.store))
     response.headers["content-type"] = CONTENT_TYPE
     return response

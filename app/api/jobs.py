@@ -19,8 +19,8 @@ from starlette.responses import Response
 from app.api import problems
 from app.api.auth import Principal, Viewer
 from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, answer, path_of
-from app.api.schemas import JobOut, JobPath, Limit, told
+from app.api.responses import StrictRoute, api_path, json_response
+from app.api.schemas import JobOut, JobPath, Limit, problem_responses
 from app.convert.cache import CachedMap
 from app.convert.maps import Maps
 from app.convert.recipe import Recipe
@@ -31,9 +31,9 @@ from app.store.values import Job, State, rfc3339
 
 log = logging.getLogger(__name__)
 
-AT_ONCE = 32
-WAITING = 256
-BEAT_SECONDS = 5.0
+MAX_CONCURRENT_CONVERSIONS = 32
+MAX_QUEUED_CONVERSIONS = 256
+HEARTBEAT_SECONDS = 5.0
 LOST_AFTER = timedelta(seconds=60)
 """A job that nobody has touched for this long belonged to a process that is no more."""
 
@@ -47,11 +47,11 @@ class JobStarted:
 
 @dataclass(slots=True)
 class _RunningConversion:
-    """A map in the making. asking: requests that wait for it. jobs: principal's id -> job id."""
+    """A map in the making. waiters: requests that wait for it. jobs: principal's id -> job id."""
 
     future: asyncio.Future[CachedMap]
     stop: CancelHandle
-    asking: int = 0
+    waiters: int = 0
     jobs: dict[str, str] = field(default_factory=dict)
 
 
@@ -62,10 +62,10 @@ class ConversionJobs:
         self._store, self._maps, self._seconds, self._count = store, maps, seconds, count
         self._running: dict[str, _RunningConversion] = {}
         self._lock = threading.Lock()
-        self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fleetmap-make")
+        self._threads = ThreadPoolExecutor(MAX_CONCURRENT_CONVERSIONS, thread_name_prefix="fleetmap-make")
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def make(self, recipe: Recipe, principal: Principal, address: str) -> CachedMap | JobStarted:
+    async def get_or_start(self, recipe: Recipe, principal: Principal, address: str) -> CachedMap | JobStarted:
         """The map, or after ``seconds`` the job that will end with it. address: where the finished map is had.
 
         Raises what making raises; Unavailable where too much is being made.
@@ -73,10 +73,10 @@ class ConversionJobs:
         with self._lock:  # held for a moment only: whoever comes to a map keeps it from being stopped
             running = self._running.get(recipe.key)
             if running is None:
-                if len(self._running) >= AT_ONCE + WAITING:
+                if len(self._running) >= MAX_CONCURRENT_CONVERSIONS + MAX_QUEUED_CONVERSIONS:
                     raise Unavailable("too many maps are being made: try again in a few seconds")
-                running = self._begin(recipe)
-            running.asking += 1
+                running = self._start(recipe)
+            running.waiters += 1
         try:
             done, _ = await asyncio.wait({running.future}, timeout=self._seconds)
             if done:
@@ -90,7 +90,7 @@ class ConversionJobs:
                 return await asyncio.shield(running.future)
         finally:
             with self._lock:
-                running.asking -= 1
+                running.waiters -= 1
 
     def cancel(self, job: str) -> bool:
         """Stop the making that a job waits for, unless others wait for it too: whether it was of this process."""
@@ -100,20 +100,20 @@ class ConversionJobs:
                 if owner is None:
                     continue
                 del running.jobs[owner]
-                if not running.jobs and not running.asking:
+                if not running.jobs and not running.waiters:
                     running.stop()
                     del self._running[key]  # who asks from now on begins anew
                 return True
         return False
 
-    def _begin(self, recipe: Recipe) -> _RunningConversion:
+    def _start(self, recipe: Recipe) -> _RunningConversion:
         stop = CancelHandle()
         future = asyncio.get_running_loop().run_in_executor(self._threads, self._maps.make, recipe, stop)
         running = self._running[recipe.key] = _RunningConversion(future, stop)
-        future.add_done_callback(lambda _: self._finished(recipe, running))
+        future.add_done_callback(lambda _: self._on_done(recipe, running))
         return running
 
-    def beat(self) -> None:
+    def send_heartbeats(self) -> None:
         """Show that the jobs of this process are alive, and stop those that were cancelled elsewhere. Blocks."""
         with self._lock:
             jobs = [job for running in self._running.values() for job in running.jobs.values()]
@@ -137,14 +137,14 @@ class ConversionJobs:
         async def follow() -> None:
             await asyncio.wait({running.future})
             if not running.future.cancelled():
-                await run_in_threadpool(self._end, job.id, running.future.exception(), label, address)
+                await run_in_threadpool(self._finish_job, job.id, running.future.exception(), label, address)
 
         task = asyncio.create_task(follow())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return job
 
-    def _end(self, job: str, error: BaseException | None, label: str, address: str) -> None:
+    def _finish_job(self, job: str, error: BaseException | None, label: str, address: str) -> None:
         try:
             if self._store.job(job).state == "cancelled":
                 return
@@ -166,7 +166,7 @@ class ConversionJobs:
         except FleetMapError as error:
             log.warning("a job could not be kept alive: %s", error.detail)
 
-    def _finished(self, recipe: Recipe, running: _RunningConversion) -> None:
+    def _on_done(self, recipe: Recipe, running: _RunningConversion) -> None:
         with self._lock:
             if self._running.get(recipe.key) is running:
                 del self._running[recipe.key]
@@ -200,23 +200,23 @@ def as_dict(job: Job) -> dict[str, Any]:
     return {**out, "created": rfc3339(job.created), "updated": rfc3339(job.updated)}
 
 
-def started(job: Job) -> Response:
+def job_started_response(job: Job) -> Response:
     """The answer 202 of a call that became a job."""
-    return answer(as_dict(job), 202, {"location": path_of("jobs", job.id), "retry-after": "2"})
+    return json_response(as_dict(job), 202, {"location": api_path("jobs", job.id), "retry-after": "2"})
 
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=StrictRoute)
 
 
-def _mine(services: ServicesDep, principal: Principal, id: str) -> Job:
+def _require_job_owner(services: ServicesDep, principal: Principal, id: str) -> Job:
     """A job that the caller may see; NotFound for all others, as if there were none."""
     job = services.store.job(id)
-    if job.owner != principal.id and not (principal.can("admin") and principal.environments is None):
+    if job.owner != principal.id and not (principal.has_role("admin") and principal.environments is None):
         raise NotFound(f"there is no job {id[:80]!r}")
     return job
 
 
-@router.get("", responses=told(list[JobOut]), summary="List jobs")
+@router.get("", responses=problem_responses(list[JobOut]), summary="List jobs")
 def list_jobs(
     services: ServicesDep,
     principal: Viewer,
@@ -227,26 +227,26 @@ def list_jobs(
     every = principal.role == "admin" and principal.environments is None
     visible_jobs = (job for job in reversed(services.store.jobs()) if every or job.owner == principal.id)
     bodies = (body for body in map(as_dict, visible_jobs) if state in (None, body["state"]))
-    return answer(list(itertools.islice(bodies, limit)))
+    return json_response(list(itertools.islice(bodies, limit)))
 
 
-@router.get("/{id}", responses=told(JobOut, 404), summary="How far a job is")
+@router.get("/{id}", responses=problem_responses(JobOut, 404), summary="How far a job is")
 def get_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
     """A job of the own token; an administrator of all environments sees all. ``result.location`` is where a
     finished map is had.
     """
-    return answer(as_dict(_mine(services, principal, id)))
+    return json_response(as_dict(_require_job_owner(services, principal, id)))
 
 
-@router.delete("/{id}", status_code=204, responses=told(None, 404), summary="Cancel or forget a job")
+@router.delete("/{id}", status_code=204, responses=problem_responses(None, 404), summary="Cancel or forget a job")
 def delete_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
     """Cancels a job that runs: the work is stopped, unless somebody else waits for it too. Forgets one that has
     ended.
     """
-    job = _mine(services, principal, id)
+    job = _require_job_owner(services, principal, id)
     if as_dict(job)["state"] in ("queued", "running"):
         services.store.update_job(id, state="cancelled", detail="cancelled")
-        services.work.cancel(id)  # where another process is at it, that one notices within seconds
+        services.jobs.cancel(id)  # where another process is at it, that one notices within seconds
     else:
         services.store.delete_job(id)
     return Response(status_code=204)

@@ -20,11 +20,11 @@ from starlette.responses import Response
 from app.api.auth import Viewer
 from app.api.caching import none_match
 from app.api.dependencies import Services, ServicesDep
-from app.api.environments import box_of, numbers
-from app.api.maps import number_of
+from app.api.environments import numbers, parse_box
+from app.api.maps import parse_version_ref
 from app.api.problems import NotAcceptable
-from app.api.responses import StrictRoute, answer, json_bytes
-from app.api.schemas import EnvironmentPath, LayerOut, LayerPath, VersionPath, told
+from app.api.responses import StrictRoute, json_bytes, json_response
+from app.api.schemas import EnvironmentPath, LayerOut, LayerPath, VersionPath, problem_responses
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
 from app.model.features import Features
 from app.model.frame import GROUND, MAX_METRES, Anchor
@@ -68,18 +68,18 @@ def entry_dict(entry: PartEntry) -> dict[str, Any]:
     }
 
 
-@router.get("", responses=told(list[LayerOut], 404), summary="What a version holds")
+@router.get("", responses=problem_responses(list[LayerOut], 404), summary="What a version holds")
 def list_layers(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """Every part: layer, level and name, how much it holds, where, and where it comes from."""
-    version = services.store.version(env, number_of(v))
-    return answer([entry_dict(entry) for entry in version.parts if entry.key.layer != "resources"])
+    version = services.store.version(env, parse_version_ref(v))
+    return json_response([entry_dict(entry) for entry in version.parts if entry.key.layer != "resources"])
 
 
 @router.get(
     "/{layer}",
     response_class=Response,
     responses={
-        **told(None, 404, 406, 409, 422),
+        **problem_responses(None, 404, 406, 409, 422),
         200: {
             "description": "The content",
             "content": {
@@ -110,7 +110,7 @@ def get_layer(
     `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`; `voxels` are JSON (`counts` in
     smallest voxels, however leaves were merged), or the `.bt` with `Accept: application/octet-stream`.
     """
-    version = services.store.version(env, number_of(v))
+    version = services.store.version(env, parse_version_ref(v))
     accept = request.headers.get("accept", "*/*")
     seed = [version.root, layer, level, name, bbox, crs, accept]
     etag = f'"{hashlib.sha256(json_bytes(seed)).hexdigest()[:32]}"'
@@ -128,7 +128,7 @@ def get_layer(
     else:
         if crs == "wgs84" and version.datum is None:
             raise _no_datum(env)
-        key = _one(version, layer, level, name)
+        key = _select_part(version, layer, level, name)
         if layer == "voxels":
             response = _voxels(services, version, key, _local_box(version, bbox, crs), accept)
         elif layer == "occupancy":
@@ -161,9 +161,9 @@ def _vector(
     accept: str,
 ) -> Response:
     _choose(accept, GEOJSON, "application/json")
-    keys = _fitting(version, layer, level, name)
+    keys = _fit_to_size(version, layer, level, name)
     if not keys and (level is not None or name is not None):
-        raise _none(version, layer, level, name)
+        raise _no_such_part_error(version, layer, level, name)
     frame = local_frame(version.datum) if version.datum else None
     parts = [(key, services.store.features(version, key, bbox=box, crs=crs)) for key in keys]
     if frame is None and any(len(part) and bool((part.local != (crs == "local")).any()) for _, part in parts):
@@ -192,7 +192,7 @@ def feature_collection(
     datum = version.datum.as_dict() if version.datum else None
     for key, part in parts:
         geometry = part.in_local(frame) if local else part.in_wgs84(frame)
-        shapes = geojson_of(geometry, 9 if local else 12)
+        shapes = geometries_as_geojson(geometry, 9 if local else 12)
         for k, (item, properties) in enumerate(zip(part.ids, part.properties, strict=True)):
             feature: dict[str, Any] = {"type": "Feature", "id": item}
             if local:
@@ -226,7 +226,7 @@ def _datum_within(version: Version, box: Box, crs: Anchor) -> bool:
     return across and box[1] <= y <= box[3]
 
 
-def geojson_of(geometry: NDArray[np.object_], digits: int) -> list[orjson.Fragment | None]:
+def geometries_as_geojson(geometry: NDArray[np.object_], digits: int) -> list[orjson.Fragment | None]:
     """Each geometry as GeoJSON, rounded; None for those without coordinates."""
     if not len(geometry):
         return []
@@ -250,10 +250,10 @@ def geojson_of(geometry: NDArray[np.object_], digits: int) -> list[orjson.Fragme
 def _grid(key: PartKey, grid: OccupancyGrid, box: Box | None, accept: str) -> Response:
     kind = _choose(accept, "image/png", "application/json")
     if box is not None:
-        grid = cut(grid, box)
+        grid = crop_grid(grid, box)
     if kind == "image/png":
         return Response(png(np.flipud(grid.cells)), media_type=kind)
-    return answer(
+    return json_response(
         {
             "name": key.name,
             "level": key.level,
@@ -266,7 +266,7 @@ def _grid(key: PartKey, grid: OccupancyGrid, box: Box | None, accept: str) -> Re
     )
 
 
-def cut(grid: OccupancyGrid, box: Box) -> OccupancyGrid:
+def crop_grid(grid: OccupancyGrid, box: Box) -> OccupancyGrid:
     """The smallest part of a grid that holds all its cells meeting a local box; Invalid where there are none."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
@@ -316,7 +316,7 @@ def _voxels(services: Services, version: Version, key: PartKey, box: Box | None,
         if not len(part):
             raise NotFound("the bbox lies outside of the voxel map")
     bounds = part.bounds()
-    return answer(
+    return json_response(
         {
             "name": key.name,
             "level": key.level,
@@ -333,7 +333,7 @@ def _picture(key: PartKey, picture: GeoImage, accept: str) -> Response:
     kind = _choose(accept, "image/png", "application/json")
     height, width, bands = picture.pixels.shape
     if kind == "application/json":
-        return answer(
+        return json_response(
             {
                 "name": key.name,
                 "level": key.level,
@@ -354,16 +354,16 @@ def _picture(key: PartKey, picture: GeoImage, accept: str) -> Response:
 # --- choosing ---
 
 
-def _fitting(version: Version, layer: Layer, level: str | None, name: str | None) -> list[PartKey]:
+def _fit_to_size(version: Version, layer: Layer, level: str | None, name: str | None) -> list[PartKey]:
     keys = (entry.key for entry in version.parts)
     return sorted(k for k in keys if k.layer == layer and level in (None, k.level) and name in (None, k.name))
 
 
-def _one(version: Version, layer: Layer, level: str | None, name: str | None) -> PartKey:
+def _select_part(version: Version, layer: Layer, level: str | None, name: str | None) -> PartKey:
     """The part that is meant: the named one, else ``map``, else the only one; Ambiguous names the choices."""
-    keys = _fitting(version, layer, level, name)
+    keys = _fit_to_size(version, layer, level, name)
     if not keys:
-        raise _none(version, layer, level, name)
+        raise _no_such_part_error(version, layer, level, name)
     usual = [k for k in keys if k.name == MAP] if name is None else keys
     if len(keys) == 1 or len(usual) == 1:
         return keys[0] if len(keys) == 1 else usual[0]
@@ -377,7 +377,7 @@ def _one(version: Version, layer: Layer, level: str | None, name: str | None) ->
     )
 
 
-def _none(version: Version, layer: Layer, level: str | None, name: str | None) -> NotFound:
+def _no_such_part_error(version: Version, layer: Layer, level: str | None, name: str | None) -> NotFound:
     existing_names = [f"{e.key.name} (level {e.key.level})" for e in version.parts if e.key.layer == layer]
     selection = " ".join(f"{k}={t!r}" for k, t in (("level", level), ("name", name)) if t is not None)
     description = f"{layer} {selection}".strip()
@@ -395,7 +395,7 @@ def _box(text: str | None, crs: Anchor) -> Box | None:
     if text is None:
         return None
     if crs == "wgs84":
-        return box_of(text)
+        return parse_box(text)
     x0, y0, x1, y1 = numbers(text, "bbox", "X0,Y0,X1,Y1")
     if not (x0 <= x1 and y0 <= y1 and max(map(abs, (x0, y0, x1, y1))) <= MAX_METRES):
         raise Invalid("bbox must be X0,Y0,X1,Y1 in metres, the smaller ones first", [Problem("range", where="bbox")])
@@ -408,7 +408,7 @@ def _local_box(version: Version, text: str | None, crs: Anchor | None) -> Box | 
         anchor: Anchor = "wgs84" if crs is None and version.datum else "local"
         if text is None or anchor == "local":
             return _box(text, "local")
-    west, south, east, north = box_of(text)
+    west, south, east, north = parse_box(text)
     assert version.datum is not None
     east += 360.0 if east < west else 0.0
     edge = np.linspace(0.0, 1.0, 9)

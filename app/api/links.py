@@ -11,10 +11,10 @@ from starlette.responses import Response
 
 from app.api.auth import Principal, Viewer
 from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, started
-from app.api.maps import MapRequest, made_at, number_of
-from app.api.responses import API, StrictRoute, answer
-from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, told
+from app.api.jobs import JobStarted, job_started_response
+from app.api.maps import MapRequest, convert_at_address, parse_version_ref
+from app.api.responses import API, StrictRoute, json_response
+from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, problem_responses
 from app.api.signed import Grant
 from app.convert.cache import CachedFile
 from app.convert.maps import file_of
@@ -28,7 +28,7 @@ router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], rou
     "/links",
     status_code=201,
     responses={
-        **told(LinkOut, 400, 404, 409, 415, ok=201, description="The link"),
+        **problem_responses(LinkOut, 400, 404, 409, 415, ok=201, description="The link"),
         202: {"description": "The map takes long: follow the job at `Location`, then ask again."},
     },
     summary="Create a signed link to a map",
@@ -43,11 +43,11 @@ async def create_link(
     link.
     """
     services.links.check_life(body.seconds)
-    version = await run_in_threadpool(services.store.version, env, number_of(v))
+    version = await run_in_threadpool(services.store.version, env, parse_version_ref(v))
     values = {name: _text(value) for name, value in body.parameters.items()}
     linked = await link_to(services, request, principal, version, body.format, body.file, values, body.seconds)
     if isinstance(linked, JobStarted):
-        return started(linked.job)
+        return job_started_response(linked.job)
     about(target=f"link to {body.format} of version {version.number}, until {linked.expires}")
     await run_in_threadpool(services.store.record_change)
     out = {
@@ -59,7 +59,7 @@ async def create_link(
         "size": linked.file.size,
         "sha256": linked.file.sha256,
     }
-    return answer(out, 201, {"cache-control": "no-store"})
+    return json_response(out, 201, {"cache-control": "no-store"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ async def link_to(
     Raises what converting raises; NotFound for a file that the map does not have.
     """
     map_request = MapRequest(version.environment, str(version.number), format, file)
-    outcome = await made_at(services, map_request, urlencode(sorted(values.items())).encode(), principal)
+    outcome = await convert_at_address(services, map_request, urlencode(sorted(values.items())).encode(), principal)
     if isinstance(outcome, JobStarted):
         return outcome
     map_file = file_of(*outcome, file)

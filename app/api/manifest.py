@@ -19,10 +19,10 @@ from app import formats
 from app.api.auth import ServerAdmin, Viewer
 from app.api.caching import none_match
 from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, started
-from app.api.maps import address_of, number_of, options_of
-from app.api.responses import StrictRoute, answer, json_bytes
-from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
+from app.api.jobs import JobStarted, job_started_response
+from app.api.maps import parse_options, parse_version_ref, request_address
+from app.api.responses import StrictRoute, json_bytes, json_response
+from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, problem_responses
 from app.convert import site
 from app.convert.cache import CachedMap
 from app.convert.recipe import Recipe, own_options
@@ -46,14 +46,17 @@ LAYER_DIGITS = 16
 router = APIRouter(tags=["manifest"], route_class=StrictRoute)
 
 
-@router.get("/keys", responses=told(list[KeyOut]), summary="Keys that sign manifests")
+@router.get("/keys", responses=problem_responses(list[KeyOut]), summary="Keys that sign manifests")
 def list_keys(services: ServicesDep, _: Viewer) -> Response:
     """The newest first: it signs. `endorsement` is the signature of the key before it over the raw public key."""
-    return answer([key.as_dict() for key in services.keys.public()])
+    return json_response([key.as_dict() for key in services.keys.public()])
 
 
 @router.post(
-    "/keys", status_code=201, responses=told(KeyOut, ok=201, description="The new key"), summary="Rotate the key"
+    "/keys",
+    status_code=201,
+    responses=problem_responses(KeyOut, ok=201, description="The new key"),
+    summary="Rotate the key",
 )
 def rotate_key(services: ServicesDep, _: ServerAdmin) -> Response:
     """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one. Takes a
@@ -67,12 +70,12 @@ def rotate_key(services: ServicesDep, _: ServerAdmin) -> Response:
             services.links.rotate()
     finally:
         services.store.generation.change()  # what was signed with the old key is in memory no longer
-    return answer(key.as_dict(), 201)
+    return json_response(key.as_dict(), 201)
 
 
 @router.get(
     "/environments/{env}/versions/{v}/manifest",
-    responses={**told(ManifestOut, 404, 409), 304: {"description": "The client has it"}},
+    responses={**problem_responses(ManifestOut, 404, 409), 304: {"description": "The client has it"}},
     summary="A signed list of a version's files",
 )
 async def get_manifest(
@@ -111,21 +114,23 @@ async def get_manifest(
     entries = _entries(formats, optional)
     cached_maps: dict[str, CachedMap] = {}
     while True:
-        outcome = await services.hot.shared(request, _signed, services, env, v, entries, closures, request, {})
+        outcome = await services.response_cache.run_shared(
+            request, _sign_manifest, services, env, v, entries, closures, request, {}
+        )
         if (
             isinstance(outcome, _PendingConversion) and outcome.recipe.key in cached_maps
         ):  # the cache has no room for all of them at once
-            outcome = await run_in_threadpool(_signed, services, env, v, entries, closures, request, cached_maps)
+            outcome = await run_in_threadpool(_sign_manifest, services, env, v, entries, closures, request, cached_maps)
         if not isinstance(outcome, _PendingConversion):
             break
         try:
-            conversion = await _made(services, outcome.recipe, request, principal)
+            conversion = await _convert_entry(services, outcome.recipe, request, principal)
         except UNAVAILABLE as error:
             if outcome.entry.required:
-                raise _named(error, outcome.entry) from error
+                raise _with_format_name(error, outcome.entry) from error
             continue  # it is remembered: the next look lists it as missing
         if isinstance(conversion, JobStarted):
-            return started(conversion.job)
+            return job_started_response(conversion.job)
         if conversion is not None:
             cached_maps[outcome.recipe.key] = conversion
     headers, data = outcome
@@ -154,7 +159,7 @@ class _PendingConversion:
     recipe: Recipe
 
 
-def _signed(
+def _sign_manifest(
     services: Services,
     env: str,
     v: str,
@@ -167,11 +172,11 @@ def _signed(
 
     cached_maps: maps that were made for this answer, by their recipes' keys: they may have left the cache again.
     """
-    channel = None if isinstance(number_of(v), int) else v
-    generation = services.hot.generation()
-    version, sequence = services.store.standing(env, number_of(v), mode)
+    channel = None if isinstance(parse_version_ref(v), int) else v
+    generation = services.response_cache.generation()
+    version, sequence = services.store.standing(env, parse_version_ref(v), mode)
     closures = version.closures or NO_CLOSURES
-    listed = _listed(services, version, entries, cached_maps)
+    listed = _list_files(services, version, entries, cached_maps)
     if isinstance(listed, _PendingConversion):
         return listed
     files, missing = listed
@@ -207,7 +212,7 @@ def _signed(
     key, signature = services.keys.sign(data)
     header = f"{key}:{base64.b64encode(signature).decode()}"
     headers = {"etag": f'"{header[-40:-2]}"', "cache-control": "no-cache", SIGNATURE: header}
-    services.hot.keep(request, env, headers, data, generation)
+    services.response_cache.store_response(request, env, headers, data, generation)
     return headers, data
 
 
@@ -216,7 +221,7 @@ def _seconds(moment: float) -> str:
     return datetime.fromtimestamp(int(moment), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def _listed(
+def _list_files(
     services: Services, version: Version, entries: list[_Entry], cached_maps: Mapping[str, CachedMap]
 ) -> tuple[list[dict[str, Any]], list[dict[str, str]]] | _PendingConversion:
     """The files of all formats, and the optional formats that cannot be given; or a map that is to be made first."""
@@ -231,7 +236,7 @@ def _listed(
                 raise failure
         except UNAVAILABLE as error:
             if entry.required:
-                raise _named(error, entry) from error
+                raise _with_format_name(error, entry) from error
             missing.append({"format": entry.format, "detail": error.detail})
             continue
         if cached_map is None:
@@ -251,7 +256,7 @@ def _recipe(services: Services, version: Version, entry: _Entry) -> Recipe:
     return services.maps.recipe(version, entry.format, values, derive=entry.derive, listed=True)
 
 
-def _named(error: FleetMapError, entry: _Entry) -> FleetMapError:
+def _with_format_name(error: FleetMapError, entry: _Entry) -> FleetMapError:
     """The same error, saying which format cannot be given."""
     if entry.format in error.detail:
         return error
@@ -300,19 +305,21 @@ def _entry(text: str, location: str, *, required: bool) -> _Entry:
     if fmt.write is None:
         raise Invalid(f"{name} is not served", [Problem("not served", where=location)])
     try:
-        values, derive, closures = options_of(query)
+        values, derive, closures = parse_options(query)
         own_options(fmt, values)
     except Invalid as error:
         raise Invalid(f"{name}: {error.detail}", error.problems) from None
     return _Entry(name, values, derive, closures, required, dict(parse_qsl(query, keep_blank_values=True)))
 
 
-async def _made(services: Services, recipe: Recipe, request: Request, principal: Any) -> CachedMap | JobStarted | None:
+async def _convert_entry(
+    services: Services, recipe: Recipe, request: Request, principal: Any
+) -> CachedMap | JobStarted | None:
     """A map that is not ready, or the job that makes it. None where it cannot be derived so: the next recipe goes
     another way, or says that there is none.
     """
     try:
-        return await services.work.make(recipe, principal, address_of(request))
+        return await services.jobs.get_or_start(recipe, principal, request_address(request))
     except CannotDerive:
         await asyncio.sleep(0)
         return None

@@ -29,12 +29,12 @@ from app.api import deltas
 from app.api.auth import Authenticator, Principal, Viewer
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
 from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, started
+from app.api.jobs import JobStarted, job_started_response
 from app.api.metrics import Metrics
-from app.api.middleware import is_from_here
+from app.api.middleware import is_local_origin
 from app.api.protocol import PROVE
-from app.api.responses import API, StrictRoute, answer, path_of
-from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
+from app.api.responses import API, StrictRoute, api_path, json_response
+from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, problem_responses
 from app.api.signed import LINK
 from app.api.single_flight import SingleFlight
 from app.convert.cache import CachedFile, CachedMap, LostMap
@@ -46,7 +46,7 @@ from app.model.closures import CLOSURE_MODES, ClosureMode
 from app.store.values import LATEST, Version
 
 FRESH_SECONDS = 1.0
-LOST_ATTEMPTS = 5
+MAX_LOST_ATTEMPTS = 5
 """How often a map is made again that was lost from the cache before it was read."""
 
 IN_MEMORY = 8 * 2**20
@@ -107,56 +107,65 @@ class ResponseCache:
         self._limit, self._size = here_bytes, 0
         self.access, self._metrics, self.generation = access, metrics, generation
         self._entries: OrderedDict[Key, CachedResponse] = OrderedDict()
-        self._looks: SingleFlight[tuple[Any, ...], Any] = SingleFlight()
+        self._poll_task: SingleFlight[tuple[Any, ...], Any] = SingleFlight()
         self._lock = threading.Lock()
         self._tallies: dict[str, list[int]] = {}
 
-    def get(self, key: Key) -> CachedResponse | None:
+    def get_fresh(self, key: Key) -> CachedResponse | None:
         """What is known to stand there at this moment."""
         entry = self._entries.get(key)
         if entry is None or entry.fresh_until < time.monotonic() or entry.generation != self.generation():
             return None
         return entry
 
-    async def find(self, request: Request, services: Services, principal: Principal) -> CachedResponse | JobStarted:
+    async def get_or_convert(
+        self, request: Request, services: Services, principal: Principal
+    ) -> CachedResponse | JobStarted:
         """What stands at the request's address; made where need be, or the job that makes it."""
         key = _key(request)
-        fresh = self.get(key)
+        fresh = self.get_fresh(key)
         if fresh is not None and (fresh.body is not None or fresh.file is not None):
             return fresh
-        link = link_of(request)
+        link = signed_link(request)
         values, derive, closures = _options(key[1] if link is None else link.query)
-        map_request = replace(wanted_of(request), closures=closures)
+        map_request = replace(parse_map_path(request), closures=closures)
         # Taken before anything is read: a commit in between makes this answer stale, never fresh.
         generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
         for attempt in itertools.count():
-            recipe = await self.shared(request, _resolve, services, map_request, values, derive)
+            recipe = await self.run_shared(request, _resolve, services, map_request, values, derive)
             old = self._entries.get(key)
-            if old is not None and old.recipe is not None and _same(old.recipe, recipe) and old.body is not None:
+            if (
+                old is not None
+                and old.recipe is not None
+                and _is_same_request(old.recipe, recipe)
+                and old.body is not None
+            ):
                 fresh = replace(old, generation=generation, fresh_until=until)
-                self._put(key, fresh)
+                self._insert(key, fresh)
                 return fresh
             empty = self._resource(map_request, recipe, values, derive, generation, until, _route(request))
             if link is not None:
-                empty = _by_link(empty, link)
+                empty = _without_link_headers(empty, link)
             if _matches(request, empty.etag):
-                self._put(key, empty)
+                self._insert(key, empty)
                 return empty
             # From here on the recipe says what is meant: who was told of a later commit has another one.
             try:
-                entry: CachedResponse | None = await self._looks.run(
-                    (key, _meant(recipe), "ready"), self._ready, services, key, empty
+                entry: CachedResponse | None = await self._poll_task.run(
+                    (key, _recipe_identity(recipe), "ready"), self._ready, services, key, empty
                 )
                 if entry is not None:
                     return entry
-                outcome = await services.work.make(recipe, principal, address_of(request))
+                outcome = await services.jobs.get_or_start(recipe, principal, request_address(request))
                 if isinstance(outcome, JobStarted):
                     return outcome
-                entry = await self._looks.run((key, _meant(recipe), "fill"), self._fill, key, empty, outcome)
+                entry = await self._poll_task.run(
+                    (key, _recipe_identity(recipe), "fill"), self._fill, key, empty, outcome
+                )
             except CannotDerive:
                 continue  # it is remembered: the next recipe goes another way, or says that there is none
             except LostMap:  # damaged or evicted while it was read: it is made again
-                if attempt >= LOST_ATTEMPTS:
+                if attempt >= MAX_LOST_ATTEMPTS:
                     raise
                 continue
             return entry
@@ -171,17 +180,17 @@ class ResponseCache:
         return self._fill(key, empty, cached_map)
 
     def _fill(self, key: Key, empty: CachedResponse, cached_map: CachedMap) -> CachedResponse:
-        full = _filled(empty, cached_map)
-        self._put(key, full)
+        full = _with_body(empty, cached_map)
+        self._insert(key, full)
         return full
 
-    async def shared(self, request: Request, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    async def run_shared(self, request: Request, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """What ``function`` finds, called in a thread: one look for all who ask for this address at the same moment.
 
         Nobody joins a look that began before the last commit. So what it finds must depend on what commits tell of
         alone (robots' reports are not), and on nothing that was found before it, nor on who asks.
         """
-        result: T = await self._looks.run((_key(request), self.generation(), function), function, *args, **kwargs)
+        result: T = await self._poll_task.run((_key(request), self.generation(), function), function, *args, **kwargs)
         return result
 
     def _resource(
@@ -199,7 +208,9 @@ class ResponseCache:
         closures = version.closures
         more = ({} if derive else {"derive": "false"}) | ({} if closures is None else {"closures": closures.mode})
         query = urlencode({**values, **more})
-        report = path_of("environments", version.environment, "versions", version.number, "reports", map_request.format)
+        report = api_path(
+            "environments", version.environment, "versions", version.number, "reports", map_request.format
+        )
         bare = [
             (b"etag", etag.encode()),
             (b"cache-control", b"no-cache"),
@@ -215,7 +226,7 @@ class ResponseCache:
             map_request, recipe, etag, etag.encode(), headers, bare, 0, None, None, "", generation, until, tally
         )
 
-    def keep(
+    def store_response(
         self, request: Request, environment: str, headers: Mapping[str, str], body: bytes, generation: int
     ) -> None:
         """Another answer (200, with an ``etag``) that a whole fleet asks for at once; good until the next commit.
@@ -232,20 +243,20 @@ class ResponseCache:
             time.monotonic() + FRESH_SECONDS,
             headers["etag"],
         )
-        self._put(
+        self._insert(
             key,
             CachedResponse(
                 map_request, None, etag, etag.encode(), full, bare, len(body), body, None, "", generation, until, tally
             ),
         )
 
-    def forget(self, request: Request) -> None:
+    def evict(self, request: Request) -> None:
         """Drop what is remembered of an address."""
         with self._lock:
             old = self._entries.pop(_key(request), None)
-            self._size -= _weight(old) if old else 0
+            self._size -= _entry_bytes(old) if old else 0
 
-    def count(self) -> None:
+    def flush_counters(self) -> None:
         """Add what was answered from memory since the last call to the metrics."""
         for route, tally in list(self._tallies.items()):
             for place, status in enumerate(("200", "304")):
@@ -254,22 +265,22 @@ class ResponseCache:
                     self._metrics.requests.labels("GET", route, status).inc(new)
                     self._metrics.memory_hits.inc(new)
 
-    def _put(self, key: Key, resource: CachedResponse) -> None:
+    def _insert(self, key: Key, resource: CachedResponse) -> None:
         with self._lock:
             old = self._entries.pop(key, None)
-            self._size += _weight(resource) - (_weight(old) if old else 0)
+            self._size += _entry_bytes(resource) - (_entry_bytes(old) if old else 0)
             self._entries[key] = resource
             while self._size > self._limit and len(self._entries) > 1:
-                self._size -= _weight(self._entries.popitem(last=False)[1])
+                self._size -= _entry_bytes(self._entries.popitem(last=False)[1])
 
 
-def link_of(request: Request) -> SignedAddress | None:
+def signed_link(request: Request) -> SignedAddress | None:
     """The signed link, already checked, that a request was made by."""
     link: SignedAddress | None = request.scope["state"].get(LINK)
     return link
 
 
-def _by_link(resource: CachedResponse, link: SignedAddress) -> CachedResponse:
+def _without_link_headers(resource: CachedResponse, link: SignedAddress) -> CachedResponse:
     """The same for a link: only its holder may cache it, and no page learns the link as a referrer."""
 
     def private(headers: Headers) -> Headers:
@@ -284,7 +295,7 @@ def _key(request: Request) -> Key:
     return (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
 
 
-def _weight(resource: CachedResponse) -> int:
+def _entry_bytes(resource: CachedResponse) -> int:
     return 2048 + len(resource.body or b"")
 
 
@@ -292,14 +303,14 @@ def _file_etag(recipe: Recipe, name: str) -> str:
     return f'{recipe.etag[:-1]}-{hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]}"'
 
 
-def _meant(recipe: Recipe) -> tuple[str, int, str, str]:
+def _recipe_identity(recipe: Recipe) -> tuple[str, int, str, str]:
     """What tells recipes at one address apart."""
     closures = recipe.version.closures
     return recipe.key, recipe.version.number, recipe.version.environment, closures.digest if closures else ""
 
 
-def _same(a: Recipe, b: Recipe) -> bool:
-    return _meant(a) == _meant(b)
+def _is_same_request(a: Recipe, b: Recipe) -> bool:
+    return _recipe_identity(a) == _recipe_identity(b)
 
 
 def _matches(request: Request, etag: str) -> bool:
@@ -310,28 +321,30 @@ def _matches(request: Request, etag: str) -> bool:
 
 def _resolve(services: Services, map_request: MapRequest, values: Mapping[str, str], derive: bool) -> Recipe:
     return services.maps.recipe(
-        version_of(services, map_request), map_request.format, values, derive=derive, file=map_request.file
+        resolve_version(services, map_request), map_request.format, values, derive=derive, file=map_request.file
     )
 
 
-def version_of(services: Services, map_request: MapRequest) -> Version:
+def resolve_version(services: Services, map_request: MapRequest) -> Version:
     """The version that an address means, with the closures that its maps show: on a short one production where there is
     one, else the head.
     """
     if map_request.version is not None:
-        return services.store.standing(map_request.environment, number_of(map_request.version), map_request.closures)[0]
+        return services.store.standing(
+            map_request.environment, parse_version_ref(map_request.version), map_request.closures
+        )[0]
     try:
         return services.store.standing(map_request.environment, PRODUCTION, map_request.closures)[0]
     except NotFound:
         return services.store.standing(map_request.environment, LATEST, map_request.closures)[0]
 
 
-def number_of(ref: str) -> str | int:
+def parse_version_ref(ref: str) -> str | int:
     """A version as an address names it: a number, or a channel."""
     return int(ref) if ref.isascii() and ref.isdigit() and len(ref) <= 18 else ref
 
 
-def _filled(empty: CachedResponse, cached_map: CachedMap) -> CachedResponse:
+def _with_body(empty: CachedResponse, cached_map: CachedMap) -> CachedResponse:
     """With headers and content of the made map. NotFound where it has no such file."""
     assert empty.recipe is not None
     file = file_of(empty.recipe, cached_map, empty.wanted.file)
@@ -369,7 +382,7 @@ _SHORT = re.compile(r"/maps/([^/]+)/([^/]+)(?:/(.+))?", re.DOTALL)
 _LONG = re.compile(rf"{API}/environments/([^/]+)/versions/([^/]+)/maps/([^/]+)(?:/(.+))?", re.DOTALL)
 
 
-def wanted_of(request: Request) -> MapRequest:
+def parse_map_path(request: Request) -> MapRequest:
     """What the address of a map asks for."""
     path = request.scope["path"]
     short, long = _SHORT.fullmatch(path), _LONG.fullmatch(path)
@@ -384,9 +397,9 @@ def _route(request: Request) -> str:
     return str(request.scope["state"]["route"])
 
 
-def address_of(request: Request) -> str:
+def request_address(request: Request) -> str:
     """The request's own address, to be asked for again; without the signature of a link."""
-    link = link_of(request)
+    link = signed_link(request)
     query = request.url.query if link is None else link.query.decode()
     return quote(request.scope["path"], safe="/") + (f"?{quote(query, safe='&=%,.:+-_~/')}" if query else "")
 
@@ -399,10 +412,10 @@ def _options(query: bytes) -> tuple[dict[str, str], bool, ClosureMode | None]:
         text = query.decode("ascii")
     except UnicodeDecodeError:
         raise Invalid("the query cannot be read: it must be percent-encoded UTF-8") from None
-    return options_of(text)
+    return parse_options(text)
 
 
-def options_of(query: str) -> tuple[dict[str, str], bool, ClosureMode | None]:
+def parse_options(query: str) -> tuple[dict[str, str], bool, ClosureMode | None]:
     """The same of a query that is text, as a manifest's entries hold one."""
     try:
         pairs = parse_qsl(query, keep_blank_values=True, max_num_fields=100, errors="strict")
@@ -433,16 +446,16 @@ def closure_mode(text: str | None) -> ClosureMode | None:
 class FleetMapApp(FastAPI):
     """The application, with the answers it has in memory in front of everything else.
 
-    ``hot`` is None until the services are open.
+    ``response_cache`` is None until the services are open.
     """
 
-    hot: ResponseCache | None = None
+    response_cache: ResponseCache | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a repeated request for a map from memory, or go the long way."""
-        hot = self.hot
+        hot = self.response_cache
         if hot is not None and scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
-            entry = hot.get((scope.get("raw_path") or b"", scope["query_string"]))
+            entry = hot.get_fresh((scope.get("raw_path") or b"", scope["query_string"]))
             if entry is not None:
                 reply = _reply(hot, entry, scope["headers"], scope["method"] == "HEAD")
                 if reply is not None:
@@ -472,12 +485,12 @@ def _reply(
         elif name in (b"range", b"if-match", b"available-dictionary"):
             return None
     if entry.link_expires is None:
-        principal = hot.access.known(authorization)
-        if principal is None or not principal.may_enter(entry.wanted.environment):
+        principal = hot.access.cached_principal(authorization)
+        if principal is None or not principal.can_access(entry.wanted.environment):
             return None
     elif entry.link_expires <= time.time():  # the signature is part of the key: it was checked with the first request
         return None
-    if hot.access.insecure and not is_from_here(dict(headers)):
+    if hot.access.insecure and not is_local_origin(dict(headers)):
         return None
     if condition is not None and (condition == entry.raw_etag or none_match(condition.decode("latin-1"), entry.etag)):
         if entry.body is None and condition.strip() == b"*":
@@ -496,19 +509,21 @@ async def download(template: str, request: Request) -> Response:
     request.scope["state"]["route"] = template  # for the metrics; plain routes leave none in the scope
     services: Services = request.app.state.services
     principal: Principal = request.scope["state"]["principal"]
-    for _ in range(LOST_ATTEMPTS):
+    for _ in range(MAX_LOST_ATTEMPTS):
         try:
-            return await _answer(request, services, await services.hot.find(request, services, principal))
+            return await _answer(
+                request, services, await services.response_cache.get_or_convert(request, services, principal)
+            )
         except LostMap:  # it left the cache since it was found
-            services.hot.forget(request)
+            services.response_cache.evict(request)
     raise Unavailable("the map is removed from the cache faster than it is sent: try again in a few seconds")
 
 
 async def _answer(request: Request, services: Services, outcome: CachedResponse | JobStarted) -> Response:
     if isinstance(outcome, JobStarted):
-        if link_of(request) is not None:  # its holder has no token to follow a job with
+        if signed_link(request) is not None:  # its holder has no token to follow a job with
             raise Unavailable("the map is still being converted: try again in a few seconds")
-        return started(outcome.job)
+        return job_started_response(outcome.job)
     if none_match(request.headers.get("if-none-match"), outcome.etag):
         return _response(304, outcome.bare)
     delta = await _delta(request, services, outcome)
@@ -527,7 +542,7 @@ async def _answer(request: Request, services: Services, outcome: CachedResponse 
 
 async def _delta(request: Request, services: Services, entry: CachedResponse) -> Response | None:
     """The file as a delta to the one that the client has, if it has one that is known here."""
-    old = deltas.wanted(request.headers)
+    old = deltas.offered_dictionary(request.headers)
     if old is None or "range" in request.headers or entry.size > deltas.MAX_BYTES:
         return None
     content = entry.body if entry.body is not None else entry.file
@@ -581,10 +596,10 @@ async def _from_disk(request: Request, entry: CachedResponse) -> Response:
         file = await run_in_threadpool(entry.file.path.open, "rb")
     except OSError as error:
         raise entry.file.lost(error) from error
-    return streamed(file, start, end, status, headers, None if part else entry.file.check)
+    return stream_file(file, start, end, status, headers, None if part else entry.file.check)
 
 
-def streamed(
+def stream_file(
     file: BinaryIO, start: int, end: int, status: int, headers: Headers, check: Callable[[str], None] | None = None
 ) -> Response:
     """The bytes [start, end) of an open file, which is closed at the end.
@@ -627,7 +642,7 @@ def add_routes(app: FastAPI) -> None:
         app.router.add_route(path, partial(download, path), methods=["GET"], include_in_schema=False)
 
 
-async def made_at(
+async def convert_at_address(
     services: Services, map_request: MapRequest, query: bytes, principal: Principal
 ) -> tuple[Recipe, CachedMap] | JobStarted:
     """The map that an address of a version's number gives, made where need be; the job that makes it if it takes long.
@@ -635,13 +650,15 @@ async def made_at(
     query: the map's parameters, percent-encoded.
     """
     values, derive, closures = _options(query)
-    path = path_of("environments", map_request.environment, "versions", map_request.version, "maps", map_request.format)
+    path = api_path(
+        "environments", map_request.environment, "versions", map_request.version, "maps", map_request.format
+    )
     address = f"{path}?{query.decode()}" if query else path
     plan = partial(_resolve, services, replace(map_request, closures=closures), values, derive)
-    return await made_by(services, plan, address, principal)
+    return await convert_plan(services, plan, address, principal)
 
 
-async def made_by(
+async def convert_plan(
     services: Services, plan: Callable[[], Recipe], address: str, principal: Principal
 ) -> tuple[Recipe, CachedMap] | JobStarted:
     """The map of a recipe, made where need be; the job that makes it for ``address`` if it takes long.
@@ -654,7 +671,7 @@ async def made_by(
         if cached_map is not None:
             return recipe, cached_map
         try:
-            outcome = await services.work.make(recipe, principal, address)
+            outcome = await services.jobs.get_or_start(recipe, principal, address)
         except CannotDerive:
             continue
         return outcome if isinstance(outcome, JobStarted) else (recipe, outcome)
@@ -663,15 +680,15 @@ async def made_by(
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
 
 
-@router.get("/maps", responses=told(list[CoverageOut], 404), summary="Which formats can be had")
+@router.get("/maps", responses=problem_responses(list[CoverageOut], 404), summary="Which formats can be had")
 def coverage(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """For every format: whether it can be written as it is, by deriving what lacks, or what to supply."""
-    return answer(services.maps.coverage(services.store.version(env, number_of(v))))
+    return json_response(services.maps.coverage(services.store.version(env, parse_version_ref(v))))
 
 
 @router.get(
     "/reports/{format}",
-    responses=told(ReportOut, 404, 409, 422),
+    responses=problem_responses(ReportOut, 404, 409, 422),
     summary="What a map is made of",
     openapi_extra={"x-free-query": True},
 )
@@ -687,7 +704,7 @@ async def report(
     """Raw, derived and filled-in information of a map, what was dropped and why. Takes the map's own parameters."""
     values, allowed, mode = _options(request.scope["query_string"])
     plan = partial(_resolve, services, MapRequest(env, v, format, None, mode), values, allowed and derive)
-    outcome = await made_by(services, plan, address_of(request), principal)
+    outcome = await convert_plan(services, plan, request_address(request), principal)
     if isinstance(outcome, JobStarted):
-        return started(outcome.job)
-    return answer(await run_in_threadpool(services.maps.report, outcome[0]))
+        return job_started_response(outcome.job)
+    return json_response(await run_in_threadpool(services.maps.report, outcome[0]))

@@ -18,12 +18,12 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api import problems
-from app.api.auth import MAX_SOURCES, Principal, environment_of, is_open, source_of
+from app.api.auth import MAX_SOURCES, Principal, client_source, environment_in_path, is_open
 from app.api.dependencies import Services
 from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
 from app.api.protocol import PROVE
 from app.api.responses import API
-from app.api.signed import LINK, signed_address
+from app.api.signed import LINK, request_link
 from app.api.single_flight import SingleFlight
 from app.errors import Denied, FleetMapError, TooLarge
 from app.logs import REQUEST_ID, log_request
@@ -47,7 +47,7 @@ _REPORT = re.compile(r"/api/v1/robots/[^/]+/(?:status|vda5050/state)")
 MAX_LOGGED_PATH = 300
 """Characters of an address that a log line has."""
 
-LOGGED_REFUSALS = 20
+MAX_LOGGED_REJECTIONS = 20
 """Refusals of one source a minute that are logged; further ones with level debug."""
 
 SLOW_SECONDS = 1.0
@@ -89,14 +89,14 @@ class Guard:
             return
         except FleetMapError as error:
             reason = error.detail
-            await self._refuse(problems.of_error(error), scope, body, answer)
+            await self._reject(problems.error_response(error), scope, body, answer)
         except HTTPException as error:
             reason = str(error.detail)
-            await self._refuse(problems.of_http(error), scope, body, answer)
+            await self._reject(problems.http_error_response(error), scope, body, answer)
         except asyncio.CancelledError:
             raise
         except Exception as error:  # noqa: BLE001  the last place where a bug can become a 500 with a shape
-            await self._refuse(problems.of_bug(error), scope, body, answer)
+            await self._reject(problems.internal_error_response(error), scope, body, answer)
         finally:
             route = scope["state"].get("route") or _template(scope)
             method = scope["method"] if scope["method"] in _METHODS else "other"
@@ -108,7 +108,7 @@ class Guard:
     async def _pass(self, scope: Scope, body: _RequestBody, answer: _ResponseSender, services: Services) -> None:
         headers = _headers(scope)
         if services.options.insecure_no_auth:
-            _only_from_here(headers)
+            _require_local_origin(headers)
         if is_open(scope["path"]):
             # Anybody can send a body: it is not read before it is known who takes it.
             await self._app(scope, body, answer)
@@ -116,30 +116,30 @@ class Guard:
         principal = await self._principal(scope, headers, services)
         if PROVE in scope["state"]:
             scope["state"][PROVE]()
-        environment = environment_of(scope["path"])
+        environment = environment_in_path(scope["path"])
         if environment is not None:
-            principal.enter(environment)
+            principal.require_environment(environment)
         scope["state"]["principal"] = principal
         CALLER.set(_caller(scope, principal, environment))
-        if scope["method"] in _BODY and body.begin(scope, headers):
+        if scope["method"] in _BODY and body.check_headers(scope, headers):
             await body.preload()
         await self._app(scope, body, answer)
 
     async def _principal(self, scope: Scope, headers: dict[bytes, bytes], services: Services) -> Principal:
         """The caller: by the link that the address is, else by the token. A token beside a link counts for nothing."""
         client = scope["client"][0] if scope.get("client") else None
-        link = signed_address(scope)
+        link = request_link(scope)
         if link is not None:
             scope["state"][LINK] = link
             return await run_in_threadpool(services.links.check, link, client)
         authorization = headers.get(b"authorization")
-        principal = services.access.known(authorization)
+        principal = services.access.cached_principal(authorization)
         if principal is None:
-            key = (authorization, client, services.hot.generation())
-            principal = await self._checks.run(key, services.access.check, authorization, client)
+            key = (authorization, client, services.response_cache.generation())
+            principal = await self._checks.run(key, services.access.authenticate, authorization, client)
         return principal
 
-    async def _refuse(self, response: Response, scope: Scope, body: _RequestBody, answer: _ResponseSender) -> None:
+    async def _reject(self, response: Response, scope: Scope, body: _RequestBody, answer: _ResponseSender) -> None:
         if answer.started:
             # Half an answer is out: the only honest end is a broken connection.
             raise ConnectionAbortedError("the answer could not be finished")
@@ -189,17 +189,19 @@ class _Quota:
         if minute != self._minute or len(self._counts) > MAX_SOURCES:
             self._counts, self._minute = {}, minute
         self._counts[source] = self._counts.get(source, 0) + 1
-        return self._counts[source] <= LOGGED_REFUSALS
+        return self._counts[source] <= MAX_LOGGED_REJECTIONS
 
 
-_refusals = _Quota()
+_rejections = _Quota()
 
 
 def _log(scope: Scope, status: int, seconds: float, reason: str) -> None:
     """A request: refusals and failures always, changes and slow ones from level info on, the others with debug."""
     changes = scope["method"] not in ("GET", "OPTIONS") and not _REPORT.fullmatch(scope["path"])
     starting = status == 503 and scope["path"] == "/readyz"  # what is wrong later is logged where it goes wrong
-    if (status >= 500 and not starting) or (status in (401, 403, 429) and _refusals.allow(source_of(_address(scope)))):
+    if (status >= 500 and not starting) or (
+        status in (401, 403, 429) and _rejections.allow(client_source(_address(scope)))
+    ):
         level = logging.WARNING
     elif changes or seconds > SLOW_SECONDS:
         level = logging.INFO
@@ -226,15 +228,15 @@ def _headers(scope: Scope) -> dict[bytes, bytes]:
     return dict(scope["headers"])
 
 
-def _only_from_here(headers: dict[bytes, bytes]) -> None:
-    if not is_from_here(headers):
+def _require_local_origin(headers: dict[bytes, bytes]) -> None:
+    if not is_local_origin(headers):
         raise Denied(
             "without access control the server answers only to a loopback name (localhost, 127.0.0.1), and no pages of "
             "other sites"
         )
 
 
-def is_from_here(headers: dict[bytes, bytes]) -> bool:
+def is_local_origin(headers: dict[bytes, bytes]) -> bool:
     """Without tokens a browser must not be led here by a foreign page (DNS rebinding, cross-site requests)."""
     host = urlsplit("//" + headers.get(b"host", b"").decode("latin-1")).hostname
     origin = headers.get(b"origin")
@@ -272,26 +274,26 @@ class _RequestBody:
     """Receives, counts, and keeps the time."""
 
     __slots__ = (
-        "_begun",
+        "_complete",
         "_declared",
         "_here",
         "_limit",
         "_loaded",
         "_receive",
         "_received",
-        "_whole",
+        "_started",
         "what",
     )
 
     def __init__(self, receive: Receive, services: Services) -> None:
         self._receive, self._here = receive, services
         self._limit = services.options.max_json_bytes
-        self._received, self._begun, self._whole = 0, time.monotonic(), False
+        self._received, self._started, self._complete = 0, time.monotonic(), False
         self._declared: int | None = 0
         self._loaded: Message | None = None
         self.what = "request body"
 
-    def begin(self, scope: Scope, headers: dict[bytes, bytes]) -> bool:
+    def check_headers(self, scope: Scope, headers: dict[bytes, bytes]) -> bool:
         """Look at what is announced (coding, media type, length): whether the body is one to be read as a whole."""
         coding = headers.get(b"content-encoding", b"identity").strip().lower()
         length = headers.get(b"content-length")
@@ -306,7 +308,7 @@ class _RequestBody:
         if self._declared == 0:
             return False
         media = headers.get(b"content-type", b"").partition(b";")[0].strip().lower().decode("latin-1")
-        upload = takes_files(scope["path"])
+        upload = accepts_files(scope["path"])
         if media == "multipart/form-data" and upload:
             limits = self._here.options.limits
             self.what = "upload"
@@ -323,7 +325,7 @@ class _RequestBody:
     async def preload(self) -> None:
         """Read the whole body now: its errors are told from here, before any route parses half of it."""
         chunks = []
-        while not self._whole:
+        while not self._complete:
             chunks.append((await self()).get("body", b""))
         self._loaded = {"type": "http.request", "body": b"".join(chunks), "more_body": False}
 
@@ -331,10 +333,10 @@ class _RequestBody:
         if self._loaded is not None:
             message, self._loaded = self._loaded, None
             return message
-        if self._declared == 0 or self._whole:
+        if self._declared == 0 or self._complete:
             return await self._receive()
         pause, pace = self._here.options.body_seconds, self._here.options.body_pace
-        late = self._begun + pause + self._received / pace - time.monotonic()
+        late = self._started + pause + self._received / pace - time.monotonic()
         try:
             async with asyncio.timeout(min(pause, max(0.001, late))):
                 message = await self._receive()
@@ -345,7 +347,7 @@ class _RequestBody:
         if message["type"] == "http.disconnect":
             raise _Disconnected
         self._received += len(message.get("body", b""))
-        self._whole = not message.get("more_body", False)
+        self._complete = not message.get("more_body", False)
         if self._received > self._limit:
             raise self._too_large()
         return message
@@ -354,7 +356,7 @@ class _RequestBody:
         return TooLarge(f"the {self.what} is larger than {self._limit} bytes, the most that this server takes")
 
 
-def takes_files(path: str) -> bool:
+def accepts_files(path: str) -> bool:
     """Whether files can be uploaded at this address."""
     parts = path.split("/")
     if path == "/api/v1/convert":

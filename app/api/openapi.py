@@ -15,7 +15,7 @@ from app import formats, parameters
 from app.api.auth import is_open
 from app.api.problems import MEDIA_TYPE
 from app.api.responses import API
-from app.api.schemas import ProblemOut, RevertBody, told
+from app.api.schemas import ProblemOut, RevertBody, problem_responses
 from app.derive import all_derivations
 from app.errors import NotFound
 from app.model.closures import CLOSURE_MODES
@@ -229,7 +229,7 @@ def _map_paths(paths: dict[str, Any]) -> None:
                 },
                 "206": {"description": "A part of the file"},
                 "304": {"description": "The client has it"},
-                **{str(k): v for k, v in told(None, 404, 409, 416, 422, 503).items()},
+                **{str(k): v for k, v in problem_responses(None, 404, 409, 416, 422, 503).items()},
             },
         }
         paths[path] = {"get": operation}
@@ -245,12 +245,12 @@ def _map_paths(paths: dict[str, Any]) -> None:
                 "tags": ["maps by format"],
                 "summary": fmt.title,
                 "operationId": f"get_{fmt.name}",
-                "parameters": [*common[:1], *_own_parameters(fmt), *common[1:]],
+                "parameters": [*common[:1], *_writer_parameters(fmt), *common[1:]],
             }
         }
 
 
-def _own_parameters(fmt: formats.Format) -> list[dict[str, Any]]:
+def _writer_parameters(fmt: formats.Format) -> list[dict[str, Any]]:
     """The parameters of one format's writer."""
     return [
         {

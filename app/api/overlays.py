@@ -15,9 +15,9 @@ from starlette.responses import Response
 
 from app.api.auth import Editor, Principal, RobotRole, Viewer
 from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, started
-from app.api.maps import address_of, made_by
-from app.api.responses import StrictRoute, answer
+from app.api.jobs import JobStarted, job_started_response
+from app.api.maps import convert_plan, request_address
+from app.api.responses import StrictRoute, json_response
 from app.api.schemas import (
     DynamicEdgesOut,
     EnvironmentPath,
@@ -26,7 +26,7 @@ from app.api.schemas import (
     OverlayOut,
     OverlayPath,
     ZoneSetsOut,
-    told,
+    problem_responses,
 )
 from app.convert.cache import CachedMap
 from app.convert.closures import place_problem
@@ -55,7 +55,7 @@ Ref = Annotated[
 ]
 
 
-@router.get("", responses=told(list[OverlayOut], 404), summary="List overlays")
+@router.get("", responses=problem_responses(list[OverlayOut], 404), summary="List overlays")
 def list_overlays(
     env: EnvironmentPath,
     services: ServicesDep,
@@ -68,14 +68,16 @@ def list_overlays(
     """Oldest first. `pending` waits for a decision, `accepted` is in force on every channel, `expired` was never
     decided on, `ended` is over.
     """
-    return answer([overlay.as_dict() for overlay in services.store.overlays(env, state)])
+    return json_response([overlay.as_dict() for overlay in services.store.overlays(env, state)])
 
 
 @router.post(
     "",
     status_code=201,
     responses={
-        **told(OverlayOut, 400, 404, 409, 415, ok=201, description="It waits for a decision, or is in force"),
+        **problem_responses(
+            OverlayOut, 400, 404, 409, 415, ok=201, description="It waits for a decision, or is in force"
+        ),
         200: {"model": OverlayOut, "description": "The same was reported before: its end has moved."},
     },
     summary="Report what is blocked",
@@ -107,17 +109,17 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
         detail=body.detail,
         reporter=principal.robot or principal.name,
         created=now,
-        expires=_end_of(body, now),
+        expires=_expiry_of(body, now),
         state=body.state,
         decided_by=principal.name if body.state == "accepted" else None,
         decided=now if body.state == "accepted" else None,
     )
     _check_place(reported, versions)
     overlay, new = services.store.add_overlay(reported)
-    return answer(overlay.as_dict(), 201 if new else 200)
+    return json_response(overlay.as_dict(), 201 if new else 200)
 
 
-def _end_of(body: OverlayBody, now: datetime) -> datetime:
+def _expiry_of(body: OverlayBody, now: datetime) -> datetime:
     """When a report ends. Raises Invalid."""
     if body.expires is None:
         return now + timedelta(seconds=DEFAULT_SECONDS if body.ttl_seconds is None else body.ttl_seconds)
@@ -168,7 +170,7 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
     return clean
 
 
-@router.post("/{id}/accept", responses=told(OverlayOut, 404, 409, 422, 503), summary="Accept an overlay")
+@router.post("/{id}/accept", responses=problem_responses(OverlayOut, 404, 409, 422, 503), summary="Accept an overlay")
 def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """Put it in force on every channel until its end: areas become keepout, edges are closed. No version changes."""
     now = datetime.now(UTC)
@@ -180,25 +182,29 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep,
         if overlay.edge is not None:
             overlays.edge_of(services.store, versions, overlay.edge)
         _check_place(overlay, versions)
-    return answer(services.store.decide_overlay(env, id, "pending", "accepted", principal.name, now).as_dict())
+    return json_response(services.store.decide_overlay(env, id, "pending", "accepted", principal.name, now).as_dict())
 
 
-@router.post("/{id}/reject", responses=told(OverlayOut, 404, 409), summary="Reject an overlay")
+@router.post("/{id}/reject", responses=problem_responses(OverlayOut, 404, 409), summary="Reject an overlay")
 def reject_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """It stays in the list, and nothing changes."""
     decided = services.store.decide_overlay(env, id, "pending", "rejected", principal.name, datetime.now(UTC))
-    return answer(decided.as_dict())
+    return json_response(decided.as_dict())
 
 
-@router.post("/{id}/end", responses=told(OverlayOut, 404, 409), summary="End an accepted overlay now")
+@router.post("/{id}/end", responses=problem_responses(OverlayOut, 404, 409), summary="End an accepted overlay now")
 def end_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """Open the area or edge again, on every channel at once."""
-    return answer(
+    return json_response(
         services.store.decide_overlay(env, id, "accepted", "ended", principal.name, datetime.now(UTC)).as_dict()
     )
 
 
-@router.post("/{id}/keep", responses=told(OverlayOut, 404, 409, 422, 503), summary="Make an accepted overlay permanent")
+@router.post(
+    "/{id}/keep",
+    responses=problem_responses(OverlayOut, 404, 409, 422, 503),
+    summary="Make an accepted overlay permanent",
+)
 def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """A new version holds it: an area as a keepout zone, an edge with `blocked: true`. The overlay stays in force until
     its end; promote the version before that to keep robots out for good.
@@ -214,27 +220,33 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, p
         author=principal.name,
     )
     assert outcome.version is not None
-    return answer(services.store.note_kept_overlay(env, id, outcome.version.number).as_dict())
+    return json_response(services.store.note_kept_overlay(env, id, outcome.version.number).as_dict())
 
 
 # --- ready-made for planners that take closures live ---
 
 
-@router.get("/nav2", responses=told(DynamicEdgesOut, 404, 409, 422), summary="Closures for Nav2's route server")
+@router.get(
+    "/nav2", responses=problem_responses(DynamicEdgesOut, 404, 409, 422), summary="Closures for Nav2's route server"
+)
 async def nav2_edges(
     env: EnvironmentPath, request: Request, services: ServicesDep, principal: Viewer, version: Ref = None
 ) -> Response:
     """A request of `nav2_msgs/srv/DynamicEdges`: the numbers of closed edges, and of those that were closed and are
     open again, in the graph that `maps/nav2_route?closures=mark` gives.
     """
-    maps = await _marked(services, env, version, "nav2_route", request, principal)
+    maps = await _files_with_marks(services, env, version, "nav2_route", request, principal)
     if isinstance(maps, JobStarted):
-        return started(maps.job)
+        return job_started_response(maps.job)
     now, before = (live.closed_edges(files) for files in maps)
-    return answer({"closed_edges": now, "opened_edges": sorted(set(before) - set(now))})
+    return json_response({"closed_edges": now, "opened_edges": sorted(set(before) - set(now))})
 
 
-@router.get("/rmf", responses=told(LaneRequestsOut, 404, 409, 422), summary="Closures for Open-RMF's fleet adapters")
+@router.get(
+    "/rmf",
+    responses=problem_responses(LaneRequestsOut, 404, 409, 422),
+    summary="Closures for Open-RMF's fleet adapters",
+)
 async def rmf_lanes(
     env: EnvironmentPath,
     request: Request,
@@ -246,9 +258,9 @@ async def rmf_lanes(
     """Messages of `rmf_fleet_msgs/msg/LaneRequest`, one for each graph: lanes to close, and lanes that were closed and
     are open again, by their indexes in the graphs that `maps/rmf_nav_graph?closures=mark` gives.
     """
-    maps = await _marked(services, env, version, "rmf_nav_graph", request, principal)
+    maps = await _files_with_marks(services, env, version, "rmf_nav_graph", request, principal)
     if isinstance(maps, JobStarted):
-        return started(maps.job)
+        return job_started_response(maps.job)
     now, before = (live.closed_lanes(files) for files in maps)
     messages = [
         {
@@ -261,10 +273,12 @@ async def rmf_lanes(
         }
         for name, lanes in sorted(now.items())
     ]
-    return answer({"requests": messages})
+    return json_response({"requests": messages})
 
 
-@router.get("/vda5050", responses=told(ZoneSetsOut, 404, 409, 422), summary="Closures for VDA 5050 fleet managers")
+@router.get(
+    "/vda5050", responses=problem_responses(ZoneSetsOut, 404, 409, 422), summary="Closures for VDA 5050 fleet managers"
+)
 def vda5050_zones(
     env: EnvironmentPath,
     services: ServicesDep,
@@ -278,9 +292,9 @@ def vda5050_zones(
     """Zone sets of VDA 5050 3.0 with a `BLOCKED` zone for each closed area, one set for each level, and the closed
     edges by id, for the fleet manager's own routing. A set's id changes with its content.
     """
-    shown = _shown(services, env, version)
+    shown = _as_json(services, env, version)
     closures = shown.closures or Closures()
-    return answer(
+    return json_response(
         {
             "zoneSets": live.zone_sets(shown, closures, map_id or env),
             "closedEdges": [{"edgeId": c.edge, "until": c.expires} for c in closures.items if c.edge is not None],
@@ -288,7 +302,7 @@ def vda5050_zones(
     )
 
 
-def _shown(services: Services, env: str, ref: str | None) -> Version:
+def _as_json(services: Services, env: str, ref: str | None) -> Version:
     """The version that planners have loaded, with the closures in force. Raises NotFound."""
     refs: list[str | int] = ["production", "latest"] if ref is None else [int(ref) if ref.isdigit() else ref]
     for name in refs[:-1]:
@@ -299,16 +313,16 @@ def _shown(services: Services, env: str, ref: str | None) -> Version:
     return services.store.standing(env, refs[-1], "mark")[0]
 
 
-async def _marked(
+async def _files_with_marks(
     services: Services, env: str, ref: str | None, name: str, request: Request, principal: Principal
 ) -> list[dict[str, bytes]] | JobStarted:
     """A map's files twice, with marks: of the closures in force, and of those that ended."""
-    shown = await run_in_threadpool(_shown, services, env, ref)
+    shown = await run_in_threadpool(_as_json, services, env, ref)
     ended = [o for o in await run_in_threadpool(services.store.overlays, env) if o.state == "ended"]
     out = []
     for closures in (shown.closures, Closures(tuple(o.closure for o in ended), "mark")):
         plan = partial(services.maps.recipe, live.with_closures(shown, closures), name)
-        outcome = await made_by(services, plan, address_of(request), principal)
+        outcome = await convert_plan(services, plan, request_address(request), principal)
         if isinstance(outcome, JobStarted):
             return outcome
         out.append(await run_in_threadpool(_files, outcome[1]))

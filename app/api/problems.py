@@ -86,7 +86,7 @@ STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
 """Class -> status and title; a class that is not listed takes its nearest base's."""
 
 RETRY_SECONDS = 5
-NO_ROOM_RETRY_SECONDS = 60
+DISK_FULL_RETRY_SECONDS = 60
 ALARM_SECONDS = 3600.0
 """How often the same alarm is logged, however many requests meet it."""
 
@@ -94,7 +94,7 @@ MAX_ERRORS = 100
 MAX_ALARMS = 1000
 
 
-def status_of(error: errors.FleetMapError) -> tuple[int, str, str]:
+def problem_status(error: errors.FleetMapError) -> tuple[int, str, str]:
     """Status, title and the problem's type of an error."""
     for cls in type(error).__mro__:
         if cls in STATUS:
@@ -148,13 +148,13 @@ def problem(
 
 def as_document(error: errors.FleetMapError) -> dict[str, Any]:
     """The JSON of an error, for a job that failed."""
-    status, title, type_ = status_of(error)
+    status, title, type_ = problem_status(error)
     return document(status, error.detail, title=title, type_=type_, problems=error.problems)
 
 
-def of_error(error: errors.FleetMapError) -> Response:
+def error_response(error: errors.FleetMapError) -> Response:
     """The answer for one of our own errors."""
-    status, title, type_ = status_of(error)
+    status, title, type_ = problem_status(error)
     headers = {}
     if isinstance(error, errors.Unauthenticated):
         headers["www-authenticate"] = 'Bearer realm="fleetmap"'
@@ -163,7 +163,7 @@ def of_error(error: errors.FleetMapError) -> Response:
     elif status == 503:
         headers["retry-after"] = str(RETRY_SECONDS)
     elif status == 507:
-        headers["retry-after"] = str(NO_ROOM_RETRY_SECONDS)
+        headers["retry-after"] = str(DISK_FULL_RETRY_SECONDS)
     if isinstance(error, errors.Damaged | errors.NoRoom) and _is_news(error.detail):
         # The operator's alarm; the client learns only that it was not its fault.
         alarm = "stored data is damaged" if isinstance(error, errors.Damaged) else "no room left on the server's disk"
@@ -187,12 +187,14 @@ def _is_news(detail: str) -> bool:
         return True
 
 
-def body_of(error: Exception) -> bytes:
+def problem_body(error: Exception) -> bytes:
     """The JSON of any error, for who asks otherwise than over HTTP."""
-    return bytes((of_error(error) if isinstance(error, errors.FleetMapError) else of_bug(error)).body)
+    return bytes(
+        (error_response(error) if isinstance(error, errors.FleetMapError) else internal_error_response(error)).body
+    )
 
 
-def of_http(error: HTTPException) -> Response:
+def http_error_response(error: HTTPException) -> Response:
     """The answer for Starlette's and FastAPI's own errors (no route, wrong method …)."""
     if error.status_code in (204, 304):
         return Response(status_code=error.status_code, headers=error.headers)
@@ -207,7 +209,7 @@ def of_http(error: HTTPException) -> Response:
     return problem(error.status_code, detail, headers=error.headers)
 
 
-def of_validation(error: RequestValidationError) -> Response:
+def validation_error_response(error: RequestValidationError) -> Response:
     """The answer for a request that does not fit its schema; 400 where the body is not even JSON."""
     problems = []
     for item in error.errors():
@@ -227,13 +229,13 @@ def of_validation(error: RequestValidationError) -> Response:
     return problem(422, detail, title="Invalid request", type_="urn:fleetmap:problem:invalid", problems=problems)
 
 
-def of_bug(error: BaseException) -> Response:
+def internal_error_response(error: BaseException) -> Response:
     """The answer for anything else. The log gets the class and our own lines, no data, paths or tokens."""
     if isinstance(error, OSError) and error.errno in errors.NO_ROOM:
         detail = "the server has no room left; nothing was stored. Try again after its operator has freed space"
-        return of_error(errors.NoRoom(detail))
+        return error_response(errors.NoRoom(detail))
     if isinstance(error, OSError) and error.errno == errno.EROFS:
-        return of_error(errors.Unavailable("the server's disk is read-only; nothing was stored. Try again later"))
+        return error_response(errors.Unavailable("the server's disk is read-only; nothing was stored. Try again later"))
     log.error("internal error: %s", describe(error))
     return problem(500, "internal error; the server's log has the details. Nothing was stored", title="Internal error")
 
@@ -251,16 +253,16 @@ def describe(error: BaseException) -> str:
 async def handle_error(_: Request, error: Exception) -> Response:
     """FastAPI's handler for our own errors."""
     assert isinstance(error, errors.FleetMapError)
-    return of_error(error)
+    return error_response(error)
 
 
 async def handle_http(_: Request, error: Exception) -> Response:
     """FastAPI's handler for HTTP errors."""
     assert isinstance(error, HTTPException)
-    return of_http(error)
+    return http_error_response(error)
 
 
 async def handle_validation(_: Request, error: Exception) -> Response:
     """FastAPI's handler for requests that do not fit their schema."""
     assert isinstance(error, RequestValidationError)
-    return of_validation(error)
+    return validation_error_response(error)

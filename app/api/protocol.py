@@ -89,7 +89,7 @@ class BoundedProtocol(HttpToolsProtocol):
         """Whether something that is no request came after the last one, whose answer is still due."""
         return self._broken
 
-    def give_way(self) -> None:
+    def close_idle(self) -> None:
         """Close at once."""
         self.transport.abort()
 
@@ -104,18 +104,18 @@ class BoundedProtocol(HttpToolsProtocol):
         peer = get_remote_addr(transport)
         accepted = self._connections.open(self, peer[0] if peer else None)
         if self._tls is None:
-            self._begin(transport)
+            self._start(transport)
             if not accepted:
-                self._refuse(503, "too many connections are open: try again in a few seconds")
+                self._reject(503, "too many connections are open: try again in a few seconds")
             return
         self.transport = transport
         if not accepted:
             transport.abort()  # nothing can be said before the handshake
             return
         self._held = bytearray()
-        self._handshake = self.loop.create_task(self._begin_tls(transport, self._tls))
+        self._handshake = self.loop.create_task(self._start_tls(transport, self._tls))
 
-    async def _begin_tls(self, transport: asyncio.Transport, tls: tuple[Path, Path]) -> None:
+    async def _start_tls(self, transport: asyncio.Transport, tls: tuple[Path, Path]) -> None:
         """Agree on TLS. The event loop's own way to do so counts no connection before its handshake is over."""
         secured = None
         handshake = asyncio.ensure_future(
@@ -138,12 +138,12 @@ class BoundedProtocol(HttpToolsProtocol):
             self._connections.close(self)
             transport.abort()
             return
-        self._begin(secured)
+        self._start(secured)
         early, self._held = self._held, None
         if early:
             self.data_received(bytes(early))
 
-    def _begin(self, transport: asyncio.Transport) -> None:
+    def _start(self, transport: asyncio.Transport) -> None:
         super().connection_made(transport)
         self._closing = _Closing(self)
         self._await_head()
@@ -235,9 +235,9 @@ class BoundedProtocol(HttpToolsProtocol):
         if self.pipeline or not (self.is_idle or (self.cycle.more_body and not self.cycle.response_started)):
             self._end_after_answers()
         elif self._head_size > MAX_HEAD:
-            self._refuse(431, "the request's head is too large")
+            self._reject(431, "the request's head is too large")
         else:
-            self._refuse(400, "this is not a valid HTTP request")
+            self._reject(400, "this is not a valid HTTP request")
 
     def linger(self) -> None:
         """Close, but first let the client read the answer: bytes that nobody takes in would reset the connection."""
@@ -256,7 +256,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._broken = True
         self.cycle.keep_alive = False
 
-    def _refuse(self, status: int, detail: str) -> None:
+    def _reject(self, status: int, detail: str) -> None:
         body = orjson.dumps(document(status, detail))
         retry = f"retry-after: {RETRY_SECONDS}\r\n" if status == 503 else ""
         head = f"content-type: {MEDIA_TYPE}\r\ncontent-length: {len(body)}\r\n{retry}connection: close\r\n\r\n"
@@ -270,14 +270,14 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def _await_head(self) -> None:
         if self._head_timer is None:
-            self._head_timer = self.loop.call_later(self._limits.head_seconds, self._give_up)
+            self._head_timer = self.loop.call_later(self._limits.head_seconds, self._abort)
 
     def _head_came(self) -> None:
         if self._head_timer is not None:
             self._head_timer.cancel()
             self._head_timer = None
 
-    def _give_up(self) -> None:
+    def _abort(self) -> None:
         self._head_timer = None
         if not self.transport.is_closing():
             self.transport.close()

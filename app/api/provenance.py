@@ -11,9 +11,9 @@ from starlette.responses import Response
 
 from app.api.auth import Viewer
 from app.api.dependencies import ServicesDep
-from app.api.maps import number_of
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, told
+from app.api.maps import parse_version_ref
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, problem_responses
 from app.convert.maps import Maps
 from app.store.values import Version
 
@@ -163,14 +163,17 @@ def _short(text: str, limit: int) -> str:
 
 @router.get(
     "/provenance",
-    responses={**told(ProvenanceOut, 404), 200: {"model": ProvenanceOut, "content": {"image/svg+xml": {}}}},
+    responses={
+        **problem_responses(ProvenanceOut, 404),
+        200: {"model": ProvenanceOut, "content": {"image/svg+xml": {}}},
+    },
     summary="Which file made which map",
 )
 def provenance(env: EnvironmentPath, v: VersionPath, request: Request, services: ServicesDep, _: Viewer) -> Response:
     """An SVG picture, or the same as JSON with `Accept: application/json`. What is stale is marked."""
-    version = services.store.version(env, number_of(v))
+    version = services.store.version(env, parse_version_ref(v))
     lineage = graph(services.maps, version)
     if "application/json" in request.headers.get("accept", ""):
-        return answer({"environment": env, "version": version.number, **lineage})
+        return json_response({"environment": env, "version": version.number, **lineage})
     picture = svg(lineage, f"{env}, version {version.number}")
     return Response(picture, media_type="image/svg+xml", headers={"content-security-policy": "default-src 'none'"})

@@ -19,7 +19,7 @@ from app.model.names import did_you_mean
 API = "/api/v1"
 
 
-def path_of(*parts: object) -> str:
+def api_path(*parts: object) -> str:
     """An address below the API from its parts, each quoted whole."""
     return API + "".join("/" + quote(str(part), safe="") for part in parts)
 
@@ -29,19 +29,19 @@ def json_bytes(value: Any) -> bytes:
     return orjson.dumps(value, option=orjson.OPT_NON_STR_KEYS)
 
 
-def answer(value: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+def json_response(value: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
     """A JSON answer."""
     return Response(json_bytes(value), status, headers, "application/json")
 
 
-def page(request: Request, items: list[Any], cursor: str | None) -> Response:
+def page_response(request: Request, items: list[Any], cursor: str | None) -> Response:
     """One page of a list; ``Link: <…>; rel="next"`` where there is more."""
     headers = {}
     if cursor is not None:
         query = [(k, v) for k, v in request.query_params.multi_items() if k != "cursor"]
         path = quote(request.url.path, safe="/")
         headers["link"] = f'<{path}?{urlencode([*query, ("cursor", cursor)])}>; rel="next"'
-    return answer(items, headers=headers)
+    return json_response(items, headers=headers)
 
 
 class _StrictRequest(Request):

@@ -14,8 +14,18 @@ from starlette.responses import Response
 from app import fleet
 from app.api.auth import Editor, Principal, RobotRole, Viewer
 from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, answer, page
-from app.api.schemas import CHANNEL, NAME, Cursor, Limit, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
+from app.api.responses import StrictRoute, json_response, page_response
+from app.api.schemas import (
+    CHANNEL,
+    NAME,
+    Cursor,
+    Limit,
+    RobotDetailOut,
+    RobotOut,
+    RobotPath,
+    StatusBody,
+    problem_responses,
+)
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.audit import about
 from app.store.values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport, rfc3339
@@ -27,7 +37,7 @@ EnvironmentQuery = Annotated[
 ]
 
 
-@router.get("", responses=told(list[RobotOut], 404), summary="All robots")
+@router.get("", responses=problem_responses(list[RobotOut], 404), summary="All robots")
 def list_robots(
     request: Request,
     services: ServicesDep,
@@ -41,14 +51,14 @@ def list_robots(
     environment and name.
     """
     if environment is not None:
-        principal.enter(environment)
+        principal.require_environment(environment)
     robots, following = services.store.robots_page(
         environment, channel=channel, limit=limit, cursor=cursor, allowed=principal.environments
     )
-    return page(request, _told(services, robots), following)
+    return page_response(request, _robots_as_json(services, robots), following)
 
 
-@router.get("/{robot}", responses=told(RobotDetailOut, 404), summary="One robot, with what it said before")
+@router.get("/{robot}", responses=problem_responses(RobotDetailOut, 404), summary="One robot, with what it said before")
 def get_robot(
     robot: RobotPath,
     services: ServicesDep,
@@ -59,24 +69,27 @@ def get_robot(
     """In the environment where it reported last, unless one is named. `history`: newest first, each time that it said
     something new; `environments`: all in which it reported.
     """
-    robots = [r for r in services.store.robots(None, robot) if principal.may_enter(r.environment)]
+    robots = [r for r in services.store.robots(None, robot) if principal.can_access(r.environment)]
     if environment is not None:
-        principal.enter(environment)
+        principal.require_environment(environment)
     chosen = [r for r in robots if environment is None or r.environment == environment]
     if not chosen:
         scope = "" if environment is None else f" in {environment}"
         raise NotFound(f"no robot {robot[:80]!r} has reported{scope}")
     newest = max(chosen, key=lambda r: r.time)
     history = services.store.robot_history(newest.environment, robot, limit)
-    body = _one(services, [newest])
+    body = _only_robot(services, [newest])
     body["environments"] = [r.environment for r in robots]
     body["history"] = [{**_report(report, time), "received": rfc3339(time)} for time, report in history]
-    return answer(body)
+    return json_response(body)
 
 
 @router.put(
     "/{robot}/status",
-    responses={**told(RobotOut, 400, 404, 409, 415, 503), 204: {"description": "Taken (`Prefer: return=minimal`)"}},
+    responses={
+        **problem_responses(RobotOut, 400, 404, 409, 415, 503),
+        204: {"description": "Taken (`Prefer: return=minimal`)"},
+    },
     summary="A robot says what it holds",
 )
 async def put_status(
@@ -87,8 +100,8 @@ async def put_status(
     prefer: Annotated[str | None, Header(description="`return=minimal` (RFC 7240): 204 instead of the robot.")] = None,
 ) -> Response:
     """The same as over Zenoh. A robot's token may tell of the robot that it names; editors may tell of any."""
-    may_report(principal, robot)
-    principal.enter(body.environment)
+    require_report_permission(principal, robot)
+    principal.require_environment(body.environment)
     if body.time is not None and body.time.tzinfo is None:
         raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
     holds = None if body.holds is None else (body.holds.version, body.holds.root)
@@ -100,10 +113,14 @@ async def put_status(
     fleet.settle(noting)
     if prefer is not None and prefer.strip().lower() == "return=minimal":
         return Response(status_code=204, headers={"preference-applied": "return=minimal"})
-    return answer(await run_in_threadpool(lambda: _one(services, services.store.robots(body.environment, robot))))
+    return json_response(
+        await run_in_threadpool(lambda: _only_robot(services, services.store.robots(body.environment, robot)))
+    )
 
 
-@router.delete("/{robot}", status_code=204, responses=told(None, 404), summary="Forget a robot that is gone for good")
+@router.delete(
+    "/{robot}", status_code=204, responses=problem_responses(None, 404), summary="Forget a robot that is gone for good"
+)
 def forget_robot(
     robot: RobotPath,
     services: ServicesDep,
@@ -111,13 +128,13 @@ def forget_robot(
     environment: Annotated[str, Query(pattern=NAME, description="Where it is to be forgotten.", examples=["orchard"])],
 ) -> Response:
     """It no longer counts among its channel's robots. It comes back with its next report."""
-    principal.enter(environment)
+    principal.require_environment(environment)
     about(environment=environment)
     services.store.forget_robot(environment, robot)
     return Response(status_code=204)
 
 
-def may_report(principal: Principal, robot: str) -> None:
+def require_report_permission(principal: Principal, robot: str) -> None:
     """Denied for a robot's token that names another robot, or none."""
     if principal.role != "robot" or principal.robot == robot:
         return
@@ -125,20 +142,20 @@ def may_report(principal: Principal, robot: str) -> None:
     raise Denied(f"your token {names}: it cannot tell the status of {robot[:128]}")
 
 
-def noted(services: Services, environment: str, robot: str, report: RobotReport) -> dict[str, Any]:
+def store_report(services: Services, environment: str, robot: str, report: RobotReport) -> dict[str, Any]:
     """Store a report; the robot as it is now."""
     services.fleet.note(ReceivedReport(environment, robot, report, datetime.now(UTC)))
-    return _one(services, services.store.robots(environment, robot))
+    return _only_robot(services, services.store.robots(environment, robot))
 
 
-def _one(services: Services, robots: Sequence[Robot]) -> dict[str, Any]:
+def _only_robot(services: Services, robots: Sequence[Robot]) -> dict[str, Any]:
     """The only one of them; NotFound where it, or its environment, went meanwhile."""
-    for body in _told(services, robots):
+    for body in _robots_as_json(services, robots):
         return body
     raise NotFound("the robot, or its environment, is no longer there")
 
 
-def _told(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
+def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
     """As clients see them; without those whose environment is deleted meanwhile."""
     now = datetime.now(UTC)
     channels: dict[str, dict[str, Channel]] = {}
@@ -165,7 +182,7 @@ def _told(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
         body |= {
             "received": rfc3339(robot.time),
             "since": rfc3339(robot.since),
-            "holds": active_map and _held(active_map),
+            "holds": active_map and _active_map_as_json(active_map),
             "online": fleet.is_online(robot, now),
             "vouched": robot.vouched,
             "lag": lag,
@@ -174,7 +191,7 @@ def _told(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
     return out
 
 
-def _held(active_map: ActiveMap) -> dict[str, Any]:
+def _active_map_as_json(active_map: ActiveMap) -> dict[str, Any]:
     overlays = {} if active_map.overlays is None else {"overlays": active_map.overlays}
     return {"version": active_map.version, "root": active_map.root, **overlays, "since": rfc3339(active_map.since)}
 

@@ -21,7 +21,7 @@ PRODUCTION = "production"
 PAGE = 1000
 
 
-def standing(services: Services, chosen: tuple[EnvironmentSelector, ...], channel: str) -> dict[str, Version]:
+def channel_versions(services: Services, chosen: tuple[EnvironmentSelector, ...], channel: str) -> dict[str, Version]:
     """The chosen environments that there are, each with the version and closures that the channel shows.
 
     channel: empty for production where there is one, else the latest. Where it stands nowhere, nothing goes out.
@@ -50,7 +50,7 @@ def _all_names(services: Services) -> list[str]:
             return names
 
 
-def content(services: Services, derive: bool, version: Version) -> TopicContent:
+def topic_content(services: Services, derive: bool, version: Version) -> TopicContent:
     """Each level's grid, and the network. derive: also what is not stored but can be computed."""
     absent: list[str] = []
     grids: dict[str, cdr.Grid] = {}

@@ -1145,7 +1145,9 @@ IdempotencyKey = Annotated[
 ]
 
 
-def told(model: Any, *statuses: int, ok: int = 200, description: str = "OK") -> dict[int | str, dict[str, Any]]:
+def problem_responses(
+    model: Any, *statuses: int, ok: int = 200, description: str = "OK"
+) -> dict[int | str, dict[str, Any]]:
     """OpenAPI's responses: the good one by its shape, and which problems this call can meet besides the usual ones."""
     reasons = {
         400: "The body is malformed.",

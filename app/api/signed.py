@@ -26,7 +26,7 @@ LINK = "link"
 """Id and name of the principal of a request by link, and the member of a request's state that has the link."""
 
 
-def signed_address(scope: Scope) -> SignedAddress | None:
+def request_link(scope: Scope) -> SignedAddress | None:
     """The link that a request was made by; None for all other requests. Only maps are given by link, and only read.
 
     Raises InvalidLink where the query has a signature but is no link.

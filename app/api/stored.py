@@ -9,9 +9,9 @@ from starlette.responses import Response
 
 from app.api.auth import ServerAdmin
 from app.api.dependencies import ServicesDep
-from app.api.maps import IN_MEMORY, streamed
+from app.api.maps import IN_MEMORY, stream_file
 from app.api.responses import StrictRoute
-from app.api.schemas import told
+from app.api.schemas import problem_responses
 from app.errors import Damaged, NotFound
 
 TYPE = "application/octet-stream"
@@ -24,7 +24,7 @@ router = APIRouter(prefix="/stored", tags=["stored data"], route_class=StrictRou
     response_class=Response,
     responses={
         200: {"description": "The bytes", "content": {TYPE: {}}},
-        **told(None, 404),
+        **problem_responses(None, 404),
     },
     summary="Stored bytes by their hash",
 )
@@ -41,7 +41,7 @@ def stored(
     try:
         if kind == "blobs" and (size := services.store.blobs.size(sha256)) > IN_MEMORY:
             headers = [(b"content-type", TYPE.encode()), (b"content-length", str(size).encode())]
-            return streamed(services.store.blobs.open(sha256), 0, size, 200, headers)
+            return stream_file(services.store.blobs.open(sha256), 0, size, 200, headers)
         data = services.store.blobs.get(sha256) if kind == "blobs" else services.store.chunk(sha256)
     except Damaged as error:  # a chunk that was never here is the same as a lost one
         raise NotFound(f"there are no such {kind}: {sha256}") from error

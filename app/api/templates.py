@@ -10,8 +10,8 @@ from starlette.responses import Response
 from app import formats, templates
 from app.api.auth import Editor, Principal, Viewer
 from app.api.dependencies import Services, ServicesDep
-from app.api.maps import number_of
-from app.api.responses import StrictRoute, answer
+from app.api.maps import parse_version_ref
+from app.api.responses import StrictRoute, json_response
 from app.api.schemas import (
     MAX_TEXT,
     VERSION,
@@ -24,9 +24,9 @@ from app.api.schemas import (
     TemplateSetOut,
     TemplatesOut,
     VersionOut,
-    told,
+    problem_responses,
 )
-from app.api.versions import told_as
+from app.api.versions import commit_response
 from app.formats import Format
 from app.ingest import TemplateUpdate
 from app.model.templates import FormatTemplate, Templates
@@ -37,22 +37,22 @@ router = APIRouter(tags=["templates"], route_class=StrictRoute)
 FormatPath = Annotated[
     str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["tmap2"])
 ]
-Which = Annotated[
+TemplateVersion = Annotated[
     str, Query(alias="version", pattern=VERSION, description="Number, channel, or `latest`.", examples=["latest"])
 ]
 Message = Annotated[str, Query(max_length=MAX_TEXT, description="Why, for the history.")]
 DryRun = Annotated[bool, Query(description="Only say what would be.")]
 
 CHANGED: dict[int | str, dict[str, Any]] = {
-    **told(VersionOut, 400, 404, 409, 412, 415, ok=201, description="A new version"),
+    **problem_responses(VersionOut, 400, 404, 409, 412, 415, ok=201, description="A new version"),
     200: {"model": VersionOut, "description": "Nothing changed: the head. Or a dry run: `version` is null."},
 }
 
 
-@router.get("/templates", responses=told(list[TemplateSetOut]), summary="All template sets")
+@router.get("/templates", responses=problem_responses(list[TemplateSetOut]), summary="All template sets")
 def list_sets(_: Viewer) -> Response:
     """Named sets of values for parameters of formats. What one does not say is left to the format's defaults."""
-    return answer(sets())
+    return json_response(sets())
 
 
 def sets() -> list[dict[str, Any]]:
@@ -60,14 +60,20 @@ def sets() -> list[dict[str, Any]]:
     return [one.as_dict(name) for name, one in templates.SETS.items()]
 
 
-@router.get("/environments/{env}/templates", responses=told(TemplatesOut, 404), summary="An environment's templates")
-def get_templates(env: EnvironmentPath, services: ServicesDep, _: Viewer, version: Which = "latest") -> Response:
+@router.get(
+    "/environments/{env}/templates",
+    responses=problem_responses(TemplatesOut, 404),
+    summary="An environment's templates",
+)
+def get_templates(
+    env: EnvironmentPath, services: ServicesDep, _: Viewer, version: TemplateVersion = "latest"
+) -> Response:
     """The chosen set, and for each format with parameters the values of its own, what holds, and from where.
 
     A parameter of a request goes before the environment's values, these before the set's, these before the format's
     defaults.
     """
-    stored_version = services.store.version(env, number_of(version))
+    stored_version = services.store.version(env, parse_version_ref(version))
     fmts = [f for f in formats.all_formats().values() if f.write is not None and templates.has_parameters(f)]
     body = {
         "environment": env,
@@ -76,7 +82,7 @@ def get_templates(env: EnvironmentPath, services: ServicesDep, _: Viewer, versio
         "sets": list(templates.SETS),
         "formats": [_line(stored_version.templates, one) for one in fmts],
     }
-    return answer(body, headers=_headers(stored_version))
+    return json_response(body, headers=_headers(stored_version))
 
 
 @router.put("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Choose a template set")
@@ -91,7 +97,7 @@ def put_templates(
     """A version in which another set holds, or other values of several formats at once. What is left out stays."""
     format_templates = {name: FormatTemplate(template.set, template.values) for name, template in body.formats.items()}
     update = TemplateUpdate(body.set, format_templates, dry_run=body.dry_run).checked()
-    return _said(services, env, update, body.message, principal, if_match, idempotency_key)
+    return _commit_templates(services, env, update, body.message, principal, if_match, idempotency_key)
 
 
 @router.delete("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Take all templates back")
@@ -106,23 +112,23 @@ def delete_templates(
 ) -> Response:
     """A version in which the formats' own defaults hold."""
     update = TemplateUpdate(clear=True, dry_run=dry_run)
-    return _said(services, env, update, message, principal, if_match, idempotency_key)
+    return _commit_templates(services, env, update, message, principal, if_match, idempotency_key)
 
 
 @router.get(
     "/environments/{env}/templates/{format}",
-    responses=told(FormatTemplatesOut, 404),
+    responses=problem_responses(FormatTemplatesOut, 404),
     summary="An environment's templates for a format",
 )
 def get_format_templates(
-    env: EnvironmentPath, format: FormatPath, services: ServicesDep, _: Viewer, version: Which = "latest"
+    env: EnvironmentPath, format: FormatPath, services: ServicesDep, _: Viewer, version: TemplateVersion = "latest"
 ) -> Response:
     """`values`: the environment's own. `effective`: each parameter's value, and `from`: `environment`, `set NAME` or
     `default`."""
     fmt = templates.check_format(format)
-    stored_version = services.store.version(env, number_of(version))
+    stored_version = services.store.version(env, parse_version_ref(version))
     body = {"environment": env, "version": stored_version.number, **_line(stored_version.templates, fmt)}
-    return answer(body, headers=_headers(stored_version))
+    return json_response(body, headers=_headers(stored_version))
 
 
 @router.put(
@@ -145,7 +151,7 @@ def put_format_templates(
     Maps of the new version are made with them; old versions keep answering as they did.
     """
     update = TemplateUpdate(None, {format: FormatTemplate(body.set, body.values)}, dry_run=body.dry_run).checked("body")
-    return _said(services, env, update, body.message, principal, if_match, idempotency_key)
+    return _commit_templates(services, env, update, body.message, principal, if_match, idempotency_key)
 
 
 @router.delete(
@@ -166,10 +172,10 @@ def delete_format_templates(
 ) -> Response:
     """A version in which the environment's set holds for the format again."""
     update = TemplateUpdate(None, {format: FormatTemplate()}, dry_run=dry_run).checked()
-    return _said(services, env, update, message, principal, if_match, idempotency_key)
+    return _commit_templates(services, env, update, message, principal, if_match, idempotency_key)
 
 
-def _said(
+def _commit_templates(
     services: Services,
     env: str,
     update: TemplateUpdate,
@@ -181,7 +187,7 @@ def _said(
     outcome = services.ingest.template(
         env, update, message=message, author=principal.name, if_match=if_match, idempotency=key
     )
-    return told_as(outcome)
+    return commit_response(outcome)
 
 
 def _line(stored_templates: Templates, fmt: Format) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from starlette.responses import Response
 
 from app.api.auth import ServerAdmin
 from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, told
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, problem_responses
 from app.errors import Conflict, Invalid, NotFound, Problem
 from app.events.messages import ROBOT_NAME
 from app.store.values import Token, rfc3339
@@ -33,16 +33,16 @@ def as_dict(token: Token) -> dict[str, Any]:
     }
 
 
-@router.get("", responses=told(list[TokenOut]), summary="All tokens, without their secrets")
+@router.get("", responses=problem_responses(list[TokenOut]), summary="All tokens, without their secrets")
 def list_tokens(services: ServicesDep, _: ServerAdmin) -> Response:
     """Oldest first."""
-    return answer([as_dict(token) for token in services.store.tokens()])
+    return json_response([as_dict(token) for token in services.store.tokens()])
 
 
 @router.post(
     "",
     status_code=201,
-    responses=told(NewTokenOut, 400, 415, ok=201, description="Made"),
+    responses=problem_responses(NewTokenOut, 400, 415, ok=201, description="Made"),
     summary="Make a token",
 )
 def create_token(body: TokenBody, services: ServicesDep, _: ServerAdmin) -> Response:
@@ -57,12 +57,12 @@ def create_token(body: TokenBody, services: ServicesDep, _: ServerAdmin) -> Resp
             raise Invalid("expires is in the past", [Problem("past", where="expires")])
     if body.robot is not None and body.role != "robot":
         raise Invalid("only a token with the role robot names a robot", [Problem("role is not robot", where="robot")])
-    robot = _robot_of(body)
+    robot = _robot_name(body)
     token, secret = services.store.create_token(body.name, body.role, body.environments, robot, body.expires)
-    return answer({**as_dict(token), "token": secret}, 201, {"cache-control": "no-store"})
+    return json_response({**as_dict(token), "token": secret}, 201, {"cache-control": "no-store"})
 
 
-def _robot_of(body: TokenBody) -> str | None:
+def _robot_name(body: TokenBody) -> str | None:
     """The robot that a token names; None for other roles than ``robot``."""
     if body.role != "robot":
         return None
@@ -77,19 +77,19 @@ def _robot_of(body: TokenBody) -> str | None:
     return name
 
 
-@router.delete("/{id}", status_code=204, responses=told(None, 404, 409), summary="Revoke a token")
+@router.delete("/{id}", status_code=204, responses=problem_responses(None, 404, 409), summary="Revoke a token")
 def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Response:
     """It is refused from now on (within a second by other worker processes). The last administrator's stays."""
     tokens = {token.id: token for token in services.store.tokens()}
     if id not in tokens:
         raise NotFound("there is no token with this id")
-    if _rules_all(tokens[id]) and not any(_rules_all(t) for t in tokens.values() if t.id != id):
+    if _is_full_admin(tokens[id]) and not any(_is_full_admin(t) for t in tokens.values() if t.id != id):
         raise Conflict("this is the last administrator's token: make another one first")
     services.store.delete_token(id)
-    services.access.forget()
+    services.access.invalidate()
     return Response(status_code=204)
 
 
-def _rules_all(token: Token) -> bool:
+def _is_full_admin(token: Token) -> bool:
     """Whether it is an administrator's for everything, and for good."""
     return token.role == "admin" and token.environments is None and token.expires is None

@@ -11,9 +11,9 @@ from starlette.responses import Response
 from app.api.auth import Viewer
 from app.api.dependencies import ServicesDep
 from app.api.environments import numbers
-from app.api.maps import number_of
-from app.api.responses import StrictRoute, answer
-from app.api.schemas import VERSION, EnvironmentPath, TransformOut, told
+from app.api.maps import parse_version_ref
+from app.api.responses import StrictRoute, json_response
+from app.api.schemas import VERSION, EnvironmentPath, TransformOut, problem_responses
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES
 from app.model.geodesy import local_frame
@@ -21,14 +21,14 @@ from app.model.geodesy import local_frame
 router = APIRouter(prefix="/environments/{env}", tags=["transform"], route_class=StrictRoute)
 
 
-FAR = "the place is too far from the datum for the local frame"
+TOO_FAR = "the place is too far from the datum for the local frame"
 
 
-def _refused(location: str, detail: str) -> Invalid:
+def _invalid_place_error(location: str, detail: str) -> Invalid:
     return Invalid(detail, [Problem(detail, where=location)])
 
 
-@router.get("/transform", responses=told(TransformOut, 404), summary="Between earth and local frame")
+@router.get("/transform", responses=problem_responses(TransformOut, 404), summary="Between earth and local frame")
 def transform(
     env: EnvironmentPath,
     services: ServicesDep,
@@ -42,28 +42,28 @@ def transform(
     """Give ``latlon`` or ``xy``; the answer has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
     if (latlon is None) == (xy is None):
         raise Invalid("give either latlon=LAT,LON or xy=X,Y", [Problem("one of latlon and xy", where="query")])
-    datum = services.store.version(env, number_of(version)).datum
+    datum = services.store.version(env, parse_version_ref(version)).datum
     if datum is None:
         raise MissingDatum(f'{env} has no datum: PATCH it with {{"datum": {{…}}}} or upload a datum.yaml')
     frame = local_frame(datum)
     if latlon is not None:
         latitude, longitude = numbers(latlon, "latlon", "LAT,LON")
         if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
-            raise _refused("latlon", "latlon must be LAT,LON in degrees: the latitude comes first")
+            raise _invalid_place_error("latlon", "latlon must be LAT,LON in degrees: the latitude comes first")
         lonlat = np.array([[longitude, latitude]])
         place = frame.to_local(lonlat)
         if not (np.isfinite(place).all() and (np.abs(place) <= MAX_METRES).all()):
-            raise _refused("latlon", FAR)
+            raise _invalid_place_error("latlon", TOO_FAR)
     else:
         x, y = numbers(xy or "", "xy", "X,Y")
         if max(abs(x), abs(y)) > MAX_METRES:
-            raise _refused("xy", f"x and y must be within ±{MAX_METRES:g} metres")
+            raise _invalid_place_error("xy", f"x and y must be within ±{MAX_METRES:g} metres")
         place = np.array([[x, y]])
         lonlat = frame.to_wgs84(place)
         if not np.isfinite(lonlat).all():
-            raise _refused("xy", FAR)
+            raise _invalid_place_error("xy", TOO_FAR)
     degrees, metres = np.round(lonlat[0], 12) + 0.0, np.round(place[0], 9) + 0.0
-    return answer(
+    return json_response(
         {
             "latlon": [float(degrees[1]), float(degrees[0])],
             "xy": [float(metres[0]), float(metres[1])],

@@ -60,7 +60,7 @@ class UploadSpool:
         self._folder = spool / uuid4().hex
         self._alive: IO[str] | None = None
         if spool.is_dir():
-            _remove_left(spool)
+            _remove_abandoned(spool)
         with contextlib.suppress(OSError):  # a full disk keeps uploads away, not the server from starting
             self._open()
 
@@ -90,7 +90,7 @@ class UploadSpool:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     @contextlib.asynccontextmanager
-    async def take(self, request: Request) -> AsyncIterator[UploadForm]:
+    async def receive(self, request: Request) -> AsyncIterator[UploadForm]:
         """The form of a multipart request; its files last as long as the block.
 
         Raises Unavailable (too many uploads at once), MalformedBody, Invalid, TooLarge.
@@ -128,7 +128,7 @@ async def _feed(request: Request, receiver: _MultipartReceiver) -> None:
     await run_in_threadpool(receiver.finish, b"".join(batch))
 
 
-def _remove_left(spool: Path) -> None:
+def _remove_abandoned(spool: Path) -> None:
     """Remove the folders of processes that are no more: nobody holds their lock."""
     for folder in spool.iterdir():
         try:

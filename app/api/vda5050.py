@@ -13,12 +13,21 @@ from starlette.responses import Response
 from app import formats
 from app.api.auth import Principal, RobotRole, Viewer
 from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, started
+from app.api.jobs import JobStarted, job_started_response
 from app.api.links import LinkedFile, link_to
-from app.api.maps import number_of
-from app.api.responses import StrictRoute, answer
-from app.api.robots import may_report, noted
-from app.api.schemas import CHANNEL, NAME, ActionsOut, EnvironmentPath, RobotPath, StateOut, VersionPath, told
+from app.api.maps import parse_version_ref
+from app.api.responses import StrictRoute, json_response
+from app.api.robots import require_report_permission, store_report
+from app.api.schemas import (
+    CHANNEL,
+    NAME,
+    ActionsOut,
+    EnvironmentPath,
+    RobotPath,
+    StateOut,
+    VersionPath,
+    problem_responses,
+)
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
 from app.store.values import Channel, RobotReport, RobotState, Version
@@ -35,7 +44,7 @@ STATE: dict[str, Any] = {
 @router.get(
     "/environments/{env}/versions/{v}/vda5050/actions",
     responses={
-        **told(ActionsOut, 404, 409),
+        **problem_responses(ActionsOut, 404, 409),
         202: {"description": "The map takes long: follow the job at `Location`, then ask again."},
     },
     summary="A version as VDA 5050 instant actions",
@@ -87,7 +96,7 @@ async def get_actions(
     """
     reserved_names = {"mapId", "format", "level", "signed", "seconds"}
     values = {name: text for name, text in request.query_params.multi_items() if name not in reserved_names}
-    version = await run_in_threadpool(services.store.version, env, number_of(v))
+    version = await run_in_threadpool(services.store.version, env, parse_version_ref(v))
     _check_format(format, by_level=level is not None)
     services.links.check_life(seconds)
     maps: list[dict[str, Any]] = []
@@ -105,13 +114,13 @@ async def get_actions(
             missing.append({"level": name, "detail": error.detail})
             continue
         if isinstance(outcome, JobStarted):
-            return started(outcome.job)
+            return job_started_response(outcome.job)
         floor = map_id if map_id is not None and level != "*" else vda5050.map_id_of(site, _other(version, name))
         maps.append(_actions(version, floor, name if level is not None else None, outcome))
     if not maps:
         raise CannotConvert("no level has this map: " + "; ".join(f"{m['level']}: {m['detail']}" for m in missing[:20]))
     body = {"environment": env, "version": version.number, "root": version.root, **maps[0], "maps": maps}
-    return answer(body | {"missing": missing}, headers={"cache-control": "no-store"})
+    return json_response(body | {"missing": missing}, headers={"cache-control": "no-store"})
 
 
 def _check_format(name: str, *, by_level: bool) -> None:
@@ -171,7 +180,9 @@ def _actions(version: Version, map_id: str, level: str | None, link: LinkedFile)
 
 
 @router.post(
-    "/robots/{robot}/vda5050/state", responses=told(StateOut, 400, 404, 409, 415), summary="A vehicle's VDA 5050 state"
+    "/robots/{robot}/vda5050/state",
+    responses=problem_responses(StateOut, 400, 404, 409, 415),
+    summary="A vehicle's VDA 5050 state",
 )
 def post_state(
     robot: RobotPath,
@@ -199,7 +210,7 @@ def post_state(
     each floor in the message, and `active` with the oldest that is enabled on any. `ignored`: what is not known here,
     and why.
     """
-    may_report(principal, robot)
+    require_report_permission(principal, robot)
     out: dict[str, list[dict[str, Any]]] = {"robots": [], "ignored": []}
     sites: dict[str, list[vda5050.VehicleMaps]] = {}
     for maps in vda5050.read_state(message):
@@ -209,11 +220,11 @@ def post_state(
         names = ", ".join(list(sites)[:20])
         raise Invalid(f"the state tells of several maps: say which is {environment}'s, mapId being one of {names}")
     for site, floors in sites.items():
-        _take(services, principal, robot, floors, environment or site, channel, out)
-    return answer(out)
+        _collect_reports(services, principal, robot, floors, environment or site, channel, out)
+    return json_response(out)
 
 
-def _take(
+def _collect_reports(
     services: Services,
     principal: Principal,
     robot: str,
@@ -223,7 +234,7 @@ def _take(
     out: dict[str, list[dict[str, Any]]],
 ) -> None:
     try:
-        if not principal.may_enter(env):
+        if not principal.can_access(env):
             raise NotFound("your token does not reach it, or it is none of this server's environments")
         stored_robot = next(iter(services.store.robots(env, robot)), None)
         channels = {c.name: c for c in services.store.channels(env)}
@@ -244,7 +255,7 @@ def _take(
     ):
         reports = reports[1:]
     for report in reports:
-        body = noted(services, env, robot, report)
+        body = store_report(services, env, robot, report)
     if reports:
         out["robots"].append(body)
 

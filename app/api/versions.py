@@ -14,9 +14,9 @@ from app import formats
 from app.api.auth import Editor, Principal, Viewer
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
 from app.api.dependencies import Services, ServicesDep
-from app.api.maps import IN_MEMORY, number_of, streamed
+from app.api.maps import IN_MEMORY, parse_version_ref, stream_file
 from app.api.problems import UnsupportedMedia
-from app.api.responses import StrictRoute, answer, page, path_of
+from app.api.responses import StrictRoute, api_path, json_response, page_response
 from app.api.schemas import (
     VERSION,
     Cursor,
@@ -29,7 +29,7 @@ from app.api.schemas import (
     SourceOut,
     VersionOut,
     VersionPath,
-    told,
+    problem_responses,
 )
 from app.api.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
@@ -90,7 +90,7 @@ UPLOAD_BODY: dict[str, Any] = {
 }
 
 
-@router.get("/versions", responses=told(list[VersionOut], 404), summary="History, newest first")
+@router.get("/versions", responses=problem_responses(list[VersionOut], 404), summary="History, newest first")
 def list_versions(
     env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer, limit: Limit = 100, cursor: Cursor = None
 ) -> Response:
@@ -100,14 +100,14 @@ def list_versions(
     before = int(cursor) if cursor is not None else None
     versions = services.store.versions(env, limit=limit + 1, before=before)
     following = str(versions[limit - 1].number) if len(versions) > limit else None
-    return page(request, [version.as_dict() for version in versions[:limit]], following)
+    return page_response(request, [version.as_dict() for version in versions[:limit]], following)
 
 
 @router.post(
     "/versions",
     status_code=201,
     responses={
-        **told(VersionOut, 400, 404, 409, 412, 413, 415, 503, ok=201, description="A new version"),
+        **problem_responses(VersionOut, 400, 404, 409, 412, 413, 415, 503, ok=201, description="A new version"),
         200: {"model": VersionOut, "description": "Nothing changed: the head. Or a dry run: `version` is null."},
     },
     summary="Upload files, or revert",
@@ -124,10 +124,10 @@ async def create_version(
     """One upload is one version, all or nothing. Files are taken as they are; what is doubtful comes as warnings."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media == "multipart/form-data":
-        async with services.intake.take(request) as form:
+        async with services.intake.receive(request) as form:
             upload = _upload(form, request)
             outcome = await run_in_threadpool(
-                _counted, services, services.ingest.upload, env, upload, principal, if_match, idempotency_key
+                _count_upload, services, services.ingest.upload, env, upload, principal, if_match, idempotency_key
             )
     elif media == "application/json" or media.endswith("+json"):
         _no_query(request)
@@ -136,14 +136,14 @@ async def create_version(
         )
     else:
         raise UnsupportedMedia("send multipart/form-data with files, or application/json with revert_to")
-    return told_as(outcome)
+    return commit_response(outcome)
 
 
 @router.post(
     "/edits",
     status_code=201,
     responses={
-        **told(VersionOut, 400, 404, 409, 412, 415, ok=201, description="A new version"),
+        **problem_responses(VersionOut, 400, 404, 409, 412, 415, ok=201, description="A new version"),
         200: {"model": VersionOut, "description": "Nothing changed: the head."},
     },
     summary="Edit features and cells",
@@ -167,21 +167,26 @@ def create_edit(
         _count("refused").inc()
         raise
     _count(outcome.status).inc()
-    return told_as(outcome)
+    return commit_response(outcome)
 
 
-@router.get("/versions/{v}", responses=told(VersionOut, 404), summary="One version")
+@router.get("/versions/{v}", responses=problem_responses(VersionOut, 404), summary="One version")
 def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """A version by number, by channel, or the newest."""
-    version = services.store.version(env, number_of(v))
+    version = services.store.version(env, parse_version_ref(v))
     headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    return answer(version.as_dict(), headers=headers)
+    return json_response(version.as_dict(), headers=headers)
 
 
-@router.get("/versions/{v}/sources", tags=["sources"], responses=told(list[SourceOut], 404), summary="Uploaded files")
+@router.get(
+    "/versions/{v}/sources",
+    tags=["sources"],
+    responses=problem_responses(list[SourceOut], 404),
+    summary="Uploaded files",
+)
 def list_sources(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """The files that made a version, also those that were not used."""
-    return answer([source.as_dict() for source in services.store.version(env, number_of(v)).sources])
+    return json_response([source.as_dict() for source in services.store.version(env, parse_version_ref(v)).sources])
 
 
 @router.get(
@@ -189,7 +194,7 @@ def list_sources(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _:
     tags=["sources"],
     response_class=Response,
     responses={
-        **told(None, 404, 416),
+        **problem_responses(None, 404, 416),
         200: {"description": "The file", "content": {"application/octet-stream": {}}},
         206: {"description": "A part of it"},
         304: {"description": "The client has it"},
@@ -210,7 +215,7 @@ def get_source(
     ] = None,
 ) -> Response:
     """Always as an attachment, never to be shown by a browser as what it says it is."""
-    source = _source(services.store.version(env, number_of(v)).sources, name, sha256)
+    source = _source(services.store.version(env, parse_version_ref(v)).sources, name, sha256)
     etag = f'"{source.sha256}"'
     headers = [
         (b"content-type", b"application/octet-stream"),
@@ -235,7 +240,7 @@ def get_source(
         headers.insert(1, (b"content-range", f"bytes {start}-{end - 1}/{source.size}".encode()))
     status = 206 if part else 200
     if source.size > IN_MEMORY:
-        return streamed(services.store.blobs.open(source.sha256), start, end, status, headers)
+        return stream_file(services.store.blobs.open(source.sha256), start, end, status, headers)
     response = Response(services.store.blobs.get(source.sha256)[start:end], status)
     response.raw_headers = headers
     return response
@@ -249,16 +254,16 @@ def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Sourc
     return next((s for s in fitting if s.used), fitting[0])
 
 
-def told_as(outcome: CommitResult) -> Response:
+def commit_response(outcome: CommitResult) -> Response:
     """The answer for what became of a change: 201 where there is a new version, also when it is told again."""
     version = outcome.version
     if version is None:
-        return answer(outcome.body)
+        return json_response(outcome.body)
     headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    location = path_of("environments", version.environment, "versions", version.number)
+    location = api_path("environments", version.environment, "versions", version.number)
     if outcome.status == "unchanged":
-        return answer(outcome.body, headers={**headers, "content-location": location})
-    return answer(outcome.body, 201, {**headers, "location": location})
+        return json_response(outcome.body, headers={**headers, "content-location": location})
+    return json_response(outcome.body, 201, {**headers, "location": location})
 
 
 def _upload(form: UploadForm, request: Request) -> Upload:
@@ -277,7 +282,7 @@ def _upload(form: UploadForm, request: Request) -> Upload:
     message = fields.pop("message", "")
     return Upload(
         files=tuple(form.files),
-        format=format_named(fields.pop("format", ""), "format"),
+        format=parse_format_name(fields.pop("format", ""), "format"),
         layer=layer,
         level=level,
         grid=fields.pop("grid", "") or None,
@@ -288,7 +293,7 @@ def _upload(form: UploadForm, request: Request) -> Upload:
     )
 
 
-def format_named(text: str, location: str) -> str | None:
+def parse_format_name(text: str, location: str) -> str | None:
     """A format's id as a form says it; empty is none. Invalid, with those there are, where it is not known."""
     if not text:
         return None
@@ -321,7 +326,7 @@ def truth(text: str, parameter: str) -> bool:
     return values[text.lower()]
 
 
-def _counted(
+def _count_upload(
     services: Services, take: Any, env: str, upload: Upload, principal: Principal, if_match: str | None, key: str | None
 ) -> CommitResult:
     try:

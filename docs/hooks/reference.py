@@ -400,7 +400,7 @@ def errors() -> str:
     """All types of problems."""
     rows = []
     for cls, (status, title) in problems.STATUS.items():
-        _, _, kind = problems.status_of(cls.__new__(cls))
+        _, _, kind = problems.problem_status(cls.__new__(cls))
         rows.append((code(kind), str(status), title, sentence(plain(inspect.getdoc(cls) or ""))))
     return table(("type", "status", "title", "meaning"), sorted(rows, key=lambda row: (row[1], row[0])))
 

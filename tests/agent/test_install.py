@@ -199,12 +199,15 @@ def test_the_unit_keeps_the_maps_where_the_robot_can_read_them() -> None:
 
 
 def test_router_addresses_are_told_for_who_asks() -> None:
-    from app.api.health import router_for
+    from app.api.health import advertised_router
 
-    assert router_for("", "tcp/127.0.0.1:7447", "127.0.0.1") == "tcp/127.0.0.1:7447"
-    assert router_for("", "tcp/127.0.0.1:7447", "edge.local") == "", "nobody else reaches it there"
-    assert router_for("", "tcp/0.0.0.0:7447,tls/[::]:7448", "edge.local") == "tcp/edge.local:7447,tls/edge.local:7448"
-    assert router_for("", "tcp/0.0.0.0:7447", "::1") == "tcp/[::1]:7447"
-    assert router_for("tcp/router.farm:7447", "tcp/0.0.0.0:1", "x") == "tcp/router.farm:7447"
-    assert router_for("", "tcp/0.0.0.0:7447", "bad host\n") == ""
-    assert router_for("", "", "x") == ""
+    assert advertised_router("", "tcp/127.0.0.1:7447", "127.0.0.1") == "tcp/127.0.0.1:7447"
+    assert advertised_router("", "tcp/127.0.0.1:7447", "edge.local") == "", "nobody else reaches it there"
+    assert (
+        advertised_router("", "tcp/0.0.0.0:7447,tls/[::]:7448", "edge.local")
+        == "tcp/edge.local:7447,tls/edge.local:7448"
+    )
+    assert advertised_router("", "tcp/0.0.0.0:7447", "::1") == "tcp/[::1]:7447"
+    assert advertised_router("tcp/router.farm:7447", "tcp/0.0.0.0:1", "x") == "tcp/router.farm:7447"
+    assert advertised_router("", "tcp/0.0.0.0:7447", "bad host\n") == ""
+    assert advertised_router("", "", "x") == ""

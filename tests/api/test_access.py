@@ -11,10 +11,10 @@ from app.api.auth import (
     WINDOW_SECONDS,
     Authenticator,
     Principal,
-    environment_of,
+    client_source,
+    environment_in_path,
     is_loopback,
     is_open,
-    source_of,
 )
 from app.api.problems import Throttled
 from app.errors import Denied, Unauthenticated
@@ -50,24 +50,24 @@ def test_a_token_is_asked_for_once_a_second() -> None:
     clock, book = Clock(), Book(good=token())
     access = Authenticator(book, failures=3, clock=clock)
     header = b"Bearer good"
-    assert access.known(header) is None
-    assert access.check(header, "10.0.0.1").name == "somebody"
-    assert access.known(header) is not None
-    access.check(header, "10.0.0.1")
+    assert access.cached_principal(header) is None
+    assert access.authenticate(header, "10.0.0.1").name == "somebody"
+    assert access.cached_principal(header) is not None
+    access.authenticate(header, "10.0.0.1")
     assert book.asked == 1
     clock.time += FRESH_SECONDS + 0.01
-    assert access.known(header) is None
+    assert access.cached_principal(header) is None
     book.tokens.clear()
     with pytest.raises(Unauthenticated):
-        access.check(header, "10.0.0.1")
+        access.authenticate(header, "10.0.0.1")
 
 
 def test_a_revoked_token_is_forgotten_at_once() -> None:
     book = Book(good=token())
     access = Authenticator(book, failures=3, clock=Clock())
-    access.check(b"Bearer good", None)
-    access.forget()
-    assert access.known(b"Bearer good") is None
+    access.authenticate(b"Bearer good", None)
+    access.invalidate()
+    assert access.cached_principal(b"Bearer good") is None
 
 
 @pytest.mark.parametrize(
@@ -76,61 +76,61 @@ def test_a_revoked_token_is_forgotten_at_once() -> None:
 def test_without_a_usable_token(header: bytes | None) -> None:
     book = Book(good=token())
     with pytest.raises(Unauthenticated):
-        Authenticator(book, failures=3, clock=Clock()).check(header, None)
+        Authenticator(book, failures=3, clock=Clock()).authenticate(header, None)
     assert book.asked == 0
 
 
 def test_the_scheme_is_not_case_sensitive() -> None:
-    assert Authenticator(Book(good=token()), failures=3).check(b"bearer good", None).id == "t1"
+    assert Authenticator(Book(good=token()), failures=3).authenticate(b"bearer good", None).id == "t1"
 
 
 def test_expired() -> None:
     access = Authenticator(Book(old=token(expires=NOW - timedelta(seconds=1))), failures=3)
     with pytest.raises(Unauthenticated):
-        access.check(b"Bearer old", None)
+        access.authenticate(b"Bearer old", None)
 
 
 def test_guessing_is_slowed_for_its_source_alone() -> None:
     clock, book = Clock(), Book(good=token())
     access = Authenticator(book, failures=3, clock=clock)
-    access.check(b"Bearer good", "10.0.0.1")
+    access.authenticate(b"Bearer good", "10.0.0.1")
     for _ in range(3):
         with pytest.raises(Unauthenticated):
-            access.check(b"Bearer wrong", "10.0.0.1")
+            access.authenticate(b"Bearer wrong", "10.0.0.1")
     with pytest.raises(Throttled, match="accepted at any time"):
-        access.check(b"Bearer wrong", "10.0.0.1")
+        access.authenticate(b"Bearer wrong", "10.0.0.1")
     with pytest.raises(Throttled):
         access.note_failure("::ffff:10.0.0.1")  # a wrong signature of a link
     with pytest.raises(Unauthenticated):
-        access.check(None, "10.0.0.1")
+        access.authenticate(None, "10.0.0.1")
     book.tokens["other"] = token("robot")
-    assert access.check(b"Bearer other", "10.0.0.1").role == "robot", "robots behind one NAT share its address"
-    assert access.check(b"Bearer good", "10.0.0.1"), "a token that was good a moment ago stays good"
-    assert access.check(b"Bearer good", "10.0.0.2")
+    assert access.authenticate(b"Bearer other", "10.0.0.1").role == "robot", "robots behind one NAT share its address"
+    assert access.authenticate(b"Bearer good", "10.0.0.1"), "a token that was good a moment ago stays good"
+    assert access.authenticate(b"Bearer good", "10.0.0.2")
     with pytest.raises(Unauthenticated):
-        access.check(b"Bearer wrong", "10.0.0.2")
+        access.authenticate(b"Bearer wrong", "10.0.0.2")
     clock.time += WINDOW_SECONDS + 1
     with pytest.raises(Unauthenticated):
-        access.check(b"Bearer wrong", "10.0.0.1")
+        access.authenticate(b"Bearer wrong", "10.0.0.1")
 
 
 def test_asking_without_a_token_is_no_failure() -> None:
     access = Authenticator(Book(good=token()), failures=1, clock=Clock())
     for _ in range(5):
         with pytest.raises(Unauthenticated):
-            access.check(None, "10.0.0.1")
-    assert access.check(b"Bearer good", "10.0.0.1")
+            access.authenticate(None, "10.0.0.1")
+    assert access.authenticate(b"Bearer good", "10.0.0.1")
 
 
 def test_sources() -> None:
-    assert source_of("10.0.0.1") == "10.0.0.1"
-    assert source_of("2001:db8::1") == source_of("2001:db8::2") != source_of("2001:db9::1")
-    assert source_of("::ffff:10.0.0.1") == "10.0.0.1", "an IPv4 client of a server that listens on ::"
-    assert is_loopback(source_of("::1"))
-    assert is_loopback(source_of("127.1.2.3"))
-    assert not is_loopback(source_of("::"))
-    assert source_of(None) == ""
-    assert source_of("testclient") == "testclient"
+    assert client_source("10.0.0.1") == "10.0.0.1"
+    assert client_source("2001:db8::1") == client_source("2001:db8::2") != client_source("2001:db9::1")
+    assert client_source("::ffff:10.0.0.1") == "10.0.0.1", "an IPv4 client of a server that listens on ::"
+    assert is_loopback(client_source("::1"))
+    assert is_loopback(client_source("127.1.2.3"))
+    assert not is_loopback(client_source("::"))
+    assert client_source(None) == ""
+    assert client_source("testclient") == "testclient"
 
 
 @pytest.mark.parametrize(
@@ -143,24 +143,24 @@ def test_sources() -> None:
     ],
 )
 def test_roles(role: Role, may: set[str]) -> None:
-    principal = Principal.of(token(role))
+    principal = Principal.from_token(token(role))
     for need in ("viewer", "editor", "admin"):
         if need in may:
-            principal.demand(need)  # type: ignore[arg-type]
+            principal.require_role(need)  # type: ignore[arg-type]
         else:
             with pytest.raises(Denied):
-                principal.demand(need)  # type: ignore[arg-type]
+                principal.require_role(need)  # type: ignore[arg-type]
 
 
 def test_environments_by_pattern() -> None:
-    principal = Principal.of(token(environments="farm-*"))
-    principal.enter("farm-1")
+    principal = Principal.from_token(token(environments="farm-*"))
+    principal.require_environment("farm-1")
     for other in ("farm", "xfarm-1", "street"):
         with pytest.raises(Denied):
-            principal.enter(other)
+            principal.require_environment(other)
     with pytest.raises(Denied):
-        principal.demand_everywhere()
-    Principal.of(token()).enter("anything")
+        principal.require_all_environments()
+    Principal.from_token(token()).require_environment("anything")
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_environments_by_pattern() -> None:
     ],
 )
 def test_the_environment_of_an_address(path: str, environment: str | None) -> None:
-    assert environment_of(path) == environment
+    assert environment_in_path(path) == environment
 
 
 def test_open_addresses() -> None:

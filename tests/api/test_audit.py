@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from app.api import middleware
-from app.api.middleware import LOGGED_REFUSALS
+from app.api.middleware import MAX_LOGGED_REJECTIONS
 from app.logs import REQUEST_ID, JsonFormatter, TextFormatter
 from app.store.audit import CALLER, Caller
 from app.store.store import Store
@@ -100,7 +100,7 @@ def test_entry_and_change_are_one_transaction(tmp_path: Path) -> None:
 def test_log_names_changes_and_refused_tokens_but_no_token(
     api: Api, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(middleware, "_refusals", middleware._Quota())  # other tests of this process were refused, too
+    monkeypatch.setattr(middleware, "_rejections", middleware._Quota())  # other tests of this process were refused, too
     with caplog.at_level(logging.INFO, logger="app.requests"):
         api.post("environments", {"name": "logged"})
         api.as_("not-a-token-that-anybody-has").problem("GET", "environments/a%0Ab", 401)
@@ -120,10 +120,10 @@ def test_log_names_changes_and_refused_tokens_but_no_token(
 def test_log_is_not_filled_by_strangers(api: Api, caplog: pytest.LogCaptureFixture) -> None:
     nobody = api.as_(None)
     with caplog.at_level(logging.INFO, logger="app.requests"):
-        for _ in range(LOGGED_REFUSALS + 10):
+        for _ in range(MAX_LOGGED_REJECTIONS + 10):
             nobody("GET", "environments/" + "x" * 3000)
     lines = [r.getMessage() for r in caplog.records if r.name == "app.requests"]
-    assert len(lines) <= LOGGED_REFUSALS
+    assert len(lines) <= MAX_LOGGED_REJECTIONS
     assert all(len(line) < 600 for line in lines)
 
 

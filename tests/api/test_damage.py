@@ -53,7 +53,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Api, Path]]:
 def forget(api: Api) -> None:
     """What is in the server's memory, as after a start."""
     services = api.app.state.services
-    services.hot._entries.clear()
+    services.response_cache._entries.clear()
     services.store._chunks.forget()
 
 

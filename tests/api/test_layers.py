@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from pyproj import Proj
 
-from app.api.layers import cut, geojson_of
+from app.api.layers import crop_grid, geometries_as_geojson
 from app.errors import NotFound
 from app.model.grid import OccupancyGrid
 from tests.api import samples
@@ -176,11 +176,11 @@ def test_cut_of_a_turned_grid() -> None:
     cells = np.arange(16, dtype=np.uint8).reshape(4, 4)
     turned = OccupancyGrid(cells, 1.0, (0.0, 0.0, math.pi / 2))
     # Turned by a quarter: cell (row r, column c) covers x in [-r-1, -r], y in [c, c+1].
-    part = cut(turned, (-1.9, 2.1, -1.1, 2.9))
+    part = crop_grid(turned, (-1.9, 2.1, -1.1, 2.9))
     assert part.cells.tolist() == [[6]]
     assert part.origin == pytest.approx((-1.0, 2.0, math.pi / 2))
     with pytest.raises(NotFound):
-        cut(turned, (1.0, 1.0, 2.0, 2.0))
+        crop_grid(turned, (1.0, 1.0, 2.0, 2.0))
 
 
 OCTOMAP = Path(__file__).resolve().parents[1] / "samples" / "octomap"
@@ -253,7 +253,7 @@ def test_coordinates_are_rounded() -> None:
     import shapely
 
     shapes = np.array([shapely.Point(1 / 3, -1e-15), shapely.Point(1, 2, 3), shapely.GeometryCollection()], object)
-    flat, deep, none = orjson.loads(orjson.dumps(geojson_of(shapes, 9)))
+    flat, deep, none = orjson.loads(orjson.dumps(geometries_as_geojson(shapes, 9)))
     assert flat["coordinates"] == [0.333333333, 0.0]
     assert deep["coordinates"] == [1.0, 2.0, 3.0]
     assert none is None

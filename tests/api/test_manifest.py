@@ -268,11 +268,11 @@ def test_a_fleet_that_asks_for_a_new_map_costs_one_conversion(api: Api, bare: st
 def test_what_a_fleet_asks_for_at_once_comes_from_memory_and_is_never_old(api: Api, farm: str) -> None:
     place = f"environments/{farm}"
     paths = (f"{place}/versions/latest/manifest?formats=tmap2", f"{place}/channels?robots=false")
-    hot = api.app.state.services.hot
+    hot = api.app.state.services.response_cache
 
     def is_cached(path: str) -> bool:
         full_path, _, query = f"/api/v1/{path}".partition("?")
-        return hot.get((full_path.encode(), query.encode())) is not None
+        return hot.get_fresh((full_path.encode(), query.encode())) is not None
 
     for path in paths:
         first = api.get(path)

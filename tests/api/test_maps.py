@@ -104,7 +104,7 @@ def test_304_without_making(api: Api, farm: str) -> None:
     """A robot that has the map already costs no conversion, also after a restart of the server."""
     path = f"environments/{farm}/versions/3/maps/kml"
     etag = api.get(path).headers["etag"]
-    hot = api.app.state.services.hot
+    hot = api.app.state.services.response_cache
     hot._entries.clear()
     api.get(path, 304, headers={"If-None-Match": etag})
     api.get(path, 304, headers={"If-None-Match": etag})
@@ -316,7 +316,7 @@ def test_a_large_file_is_streamed_from_disk(api: Api, farm: str, monkeypatch: py
     small = api.get(f"/maps/{farm}/tmap2")
     monkeypatch.setattr(maps, "IN_MEMORY", 100)
     monkeypatch.setattr(maps, "CHUNK", 1000)
-    api.app.state.services.hot._entries.clear()
+    api.app.state.services.response_cache._entries.clear()
     for _ in range(2):
         large = api.get(f"/maps/{farm}/tmap2")
         assert large.content == small.content
@@ -329,14 +329,14 @@ def test_a_large_file_is_streamed_from_disk(api: Api, farm: str, monkeypatch: py
     head = api("HEAD", f"/maps/{farm}/tmap2", 200)
     assert head.headers["content-length"] == str(len(small.content))
     assert api.get(f"environments/{farm}/versions/2/sources/network.tmap2.yaml").content == samples.tmap2()
-    api.app.state.services.hot._entries.clear()
+    api.app.state.services.response_cache._entries.clear()
 
 
 def test_memory_is_bounded(tmp_path: Path) -> None:
     with running(settings_for(tmp_path, memory_cache_bytes=10_000)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2(), **samples.grid()})
-        hot = api.app.state.services.hot
+        hot = api.app.state.services.response_cache
         for _ in range(2):
             for name in ("tmap2", "kml", "datum", "occupancy_grid", "kmz"):
                 api.get(f"/maps/farm/{name}")
@@ -479,7 +479,7 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
         services = api.app.state.services
         services.store.update_job(job, state="cancelled", detail="cancelled")
         assert not stopped.is_set()
-        services.work.beat()
+        services.jobs.send_heartbeats()
         assert stopped.wait(10)
 
 

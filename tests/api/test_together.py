@@ -160,7 +160,7 @@ def test_no_map_is_older_than_a_commit_that_was_told(api: Api, bare: str, monkey
 def test_what_robots_say_is_in_the_next_answer(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of robots change no generation number: who was told that his is stored sees it all the same."""
     root = api.get(f"environments/{farm}/versions/3").json()["root"]
-    gate, quick = Gate(), channels._listed
+    gate, quick = Gate(), channels._list_response
     first_only = iter([True])
 
     def slow(*args: Any) -> Any:
@@ -169,7 +169,7 @@ def test_what_robots_say_is_in_the_next_answer(api: Api, farm: str, monkeypatch:
             gate()
         return result
 
-    monkeypatch.setattr(channels, "_listed", slow)
+    monkeypatch.setattr(channels, "_list_response", slow)
     with at_once(2) as ask:
         first = ask(api.get, f"environments/{farm}/channels")
         assert gate.reached.wait(20)
@@ -212,13 +212,13 @@ def test_one_look_for_a_fleet_but_none_for_strangers(api: Api, farm: str, monkey
 def test_an_environment_that_is_not_there_is_told_to_each(
     api: Api, fresh: Callable[[], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gate, quick = Gate(), channels._listed
+    gate, quick = Gate(), channels._list_response
 
     def slow(*args: Any) -> Any:
         gate()
         return quick(*args)
 
-    monkeypatch.setattr(channels, "_listed", slow)
+    monkeypatch.setattr(channels, "_list_response", slow)
     path = f"environments/{fresh()}/channels?robots=false"
     clients = [api.as_(api.token) for _ in range(3)]
     with at_once(3) as ask:
@@ -243,8 +243,8 @@ def test_a_token_is_looked_up_once_and_each_its_own(api: Api, farm: str, monkeyp
 
     tokens = [api.token_for("viewer").token, api.token_for("viewer", environments="other-*").token, "x" * 40]
     access = api.app.state.services.access
-    access.forget()
-    monkeypatch.setattr(access, "_find", lambda text: slow(api.app.state.services.store, text))
+    access.invalidate()
+    monkeypatch.setattr(access, "_find_token", lambda text: slow(api.app.state.services.store, text))
     clients = [api.as_(token) for token in tokens for _ in range(3)]
     with at_once(len(clients)) as ask:
         futures = [ask(client.get, f"environments/{farm}", None) for client in clients]
@@ -269,13 +269,13 @@ def test_a_token_revoked_while_it_is_looked_up_is_not_believed_again() -> None:
 
     access = Authenticator(find, failures=10)
     with at_once(1) as ask:
-        looking = ask(access.check, b"Bearer t", "1.2.3.4")
+        looking = ask(access.authenticate, b"Bearer t", "1.2.3.4")
         assert gate.reached.wait(20)
         store.clear()
-        access.forget()
+        access.invalidate()
         gate.open.set()
         looking.result(20)  # it was valid when it was asked for
-    assert access.known(b"Bearer t") is None
+    assert access.cached_principal(b"Bearer t") is None
 
 
 # --- writers ---

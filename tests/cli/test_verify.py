@@ -108,7 +108,7 @@ def test_verify_says_what_is_damaged_and_changes_nothing(
     assert {f["repaired_from"].rpartition(" ")[0] for f in report["findings"]} == {"the uploads of farm"}
     for path in (folder / "cache").glob("??/*/map.json"):
         path.unlink()
-    api.app.state.services.hot._entries.clear()
+    api.app.state.services.response_cache._entries.clear()
     assert answers(api) == good
     assert verify(folder, capfd)[0] == 0
 
@@ -148,7 +148,7 @@ def test_a_replica_heals_everything(
     status, report = verify(folder, capfd, "--repair", "--from", place, "--token", ADMIN)
     assert status == 0, report
     assert {f["repaired_from"] for f in report["findings"]} == {place}
-    api.app.state.services.hot._entries.clear()
+    api.app.state.services.response_cache._entries.clear()
     assert answers(api) == good
 
 
