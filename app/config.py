@@ -18,7 +18,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 from pydantic import Field, SecretStr, ValidationInfo, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from app.events.ros_names import parse_chosen, parse_keys
+from app.events.ros_names import parse_keys, parse_selectors
 from app.formats import Limits
 from app.logs import LogFormat
 
@@ -432,7 +432,7 @@ class Settings(BaseSettings):
     @field_validator("ros2_environments", "ros2_keys")
     @classmethod
     def _ros2_names(cls, value: str, info: ValidationInfo) -> str:
-        (parse_keys if info.field_name == "ros2_keys" else parse_chosen)(value)
+        (parse_keys if info.field_name == "ros2_keys" else parse_selectors)(value)
         return value
 
     @model_validator(mode="after")

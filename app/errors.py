@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """What writing fails with where the disk is full, or a quota or the process's limit is reached."""
 
-BROKEN = frozenset({errno.EIO, errno.EBADMSG, errno.EUCLEAN})
+BROKEN_STORAGE_ERRNOS = frozenset({errno.EIO, errno.EBADMSG, errno.EUCLEAN})
 """What reading damaged storage fails with. All others (too many open files, no permission) say nothing about bytes."""
 
 
-def reason_of(error: OSError) -> str:
+def system_reason(error: OSError) -> str:
     """Why the system refuses, without the path, for clients and the log."""
     return os.strerror(error.errno) if error.errno else type(error).__name__
 

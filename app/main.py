@@ -76,10 +76,10 @@ from app.events.bus import Bus, BusOptions
 from app.events.credentials import ZenohCredentials
 from app.events.relay import Relay
 from app.events.ros2 import Ros2Options, Ros2Publisher
-from app.events.ros_names import parse_chosen, parse_keys
+from app.events.ros_names import parse_keys, parse_selectors
 from app.events.security import RouterSecurity
 from app.fleet import ReportQueue as FleetIntake
-from app.fleet import decide
+from app.fleet import next_step
 from app.ingest import Ingest, Provider
 from app.links import LinkSecrets
 from app.pool import WARM, Pool
@@ -402,8 +402,8 @@ def relay_of(settings: Settings, services: Services) -> Relay | None:
         options,
         ask=partial(events.answer_zenoh_query, services, options.max_reply_bytes),
         explain=problems.problem_body,
-        on_status=services.fleet.heard,
-        on_alive=services.fleet.alive,
+        on_status=services.fleet.enqueue_status,
+        on_alive=services.fleet.set_presence,
     )
     relay = Relay(services.store, zenoh_bus, settings.data_dir)
     relay.start()
@@ -412,7 +412,7 @@ def relay_of(settings: Settings, services: Services) -> Relay | None:
 
 def ros2_of(settings: Settings, services: Services) -> Ros2Publisher | None:
     """Topics for ROS 2, begun; None where no environment is chosen."""
-    chosen = parse_chosen(settings.ros2_environments)
+    chosen = parse_selectors(settings.ros2_environments)
     if not chosen or settings.zenoh_mode == "off":
         return None
     publishing = Ros2Publisher(
@@ -521,7 +521,7 @@ async def _tick(services: Services) -> None:
             newest = _note_time(newest)
             await run_in_threadpool(services.store.end_expired_tokens)
             await run_in_threadpool(services.store.apply_due, datetime.now(UTC))
-            await run_in_threadpool(services.store.advance_rollouts, datetime.now(UTC), decide)
+            await run_in_threadpool(services.store.advance_rollouts, datetime.now(UTC), next_step)
             await run_in_threadpool(services.store.end_due_overlays, datetime.now(UTC))
             if beat >= HEARTBEAT_SECONDS:
                 beat = 0.0

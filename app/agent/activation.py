@@ -22,9 +22,9 @@ from app.agent.levels import level_problem, level_variables, read_level
 from app.agent.map_directory import MapDirectory
 from app.agent.options import AgentOptions
 from app.agent.signed_manifest import Manifest
-from app.agent.state import StateStore, write_whole
+from app.agent.state import StateStore, write_durably
 
-NOT_NOW = 75
+DELAY_STATUS = 75
 """Exit status of ``--before-switch`` that delays the switch (EX_TEMPFAIL of sysexits.h)."""
 
 BEFORE_SWITCH_SECONDS = 5.0
@@ -53,7 +53,7 @@ class Retries:
         self._longest, self._first = longest, first
         self._failures: dict[str, tuple[int, float, str]] = {}
 
-    def failed(self, subject: str, reason: str) -> None:
+    def note_failure(self, subject: str, reason: str) -> None:
         """Note a failure: the next attempt is due later than after the one before."""
         count = self._failures.get(subject, (0, 0.0, ""))[0] + 1
         pause = min(self._longest, self._first() * 2 ** min(20, count - 1))
@@ -65,7 +65,7 @@ class Retries:
         _, due, reason = self._failures.get(subject, (0, 0.0, None))
         return reason if due > time.monotonic() else None
 
-    def keep_only(self, *subjects: str | None) -> None:
+    def forget_others(self, *subjects: str | None) -> None:
         """Forget the failures of all other subjects: each may be tried at once."""
         self._failures = {name: failure for name, failure in self._failures.items() if name in subjects}
 
@@ -130,7 +130,7 @@ class Activation:
             if problem is not None and self._folder.manifest(self._store.value.working) is not None:
                 self.pending = None
                 reason = f"version {manifest.version} is refused: {problem}"
-                self.retries.failed(identity(manifest), reason)
+                self.retries.note_failure(identity(manifest), reason)
                 return Outcome("failed", reason, manifest)
             if self._options.before_switch:
                 self.pending = Pending(name, manifest, since, members)
@@ -164,7 +164,7 @@ class Activation:
 
     def refusal(self, manifest: Manifest) -> Outcome | None:
         """Return the failure of this very manifest if it is not to be tried again yet."""
-        self.retries.keep_only(identity(manifest), self._folder.standing, self._replacement)
+        self.retries.forget_others(identity(manifest), self._folder.current_version, self._replacement)
         reason = self.retries.reason(identity(manifest))
         return None if reason is None else Outcome("failed", reason, manifest)
 
@@ -189,26 +189,26 @@ class Activation:
                 continue
             if self._stopping.is_set():
                 raise AgentStopped
-            if ended.status == NOT_NOW:
+            if ended.status == DELAY_STATUS:
                 detail = (
                     f"version {manifest.version} is ready since {since}: --before-switch {command} delays the switch"
                 )
                 return Outcome("waiting", detail, manifest)
             reason = f"version {manifest.version} is refused: --before-switch {command} {ended.text}"
             self.pending = None
-            self.retries.failed(identity(manifest), reason)
+            self.retries.note_failure(identity(manifest), reason)
             return Outcome("failed", reason, manifest)
         return None
 
     @property
     def is_load_due(self) -> bool:
         """Whether ``load`` would run the hooks now."""
-        name = self._folder.standing
+        name = self._folder.current_version
         return name is not None and self._store.value.activated != name and self.retries.reason(name) is None
 
     def load(self) -> Outcome:
         """Run the hooks for the current version if they have not run yet; go back to the last good one if they fail."""
-        name = self._folder.standing
+        name = self._folder.current_version
         manifest = self._folder.manifest(name)
         if name is None or manifest is None or self._store.value.activated == name:
             return ACTIVE
@@ -217,26 +217,26 @@ class Activation:
         with self._folder.hooks_lock(self._stopping):
             if (problem := self._run_hooks(name, manifest)) is None:
                 return ACTIVE
-            return self._go_back(name, manifest, problem)
+            return self._roll_back(name, manifest, problem)
 
-    def _go_back(self, name: str, manifest: Manifest, problem: str) -> Outcome:
+    def _roll_back(self, name: str, manifest: Manifest, problem: str) -> Outcome:
         """Put the version whose hooks succeeded last in place of one whose hooks failed."""
         back = self._store.value.working
         previous = self._folder.manifest(back)
-        if back is None or back == name or previous is None or self._folder.damaged(back, previous):
+        if back is None or back == name or previous is None or self._folder.damaged_files(back, previous):
             reason = f"version {manifest.version} is in place, but its robot has not taken it: {problem}"
-            self.retries.failed(name, reason)
+            self.retries.note_failure(name, reason)
             return Outcome("failed", reason)
         reason = (
             f"version {manifest.version} is replaced by {previous.version}, since its robot has not taken it: {problem}"
         )
-        self.retries.failed(identity(manifest), reason)
+        self.retries.note_failure(identity(manifest), reason)
         self._folder.switch(back)
         self._log("restored", version=previous.version, root=previous.root, detail=problem)
         is_loaded = self._store.value.activated == back  # no hook of the newer version has run
         if not is_loaded and (second := self._run_hooks(back, previous)) is not None:
             reason = f"{reason}; nor has it taken version {previous.version} again: {second}"
-            self.retries.failed(back, reason)
+            self.retries.note_failure(back, reason)
         return Outcome("failed", reason, manifest)
 
     def _run_hooks(self, name: str, manifest: Manifest) -> str | None:
@@ -327,7 +327,7 @@ def _file_variables(path: Path, names: Sequence[str]) -> dict[str, str]:
 
     A variable's size is limited (128 KiB on Linux): what does not fit is skipped from the deepest folders up.
     """
-    write_whole(path, "".join(f"{name}\n" for name in names).encode())
+    write_durably(path, "".join(f"{name}\n" for name in names).encode())
     remaining, fit = MAX_VARIABLE_BYTES, set()
     for name in sorted(names, key=lambda n: (n.count("/"), n)):
         remaining -= len(name.encode()) + 1

@@ -39,7 +39,7 @@ PRODUCTION = "production"
 FIRST_PAUSE_SECONDS = 1.0
 """After the first failure; doubled each time up to the pause between polls."""
 
-GATHER_SECONDS = 0.02
+DEBOUNCE_SECONDS = 0.02
 """Events that come together are one look at the server. Doubled for each look that brought nothing, up to 5 seconds: on
 an open router anybody can put events.
 """
@@ -49,7 +49,7 @@ MAX_DOUBLINGS = 8
 ROUTER = re.compile(r"(tcp|tls|quic|udp|ws|wss)/[A-Za-z0-9_.:%\[\]-]+")
 """A router as a server may tell it: no device, no local socket, nothing (``#…``) that would weaken the robot's TLS."""
 
-LONG_SECONDS = 5.0
+RECHECK_AFTER_SECONDS = 5.0
 """After a longer download the channel is looked at again before the switch."""
 
 REJOIN_SECONDS = 1.0
@@ -75,8 +75,8 @@ class Agent:
 
     def __init__(self, options: AgentOptions, tell: LogEvent, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
-            options = dataclasses.replace(options, key=signed_manifest.check_given(options.key))
-        self.options, self._tell, self._clock = options, tell, clock
+            options = dataclasses.replace(options, key=signed_manifest.check_key(options.key))
+        self.options, self._log_event, self._clock = options, tell, clock
         self._robot = robot_name(options.robot)
         self._login = options.zenoh_login
         if self._login.password is not None and self._login.user is None:
@@ -87,7 +87,7 @@ class Agent:
         self._folder = MapDirectory(options.into)
         self._web = ServerClient(options.server, options.token, self._stopping, options.ca)
         self._ear: ZenohClient | None = None
-        self._store = StateStore(self._folder.state, options.environment, self._folder.spare)
+        self._store = StateStore(self._folder.state, options.environment, self._folder.free_space)
         self._retries = Retries(options.poll_seconds, lambda: FIRST_PAUSE_SECONDS)
         self._activation = Activation(
             self._folder, self._store, options, self._robot, log=tell, stopping=self._stopping, retries=self._retries
@@ -111,18 +111,18 @@ class Agent:
             self._robot,
             self._web,
             self._stopping,
-            lambda reason: self._tell_once("status", detail=reason),
+            lambda reason: self._log_once("status", detail=reason),
         )
         self._reported: tuple[Any, ...] | None = None
-        self._told: set[str] = set()
+        self._reported_once: set[str] = set()
         self._preloaded: Manifest | None = None
         self._preloaded_closures = ""
         self._fetched: Manifest | None = None
         self._refreshed: tuple[str, str] | None = None
         self._rejoined = False
-        self._in_vain = 0
-        self._called = 0
-        self._behind = 0
+        self._idle_wakeups = 0
+        self._announced_sequence = 0
+        self._stale_replies = 0
 
     @property
     def _state(self) -> AgentState:
@@ -138,13 +138,13 @@ class Agent:
         state = self._state
         if given is not None and given != state.given:
             if state.key is not None and given not in (signed_manifest.key_id(state.key), _text(state.key)):
-                self._tell("trusting", key=given, detail="the key that was pinned before is forgotten")
+                self._log_event("trusting", key=given, detail="the key that was pinned before is forgotten")
                 state = dataclasses.replace(state, key=None, marks={})
             state = dataclasses.replace(state, given=given)
-        installed = self._folder.manifest(self._folder.standing)
-        name = self._folder.standing
-        if installed is not None and name is not None and (bad := self._folder.damaged(name, installed)):
-            self._tell("damaged", version=installed.version, files=bad[:20])
+        installed = self._folder.manifest(self._folder.current_version)
+        name = self._folder.current_version
+        if installed is not None and name is not None and (bad := self._folder.damaged_files(name, installed)):
+            self._log_event("damaged", version=installed.version, files=bad[:20])
             state = dataclasses.replace(state, etag=None)
         self._store.stage(state)
         self._signed_clock.floor = state.newest_time
@@ -165,9 +165,9 @@ class Agent:
         self._wake.set()
         self._web.interrupt()
 
-    def once(self) -> bool:
+    def run_once(self) -> bool:
         """Sync once: whether the folder now holds the channel's map and all hooks succeeded."""
-        self._retries.keep_only()
+        self._retries.forget_others()
         try:
             return self._attempt(self._sync)
         except AgentStopped:
@@ -178,9 +178,9 @@ class Agent:
         self._ear = ZenohClient(
             self.options.environment,
             self._robot,
-            heard=self._heard,
-            back=self._back,
-            lost=self._lost,
+            heard=self._on_event,
+            back=self._on_router_connected,
+            lost=self._on_router_lost,
             config=self.options.zenoh_config,
             login=self._login,
         )
@@ -189,9 +189,9 @@ class Agent:
             reason = (
                 f"a fleet map server's router lets the user {self._login.user} be seen as the robot of that name alone"
             )
-            self._tell("user", detail=f"{reason}: use --robot {self._login.user}, or its own user")
-        if (installed := self._folder.manifest(self._folder.standing)) is not None:
-            self._tell("holding", version=installed.version, root=installed.root)
+            self._log_event("user", detail=f"{reason}: use --robot {self._login.user}, or its own user")
+        if (installed := self._folder.manifest(self._folder.current_version)) is not None:
+            self._log_event("holding", version=installed.version, root=installed.root)
         failures = 0
         woken = False
         while not self._stopping.is_set():
@@ -204,34 +204,36 @@ class Agent:
                 good = self._attempt(self._sync) or self._activation.is_waiting()
                 failures = 0 if good else failures + 1
                 # A server of several hosts may know for a moment less than its events say: look again, ever later.
-                self._behind = self._behind + 1 if good and self._mark < self._called else 0
+                self._stale_replies = (
+                    self._stale_replies + 1 if good and self._accepted_sequence < self._announced_sequence else 0
+                )
                 vain = woken and before == (self._state.marks, self._status.status)
-                self._in_vain = self._in_vain + 1 if vain else 0
-                if failures or self._behind:
-                    pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, max(failures, self._behind) - 1))
+                self._idle_wakeups = self._idle_wakeups + 1 if vain else 0
+                if failures or self._stale_replies:
+                    pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, max(failures, self._stale_replies) - 1))
                 pause *= random.uniform(0.5, 1.5)  # noqa: S311  jitter is no secret
                 if (due := self._retries.next_due) is not None:
                     pause = min(pause, max(0.0, due - time.monotonic()))
-                woken = self._rest_or_switch(max(self._after, pause))
+                woken = self._sleep_or_switch(max(self._after, pause))
             except AgentStopped:
                 break
 
-    def _rest_or_switch(self, seconds: float) -> bool:
+    def _sleep_or_switch(self, seconds: float) -> bool:
         """Rest for so long, running ``--before-switch`` now and then if it delays a switch: whether an event came."""
         end = time.monotonic() + seconds
         while self._activation.is_waiting():
             remaining = end - time.monotonic()
-            woken = self._rest(max(0.0, min(BEFORE_SWITCH_SECONDS, remaining)))
+            woken = self._sleep_until_woken(max(0.0, min(BEFORE_SWITCH_SECONDS, remaining)))
             if woken or self._stopping.is_set() or time.monotonic() >= end:
                 return woken
             self._attempt(self._switch_pending)
             if not self._activation.is_waiting():
                 return True  # switched, or refused: sync at once
-        return self._rest(max(0.0, end - time.monotonic()))
+        return self._sleep_until_woken(max(0.0, end - time.monotonic()))
 
     # --- what wakes it ---
 
-    def _rest(self, seconds: float) -> bool:
+    def _sleep_until_woken(self, seconds: float) -> bool:
         """Until something happens, at most so long: whether it did. What is to be confirmed is confirmed meanwhile."""
         end = time.monotonic() + seconds
         while True:
@@ -254,14 +256,14 @@ class Agent:
 
     @property
     def _gather(self) -> float:
-        return GATHER_SECONDS * 2.0 ** min(MAX_DOUBLINGS, self._in_vain)
+        return DEBOUNCE_SECONDS * 2.0 ** min(MAX_DOUBLINGS, self._idle_wakeups)
 
-    def _heard(self, event: messages.Event) -> None:
+    def _on_event(self, event: messages.Event) -> None:
         """In a thread of Zenoh's: wake the loop if it is of our concern."""
         if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
-        if not 0 < event.sequence - self._mark <= signed_manifest.MAX_SEQUENCE_AHEAD + 1:
+        if not 0 < event.sequence - self._accepted_sequence <= signed_manifest.MAX_SEQUENCE_AHEAD + 1:
             return
         ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
         if event.type == "version.created":
@@ -275,24 +277,24 @@ class Agent:
         if concerns:
             is_move = event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST)
             if is_move or (event.type in CLOSURE_EVENTS and self._manifests.has_closures):
-                self._called = event.sequence  # so far the manifest of the followed channel has moved
+                self._announced_sequence = event.sequence  # so far the manifest of the followed channel has moved
                 self._freshness.announce(event.sequence)
             self._wake.set()
 
     @property
-    def _mark(self) -> int:
+    def _accepted_sequence(self) -> int:
         """The sequence that the channel is known to have reached."""
         mark = self._state.marks.get(self._state.channel or "")
         return -1 if mark is None else mark.sequence
 
-    def _back(self) -> None:
-        self._tell("connected", detail="listening for events over Zenoh")
+    def _on_router_connected(self) -> None:
+        self._log_event("connected", detail="listening for events over Zenoh")
         self._rejoined = True
         self._status.forget_sent()
         self._wake.set()
 
-    def _lost(self, problem: str) -> None:
-        self._tell(
+    def _on_router_lost(self, problem: str) -> None:
+        self._log_event(
             "polling", detail=f"{problem}; changes are noticed within {self.options.poll_seconds:g} seconds or so"
         )
 
@@ -307,18 +309,18 @@ class Agent:
                 connect = connect or (plain(str(from_server)) if from_server else None)
                 prefix = prefix or plain(str(events.get("prefix") or messages.PREFIX))
             except (FleetMapError, AttributeError):
-                if connect is None or self._ear.aimed:
+                if connect is None or self._ear.has_endpoint:
                     return
                 prefix = prefix or messages.PREFIX
         if connect is None:
-            self._tell_once("polling", detail="the server tells no router: FLEETMAP_ZENOH_CONNECT can name one")
+            self._log_once("polling", detail="the server tells no router: FLEETMAP_ZENOH_CONNECT can name one")
             return
         from_server = self.options.zenoh_connect is None
         if from_server and not all(ROUTER.fullmatch(part.strip()) for part in connect.split(",")):
             detail = f"the server tells a router by what is no plain address ({connect[:300]}): FLEETMAP_ZENOH_CONNECT"
-            self._tell_once("polling", detail=f"{detail} can name it")
+            self._log_once("polling", detail=f"{detail} can name it")
             return
-        self._ear.aim(connect, prefix)
+        self._ear.set_endpoint(connect, prefix)
 
     # --- one sync ---
 
@@ -349,10 +351,10 @@ class Agent:
     """The map that an error is about; None for the current one."""
 
     def _sync(self) -> bool:
-        self._store.keep(self._state)
+        self._store.save(self._state)
         self._write_hooks()
         try:
-            plans = self._plans()
+            plans = self._fetch_channels()
         except FleetMapError:
             if self._activation.is_load_due:  # hooks that were cut off run without a server, too
                 self._report(self._activation.load())
@@ -380,11 +382,11 @@ class Agent:
         try:
             write_hooks(self._folder, self.options.on_change, self._robot)
         except OSError as error:  # a full disk stops agent-level, and not the agent
-            self._tell_once("hooks", detail=f"{self._folder.path}/hooks.json cannot be written: {error.strerror}")
+            self._log_once("hooks", detail=f"{self._folder.path}/hooks.json cannot be written: {error.strerror}")
 
     def _follow(self, channel: str) -> Outcome:
         """Bring ``current`` to the channel's map and have the robot load it."""
-        manifest = self._manifests.latest(channel)
+        manifest = self._manifests.fetch_latest(channel)
         outcome = self._install_latest(channel, manifest) if manifest is not None else None
         self._about = None
         loaded = self._activation.load()
@@ -392,7 +394,7 @@ class Agent:
 
     def _refresh_closures(self) -> None:
         """Bring the newest closures to the current version while the robot cannot have the channel's one."""
-        name = self._folder.standing
+        name = self._folder.current_version
         current, digest = self._folder.manifest(name), self._manifests.overlays_digest
         if name is None or current is None or digest is None or self._state.working != name:
             return
@@ -419,18 +421,18 @@ class Agent:
             built = self._folder.build(manifest, sources)
             outcome = self._activation.replace(built, manifest, members, self._time_text()[:19] + "Z")
         except FleetMapError as error:
-            self._tell("failed", detail=f"closures of version {current.version}: {error.detail}")
+            self._log_event("failed", detail=f"closures of version {current.version}: {error.detail}")
             return
         if outcome.state == "failed":
-            self._tell("failed", detail=outcome.detail)
+            self._log_event("failed", detail=outcome.detail)
 
     def _fetch_version(self, version: int, keep: Sequence[ManifestFile]) -> tuple[Manifest, dict[str, Path]]:
         """Fetch a version by its number, again if closures change meanwhile: its manifest, path -> verified file."""
         for attempt in range(MAX_CLOSURE_CHANGES):
-            manifest = self._manifests.planned(version)
+            manifest = self._manifests.fetch_planned(version)
             self._fetched = manifest
             try:
-                installed = self._folder.manifest(self._folder.standing)
+                installed = self._folder.manifest(self._folder.current_version)
                 return manifest, self._downloads.fetch(manifest, installed, keep)
             except (ClosuresChanged, NotFound) as error:
                 if manifest.overlays_digest is None:
@@ -451,13 +453,13 @@ class Agent:
         self._report(outcome, is_planned=self._preloaded is not None)
         return outcome.state == "active"
 
-    def _plans(self) -> list[Mapping[str, Any]] | None:
+    def _fetch_channels(self) -> list[Mapping[str, Any]] | None:
         try:
             return self._web.channels(self.options.environment)
         except (NotFound, Invalid) as error:
             if self.options.channel is None and PRODUCTION not in self._state.marks:
                 raise  # which channel to follow is not known then
-            self._tell_once("channels", detail=error.detail)
+            self._log_once("channels", detail=error.detail)
             return None
 
     def _channel(self, plans: Sequence[Mapping[str, Any]] | None) -> str:
@@ -467,7 +469,7 @@ class Agent:
         stands = any(p.get("channel") == PRODUCTION and p.get("version") is not None for p in plans or ())
         if stands or PRODUCTION in self._state.marks:
             return PRODUCTION
-        self._tell_once("following", channel=LATEST, detail="the channel production points to no version yet")
+        self._log_once("following", channel=LATEST, detail="the channel production points to no version yet")
         return LATEST
 
     def _install_latest(self, channel: str, manifest: Manifest) -> Outcome:
@@ -476,7 +478,7 @@ class Agent:
             try:
                 return self._install(manifest)
             except (ClosuresChanged, NotFound, Invalid, Untrusted) as error:
-                newer = self._manifests.latest(channel) if manifest.overlays_digest is not None else None
+                newer = self._manifests.fetch_latest(channel) if manifest.overlays_digest is not None else None
                 if newer is None or (newer.map_key == manifest.map_key and not isinstance(error, ClosuresChanged)):
                     raise
                 if newer.map_key == manifest.map_key and self._stopping.wait(CLOSURES_SECONDS * 2**attempt):
@@ -486,16 +488,16 @@ class Agent:
 
     def _install(self, manifest: Manifest) -> Outcome:
         """Fetch what is missing, build the version, and switch to it."""
-        name = self._folder.standing
+        name = self._folder.current_version
         installed = self._folder.manifest(name)
-        bad = self._folder.damaged(name, installed) if name is not None and installed is not None else []
+        bad = self._folder.damaged_files(name, installed) if name is not None and installed is not None else []
         if bad and installed is not None:
-            self._tell("damaged", version=installed.version, files=bad[:20])
+            self._log_event("damaged", version=installed.version, files=bad[:20])
         if name is not None and installed is not None and not bad and installed.map_key == manifest.map_key:
             self._activation.pending = None
             if installed.data != manifest.data:
                 self._folder.describe(name, manifest)  # the same files: a newer sequence or a later expiry
-            self._installed(manifest)
+            self._note_installed(manifest)
             return ACTIVE
         if (refused := self._activation.refusal(manifest)) is not None:
             return refused
@@ -511,7 +513,7 @@ class Agent:
         sources = self._downloads.fetch(
             manifest, installed, ready, lambda: self._set_status("downloading", about=manifest)
         )
-        if (newer := self._overtaken(manifest, time.monotonic() - begun)) is not None:
+        if (newer := self._superseding_manifest(manifest, time.monotonic() - begun)) is not None:
             return self._install(newer)
         members = {
             "version": manifest.version,
@@ -530,21 +532,23 @@ class Agent:
     def _switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
         outcome = self._activation.switch(name, manifest, members, since)
         if outcome.state == "active":
-            self._installed(manifest)
+            self._note_installed(manifest)
         else:
-            self._folder.tidy(self._preloaded.files if self._preloaded else ())
+            self._folder.prune(self._preloaded.files if self._preloaded else ())
         return outcome
 
-    def _installed(self, manifest: Manifest) -> None:
+    def _note_installed(self, manifest: Manifest) -> None:
         """Note the ETag of the manifest that is now the current one, and remove what is no longer needed."""
         self._manifests.note_installed(manifest)
-        self._folder.tidy(self._preloaded.files if self._preloaded else ())
+        self._folder.prune(self._preloaded.files if self._preloaded else ())
 
-    def _overtaken(self, manifest: Manifest, seconds: float) -> Manifest | None:
+    def _superseding_manifest(self, manifest: Manifest, seconds: float) -> Manifest | None:
         """The channel's newer manifest, where it moved on while this map was fetched, to one that is here already: what
         was taken back meanwhile is not put in place. Where the newer one is still to be fetched it has its turn.
         """
-        if manifest.channel is None or (self._called <= manifest.sequence and seconds < LONG_SECONDS):
+        if manifest.channel is None or (
+            self._announced_sequence <= manifest.sequence and seconds < RECHECK_AFTER_SECONDS
+        ):
             return None
 
         def is_present(newer: Manifest) -> bool:
@@ -554,7 +558,7 @@ class Agent:
             return self._downloads.has_all(newer)
 
         try:
-            return self._manifests.latest(manifest.channel, is_present)
+            return self._manifests.fetch_latest(manifest.channel, is_present)
         except FleetMapError:
             return None  # the next look tells of it
 
@@ -567,7 +571,7 @@ class Agent:
         if type(version) is not int:
             if self._preloaded is not None:
                 self._preloaded = None
-                self._folder.tidy()
+                self._folder.prune()
             return True
         closures = self._manifests.closures_key
         if self._preloaded is None or (self._preloaded.version, self._preloaded_closures) != (version, closures):
@@ -593,9 +597,9 @@ class Agent:
             if subject is not None:
                 self._set_status("downloading", detail, subject)
         elif subject is None:
-            self._tell_once("failed", detail=detail)  # an older server: which root would fail is not known
+            self._log_once("failed", detail=detail)  # an older server: which root would fail is not known
         elif self._set_status("failed", detail, subject):
-            self._tell("refused" if isinstance(error, Untrusted) else "failed", detail=detail)
+            self._log_event("refused" if isinstance(error, Untrusted) else "failed", detail=detail)
 
     # --- status ---
 
@@ -604,7 +608,7 @@ class Agent:
 
         is_planned: a planned version is reported as well; this status is then sent only if it is new.
         """
-        report_key = (outcome.state, outcome.detail, self._folder.standing, self._mark)
+        report_key = (outcome.state, outcome.detail, self._folder.current_version, self._accepted_sequence)
         if is_planned and report_key == self._reported:
             return
         self._reported = report_key
@@ -612,18 +616,18 @@ class Agent:
             self._set_status("active", self._remark())
         elif outcome.state == "failed":
             if self._set_status("failed", outcome.detail, outcome.manifest):
-                self._tell("failed", detail=outcome.detail)
+                self._log_event("failed", detail=outcome.detail)
         else:
             self._set_status("ready", outcome.detail, outcome.manifest)
 
     def _remark(self) -> str | None:
         """Return what a robot with an active map lacks: optional formats, or news that the bus announced."""
-        current = self._folder.manifest(self._folder.standing)
+        current = self._folder.manifest(self._folder.current_version)
         if current is None:
             return None
         remarks = (
             self._manifests.missing_remark(current),
-            self._freshness.behind_remark(self._mark),
+            self._freshness.behind_remark(self._accepted_sequence),
             self._activation.hook_remark(),
         )
         return "; ".join(remark for remark in remarks if remark) or None
@@ -631,7 +635,7 @@ class Agent:
     def _report_error(self, error: FleetMapError, *, is_planned: bool = False) -> None:
         if isinstance(error, RetryLater):
             self._after = error.seconds
-        report_key = ("failed", error.detail, self._folder.standing, self._mark)
+        report_key = ("failed", error.detail, self._folder.current_version, self._accepted_sequence)
         if is_planned and report_key == self._reported:
             return
         self._reported = report_key
@@ -639,23 +643,25 @@ class Agent:
 
     def _set_status(self, state: RobotState, detail: str | None = None, about: Subject | None = None) -> bool:
         """Note the status and send it: whether it is new. about: the map that it is about; default: the current one."""
-        current = self._folder.manifest(self._folder.standing)
+        current = self._folder.manifest(self._folder.current_version)
         version, root = _version(about or current)
         channel = self._state.channel or self.options.channel or LATEST
         overlays = current.overlays_digest if current else None
         # That of a version fetched by its number is of no move of the channel: the server goes by the root then.
         sequence = current.sequence if current and current.channel is not None else None
         detail = plain(detail[: messages.MAX_DETAIL]) if detail else None
-        holds = self._loaded(current)
+        holds = self._loaded_version(current)
         status = RobotStatus(channel, version, root, state, detail, self._time_text(), sequence, overlays, holds)
         if not self._status.set(status):
             return False
         if state != "failed":
-            self._tell(state, version=version, root=root, channel=channel, **({"detail": detail} if detail else {}))
+            self._log_event(
+                state, version=version, root=root, channel=channel, **({"detail": detail} if detail else {})
+            )
         self._status.send()
         return True
 
-    def _loaded(self, current: Manifest | None) -> tuple[int, str] | None:
+    def _loaded_version(self, current: Manifest | None) -> tuple[int, str] | None:
         """Version and root of the current map if the hooks have loaded it; None while they have not.
 
         A server that applies no closures does not know this member either.
@@ -664,20 +670,20 @@ class Agent:
             return (0, NO_ROOT) if self._manifests.has_closures else None
         if current.overlays_digest is None:
             return None
-        return (current.version, current.root) if self._state.activated == self._folder.standing else None
+        return (current.version, current.root) if self._state.activated == self._folder.current_version else None
 
     def _time_text(self) -> str:
         moment = datetime.fromtimestamp(self._clock(), timezone.utc)
         return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     def _fail(self, event: str, detail: str) -> None:
-        self._tell(event, detail=detail)
+        self._log_event(event, detail=detail)
         self._set_status("failed", detail, self._about)
 
-    def _tell_once(self, event: str, **members: Any) -> None:
-        if event not in self._told:
-            self._told.add(event)
-            self._tell(event, **members)
+    def _log_once(self, event: str, **members: Any) -> None:
+        if event not in self._reported_once:
+            self._reported_once.add(event)
+            self._log_event(event, **members)
 
 
 def _version(subject: Subject | None) -> tuple[int, str]:

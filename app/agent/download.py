@@ -38,7 +38,7 @@ class Downloads:
         sources: dict[str, Path] = {}
         missing = []
         for file in manifest.files:
-            local_copy = self._folder.known(file, index)
+            local_copy = self._folder.find_local_copy(file, index)
             if local_copy is None:
                 missing.append(file)
             else:
@@ -47,14 +47,14 @@ class Downloads:
             begin()
         self._folder.make_room(manifest, sources, keep)
         for file in missing:
-            ready = self._folder.ready(file)
+            ready = self._folder.is_complete(file)
             if not ready.exists():  # two names can have the same bytes
                 self._web.fetch(
                     manifest.environment,
                     manifest.version,
                     file,
                     ready,
-                    self._folder.before(file, old),
+                    self._folder.delta_base(file, old),
                     query=self._query(file, manifest),
                     overlays=manifest.overlays_digest,
                 )
@@ -71,4 +71,4 @@ class Downloads:
     def has_all(self, manifest: Manifest) -> bool:
         """Whether every file of a manifest is on the disk."""
         index = self._folder.index()
-        return all(self._folder.known(file, index) is not None for file in manifest.files)
+        return all(self._folder.find_local_copy(file, index) is not None for file in manifest.files)

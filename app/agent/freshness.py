@@ -11,12 +11,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from app.agent.signed_manifest import CLOCKS_DIFFER, Manifest
+from app.agent.signed_manifest import MAX_CLOCK_SKEW, Manifest
 
-PLAUSIBLE_SINCE = 1767225600.0
+MIN_PLAUSIBLE_TIME = 1767225600.0
 """2026-01-01: an earlier clock is unset, in seconds since 1970."""
 
-PLAUSIBLE_UNTIL = PLAUSIBLE_SINCE + 10 * 365 * 86400.0
+MAX_PLAUSIBLE_TIME = MIN_PLAUSIBLE_TIME + 10 * 365 * 86400.0
 """Latest signed time that a robot with an unset clock believes at first contact, in seconds since 1970."""
 
 MAX_AHEAD_SECONDS = 12 * 3600.0
@@ -60,10 +60,10 @@ class SignedClock:
         if manifest.time is None:
             return True
         clock = self._clock()
-        if clock >= PLAUSIBLE_SINCE:
+        if clock >= MIN_PLAUSIBLE_TIME:
             limit = clock + MAX_AHEAD_SECONDS
         else:
-            limit = self.floor + MAX_JUMP_SECONDS if self.floor else PLAUSIBLE_UNTIL
+            limit = self.floor + MAX_JUMP_SECONDS if self.floor else MAX_PLAUSIBLE_TIME
         return manifest.time.timestamp() <= limit
 
     def observe(self, manifest: Manifest) -> None:
@@ -88,7 +88,7 @@ class Freshness:
         Times ahead of the robot's clock are compared among themselves: a single one does not outdate all later ones.
         """
         signed = (manifest.time or manifest.expires).timestamp()
-        is_ahead = signed > clock + CLOCKS_DIFFER.total_seconds()
+        is_ahead = signed > clock + MAX_CLOCK_SKEW.total_seconds()
         if signed <= (self._newest_ahead if is_ahead else self._newest):
             return
         if is_ahead:

@@ -21,7 +21,7 @@ import httpx
 from app.agent.signed_manifest import ManifestFile
 from app.agent.state import digest
 from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
-from app.events.credentials import trusting
+from app.events.credentials import ca_ssl_context
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -40,7 +40,7 @@ HEAD_SECONDS = 90.0
 """Until an answer has begun: whoever sends its head byte by byte keeps nobody waiting."""
 
 WATCH_SECONDS = 0.5
-WHOLE_SECONDS = 300.0
+RESPONSE_SECONDS = 300.0
 """Until a manifest or another small answer has come."""
 
 PACE_SECONDS = 60.0
@@ -99,7 +99,7 @@ class _RequestWatchdog:
         """``late`` is called, in another thread, where the body takes longer than this, by a second at most."""
         with self._lock:
             if self._thread is None:
-                self._thread = threading.Thread(target=self._look, name="fleetmap-watch", daemon=True)
+                self._thread = threading.Thread(target=self._interrupt_overdue, name="fleetmap-watch", daemon=True)
                 self._thread.start()
         entry = object()
         self._due[entry] = (time.monotonic() + seconds, late)
@@ -108,7 +108,7 @@ class _RequestWatchdog:
         finally:
             self._due.pop(entry, None)
 
-    def _look(self) -> None:
+    def _interrupt_overdue(self) -> None:
         while True:
             time.sleep(WATCH_SECONDS)
             now = time.monotonic()
@@ -136,7 +136,7 @@ class ServerClient:
             headers=headers,
             timeout=TIMEOUT,
             follow_redirects=False,
-            verify=self._trust(ca),
+            verify=self._ssl_context(ca),
         )
         self._stopping = stopping
         self._sockets: list[socket.socket] = []
@@ -145,9 +145,9 @@ class ServerClient:
         self.deltas = 0
         self.failed_deltas = 0
 
-    def _trust(self, ca: Path | None) -> ssl.SSLContext | bool:
+    def _ssl_context(self, ca: Path | None) -> ssl.SSLContext | bool:
         if ca is not None:
-            return trusting(ca)
+            return ca_ssl_context(ca)
         # Over plain HTTP nobody's certificate is believed: no authorities are read for that.
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if self.server.startswith("http://") else True
 
@@ -193,10 +193,10 @@ class ServerClient:
                 if answer.status_code == 304 and etag:
                     return None
                 if answer.status_code == 200:
-                    data = self._whole(answer, MAX_MANIFEST_BYTES)
+                    data = self._read_all(answer, MAX_MANIFEST_BYTES)
                     return data, answer.headers.get(SIGNATURE, ""), answer.headers.get("etag")
                 if answer.status_code != 202:
-                    raise self._refused(answer)
+                    raise self._response_error(answer)
                 location = answer.headers.get("location", "")
             self._wait(path, location)
         raise Unavailable(f"{self.server} makes the maps again and again, and does not hand them out")
@@ -206,7 +206,7 @@ class ServerClient:
         path = f"{API}/robots/{quote(robot, safe='')}/status"
         with self._stream(path, {"Prefer": "return=minimal"}, dict(body)) as answer:
             if answer.status_code >= 300:
-                raise self._refused(answer)
+                raise self._response_error(answer)
 
     def fetch(
         self,
@@ -275,11 +275,11 @@ class ServerClient:
             if answer.status_code == 202:
                 raise RetryLater(f"the server is still making {file.path}", 2.0)
             if answer.status_code not in (200, 206):
-                raise self._refused(answer)
+                raise self._response_error(answer)
             coding = answer.headers.get("content-encoding", "identity").lower()
             chunks = self._chunks(answer)
             if coding == "dcz" and "Available-Dictionary" in headers and old is not None:
-                self._write(part, "wb", 0, _undo(chunks, old, file), file, keep=False)
+                self._write(part, "wb", 0, _decode(chunks, old, file), file, keep=False)
                 self.deltas += 1
                 return False
             if coding != "identity":
@@ -328,12 +328,12 @@ class ServerClient:
                 window, since = now, 0
             yield chunk
 
-    def _whole(self, answer: httpx.Response, limit: int) -> bytes:
-        data, end = bytearray(), time.monotonic() + WHOLE_SECONDS
+    def _read_all(self, answer: httpx.Response, limit: int) -> bytes:
+        data, end = bytearray(), time.monotonic() + RESPONSE_SECONDS
         for chunk in self._chunks(answer):
             data += chunk
             if time.monotonic() > end:
-                raise Unavailable(f"{self.server} has not answered within {WHOLE_SECONDS:g} seconds")
+                raise Unavailable(f"{self.server} has not answered within {RESPONSE_SECONDS:g} seconds")
             if len(data) > limit:
                 raise Untrusted(f"the answer has more than {limit} bytes")
         return bytes(data)
@@ -341,8 +341,8 @@ class ServerClient:
     def _json(self, path: str) -> Any:
         with self._stream(path, {}) as answer:
             if answer.status_code != 200:
-                raise self._refused(answer)
-            data = self._whole(answer, MAX_JSON_BYTES)
+                raise self._response_error(answer)
+            data = self._read_all(answer, MAX_JSON_BYTES)
         try:
             return json.loads(data)
         except (ValueError, RecursionError):
@@ -404,11 +404,11 @@ class ServerClient:
                 raise AgentStopped from None
             raise Unavailable(f"no answer from {self.server}: {error or type(error).__name__}") from None
 
-    def _refused(self, answer: httpx.Response) -> FleetMapError:
+    def _response_error(self, answer: httpx.Response) -> FleetMapError:
         """The server's problem as an error of ours."""
         status, detail = answer.status_code, ""
         try:
-            problem = json.loads(self._whole(answer, MAX_JSON_BYTES))
+            problem = json.loads(self._read_all(answer, MAX_JSON_BYTES))
             detail = str(problem.get("detail") or problem.get("title") or "") if isinstance(problem, dict) else ""
         except (ValueError, RecursionError, httpx.HTTPError, FleetMapError):
             detail = ""
@@ -447,7 +447,7 @@ def _fits(old: int, new: int) -> bool:
     return old >= MIN_DICTIONARY_BYTES and max(old, new) <= MAX_DICTIONARY_BYTES
 
 
-def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: ManifestFile) -> Iterator[bytes]:
+def _decode(chunks: Iterator[bytes], old: tuple[Path, str], file: ManifestFile) -> Iterator[bytes]:
     """The new file of a ``dcz`` body, in pieces; never much more than the manifest's size."""
     old_path, sha256 = old
     want = DCZ_MAGIC + bytes.fromhex(sha256)

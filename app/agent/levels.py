@@ -11,7 +11,7 @@ from typing import Any
 from app.agent import hooks
 from app.agent.map_directory import MapDirectory
 from app.agent.signed_manifest import Manifest
-from app.agent.state import write_whole
+from app.agent.state import write_durably
 from app.errors import Conflict, Invalid, NotFound, Unavailable
 
 MAX_LEVEL_BYTES = 4096
@@ -68,7 +68,7 @@ def write_hooks(folder: MapDirectory, on_change: Sequence[str], robot: str) -> N
     data = json.dumps(body, indent=1).encode() + b"\n"
     path = folder.path / "hooks.json"
     if not path.exists() or path.read_bytes() != data:
-        write_whole(path, data)
+        write_durably(path, data)
 
 
 def load_level(
@@ -92,7 +92,7 @@ def load_level(
     folder = MapDirectory(directory)
     commands, robot = _read_hooks(folder.path / "hooks.json")
     with folder.hooks_lock():
-        manifest = folder.manifest(folder.standing)
+        manifest = folder.manifest(folder.current_version)
         if manifest is None:
             raise NotFound(f"{directory} holds no map yet: wait for the agent's first sync")
         names = level_names(manifest)
@@ -105,7 +105,7 @@ def load_level(
             if (problem := hooks.run(command, values)) is not None:
                 raise Unavailable(f"level {level} is not loaded: {problem}")
             log("hook", command=command, version=manifest.version, level=level)
-        write_whole(folder.path / "level", level.encode() + b"\n")
+        write_durably(folder.path / "level", level.encode() + b"\n")
         log("level", level=level, version=manifest.version)
 
 

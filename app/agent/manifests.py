@@ -43,7 +43,7 @@ class Manifests:
             self._query += f"&optional={encode_entries(requests[count:])}"
         self._latest: tuple[str, str | None, Manifest] | None = None
 
-    def latest(self, channel: str, accept: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
+    def fetch_latest(self, channel: str, accept: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
         """Fetch the channel's manifest: None if the installed one is still it, or it is not accepted.
 
         Raises:
@@ -52,7 +52,7 @@ class Manifests:
         request_key = f"{channel}?{self._query}"
         state, now = self._store.value, self._clock.now()
         mark = state.marks.get(channel)
-        installed = self._folder.manifest(self._folder.standing)
+        installed = self._folder.manifest(self._folder.current_version)
         etag, cached = None, None
         if state.asked == request_key and state.expires > now and installed is not None and installed.mark == mark:
             etag = state.etag  # else "not modified" would be said of a map that is not installed
@@ -75,11 +75,11 @@ class Manifests:
         if state.key != key:
             self._log("trusting", key=signed_manifest.key_id(key), detail="rotated" if state.key else "first contact")
         state = dataclasses.replace(state, key=key, newest_time=self._clock.floor)
-        self._store.keep(state.marked(channel, manifest.mark))
+        self._store.save(state.with_mark(channel, manifest.mark))
         self._latest = (request_key, response[2], manifest)
         return manifest
 
-    def planned(self, version: int) -> Manifest:
+    def fetch_planned(self, version: int) -> Manifest:
         """Fetch the manifest of a version that a channel is planned to move to. Raises Untrusted."""
         closures = "&closures=apply" if self.has_closures else ""
         response = self._web.manifest(self._options.environment, str(version), self._query + closures)
@@ -115,7 +115,7 @@ class Manifests:
     @property
     def has_closures(self) -> bool:
         """Whether the server applies closures, by the newest manifest."""
-        manifest = self._latest[2] if self._latest else self._folder.manifest(self._folder.standing)
+        manifest = self._latest[2] if self._latest else self._folder.manifest(self._folder.current_version)
         return manifest is not None and manifest.overlays_digest is not None
 
     def missing_remark(self, manifest: Manifest) -> str | None:
@@ -128,9 +128,9 @@ class Manifests:
     def _verify(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, bytes]:
         """Return a manifest and the key that signed it. Raises Untrusted."""
         state = self._store.value
-        key = signed_manifest.signer(data, signature, state.key, state.given, self._web.keys)
+        key = signed_manifest.verify_signature(data, signature, state.key, state.given, self._web.keys)
         manifest = signed_manifest.parse(data, signature)
-        signed_manifest.check(
+        signed_manifest.check_manifest(
             manifest,
             environment=self._options.environment,
             channel=channel,

@@ -31,10 +31,10 @@ from typing import IO, Any
 
 from app.agent.http_client import AgentStopped
 from app.agent.signed_manifest import Manifest, ManifestFile, parse
-from app.agent.state import digest, sync_folder, write_new
+from app.agent.state import digest, sync_folder, write_atomically
 from app.errors import Conflict, Invalid, Unavailable, Untrusted
 
-KEPT = 2
+OLD_VERSIONS_KEPT = 2
 """Old versions that stay, beside the current one."""
 
 HOOKS_LOCK_SECONDS = 0.1
@@ -101,7 +101,7 @@ class MapDirectory:
     # --- what is there ---
 
     @property
-    def standing(self) -> str | None:
+    def current_version(self) -> str | None:
         """The name of the version that ``current`` points to."""
         try:
             target = self.current.readlink()
@@ -119,11 +119,11 @@ class MapDirectory:
         except (OSError, ValueError, Untrusted):
             return None
 
-    def damaged(self, name: str, manifest: Manifest) -> list[str]:
+    def damaged_files(self, name: str, manifest: Manifest) -> list[str]:
         """Files of a version that are absent or have other bytes than their manifest says."""
-        return [file.path for file in manifest.files if not _holds(self.versions / name / file.path, file)]
+        return [file.path for file in manifest.files if not _has_content(self.versions / name / file.path, file)]
 
-    def ready(self, file: ManifestFile) -> Path:
+    def is_complete(self, file: ManifestFile) -> Path:
         """Where a fetched file lies once it is whole and verified."""
         return self.partial / file.sha256
 
@@ -136,22 +136,22 @@ class MapDirectory:
                 paths.setdefault(file.sha256, []).append(self.versions / name / file.path)
         return paths
 
-    def known(self, file: ManifestFile, index: Mapping[str, Sequence[Path]]) -> Path | None:
+    def find_local_copy(self, file: ManifestFile, index: Mapping[str, Sequence[Path]]) -> Path | None:
         """A file with these bytes, fetched or of a version that is there; its hash is verified now."""
-        fetched = self.ready(file)
-        if _holds(fetched, file):
+        fetched = self.is_complete(file)
+        if _has_content(fetched, file):
             return fetched
         fetched.unlink(missing_ok=True)  # damaged while it lay here
-        return next((path for path in index.get(file.sha256, ()) if _holds(path, file)), None)
+        return next((path for path in index.get(file.sha256, ()) if _has_content(path, file)), None)
 
-    def before(self, file: ManifestFile, installed: Mapping[str, ManifestFile]) -> tuple[Path, str] | None:
+    def delta_base(self, file: ManifestFile, installed: Mapping[str, ManifestFile]) -> tuple[Path, str] | None:
         """The file of this name that is installed, with its hash: a dictionary for a delta."""
         old = installed.get(file.path)
-        standing = self.standing
+        standing = self.current_version
         if old is None or standing is None:
             return None
         path = self.versions / standing / old.path
-        return (path, old.sha256) if _holds(path, old) else None
+        return (path, old.sha256) if _has_content(path, old) else None
 
     def make_room(self, manifest: Manifest, sources: Mapping[str, Path], keep: Sequence[ManifestFile] = ()) -> None:
         """See that those of a manifest's files fit that are not among ``sources``, less what was fetched of them.
@@ -160,7 +160,7 @@ class MapDirectory:
         later map (``keep``). Unavailable where that is not enough.
         """
         new_files = {file.sha256: file for file in manifest.files if file.path not in sources}.values()
-        count = sum(file.size - min(file.size, self._fetched(file)) for file in new_files) + CHUNK
+        count = sum(file.size - min(file.size, self._partial_size(file)) for file in new_files) + CHUNK
         steps: Sequence[Callable[[], None]] = (
             lambda: self._forget((*manifest.files, *keep)),
             lambda: self._drop(0, sources.values()),
@@ -175,9 +175,9 @@ class MapDirectory:
     def _free(self) -> int:
         return shutil.disk_usage(self.path).free
 
-    def _fetched(self, file: ManifestFile) -> int:
+    def _partial_size(self, file: ManifestFile) -> int:
         try:
-            return self.ready(file).with_suffix(".part").stat().st_size
+            return self.is_complete(file).with_suffix(".part").stat().st_size
         except OSError:
             return 0
 
@@ -191,7 +191,7 @@ class MapDirectory:
         """Write what describes a version again if the directory was moved, or an older agent wrote it."""
         for path, data in self._descriptions(self.versions / name, manifest):
             if not path.exists() or path.read_bytes() != data:
-                write_new(path, data)
+                write_atomically(path, data)
 
     def build(self, manifest: Manifest, sources: dict[str, Path]) -> str:
         """A version's folder, whole and on the disk, not yet current: its name. sources: path -> verified file."""
@@ -203,7 +203,7 @@ class MapDirectory:
             if (
                 existing_manifest is not None
                 and existing_manifest.map_key == manifest.map_key
-                and not self.damaged(name, existing_manifest)
+                and not self.damaged_files(name, existing_manifest)
             ):
                 self.describe(name, manifest)
                 return name
@@ -248,24 +248,26 @@ class MapDirectory:
         link.replace(self.current)
         sync_folder(self.path)
 
-    def tidy(self, keep: Iterable[ManifestFile] = ()) -> None:
+    def prune(self, keep: Iterable[ManifestFile] = ()) -> None:
         """Remove versions beyond the kept ones, and fetched files but those to keep."""
-        self._drop(KEPT)
+        self._drop(OLD_VERSIONS_KEPT)
         self._forget(keep)
 
-    def spare(self) -> None:
+    def free_space(self) -> None:
         """Keep nothing but what stands: for a disk that is full."""
         self._drop(0)
         self._forget(())
 
     def _drop(self, keep_count: int, needed: Iterable[Path] = ()) -> None:
         """Remove versions beside the current one but so many, the last used ones, and those of needed files."""
-        spared = {self.standing} | {p.relative_to(self.versions).parts[0] for p in needed if self.versions in p.parents}
+        spared = {self.current_version} | {
+            p.relative_to(self.versions).parts[0] for p in needed if self.versions in p.parents
+        }
         old = [name for name in self._names() if name not in spared]
         removable = [name for name in old if name not in self.protected]
         # Folders that differ in closures alone share a root: they do not push out the version before.
         roots = {_root_name(name) for name in old if name in self.protected}
-        standing = _root_name(self.standing or "")
+        standing = _root_name(self.current_version or "")
         roots.discard(standing)
         spare: set[str] = set()
         for name in removable:
@@ -297,10 +299,10 @@ class MapDirectory:
 
     def _describe(self, folder: Path, manifest: Manifest) -> None:
         """Write the manifest, and what follows from it, into a version's folder."""
-        write_new(folder / "manifest.sig", manifest.signature.encode() + b"\n")
+        write_atomically(folder / "manifest.sig", manifest.signature.encode() + b"\n")
         for path, data in self._descriptions(folder, manifest):
-            write_new(path, data)
-        write_new(folder / "manifest.json", manifest.data)
+            write_atomically(path, data)
+        write_atomically(folder / "manifest.json", manifest.data)
 
     def _descriptions(self, folder: Path, manifest: Manifest) -> list[tuple[Path, bytes]]:
         """Return the files that describe a version to others than the agent."""
@@ -316,7 +318,7 @@ def _root_name(name: str) -> str:
     return "-".join(name.partition(".")[0].split("-")[:2])
 
 
-def _holds(path: Path, file: ManifestFile) -> bool:
+def _has_content(path: Path, file: ManifestFile) -> bool:
     try:
         return path.stat().st_size == file.size and digest(path) == file.sha256
     except OSError:

@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from app.agent.state import Mark
 from app.errors import Untrusted
 
-CLOCKS_DIFFER = timedelta(seconds=60)
+MAX_CLOCK_SKEW = timedelta(seconds=60)
 """How far a robot's clock may be from the server's."""
 
 MAX_SEQUENCE_AHEAD = 10**9
@@ -274,7 +274,7 @@ def key_id(public: bytes) -> str:
     return hashlib.sha256(public).hexdigest()[:16]
 
 
-def signer(
+def verify_signature(
     data: bytes, signature: str, pinned: bytes | None, given: str | None, keys: Callable[[], list[Mapping[str, Any]]]
 ) -> bytes:
     """The raw public key that signed ``data``, if the robot may believe it: the pinned one, or one that it vouches for.
@@ -327,7 +327,7 @@ def _from_server(name: str, pinned: bytes | None, given: str | None, keys: Seque
     )
 
 
-def check_given(text: str) -> str:
+def check_key(text: str) -> str:
     """A key as an operator writes it: its id (16 hexadecimal digits) or the raw public key in base64; Untrusted."""
     text = text.strip()
     raw = _bytes(text)
@@ -336,7 +336,7 @@ def check_given(text: str) -> str:
     raise Untrusted("--key takes a key's id (16 hexadecimal digits) or its public_key in base64, as GET /api/v1/keys")
 
 
-def check(
+def check_manifest(
     manifest: Manifest,
     *,
     environment: str,
@@ -357,7 +357,7 @@ def check(
         raise Untrusted(f"the manifest is of the environment {manifest.environment!r}, not of {environment!r}")
     if manifest.channel != channel:
         raise Untrusted(f"the manifest is of the channel {manifest.channel!r}, not of {channel!r}")
-    if manifest.expires < (now or datetime.now(timezone.utc)) - CLOCKS_DIFFER:
+    if manifest.expires < (now or datetime.now(timezone.utc)) - MAX_CLOCK_SKEW:
         raise Untrusted(
             f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC, and it is "
             f"{now or datetime.now(timezone.utc):%Y-%m-%d %H:%M:%S} by the newer of this robot's clock and the newest "

@@ -23,7 +23,7 @@ HASH_BYTES = 1 << 18
 MAX_TIME = 253402214400.0
 """9999-12-31, in seconds since 1970."""
 
-FORM = 2
+STATE_FORMAT = 2
 """Format of state.json. Form 1, of releases without epochs, is read as well."""
 
 
@@ -60,7 +60,7 @@ class AgentState:
     working: str | None = None
     newest_time: float = 0.0
 
-    def marked(self, channel: str, mark: Mark) -> AgentState:
+    def with_mark(self, channel: str, mark: Mark) -> AgentState:
         """Return the state after a manifest of this channel was accepted."""
         return dataclasses.replace(self, marks={**self.marks, channel: mark}, channel=channel)
 
@@ -69,8 +69,8 @@ def load(path: Path, environment: str) -> AgentState:
     """What stands there, or a fresh one; Invalid where it is of another environment or not to be read."""
     try:
         body = json.loads(path.read_bytes())
-        if body["form"] not in (1, FORM):
-            raise ValueError(f"it has the form {body['form']}, and this agent reads forms 1 and {FORM}")
+        if body["form"] not in (1, STATE_FORMAT):
+            raise ValueError(f"it has the form {body['form']}, and this agent reads forms 1 and {STATE_FORMAT}")
         state = AgentState(
             environment=str(body["environment"]),
             key=base64.b64decode(body["key"]) if body.get("key") else None,
@@ -105,7 +105,7 @@ def load(path: Path, environment: str) -> AgentState:
 def save(path: Path, state: AgentState) -> None:
     """Whole or not at all, also where the power goes."""
     body = {
-        "form": FORM,
+        "form": STATE_FORMAT,
         "environment": state.environment,
         "key": base64.b64encode(state.key).decode() if state.key else None,
         "given": state.given,
@@ -118,7 +118,7 @@ def save(path: Path, state: AgentState) -> None:
         "working": state.working,
         "newest_time": state.newest_time,
     }
-    write_whole(path, json.dumps(body, indent=1).encode() + b"\n")
+    write_durably(path, json.dumps(body, indent=1).encode() + b"\n")
 
 
 def _text(value: Any) -> str | None:
@@ -146,15 +146,15 @@ class StateStore:
         self.value = load(self._path, self.value.environment)
 
     def stage(self, state: AgentState) -> None:
-        """Replace the state; it is saved with the next call of ``keep``."""
+        """Replace the state; it is saved with the next call of ``save``."""
         if state != self.value:
             self.value, self._unsaved = state, True
 
     def set(self, **changes: Any) -> None:
         """Replace some attributes and save."""
-        self.keep(dataclasses.replace(self.value, **changes))
+        self.save(dataclasses.replace(self.value, **changes))
 
-    def keep(self, state: AgentState) -> None:
+    def save(self, state: AgentState) -> None:
         """Save a state if it is new, or if the last one could not be saved."""
         self.stage(state)
         if self._unsaved:
@@ -168,13 +168,13 @@ class StateStore:
             self._unsaved = False
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_durably(path: Path, data: bytes) -> None:
     """Replace a file at once, and for good."""
-    write_new(path, data)
+    write_atomically(path, data)
     sync_folder(path.parent)
 
 
-def write_new(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes) -> None:
     """Replace a file at once. No link that somebody has put beside it is followed, and no full disk left fuller."""
     temporary = path.with_name(f".{path.name}.new")
     temporary.unlink(missing_ok=True)

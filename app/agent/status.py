@@ -56,7 +56,7 @@ class StatusReporter:
 
     def set(self, status: RobotStatus) -> bool:
         """Note a status and send it; False if nothing but its time is new."""
-        if _same(status, self.status):
+        if _is_same_status(status, self.status):
             return False
         self.status = status
         return True
@@ -75,13 +75,13 @@ class StatusReporter:
             return
         on_bus = self.bus is not None and self.bus.connected
         stale = not on_bus and now - self._sent_http_at > REPEAT_SECONDS
-        if _same(status, self._sent_http) and not stale:
+        if _is_same_status(status, self._sent_http) and not stale:
             self.confirm_at = None
             return
         if on_bus and self.bus is not None:
-            if not _same(status, self._sent_zenoh) and self.bus.put_status(status):
+            if not _is_same_status(status, self._sent_zenoh) and self.bus.put_status(status):
                 self._sent_zenoh = status
-            if _same(status, self._sent_zenoh):
+            if _is_same_status(status, self._sent_zenoh):
                 if self.confirm_at is None:
                     longest = CONFIRM_SECONDS if self._is_confirmed else FIRST_CONFIRM_SECONDS
                     self.confirm_at = now + longest * random.uniform(0.25, 1.0)  # noqa: S311
@@ -99,5 +99,5 @@ class StatusReporter:
         self._is_confirmed = True
 
 
-def _same(one: RobotStatus, other: RobotStatus | None) -> bool:
+def _is_same_status(one: RobotStatus, other: RobotStatus | None) -> bool:
     return other is not None and dataclasses.replace(one, time=None) == dataclasses.replace(other, time=None)

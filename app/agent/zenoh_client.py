@@ -18,9 +18,9 @@ from zenoh import ext
 
 from app.errors import FleetMapError
 from app.events import messages
-from app.events.credentials import ZenohCredentials, no_router
+from app.events.credentials import ZenohCredentials, describe_connection_failure
 
-LOOK_SECONDS = 0.5
+CONNECTION_POLL_SECONDS = 0.5
 """Between two looks whether the router is there."""
 
 CONNECT_MS = 5000
@@ -49,31 +49,37 @@ class ZenohClient:
         config: Path | None = None,
         login: ZenohCredentials | None = None,
     ) -> None:
-        self._environment, self._robot, self._heard, self._back, self._lost = environment, robot, heard, back, lost
+        self._environment, self._robot, self._on_event, self._on_connected, self._on_lost = (
+            environment,
+            robot,
+            heard,
+            back,
+            lost,
+        )
         self._config, self._login = config, login or ZenohCredentials()
-        self._where: tuple[str, str] | None = None
+        self._endpoint: tuple[str, str] | None = None
         self._session: zenoh.Session | None = None
-        self._held: list[Any] = []
+        self._declared: list[Any] = []
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._aimed = threading.Event()
         self._thread: threading.Thread | None = None
         self.problem: str | None = None
 
-    def aim(self, connect: str, prefix: str) -> None:
+    def set_endpoint(self, connect: str, prefix: str) -> None:
         """Where the router is; the first call starts the thread, another address opens the session anew."""
-        if self._where == (connect, prefix):
+        if self._endpoint == (connect, prefix):
             return
-        self._where = (connect, prefix)
+        self._endpoint = (connect, prefix)
         self._aimed.set()
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="fleetmap-ear", daemon=True)
             self._thread.start()
 
     @property
-    def aimed(self) -> bool:
+    def has_endpoint(self) -> bool:
         """Whether it knows a router."""
-        return self._where is not None
+        return self._endpoint is not None
 
     @property
     def connected(self) -> bool:
@@ -87,9 +93,9 @@ class ZenohClient:
     def put_status(self, status: messages.RobotStatus) -> bool:
         """Say how the robot is: whether a router took it."""
         with self._lock:
-            if self._session is None or self._where is None or not self.connected:
+            if self._session is None or self._endpoint is None or not self.connected:
                 return False
-            key = messages.status_key(self._where[1], self._environment, self._robot)
+            key = messages.status_key(self._endpoint[1], self._environment, self._robot)
             try:
                 self._session.put(
                     key,
@@ -108,7 +114,7 @@ class ZenohClient:
         self._aimed.set()
         if self._thread is not None:
             self._thread.join(CONNECT_MS / 1000 + 5)
-        self._shut()
+        self._close_session()
 
     # --- the thread ---
 
@@ -119,12 +125,12 @@ class ZenohClient:
         while not self._stopping.is_set():
             if self._aimed.is_set():
                 self._aimed.clear()
-                self._shut()
+                self._close_session()
                 was_connected = False
             if self._session is None:
                 if not self._open():
                     if self.problem is not None and self.problem != last_problem:
-                        self._lost(self.problem)
+                        self._on_lost(self.problem)
                         last_problem = self.problem
                     self._aimed.wait(pause * random.uniform(0.5, 1.5))  # noqa: S311  jitter is no secret
                     pause = min(MAX_PAUSE_SECONDS, pause * 2)
@@ -133,19 +139,19 @@ class ZenohClient:
             now = self.connected
             if now and not was_connected:
                 last_problem = None
-                self._back()
+                self._on_connected()
             elif was_connected and not now:
-                self._lost(f"the router at {self._where[0] if self._where else ''} is gone")
+                self._on_lost(f"the router at {self._endpoint[0] if self._endpoint else ''} is gone")
             was_connected = now
-            self._aimed.wait(LOOK_SECONDS)
+            self._aimed.wait(CONNECTION_POLL_SECONDS)
 
     def _open(self) -> bool:
-        assert self._where is not None
-        connect, prefix = self._where
+        assert self._endpoint is not None
+        connect, prefix = self._endpoint
         try:
             session = zenoh.open(configuration(connect, self._config, self._login))
         except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
-            self.problem = no_router(connect, error, self._login)
+            self.problem = describe_connection_failure(connect, error, self._login)
             return False
         try:
             declarations = [
@@ -153,7 +159,7 @@ class ZenohClient:
                 ext.declare_advanced_subscriber(
                     session,
                     messages.events_key(prefix, self._environment),
-                    self._take,
+                    self._on_sample,
                     history=ext.HistoryConfig(detect_late_publishers=True),
                     recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
                 ),
@@ -164,23 +170,23 @@ class ZenohClient:
                 _close(session)
             return False
         with self._lock:
-            self._session, self._held = session, declarations
+            self._session, self._declared = session, declarations
         self.problem = None
         return True
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _on_sample(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT or len(sample.payload) > MAX_EVENT_BYTES:
             return
         try:
             event = messages.Event.from_json(bytes(sample.payload))
         except FleetMapError:
             return
-        self._heard(event)
+        self._on_event(event)
 
-    def _shut(self) -> None:
+    def _close_session(self) -> None:
         with self._lock:
-            session, declarations = self._session, self._held
-            self._session, self._held = None, []
+            session, declarations = self._session, self._declared
+            self._session, self._declared = None, []
         for declaration in declarations:
             with contextlib.suppress(Exception):
                 declaration.undeclare()

@@ -54,7 +54,7 @@ def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> 
             "sequence": channel.closures_sequence,
         }
         root = channel.planned.root if channel.planned else None
-        out["robots"] = fleet.holding(robots, channel, now, root).as_dict()
+        out["robots"] = fleet.channel_convergence(robots, channel, now, root).as_dict()
     return out
 
 

@@ -17,7 +17,7 @@ from app.api.responses import StrictRoute, json_response
 from app.api.schemas import problem_responses
 from app.errors import Unavailable
 from app.events import ros2
-from app.events.relay import state_of
+from app.events.relay import relay_state
 
 READY_SECONDS = 5.0
 
@@ -85,12 +85,12 @@ async def readyz(
         raise Unavailable(f"nothing can be stored: {refusal}")
     if not services.prepared.is_set():
         raise Unavailable("conversions are being prepared: ready in a few seconds")
-    events = state_of(services.options.data_dir, services.options.zenoh_mode)
+    events = relay_state(services.options.data_dir, services.options.zenoh_mode)
     if services.options.zenoh_mode != "off":
         options = services.options
         endpoint = advertised_router(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
         events = {**events, "prefix": options.zenoh_prefix, **({"connect": endpoint} if endpoint else {})}
-    topics = {"ros2": ros2.state_of(services.options.data_dir)} if services.options.ros2 else {}
+    topics = {"ros2": ros2.ros2_state(services.options.data_dir)} if services.options.ros2 else {}
     state = {
         "status": "ready" if refusal is None else "read-only",
         "database": "ok",

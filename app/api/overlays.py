@@ -97,7 +97,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
     level = body.level or GROUND
     edge = None
     if body.edge is not None:
-        key, feature = overlays.edge_of(services.store, versions, body.edge)
+        key, feature = overlays.find_edge(services.store, versions, body.edge)
         level, edge = key.level, feature.id
     reported = Overlay(
         environment=env,
@@ -180,7 +180,7 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep,
     if overlay.state == "pending":
         versions = list(_shown_versions(services, env))
         if overlay.edge is not None:
-            overlays.edge_of(services.store, versions, overlay.edge)
+            overlays.find_edge(services.store, versions, overlay.edge)
         _check_place(overlay, versions)
     return json_response(services.store.decide_overlay(env, id, "pending", "accepted", principal.name, now).as_dict())
 

@@ -231,7 +231,7 @@ def validation_error_response(error: RequestValidationError) -> Response:
 
 def internal_error_response(error: BaseException) -> Response:
     """The answer for anything else. The log gets the class and our own lines, no data, paths or tokens."""
-    if isinstance(error, OSError) and error.errno in errors.NO_ROOM:
+    if isinstance(error, OSError) and error.errno in errors.DISK_FULL_ERRNOS:
         detail = "the server has no room left; nothing was stored. Try again after its operator has freed space"
         return error_response(errors.NoRoom(detail))
     if isinstance(error, OSError) and error.errno == errno.EROFS:

@@ -108,9 +108,9 @@ async def put_status(
     more = (body.detail, body.sequence, body.time, body.overlays, holds)
     report = RobotReport(body.channel, body.version, body.root, body.state, *more)
     # No thread waits for the store: a whole fleet reports at once, and others want maps meanwhile.
-    noting = services.fleet.noting(ReceivedReport(body.environment, robot, report, datetime.now(UTC)))
-    await asyncio.wait({asyncio.wrap_future(noting)}, timeout=fleet.NOTE_SECONDS)
-    fleet.settle(noting)
+    noting = services.fleet.submit_report(ReceivedReport(body.environment, robot, report, datetime.now(UTC)))
+    await asyncio.wait({asyncio.wrap_future(noting)}, timeout=fleet.WARN_SECONDS)
+    fleet.wait_until_stored(noting)
     if prefer is not None and prefer.strip().lower() == "return=minimal":
         return Response(status_code=204, headers={"preference-applied": "return=minimal"})
     return json_response(
@@ -144,7 +144,7 @@ def require_report_permission(principal: Principal, robot: str) -> None:
 
 def store_report(services: Services, environment: str, robot: str, report: RobotReport) -> dict[str, Any]:
     """Store a report; the robot as it is now."""
-    services.fleet.note(ReceivedReport(environment, robot, report, datetime.now(UTC)))
+    services.fleet.store_report(ReceivedReport(environment, robot, report, datetime.now(UTC)))
     return _only_robot(services, services.store.robots(environment, robot))
 
 
@@ -176,7 +176,7 @@ def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[st
             continue  # its environment went since
         lag = None
         if channel is not None and channel.root is not None:
-            lag = fleet.lag_of(robot, channel, moves.get((robot.environment, name), [])).as_dict()
+            lag = fleet.robot_lag(robot, channel, moves.get((robot.environment, name), [])).as_dict()
         active_map = robot.held
         body = {"robot": robot.robot, "environment": robot.environment, **_report(robot.report, robot.time)}
         body |= {

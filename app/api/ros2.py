@@ -26,8 +26,8 @@ def channel_versions(services: Services, chosen: tuple[EnvironmentSelector, ...]
 
     channel: empty for production where there is one, else the latest. Where it stands nowhere, nothing goes out.
     """
-    names = [entry.pattern for entry in chosen if entry.one]
-    if any(not entry.one for entry in chosen):
+    names = [entry.pattern for entry in chosen if entry.is_single]
+    if any(not entry.is_single for entry in chosen):
         names += [name for name in _all_names(services) if namespace_of(name, chosen) is not None]
     out = {}
     for name in dict.fromkeys(names):

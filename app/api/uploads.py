@@ -26,7 +26,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.api.middleware import multipart_boundary
 from app.api.problems import MalformedBody
-from app.errors import NO_ROOM, Invalid, NoRoom, Problem, TooLarge, Unavailable
+from app.errors import DISK_FULL_ERRNOS, Invalid, NoRoom, Problem, TooLarge, Unavailable
 from app.formats import Limits
 from app.ingest import SpooledFile
 from app.store.database import check_room
@@ -80,7 +80,7 @@ class UploadSpool:
             self._open()
             check_room(self._folder)
         except OSError as error:
-            kind = NoRoom if error.errno in NO_ROOM else Unavailable
+            kind = NoRoom if error.errno in DISK_FULL_ERRNOS else Unavailable
             raise kind(f"the folder for uploads cannot be written: {error.strerror}") from error
 
     def close(self) -> None:

@@ -115,7 +115,7 @@ async def get_actions(
             continue
         if isinstance(outcome, JobStarted):
             return job_started_response(outcome.job)
-        floor = map_id if map_id is not None and level != "*" else vda5050.map_id_of(site, _other(version, name))
+        floor = map_id if map_id is not None and level != "*" else vda5050.level_map_id(site, _other(version, name))
         maps.append(_actions(version, floor, name if level is not None else None, outcome))
     if not maps:
         raise CannotConvert("no level has this map: " + "; ".join(f"{m['level']}: {m['detail']}" for m in missing[:20]))
@@ -214,8 +214,8 @@ def post_state(
     out: dict[str, list[dict[str, Any]]] = {"robots": [], "ignored": []}
     sites: dict[str, list[vda5050.VehicleMaps]] = {}
     for maps in vda5050.read_state(message):
-        if map_id in (None, maps.map_id, vda5050.site_of(maps.map_id)):
-            sites.setdefault(vda5050.site_of(maps.map_id), []).append(maps)
+        if map_id in (None, maps.map_id, vda5050.site_name(maps.map_id)):
+            sites.setdefault(vda5050.site_name(maps.map_id), []).append(maps)
     if environment is not None and len(sites) > 1:
         names = ", ".join(list(sites)[:20])
         raise Invalid(f"the state tells of several maps: say which is {environment}'s, mapId being one of {names}")
@@ -241,7 +241,7 @@ def _collect_reports(
     except NotFound as error:
         out["ignored"] += [{"mapId": floor.map_id, "why": error.detail} for floor in floors]
         return
-    maps = vda5050.whole_site(floors)
+    maps = vda5050.merge_levels(floors)
     usual = stored_robot.report.channel if stored_robot else "production" if "production" in channels else "latest"
     follows = channels.get(channel or usual)
     reports = [report for state, text, detail in _states(maps, follows) for report in _report(

@@ -205,7 +205,7 @@ def agent(
     try:
         agent.open()
         if once:
-            if not agent.once():
+            if not agent.run_once():
                 raise typer.Exit(1)
         else:
             agent.run()

@@ -21,7 +21,7 @@ import httpx
 from app.cli import variables
 from app.cli.output import ProgressBar, progress_bar, say
 from app.cli.problems import RequestFailed
-from app.events.credentials import trusting
+from app.events.credentials import ca_ssl_context
 from app.model.names import did_you_mean
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
@@ -125,7 +125,7 @@ class Client:
             headers=headers,
             timeout=TIMEOUT,
             follow_redirects=False,
-            verify=trusting(Path(ca)) if ca else True,
+            verify=ca_ssl_context(Path(ca)) if ca else True,
         )
 
     def __enter__(self) -> Client:

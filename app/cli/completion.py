@@ -90,7 +90,7 @@ def _rows(ctx: typer.Context, *path: str, **query: Any) -> list[Any]:
     from urllib.request import Request, urlopen
 
     from app.errors import FleetMapError
-    from app.events.credentials import trusting
+    from app.events.credentials import ca_ssl_context
 
     given = (ctx.params.get("server"), os.environ.get("FLEETMAP_SERVER"), "http://127.0.0.1:8000")
     server = str(next(filter(None, given))).rstrip("/")
@@ -101,7 +101,7 @@ def _rows(ctx: typer.Context, *path: str, **query: Any) -> list[Any]:
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     ca = os.environ.get("FLEETMAP_CA")
     try:
-        context = trusting(Path(ca)) if ca else None
+        context = ca_ssl_context(Path(ca)) if ca else None
         request = Request(address, headers=headers)  # noqa: S310  the server that the user has named
         with urlopen(request, timeout=TIMEOUT_SECONDS, context=context) as answer:  # noqa: S310
             rows = json.load(answer)

@@ -32,7 +32,7 @@ from uuid import uuid4
 
 import orjson
 
-from app.errors import BROKEN, NO_ROOM, Unavailable, reason_of
+from app.errors import BROKEN_STORAGE_ERRNOS, DISK_FULL_ERRNOS, Unavailable, system_reason
 
 log = logging.getLogger(__name__)
 
@@ -86,8 +86,8 @@ class CachedFile:
         """The error for content that cannot be read (or has another hash), which is reported as damage."""
         if error is None:
             self.on_damage(f"{self.name!r} does not match its hash")
-        elif error.errno in BROKEN:  # not where the cache only needed the room
-            self.on_damage(f"{self.name!r} cannot be read: {reason_of(error)}")
+        elif error.errno in BROKEN_STORAGE_ERRNOS:  # not where the cache only needed the room
+            self.on_damage(f"{self.name!r} cannot be read: {system_reason(error)}")
         return LostMap(f"the cached {self.name!r} was lost while it was read: request it again")
 
 
@@ -154,7 +154,7 @@ class Cache:
         try:
             (folder / "locks").mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            self._note_problem(reason_of(error))
+            self._note_problem(system_reason(error))
         for old in folder.glob("making-*"):
             with contextlib.suppress(OSError):
                 if time.time() - old.stat().st_mtime > ABANDONED_SECONDS:
@@ -199,8 +199,8 @@ class Cache:
             with (folder / "map.json").open("rb") as file:
                 status, raw = os.fstat(file.fileno()), file.read()
         except OSError as error:
-            if error.errno in BROKEN:
-                self.discard(key, f"map.json cannot be read: {reason_of(error)}")
+            if error.errno in BROKEN_STORAGE_ERRNOS:
+                self.discard(key, f"map.json cannot be read: {system_reason(error)}")
             return None
         line, _, text = raw.partition(b"\n")
         if line != hashlib.sha256(text).hexdigest().encode() or (described := orjson.loads(text))["key"] != key:
@@ -287,7 +287,7 @@ class Cache:
             assert folder is not None
             folder.mkdir()
         except OSError as error:
-            self._note_problem(reason_of(error))
+            self._note_problem(system_reason(error))
             folder = None
 
         def hold(cached_map: CachedMap) -> CachedMap:
@@ -319,7 +319,7 @@ class Cache:
         try:
             cached_map = self._write(key, product)
         except OSError as error:
-            self._note_problem(reason_of(error))
+            self._note_problem(system_reason(error))
             return self._keep_spare(key, product)
         self._note_problem(None)
         if cached_map is None:
@@ -378,8 +378,8 @@ class Cache:
             for path in (*folder.iterdir(), folder, folder.parent):
                 sync(path)
         except OSError as error:  # else it is gone, since the cache needed the room, or is hashed again as any other
-            if error.errno in BROKEN | NO_ROOM:
-                self.discard(key, f"it could not be written: {reason_of(error)}")
+            if error.errno in BROKEN_STORAGE_ERRNOS | DISK_FULL_ERRNOS:
+                self.discard(key, f"it could not be written: {system_reason(error)}")
 
     def _keep_spare(self, key: str, product: ConvertedMap) -> CachedMap:
         """The map in memory."""
@@ -476,7 +476,7 @@ class Cache:
                 try:
                     fcntl.flock(stack.enter_context(path.open("w")), fcntl.LOCK_EX)
                 except OSError as error:  # without room for a lock two processes may make the same map
-                    self._note_problem(reason_of(error))
+                    self._note_problem(system_reason(error))
                 yield
         with self._guard:
             if not lock.locked():

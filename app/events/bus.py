@@ -24,13 +24,13 @@ from zenoh import ext
 
 from app.errors import Invalid, Problem, Unavailable
 from app.events import messages
-from app.events.credentials import no_router, plain
+from app.events.credentials import describe_connection_failure, first_line
 from app.events.router import Router
 from app.events.security import RouterSecurity
 
 log = logging.getLogger(__name__)
 
-HISTORY = 256
+EVENT_CACHE_SIZE = 256
 """Events of each environment that late joiners get, and that outlast a router's absence."""
 
 PUBLISHERS = 4096
@@ -41,7 +41,7 @@ THREADS = 4
 """So many queries are looked at at once, and so many more maps are made for them: who asks for what is there does not
 wait for what is being made."""
 
-WAITING = 256
+MAX_WAITING_QUERIES = 256
 """Queries that may wait; further ones are told so."""
 
 MESSAGE_BYTES = 65 * 2**20
@@ -114,7 +114,7 @@ def router_configuration(options: BusOptions) -> str:
 def session_configuration(options: BusOptions) -> str:
     """The configuration of the server's own session: a client of its router, or of the operator's. FleetMapError."""
     config = _base(options)
-    endpoints = options.connect if options.mode == "client" else reachable(options.listen)
+    endpoints = options.connect if options.mode == "client" else client_endpoint(options.listen)
     _set(config, "mode", "client")
     _set(config, "connect/endpoints", [part.strip() for part in endpoints.split(",") if part.strip()])
     _set(config, "connect/timeout_ms", int(CONNECT_SECONDS * 1000))
@@ -132,10 +132,10 @@ def session_configuration(options: BusOptions) -> str:
     return str(config)
 
 
-def no_connection(options: BusOptions, error: Exception) -> str:
+def connection_error(options: BusOptions, error: Exception) -> str:
     """Why the server's own session found no router."""
-    endpoints = options.connect if options.mode == "client" else reachable(options.listen)
-    return no_router(endpoints, error, options.security.login, names=options.mode == "client")
+    endpoints = options.connect if options.mode == "client" else client_endpoint(options.listen)
+    return describe_connection_failure(endpoints, error, options.security.login, names=options.mode == "client")
 
 
 def check(options: BusOptions) -> None:
@@ -146,7 +146,7 @@ def check(options: BusOptions) -> None:
         session_configuration(options)
 
 
-def reachable(listen: str) -> str:
+def client_endpoint(listen: str) -> str:
     """Where a client on this machine finds a router that listens there."""
     first = listen.split(",", maxsplit=1)[0].strip()
     return first.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
@@ -178,14 +178,14 @@ class Bus:
         on_alive: OnLiveliness,
     ) -> None:
         self.options = options
-        self._ask, self._explain, self._on_status, self._on_alive = ask, explain, on_status, on_alive
+        self._query_handler, self._explain, self._on_status, self._on_alive = ask, explain, on_status, on_alive
         self._session: zenoh.Session | None = None
         self._router: Router | None = None
-        self._held: list[Any] = []
+        self._declared: list[Any] = []
         self._publishers: OrderedDict[str, ext.AdvancedPublisher] = OrderedDict()
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="fleetmap-zenoh")
-        self._makers = ThreadPoolExecutor(THREADS, thread_name_prefix="fleetmap-zenoh-make")
-        self._waiting = threading.Semaphore(WAITING)
+        self._workers = ThreadPoolExecutor(THREADS, thread_name_prefix="fleetmap-zenoh-make")
+        self._waiting = threading.Semaphore(MAX_WAITING_QUERIES)
         self._lock = threading.RLock()
         self._problem = "not connected yet"
         self._restart, self._pause = 0.0, 0.0
@@ -218,25 +218,25 @@ class Bus:
                     return False
                 router = Router(router_configuration(self.options))
                 if router.problem is not None:
-                    self._problem = f"the router cannot listen on {self.options.listen}: {plain(router.problem)}"
+                    self._problem = f"the router cannot listen on {self.options.listen}: {first_line(router.problem)}"
                     self._pause = min(RESTART_SECONDS, 2 * self._pause or 0.5)
                     self._restart = time.monotonic() + self._pause
                     return False
                 self._router, self._pause = router, 0.0
-                self._problem = f"the router at {self.where} has started: it is looked for"
+                self._problem = f"the router at {self.endpoints} has started: it is looked for"
             if self._session is not None:
                 return self.connected
             try:
                 self._session = zenoh.open(zenoh.Config.from_json5(session_configuration(self.options)))
                 self._declare(self._session)
             except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
-                self._problem = no_connection(self.options, error)
+                self._problem = connection_error(self.options, error)
                 self._close_session()
                 return False
             self.opened += 1
             return True
 
-    def tend(self) -> bool:
+    def ensure_connected(self) -> bool:
         """Look after it: a dead router of ours is started again; the session finds it by itself."""
         router = self._router
         is_missing = self.options.mode == "router" and (router is None or not router.alive)
@@ -244,7 +244,7 @@ class Bus:
             return self.open() and self.connected
         if self.connected:
             return True
-        self._problem = f"the router at {self.where} is gone: it is looked for"
+        self._problem = f"the router at {self.endpoints} is gone: it is looked for"
         return False
 
     def publish(self, environment: str, body: Mapping[str, Any]) -> None:
@@ -258,13 +258,13 @@ class Bus:
                 self._publishers[environment] = publisher
                 while len(self._publishers) > PUBLISHERS:
                     _, old = self._publishers.popitem(last=False)
-                    _end(old)
+                    _undeclare(old)
             self._publishers.move_to_end(environment)
             publisher.put(messages.dumps(body), encoding=messages.JSON)
 
     def close(self) -> None:
         """Undeclare, close the session, end the router."""
-        for threads in (self._threads, self._makers):
+        for threads in (self._threads, self._workers):
             threads.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             self._close_session()
@@ -273,7 +273,7 @@ class Bus:
                 self._router = None
 
     @property
-    def where(self) -> str:
+    def endpoints(self) -> str:
         """The router's address, or addresses."""
         return self.options.connect if self.options.mode == "client" else self.options.listen
 
@@ -281,7 +281,7 @@ class Bus:
         return ext.declare_advanced_publisher(
             session,
             messages.events_key(self.options.prefix, environment),
-            cache=ext.CacheConfig(HISTORY),
+            cache=ext.CacheConfig(EVENT_CACHE_SIZE),
             publisher_detection=True,
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_SECONDS),
             reliability=zenoh.Reliability.RELIABLE,
@@ -291,7 +291,7 @@ class Bus:
 
     def _declare(self, session: zenoh.Session) -> None:
         prefix = self.options.prefix
-        self._held = [
+        self._declared = [
             session.liveliness().declare_token(messages.server_key(prefix)),
             session.declare_subscriber(f"{prefix}/*/robots/*/status", self._status),
             session.liveliness().declare_subscriber(f"{prefix}/robots/*", self._alive, history=True),
@@ -303,12 +303,12 @@ class Bus:
     def _close_session(self) -> None:
         for publisher in self._publishers.values():
             with contextlib.suppress(Exception):
-                _end(publisher)
+                _undeclare(publisher)
         self._publishers.clear()
-        for declaration in self._held:
+        for declaration in self._declared:
             with contextlib.suppress(Exception):
-                _end(declaration)
-        self._held = []
+                _undeclare(declaration)
+        self._declared = []
         if self._session is not None:
             with contextlib.suppress(Exception):
                 _close(self._session)
@@ -330,9 +330,9 @@ class Bus:
 
     def _query(self, query: zenoh.Query) -> None:
         if not self._waiting.acquire(blocking=False):
-            self._refuse(query, Unavailable("too many queries wait: try again in a few seconds"))
+            self._reply_error(query, Unavailable("too many queries wait: try again in a few seconds"))
             return
-        self._submit(self._threads, query, self._look)
+        self._submit(self._threads, query, self._handle_query)
 
     def _submit(self, threads: ThreadPoolExecutor, query: zenoh.Query, find: Callable[[zenoh.Query], Any]) -> None:
         try:
@@ -349,12 +349,12 @@ class Bus:
         except Exception:
             log.exception("a message over Zenoh could not be taken")
 
-    def _look(self, query: zenoh.Query) -> Reply | DeferredReply:
+    def _handle_query(self, query: zenoh.Query) -> Reply | DeferredReply:
         key = str(query.key_expr)
         if "*" in key:
             raise Invalid("query one key at a time: a key without wildcards")
         environment, _, rest = key.removeprefix(self.options.prefix + "/").partition("/")
-        return self._ask(environment, rest, _parameters(query))
+        return self._query_handler(environment, rest, _parameters(query))
 
     def _answer(self, query: zenoh.Query, find: Callable[[zenoh.Query], Reply | DeferredReply]) -> None:
         """In a thread of ours: what ``find`` finds is the answer, or is left to the makers."""
@@ -362,22 +362,22 @@ class Bus:
             reply = find(query)
             if not isinstance(reply, Reply):
                 make = reply
-                self._submit(self._makers, query, lambda _: make())
+                self._submit(self._workers, query, lambda _: make())
                 return
             with contextlib.suppress(zenoh.ZError):  # who asked is gone
                 query.reply(query.key_expr, reply.payload, encoding=reply.encoding)
         except Exception as error:  # noqa: BLE001  told, and logged where it is a mistake of ours
-            self._refuse(query, error)
+            self._reply_error(query, error)
         self._waiting.release()
         with contextlib.suppress(Exception):
             _drop(query)
 
-    def _refuse(self, query: zenoh.Query, error: Exception) -> None:
+    def _reply_error(self, query: zenoh.Query, error: Exception) -> None:
         with contextlib.suppress(zenoh.ZError):
             query.reply_err(self._explain(error), encoding="application/problem+json")
 
 
-def _end(declaration: Any) -> None:
+def _undeclare(declaration: Any) -> None:
     declaration.undeclare()
 
 
@@ -405,7 +405,7 @@ def _parameters(query: zenoh.Query) -> dict[str, str]:
 def wait_connected(bus: Bus, seconds: float) -> bool:
     """Until a router is there, at most this long."""
     deadline = time.monotonic() + seconds
-    while not bus.tend():
+    while not bus.ensure_connected():
         if time.monotonic() > deadline:
             return False
         time.sleep(0.05)

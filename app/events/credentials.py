@@ -30,13 +30,13 @@ class ZenohCredentials:
         """Zenoh's settings for a session that connects. Invalid where something is missing."""
         out: dict[str, Any] = {}
         if self.ca is not None:
-            out["transport/link/tls/root_ca_certificate"] = file_of(self.ca)
-            trusting(self.ca)
+            out["transport/link/tls/root_ca_certificate"] = readable_file(self.ca)
+            ca_ssl_context(self.ca)
         if (self.certificate is None) != (self.key is None):
             raise Invalid("a certificate for Zenoh needs its key, and the other way round")
         if self.certificate is not None and self.key is not None:
-            out["transport/link/tls/connect_certificate"] = file_of(self.certificate)
-            out["transport/link/tls/connect_private_key"] = file_of(self.key)
+            out["transport/link/tls/connect_certificate"] = readable_file(self.certificate)
+            out["transport/link/tls/connect_private_key"] = readable_file(self.key)
             _show(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), self.certificate, self.key)
             out["transport/link/tls/enable_mtls"] = True
         if (self.user is None) != (self.password is None):
@@ -46,7 +46,7 @@ class ZenohCredentials:
         return out
 
 
-def file_of(path: Path) -> str:
+def readable_file(path: Path) -> str:
     """A file that can be read, as Zenoh is told it: of one that cannot it only says that nobody answers."""
     try:
         with path.open("rb"):
@@ -55,7 +55,7 @@ def file_of(path: Path) -> str:
         raise Invalid(f"{path} cannot be read: {error.strerror or error}") from error
 
 
-def trusting(ca: Path) -> ssl.SSLContext:
+def ca_ssl_context(ca: Path) -> ssl.SSLContext:
     """TLS that believes certificates of this certification authority alone. Raises Invalid."""
     try:
         return ssl.create_default_context(cafile=ca)
@@ -71,25 +71,25 @@ def _show(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
         raise Invalid(f"{certificate} and {key} are no certificate and its unencrypted key (PEM): {error}") from error
 
 
-def no_router(hosts: str, error: Exception, login: ZenohCredentials, *, names: bool = True) -> str:
+def describe_connection_failure(hosts: str, error: Exception, login: ZenohCredentials, *, names: bool = True) -> str:
     """Why nobody was reached at ``hosts``: what TLS has against it, of which Zenoh does not tell, else what Zenoh says.
 
     hosts: endpoints, separated by commas; the first is asked. names: whether its certificate has to name it.
     """
-    return f"no router at {hosts}: {_objection(hosts, login, names=names) or plain(str(error))}"
+    return f"no router at {hosts}: {_tls_failure(hosts, login, names=names) or first_line(str(error))}"
 
 
-def plain(text: str) -> str:
+def first_line(text: str) -> str:
     """The first line of what Zenoh says, without the places in its source."""
     return re.sub(r",? at /\S+", "", text.splitlines()[0] if text else "")[:300]
 
 
-def _objection(endpoints: str, login: ZenohCredentials, *, names: bool) -> str | None:
+def _tls_failure(endpoints: str, login: ZenohCredentials, *, names: bool) -> str | None:
     match = re.fullmatch(r"tls/\[?([^#?]+?)\]?:(\d+)(?:[#?].*)?", endpoints.split(",", maxsplit=1)[0].strip())
     if match is None:
         return None
     try:
-        context = trusting(login.ca) if login.ca is not None else ssl.create_default_context()
+        context = ca_ssl_context(login.ca) if login.ca is not None else ssl.create_default_context()
         context.check_hostname = names
         if login.certificate is not None and login.key is not None:
             _show(context, login.certificate, login.key)

@@ -27,10 +27,10 @@ class LeaderThread(ABC):
     """
 
     def __init__(self, data_dir: Path, name: str, *, well: str, trouble: str) -> None:
-        self._data_dir, self._name, self._well, self._trouble = data_dir, name, well, trouble
+        self._data_dir, self._name, self._healthy_state, self._problem = data_dir, name, well, trouble
         self._lock: IO[str] | None = None
-        self._told: dict[str, Any] = {}
-        self._ending = threading.Event()
+        self._logged_state: dict[str, Any] = {}
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"fleetmap-{name}", daemon=True)
 
     def start(self) -> None:
@@ -41,38 +41,38 @@ class LeaderThread(ABC):
 
     def close(self) -> None:
         """Stop, take back what is out, and give the lock to the next one."""
-        self._ending.set()
+        self._stopping.set()
         self._thread.join(15)
-        self._shut()
+        self._release()
         if self._lock is not None:
             self._lock.close()
             self._lock = None
 
     @abstractmethod
-    def _round(self) -> None:
+    def _run_once(self) -> None:
         """Do what there is to do, then wait for more. FleetMapError: it is down for now."""
 
     @abstractmethod
-    def _shut(self) -> None:
+    def _release(self) -> None:
         """Take back what is out."""
 
-    def _stumbled(self) -> None:
+    def _on_unexpected_error(self) -> None:
         """After an error of our own: its log entry, and what else helps."""
         log.exception("%s stumbled", self._thread.name)
 
     def _run(self) -> None:
-        while not self._ending.is_set():
+        while not self._stopping.is_set():
             try:
                 if self._try_lock():
-                    self._round()
+                    self._run_once()
                 else:
-                    self._ending.wait(POLL_SECONDS)
+                    self._stopping.wait(POLL_SECONDS)
             except FleetMapError as error:
-                self._note({"state": "down", "detail": error.detail})
-                self._ending.wait(POLL_SECONDS)
+                self._publish_state({"state": "down", "detail": error.detail})
+                self._stopping.wait(POLL_SECONDS)
             except Exception:  # noqa: BLE001  logged by _stumbled
-                self._stumbled()
-                self._ending.wait(POLL_SECONDS)
+                self._on_unexpected_error()
+                self._stopping.wait(POLL_SECONDS)
 
     def _try_lock(self) -> bool:
         if self._lock is None:
@@ -83,20 +83,20 @@ class LeaderThread(ABC):
                 handle.close()
                 return False
             self._lock = handle
-            self._note({"state": "starting"})
+            self._publish_state({"state": "starting"})
         return True
 
-    def _note(self, state: dict[str, Any]) -> None:
+    def _publish_state(self, state: dict[str, Any]) -> None:
         """Tell the log when it changes, and all processes by a file."""
         path = _state_file(self._data_dir, self._name)
-        if state == self._told and path.exists():
+        if state == self._logged_state and path.exists():
             return
-        if state["state"] != self._told.get("state"):
+        if state["state"] != self._logged_state.get("state"):
             if state["state"] == "down":
-                log.error("%s: %s", self._trouble, state.get("detail", ""))
+                log.error("%s: %s", self._problem, state.get("detail", ""))
             elif state["state"] == "connected":
-                log.info("%s", self._well)
-        self._told = state
+                log.info("%s", self._healthy_state)
+        self._logged_state = state
         temporary = path.with_suffix(f".{os.getpid()}")
         try:
             temporary.write_text(json.dumps(state))
@@ -105,7 +105,7 @@ class LeaderThread(ABC):
             log.warning("%s cannot be written: %s", path.name, error.strerror)
 
 
-def state_of(data_dir: Path, name: str) -> dict[str, Any]:
+def read_state(data_dir: Path, name: str) -> dict[str, Any]:
     """What /readyz says: ``starting``, ``connected``, or ``down`` with the reason."""
     try:
         state: dict[str, Any] = json.loads(_state_file(data_dir, name).read_text())

@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from app.events import leader
-from app.events.bus import HISTORY, Bus
+from app.events.bus import EVENT_CACHE_SIZE, Bus
 from app.events.leader import POLL_SECONDS, LeaderThread
 from app.store.store import Store
 from app.store.values import Event
 
-LOOK_SECONDS = 0.004
+COMMIT_POLL_SECONDS = 0.004
 """How often the host's generation number is looked at: a read of shared memory."""
 
 PAGE = 500
-REPLAYED = 20_000
+MAX_REPLAYED_EVENTS = 20_000
 """At a start so many events fill the publishers' caches again: where environments are many, the last ones of each."""
 
 NAME = "events"
@@ -31,34 +31,36 @@ class Relay(LeaderThread):
     """A thread that publishes what the outbox holds."""
 
     def __init__(self, store: Store, bus: Bus, data_dir: Path) -> None:
-        super().__init__(data_dir, NAME, well=f"events go out over Zenoh at {bus.where}", trouble="NO EVENTS GO OUT")
+        super().__init__(
+            data_dir, NAME, well=f"events go out over Zenoh at {bus.endpoints}", trouble="NO EVENTS GO OUT"
+        )
         self._store, self._bus = store, bus
         self._replayed_for = 0
 
-    def _shut(self) -> None:
+    def _release(self) -> None:
         self._bus.close()
 
-    def _round(self) -> None:
+    def _run_once(self) -> None:
         """Publish what is there, then wait for more."""
-        if not self._bus.tend():
-            self._note(self._bus.state)
-            self._ending.wait(POLL_SECONDS / 4)
+        if not self._bus.ensure_connected():
+            self._publish_state(self._bus.state)
+            self._stopping.wait(POLL_SECONDS / 4)
             return
         if self._replayed_for != self._bus.opened:
             self._replay()
             self._replayed_for = self._bus.opened
         generation = self._store.generation()
         self._publish_new()
-        self._note(self._bus.state)  # not before: nothing goes out while the database is away
+        self._publish_state(self._bus.state)  # not before: nothing goes out while the database is away
         # The database is asked all the same (another host may have committed), and the session looked after.
         last_read = time.monotonic()
-        while not self._ending.wait(LOOK_SECONDS):
+        while not self._stopping.wait(COMMIT_POLL_SECONDS):
             if self._store.generation() != generation or time.monotonic() - last_read > POLL_SECONDS:
                 return
 
     def _publish_new(self) -> None:
         position = self._store.relayed()
-        while not self._ending.is_set():
+        while not self._stopping.is_set():
             page = self._store.events(None, position, PAGE)
             if not page:
                 return
@@ -72,8 +74,8 @@ class Relay(LeaderThread):
     def _replay(self) -> None:
         """A new session's caches are empty: put the last events of each environment again, oldest first."""
         position = self._store.relayed()
-        for event in self._store.last_events(position, HISTORY, REPLAYED):
-            if self._ending.is_set():
+        for event in self._store.last_events(position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS):
+            if self._stopping.is_set():
                 return
             self._publish(event)
 
@@ -82,6 +84,6 @@ class Relay(LeaderThread):
         self._bus.publish(event.environment, event.body)
 
 
-def state_of(data_dir: Path, mode: str) -> dict[str, Any]:
+def relay_state(data_dir: Path, mode: str) -> dict[str, Any]:
     """What /readyz says of events: ``off``, ``starting``, ``connected`` or ``down`` with the reason."""
-    return {"state": "off"} if mode == "off" else leader.state_of(data_dir, NAME)
+    return {"state": "off"} if mode == "off" else leader.read_state(data_dir, NAME)

@@ -25,7 +25,7 @@ from zenoh import ext
 
 from app.errors import FleetMapError
 from app.events import cdr, leader, ros_names
-from app.events.bus import BusOptions, no_connection, session_configuration
+from app.events.bus import BusOptions, connection_error, session_configuration
 from app.events.leader import POLL_SECONDS, LeaderThread
 from app.events.ros_names import EnvironmentSelector, Keys, Topic
 from app.store.values import Version
@@ -36,8 +36,8 @@ FRAME = "map"
 """The frame of all maps, as Nav2 and topological_navigation call it."""
 
 HEARTBEAT_SECONDS = 0.5
-LOOK_SECONDS = 0.02
-ASK_SECONDS = 5.0
+COMMIT_POLL_SECONDS = 0.02
+VERSION_POLL_SECONDS = 5.0
 """How often the database is asked all the same: another host may have committed."""
 
 RETRY_SECONDS = 30.0
@@ -50,7 +50,7 @@ NAME = "ros2"
 class Ros2Options:
     """What goes out, and on whose keys."""
 
-    chosen: tuple[EnvironmentSelector, ...]
+    environments: tuple[EnvironmentSelector, ...]
     keys: tuple[Keys, ...] = ("rmw_zenoh", "ros2dds")
     domain: int = 0
 
@@ -137,7 +137,7 @@ class _PublishedEnvironment:
     published again after a failure.
     """
 
-    shown: tuple[str, str] = ("", "")
+    versions: tuple[str, str] = ("", "")
     topics: dict[str, _Topic] = field(default_factory=dict)
     retry: float | None = None
 
@@ -157,24 +157,24 @@ class Ros2Publisher(LeaderThread):
     ) -> None:
         super().__init__(data_dir, NAME, well="maps go out to ROS 2", trouble="NOTHING GOES OUT TO ROS 2")
         self._options, self._bus = options, bus
-        self._generation, self._look, self._fetch = generation, look, fetch
+        self._generation, self._look_up_versions, self._fetch = generation, look, fetch
         self._session: zenoh.Session | None = None
         self._node: Any = None
         self._entities = 0
-        self._places: dict[str, _PublishedEnvironment] = {}
+        self._environments: dict[str, _PublishedEnvironment] = {}
         self._owners: dict[str, str] = {}
 
-    def _round(self) -> None:
+    def _run_once(self) -> None:
         """Publish what has changed, then wait for more."""
         if self._session is None and not self._open():
-            self._ending.wait(POLL_SECONDS)
+            self._stopping.wait(POLL_SECONDS)
             return
         generation = self._generation()
-        self._tell(self._look())
-        self._note({"state": "connected", "topics": len(self._owners)})
+        self._publish_changes(self._look_up_versions())
+        self._publish_state({"state": "connected", "topics": len(self._owners)})
         last_read = time.monotonic()
-        while not self._ending.wait(LOOK_SECONDS):
-            if self._generation() != generation or time.monotonic() - last_read > ASK_SECONDS:
+        while not self._stopping.wait(COMMIT_POLL_SECONDS):
+            if self._generation() != generation or time.monotonic() - last_read > VERSION_POLL_SECONDS:
                 return
 
     def _open(self) -> bool:
@@ -186,19 +186,19 @@ class Ros2Publisher(LeaderThread):
         except FleetMapError:
             raise
         except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
-            self._shut()
-            self._note({"state": "down", "detail": no_connection(self._bus, error)})
+            self._release()
+            self._publish_state({"state": "down", "detail": connection_error(self._bus, error)})
             return False
         return True
 
-    def _stumbled(self) -> None:
-        super()._stumbled()
-        self._shut()  # what was said last is not known for sure
+    def _on_unexpected_error(self) -> None:
+        super()._on_unexpected_error()
+        self._release()  # what was said last is not known for sure
 
-    def _shut(self) -> None:
-        for name in list(self._places):
+    def _release(self) -> None:
+        for name in list(self._environments):
             self._retire(name, ())
-        self._places.clear()
+        self._environments.clear()
         if self._session is not None:
             with contextlib.suppress(Exception):
                 _close(self._session)
@@ -207,19 +207,19 @@ class Ros2Publisher(LeaderThread):
 
     # --- what has changed ---
 
-    def _tell(self, standing: Mapping[str, Version]) -> None:
-        for name in [n for n in self._places if n not in standing]:
+    def _publish_changes(self, standing: Mapping[str, Version]) -> None:
+        for name in [n for n in self._environments if n not in standing]:
             self._retire(name, ())
-            del self._places[name]
+            del self._environments[name]
         for name, version in standing.items():
-            if self._ending.is_set():
+            if self._stopping.is_set():
                 return
-            place = self._places.setdefault(name, _PublishedEnvironment())
+            place = self._environments.setdefault(name, _PublishedEnvironment())
             waits = place.retry is not None and time.monotonic() < place.retry
             shown = (version.root, version.closures.digest if version.closures else "")
-            if place.shown == shown and (place.retry is None or waits):
+            if place.versions == shown and (place.retry is None or waits):
                 continue
-            place.shown, place.retry = shown, None
+            place.versions, place.retry = shown, None
             try:
                 content = self._fetch(version)
             except Exception as error:  # one environment's trouble is not the others'
@@ -234,7 +234,7 @@ class Ros2Publisher(LeaderThread):
             self._publish(name, place, version, content)
 
     def _publish(self, name: str, place: _PublishedEnvironment, version: Version, content: TopicContent) -> None:
-        namespace = ros_names.namespace_of(name, self._options.chosen)
+        namespace = ros_names.namespace_of(name, self._options.environments)
         assert namespace is not None
         topic_names: set[str] = set()
         for level, grid in content.grids.items():
@@ -289,7 +289,7 @@ class Ros2Publisher(LeaderThread):
         return new_topic
 
     def _retire(self, name: str, topic_names: Sequence[str] | set[str]) -> None:
-        place = self._places[name]
+        place = self._environments[name]
         for topic in [t for t in place.topics if t not in topic_names]:
             place.topics.pop(topic).close()
             del self._owners[topic]
@@ -306,9 +306,9 @@ def update(before: cdr.Grid, after: cdr.Grid, version: Version) -> bytes:
     return cdr.occupancy_grid_update(x0, y0, x1 - x0, y1 - y0, block, version.time, FRAME)
 
 
-def state_of(data_dir: Path) -> dict[str, Any]:
+def ros2_state(data_dir: Path) -> dict[str, Any]:
     """What /readyz says of topics: ``starting``, ``connected`` with their number, or ``down`` with the reason."""
-    return leader.state_of(data_dir, NAME)
+    return leader.read_state(data_dir, NAME)
 
 
 def _close(session: Any) -> None:

@@ -71,7 +71,7 @@ class Topic:
             # Values of Cyclone DDS: reliable 1, transient local 1, keep last 0. A reader of the token takes the type's
             # hash from the user data, where DDS carries it since Iron.
             quality = f":1:{int(self.latched)}:0,{self.depth}:typehash={self.type.hash};"
-            return f"@/{session}/@ros2_lv/MP/{_escaped(self.name.strip('/'))}/{_escaped(self.type.name)}/{quality}"
+            return f"@/{session}/@ros2_lv/MP/{_escape(self.name.strip('/'))}/{_escape(self.type.name)}/{quality}"
         # rmw_zenoh leaves out what is its default: reliable, volatile, keep last.
         quality = f":{'1' if self.latched else ''}:,{self.depth}:,:,:,,"
         name = self.name.replace("/", "%")
@@ -88,7 +88,7 @@ def node_token(domain: int, session: str) -> str:
     return f"@ros2_lv/{domain}/{session}/0/0/NN/%/%/{NODE}"
 
 
-def _escaped(name: str) -> str:
+def _escape(name: str) -> str:
     return name.replace("/", "§")
 
 
@@ -129,12 +129,12 @@ class EnvironmentSelector:
     namespace: str | None
 
     @property
-    def one(self) -> bool:
+    def is_single(self) -> bool:
         """Whether it names a single environment."""
         return not any(c in self.pattern for c in "*?")
 
 
-def parse_chosen(text: str) -> tuple[EnvironmentSelector, ...]:
+def parse_selectors(text: str) -> tuple[EnvironmentSelector, ...]:
     """``farm, hall=/site/hall, north-*`` as a setting says it. ValueError says what is wrong."""
     out = []
     for piece in filter(None, (part.strip() for part in text.split(","))):
@@ -143,7 +143,7 @@ def parse_chosen(text: str) -> tuple[EnvironmentSelector, ...]:
         if not _PATTERN.fullmatch(name):
             raise ValueError(f"{name!r} is neither an environment's name nor a pattern of such")
         if chosen.namespace is not None:
-            if not chosen.one:
+            if not chosen.is_single:
                 raise ValueError(
                     f"{piece!r}: a pattern stands for several environments, which cannot share a namespace"
                 )

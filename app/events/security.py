@@ -18,7 +18,7 @@ from typing import Any
 
 from app.errors import Invalid, Problem
 from app.events import messages
-from app.events.credentials import ZenohCredentials, file_of
+from app.events.credentials import ZenohCredentials, readable_file
 
 SERVER = "server"
 """The user that the server itself is on its own router."""
@@ -27,9 +27,9 @@ PASSWORD_FILE = "zenoh-password"  # noqa: S105  the name of a file
 USERS_FILE = "zenoh-users"
 MAX_USERS_BYTES = 2**20
 
-EVERYWHERE = ("**", "**/@adv/**", "@ros2_lv/**", "@/*/@ros2_lv/**")
-ASKED = ("declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber")
-SAID = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
+ALL_KEYS = ("**", "**/@adv/**", "@ros2_lv/**", "@/*/@ros2_lv/**")
+SUBSCRIBER_MESSAGES = ("declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber")
+PUBLISHER_MESSAGES = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +49,12 @@ class RouterSecurity:
         """Zenoh's settings for the router. access: whether to say who may say what. Raises Invalid."""
         out = self.login.values()
         if self.login.certificate is not None and self.login.key is not None:
-            out["transport/link/tls/listen_certificate"] = file_of(self.login.certificate)
-            out["transport/link/tls/listen_private_key"] = file_of(self.login.key)
+            out["transport/link/tls/listen_certificate"] = readable_file(self.login.certificate)
+            out["transport/link/tls/listen_private_key"] = readable_file(self.login.key)
         # Unless asked for, a robot without a certificate is welcome.
         out["transport/link/tls/enable_mtls"] = self.mutual
         if self.users is not None:
-            users = {**read_users(self.users), SERVER: self._own_password()}
+            users = {**read_users(self.users), SERVER: self._server_password()}
             authentication = out.get("transport/auth/usrpwd", {"user": None, "password": None})
             out["transport/auth/usrpwd"] = {**authentication, "dictionary_file": str(self._dictionary(users))}
             if access:
@@ -68,11 +68,11 @@ class RouterSecurity:
         # It connects to an address of this machine, which no certificate may name.
         out["transport/link/tls/verify_name_on_connect"] = False
         if self.users is not None:
-            credentials = {"user": SERVER, "password": self._own_password(), "dictionary_file": None}
+            credentials = {"user": SERVER, "password": self._server_password(), "dictionary_file": None}
             out["transport/auth/usrpwd"] = credentials
         return out
 
-    def _own_password(self) -> str:
+    def _server_password(self) -> str:
         """Made once; all processes of the data folder have the same."""
         path = self.folder / PASSWORD_FILE
         if not path.is_file():
@@ -93,7 +93,7 @@ class RouterSecurity:
 
 def read_users(path: Path) -> dict[str, str]:
     """A file of ``name:password`` lines; ``#`` starts a comment line. Names are robots'. Raises Invalid."""
-    file_of(path)
+    readable_file(path)
     if path.stat().st_size > MAX_USERS_BYTES:
         raise Invalid(f"{path} has more than {MAX_USERS_BYTES} bytes: is it a file of users?")
     users: dict[str, str] = {}
@@ -132,9 +132,14 @@ def access_control(prefix: str, robots: Iterable[str]) -> dict[str, Any]:
 
     names = list(robots)
     rules = [
-        rule("the server says and hears all", ["ingress", "egress"], (*SAID, *ASKED), EVERYWHERE),
-        rule("robots hear all", ["egress"], (*SAID, *ASKED), EVERYWHERE),
-        rule("robots ask all", ["ingress"], ASKED, EVERYWHERE),
+        rule(
+            "the server says and hears all",
+            ["ingress", "egress"],
+            (*PUBLISHER_MESSAGES, *SUBSCRIBER_MESSAGES),
+            ALL_KEYS,
+        ),
+        rule("robots hear all", ["egress"], (*PUBLISHER_MESSAGES, *SUBSCRIBER_MESSAGES), ALL_KEYS),
+        rule("robots ask all", ["ingress"], SUBSCRIBER_MESSAGES, ALL_KEYS),
     ]
     subjects = [{"id": SERVER, "usernames": [SERVER]}, {"id": "robots", "usernames": names}]
     policies = [

@@ -4,19 +4,19 @@
 comes over the bus, in order, into the store.
 """
 
-from app.fleet.report_queue import NOTE_SECONDS, ReportQueue, report_of, settle
-from app.fleet.rollout import decide
-from app.fleet.status import ChannelConvergence, Lag, holding, is_online, lag_of
+from app.fleet.report_queue import WARN_SECONDS, ReportQueue, report_from_status, wait_until_stored
+from app.fleet.rollout import next_step
+from app.fleet.status import ChannelConvergence, Lag, channel_convergence, is_online, robot_lag
 
 __all__ = [
-    "NOTE_SECONDS",
+    "WARN_SECONDS",
     "ChannelConvergence",
     "Lag",
     "ReportQueue",
-    "decide",
-    "holding",
+    "channel_convergence",
     "is_online",
-    "lag_of",
-    "report_of",
-    "settle",
+    "next_step",
+    "report_from_status",
+    "robot_lag",
+    "wait_until_stored",
 ]

@@ -78,7 +78,7 @@ def zone_sets(version: Version, closures: Closures, map_id: str) -> list[dict[st
                 zone_id = closure.id if len(rings) == 1 else f"{closure.id}/{n}"
                 zones.append({"zoneId": zone_id, "zoneType": "BLOCKED", "vertices": ring})
         digest = hashlib.sha256(json.dumps(zones, sort_keys=True).encode()).hexdigest()[:16]
-        map_of = vda5050.map_id_of(map_id, None if level == vda5050.default_level(version) else level)
+        map_of = vda5050.level_map_id(map_id, None if level == vda5050.default_level(version) else level)
         out.append({"zoneSet": {"zoneSetId": f"{map_of}-{digest}", "mapId": map_of, "zones": zones}})
     return out
 

@@ -22,11 +22,11 @@ BLOCKED, UNTIL = "blocked", "blocked_until"
 def permanent_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[str, Any]]:
     """Edits that make a closure permanent; none if the edge is blocked already. Raises Invalid for an unknown edge."""
     if overlay.edge is not None:
-        key, edge = edge_of(store, [head], overlay.edge)
+        key, edge = find_edge(store, [head], overlay.edge)
         if edge.properties.get(BLOCKED) is True and UNTIL not in edge.properties:
             return []
         remaining = {name: value for name, value in edge.properties.items() if name != UNTIL}
-        return [_put(key, edge, {**remaining, BLOCKED: True})]
+        return [_put_edge(key, edge, {**remaining, BLOCKED: True})]
     about = {"id": overlay.id, "reporter": overlay.reporter}
     if overlay.detail:
         about["detail"] = overlay.detail
@@ -35,7 +35,7 @@ def permanent_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[
     return [{"op": "put", "layer": "zones", "level": overlay.level, "crs": overlay.crs, "feature": feature}]
 
 
-def edge_of(store: Store, versions: Iterable[Version], edge: str) -> tuple[PartKey, Feature]:
+def find_edge(store: Store, versions: Iterable[Version], edge: str) -> tuple[PartKey, Feature]:
     """Find an edge and its network in the first of these versions that has it. Raises Invalid if none has.
 
     A piece of a bent edge, as formats with straight edges name it, is found as that edge if no edge has its own name.
@@ -61,7 +61,7 @@ def edge_of(store: Store, versions: Iterable[Version], edge: str) -> tuple[PartK
     )
 
 
-def _put(key: PartKey, edge: Feature, properties: Mapping[str, Any]) -> dict[str, Any]:
+def _put_edge(key: PartKey, edge: Feature, properties: Mapping[str, Any]) -> dict[str, Any]:
     """The edge with other properties, where it is."""
     shape = None if edge.geometry.is_empty else json.loads(shapely.to_geojson(edge.geometry))
     local = edge.anchor == "local"

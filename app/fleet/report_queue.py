@@ -23,22 +23,22 @@ from app.store.values import ReceivedReport, RobotReport
 
 log = logging.getLogger(__name__)
 
-WAITING = 20_000
+QUEUE_SIZE = 20_000
 """So many reports wait for the database; of further ones it is told that they were left out."""
 
-SHARE = 200
+MAX_QUEUED_PER_ROBOT = 200
 """Of one robot so many wait, of those that came over the bus: who says too much displaces nobody else."""
 
 BATCH = 100
 """Reports in one transaction: a quarter of a second on SQLite, in which nobody else can write."""
 
-RENEW_SECONDS = 15.0
+PRESENCE_REFRESH_SECONDS = 15.0
 RETRY_SECONDS = 1.0
-NOTE_SECONDS = 20.0
+WARN_SECONDS = 20.0
 MAX_PRESENT = 100_000
 
 
-def report_of(status: RobotStatus) -> RobotReport:
+def report_from_status(status: RobotStatus) -> RobotReport:
     """A status as the store takes it. A time that is none counts as not told: nothing depends on robots' clocks."""
     reported_at = None
     if status.time is not None:
@@ -51,14 +51,15 @@ def report_of(status: RobotStatus) -> RobotReport:
 
 @dataclass(frozen=True, slots=True)
 class _QueuedReport:
-    """A report that waits. told: who waits to be told whether it was taken, None for what came over the bus."""
+    """A report that waits. result: who waits to be told whether it was taken, None for what came over the bus."""
 
-    heard: ReceivedReport
-    told: Future[FleetMapError | None] | None = None
+    report: ReceivedReport
+    result: Future[FleetMapError | None] | None = None
 
 
 class ReportQueue:
-    """Reports and liveliness. ``heard`` and ``alive`` return at once, ``note`` when it is stored; a thread writes.
+    """Reports and liveliness. ``enqueue_status`` and ``set_presence`` return at once, ``store_report`` when it is
+    stored; a thread writes.
 
     bus_vouches: whether reports over the bus come with authority, because its router lets nobody in but its users.
     """
@@ -67,14 +68,14 @@ class ReportQueue:
         self, store: Store, clock: Callable[[], datetime] = lambda: datetime.now(UTC), *, bus_vouches: bool = False
     ) -> None:
         self._store, self._clock, self._bus_vouches = store, clock, bus_vouches
-        self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _QueuedReport | None] = queue.Queue(WAITING)
+        self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _QueuedReport | None] = queue.Queue(QUEUE_SIZE)
         self._shares: Counter[str] = Counter()
-        self._there: set[str] = set()
-        self._gone: set[str] = set()
-        self._new: set[str] = set()
+        self._present: set[str] = set()
+        self._departed: set[str] = set()
+        self._has_news: set[str] = set()
         self._lock = threading.Lock()
-        self._lost = 0
-        self._ending = threading.Event()
+        self._dropped_count = 0
+        self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -86,33 +87,33 @@ class ReportQueue:
 
     def close(self) -> None:
         """Write what waits, then end."""
-        self._ending.set()
+        self._stopping.set()
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait(None)
         if self._thread is not None:
             self._thread.join(10)
 
-    def heard(self, environment: str, robot: str, payload: bytes) -> None:
+    def enqueue_status(self, environment: str, robot: str, payload: bytes) -> None:
         """A robot's status as it came."""
         with self._lock:
-            if self._shares[robot] >= SHARE:
-                self._lost += 1
+            if self._shares[robot] >= MAX_QUEUED_PER_ROBOT:
+                self._dropped_count += 1
                 return
             try:
                 self._queue.put_nowait((environment, robot, payload, self._clock()))
             except queue.Full:
-                self._lost += 1
+                self._dropped_count += 1
                 return
             self._shares[robot] += 1
 
-    def note(self, heard: ReceivedReport) -> None:
+    def store_report(self, heard: ReceivedReport) -> None:
         """A report that came over HTTP: blocks until it is stored. Raises what the store has against it."""
-        settle(self.noting(heard), NOTE_SECONDS)
+        wait_until_stored(self.submit_report(heard), WARN_SECONDS)
 
-    def noting(self, heard: ReceivedReport) -> Future[FleetMapError | None]:
+    def submit_report(self, heard: ReceivedReport) -> Future[FleetMapError | None]:
         """The same without waiting: what the store has against it comes as the future's result."""
         result: Future[FleetMapError | None] = Future()
-        if self._thread is None or self._ending.is_set():
+        if self._thread is None or self._stopping.is_set():
             raise Unavailable("the server is starting or stopping: try again in a few seconds")
         try:
             self._queue.put_nowait(_QueuedReport(heard, result))
@@ -120,19 +121,19 @@ class ReportQueue:
             raise Unavailable("too many reports of robots wait: try again in a few seconds") from None
         return result
 
-    def alive(self, robot: str, on_bus: bool) -> None:
+    def set_presence(self, robot: str, on_bus: bool) -> None:
         """A robot's session came or went."""
         if not ROBOT_NAME.fullmatch(robot):
             return
         with self._lock:
-            if on_bus and len(self._there) < MAX_PRESENT:
-                self._there.add(robot)
-                self._new.add(robot)
-                self._gone.discard(robot)
+            if on_bus and len(self._present) < MAX_PRESENT:
+                self._present.add(robot)
+                self._has_news.add(robot)
+                self._departed.discard(robot)
             elif not on_bus:
-                self._there.discard(robot)
-                self._new.discard(robot)
-                self._gone.add(robot)
+                self._present.discard(robot)
+                self._has_news.discard(robot)
+                self._departed.add(robot)
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait(None)
 
@@ -140,8 +141,8 @@ class ReportQueue:
         renewed = time.monotonic()
         batch: list[_QueuedReport] = []
         while True:
-            batch += self._take(RENEW_SECONDS / 3 if not batch else 0.0, BATCH - len(batch))
-            renew = time.monotonic() - renewed > RENEW_SECONDS
+            batch += self._take_batch(PRESENCE_REFRESH_SECONDS / 3 if not batch else 0.0, BATCH - len(batch))
+            renew = time.monotonic() - renewed > PRESENCE_REFRESH_SECONDS
             try:
                 self._write_presence(everybody=renew)
                 renewed = time.monotonic() if renew else renewed
@@ -150,17 +151,17 @@ class ReportQueue:
             except Unavailable as error:
                 log.warning("reports of robots wait: %s", error.detail)
                 for queued in batch:
-                    _tell(queued, error)
-                batch = [queued for queued in batch if queued.told is None]
-                if self._ending.wait(RETRY_SECONDS):
+                    _resolve_futures(queued, error)
+                batch = [queued for queued in batch if queued.result is None]
+                if self._stopping.wait(RETRY_SECONDS):
                     return
             except Exception:
                 log.exception("reports of robots could not be taken together")
                 batch = self._write_each(batch)
-            if self._ending.is_set() and self._queue.empty():
+            if self._stopping.is_set() and self._queue.empty():
                 return
 
-    def _take(self, seconds: float, limit: int) -> list[_QueuedReport]:
+    def _take_batch(self, seconds: float, limit: int) -> list[_QueuedReport]:
         out: list[_QueuedReport] = []
         refused: list[str] = []
         deadline = time.monotonic() + seconds
@@ -185,19 +186,21 @@ class ReportQueue:
             except FleetMapError as error:
                 refused.append(f"a report of {robot!r:.128} in {environment!r:.64} was left out: {error.detail}")
         _warn(refused)
-        if self._lost:
-            log.error("%d reports of robots were left out: they come faster than they can be stored", self._lost)
-            self._lost = 0
+        if self._dropped_count:
+            log.error(
+                "%d reports of robots were left out: they come faster than they can be stored", self._dropped_count
+            )
+            self._dropped_count = 0
         return out
 
     def _write(self, batch: list[_QueuedReport]) -> None:
         if not batch:
             return
         unheard: list[str] = []
-        for queued, refused in zip(batch, self._store.note_reports([queued.heard for queued in batch]), strict=True):
-            if refused is not None and queued.told is None:
-                unheard.append(f"a report of {queued.heard.robot} was left out: {refused.detail}")
-            _tell(queued, refused)
+        for queued, refused in zip(batch, self._store.note_reports([queued.report for queued in batch]), strict=True):
+            if refused is not None and queued.result is None:
+                unheard.append(f"a report of {queued.report.robot} was left out: {refused.detail}")
+            _resolve_futures(queued, refused)
         _warn(unheard)
 
     def _write_each(self, batch: list[_QueuedReport]) -> list[_QueuedReport]:
@@ -207,26 +210,26 @@ class ReportQueue:
             try:
                 self._write([queued])
             except Unavailable as error:
-                _tell(queued, error)
-                left += [queued] if queued.told is None else []
+                _resolve_futures(queued, error)
+                left += [queued] if queued.result is None else []
             except Exception:
-                log.exception("a report of %s was left out", queued.heard.robot)
-                _tell(queued, Unavailable("internal error; the server's log has the details"))
+                log.exception("a report of %s was left out", queued.report.robot)
+                _resolve_futures(queued, Unavailable("internal error; the server's log has the details"))
         return left
 
     def _write_presence(self, *, everybody: bool) -> None:
         with self._lock:
-            present_robots = set(self._there if everybody else self._new)
-            absent_robots = set(self._gone)
+            present_robots = set(self._present if everybody else self._has_news)
+            absent_robots = set(self._departed)
         if not present_robots and not absent_robots:
             return
         self._store.note_presence(present_robots, absent_robots, self._clock())
         with self._lock:
-            self._new -= present_robots
-            self._gone -= absent_robots
+            self._has_news -= present_robots
+            self._departed -= absent_robots
 
 
-def settle(result: Future[FleetMapError | None], seconds: float = 0.0) -> None:
+def wait_until_stored(result: Future[FleetMapError | None], seconds: float = 0.0) -> None:
     """Raise what the store had against a report; Unavailable where it did not say within so many seconds."""
     try:
         refused = result.result(seconds)
@@ -236,9 +239,9 @@ def settle(result: Future[FleetMapError | None], seconds: float = 0.0) -> None:
         raise refused
 
 
-def _tell(queued: _QueuedReport, refused: FleetMapError | None) -> None:
-    if queued.told is not None and not queued.told.done():
-        queued.told.set_result(refused)
+def _resolve_futures(queued: _QueuedReport, refused: FleetMapError | None) -> None:
+    if queued.result is not None and not queued.result.done():
+        queued.result.set_result(refused)
 
 
 def _warn(reasons: list[str]) -> None:
@@ -250,4 +253,4 @@ def _warn(reasons: list[str]) -> None:
 def _read(environment: str, robot: str, payload: bytes, time: datetime, *, vouched: bool) -> ReceivedReport:
     if not ROBOT_NAME.fullmatch(robot) or not ENVIRONMENT_NAME.fullmatch(environment):
         raise Invalid("a robot's or environment's name cannot be used")
-    return ReceivedReport(environment, robot, report_of(RobotStatus.from_json(payload)), time, vouched)
+    return ReceivedReport(environment, robot, report_from_status(RobotStatus.from_json(payload)), time, vouched)

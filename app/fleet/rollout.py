@@ -17,7 +17,7 @@ from app.fleet.status import is_online, is_ready
 from app.store.values import Robot, Rollout, RolloutStep, rfc3339
 
 
-def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> RolloutStep | None:
+def next_step(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> RolloutStep | None:
     """The next step of a roll-out, None for waiting on. robots: of its channel; only those vouched for count."""
     robots = [robot for robot in robots if robot.vouched]
     begun = rollout.started if rollout.moved is None else rollout.moved

@@ -51,7 +51,7 @@ class Lag:
         }
 
 
-def lag_of(robot: Robot, channel: Channel, moves: Sequence[ChannelMove]) -> Lag:
+def robot_lag(robot: Robot, channel: Channel, moves: Sequence[ChannelMove]) -> Lag:
     """A robot's lag. moves: of the channel, oldest first.
 
     A robot that says no sequence has acted on the newest move that led to the root which it holds.
@@ -103,7 +103,9 @@ def is_ready(robot: Robot, root: str) -> bool:
     return loaded or (robot.held is not None and robot.held.root == root)
 
 
-def holding(robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None) -> ChannelConvergence:
+def channel_convergence(
+    robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None
+) -> ChannelConvergence:
     """The proof of convergence of one channel. robots: of its environment; planned: root of what comes next."""
     channel_robots = [robot for robot in robots if robot.report.channel == channel.name]
     overlays = channel.closures.digest

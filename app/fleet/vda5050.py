@@ -59,17 +59,17 @@ def default_level(version: Version) -> str:
     return min(version.levels, key=lambda level: level.elevation).name
 
 
-def map_id_of(site: str, level: str | None) -> str:
+def level_map_id(site: str, level: str | None) -> str:
     """The ``mapId`` of a floor: VDA 5050 has one for each. level: None for the default level, which is the site's."""
     return site if level is None else f"{site}/{level}"
 
 
-def site_of(map_id: str) -> str:
+def site_name(map_id: str) -> str:
     """The site that a floor's ``mapId`` belongs to: the part before the first slash."""
     return map_id.partition("/")[0]
 
 
-def whole_site(floors: Sequence[VehicleMaps]) -> VehicleMaps:
+def merge_levels(floors: Sequence[VehicleMaps]) -> VehicleMaps:
     """What a vehicle holds of a site, from what its state says of each floor.
 
     It runs the oldest version that is enabled on a floor, has those that it has of every floor that it reports, and
@@ -82,7 +82,7 @@ def whole_site(floors: Sequence[VehicleMaps]) -> VehicleMaps:
     loaded = [v for v in (*first.enabled, *first.disabled) if all(v in (*o.enabled, *o.disabled) for o in others)]
     failed = dict(pair for floor in floors for pair in floor.failed)
     return VehicleMaps(
-        site_of(first.map_id), tuple(enabled), tuple(v for v in loaded if v not in enabled), tuple(failed.items())
+        site_name(first.map_id), tuple(enabled), tuple(v for v in loaded if v not in enabled), tuple(failed.items())
     )
 
 
@@ -107,11 +107,11 @@ def read_state(message: Any) -> tuple[VehicleMaps, ...]:
         map_id, version = _text(item, "mapId", location), _text(item, "mapVersion", location)
         status = item.get("mapStatus")
         if status not in ("ENABLED", "DISABLED"):
-            raise _refused("must be ENABLED or DISABLED", f"{location}.mapStatus")
+            raise _invalid_state_error("must be ENABLED or DISABLED", f"{location}.mapStatus")
         (enabled if status == "ENABLED" else disabled).setdefault(map_id, []).append(version)
     for map_id, versions in enabled.items():
         if len(set(versions)) > 1:
-            raise _refused(f"several versions of {map_id[:80]} are ENABLED: at most one may be", "maps")
+            raise _invalid_state_error(f"several versions of {map_id[:80]} are ENABLED: at most one may be", "maps")
     for (kind, map_id, version), why in _failures(message).items():
         if kind == "downloadMap" and version in (*enabled.get(map_id, ()), *disabled.get(map_id, ())):
             continue
@@ -148,7 +148,7 @@ def _failures(message: Mapping[str, Any]) -> dict[tuple[str, str, str], str]:
             for member in ("actionResult", "resultDescription"):
                 text = item.get(member)
                 if text is not None and not isinstance(text, str):
-                    raise _refused("must be a text", f"{name}[{k}].{member}")
+                    raise _invalid_state_error("must be a text", f"{name}[{k}].{member}")
                 reasons.insert(0, text)
             out[about] = next((text for text in reasons if text), "the vehicle does not say why")
     return out
@@ -159,19 +159,19 @@ def _list(message: Mapping[str, Any], name: str, limit: int, within: str = "") -
     if items is None:
         return ()
     if not isinstance(items, list) or len(items) > limit:
-        raise _refused(f"must be a list of at most {limit}", within + name)
+        raise _invalid_state_error(f"must be a list of at most {limit}", within + name)
     for k, item in enumerate(items):
         if not isinstance(item, Mapping):
-            raise _refused("must be an object", f"{within}{name}[{k}]")
+            raise _invalid_state_error("must be an object", f"{within}{name}[{k}]")
     return items
 
 
 def _text(item: Mapping[str, Any], name: str, location: str) -> str:
     value = item.get(name)
     if not isinstance(value, str) or not value or len(value) > 512:
-        raise _refused("must be a text", f"{location}.{name}")
+        raise _invalid_state_error("must be a text", f"{location}.{name}")
     return value
 
 
-def _refused(problem: str, location: str) -> Invalid:
+def _invalid_state_error(problem: str, location: str) -> Invalid:
     return Invalid(f"this is no VDA 5050 state: {location} {problem}", [Problem(problem, where=location)])

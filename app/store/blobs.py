@@ -27,15 +27,15 @@ from sqlalchemy import Connection, bindparam, delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import (
-    BROKEN,
-    NO_ROOM,
+    BROKEN_STORAGE_ERRNOS,
+    DISK_FULL_ERRNOS,
     Damaged,
     FleetMapError,
     Invalid,
     NoRoom,
     NotFound,
     Unavailable,
-    reason_of,
+    system_reason,
 )
 from app.store.database import Database, check_room
 from app.store.tables import blob
@@ -190,7 +190,7 @@ class Blobs:
         except FileNotFoundError:
             return "lost"
         except OSError as error:
-            if error.errno not in BROKEN:
+            if error.errno not in BROKEN_STORAGE_ERRNOS:
                 raise _unreadable(error) from error
             return "damaged"
         return None if complete and digest.hexdigest() == name else "damaged"
@@ -462,8 +462,8 @@ class Blobs:
 
 def _read_error(sha256: str, error: OSError) -> FleetMapError:
     """Damaged for broken storage; Unavailable for what may work later, like too many open files."""
-    if error.errno in BROKEN:
-        return Damaged(f"the stored file {sha256} cannot be read ({reason_of(error)}): {REPAIR}")
+    if error.errno in BROKEN_STORAGE_ERRNOS:
+        return Damaged(f"the stored file {sha256} cannot be read ({system_reason(error)}): {REPAIR}")
     return _unreadable(error)
 
 
@@ -472,16 +472,16 @@ class _Unreadable(Unavailable):
 
 
 def _unreadable(error: OSError) -> _Unreadable:
-    return _Unreadable(f"the blob folder cannot be read: {reason_of(error)}. Try again later")
+    return _Unreadable(f"the blob folder cannot be read: {system_reason(error)}. Try again later")
 
 
 def _refusal(error: OSError) -> Unavailable:
-    if error.errno in NO_ROOM:
+    if error.errno in DISK_FULL_ERRNOS:
         return NoRoom(
-            f"the server has no room left for files ({reason_of(error)}); nothing was stored. Try again after its "
+            f"the server has no room left for files ({system_reason(error)}); nothing was stored. Try again after its "
             "operator has freed space"
         )
-    return Unavailable(f"the blob folder cannot be written: {reason_of(error)}. Try again later")
+    return Unavailable(f"the blob folder cannot be written: {system_reason(error)}. Try again later")
 
 
 def _upsert(connection: Connection, rows: Sequence[Mapping[str, object]]) -> None:

@@ -19,7 +19,7 @@ import orjson
 from sqlalchemy import Connection, Engine, create_engine, event, exc
 from sqlalchemy.engine import make_url
 
-from app.errors import NO_ROOM, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
+from app.errors import DISK_FULL_ERRNOS, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
 
 log = logging.getLogger(__name__)
 
@@ -222,7 +222,7 @@ class Database:
         try:
             check_room(self.file.parent)
         except OSError as error:
-            kind = NoRoom if error.errno in NO_ROOM else Unavailable
+            kind = NoRoom if error.errno in DISK_FULL_ERRNOS else Unavailable
             raise kind(f"the folder of the database cannot be written: {error.strerror}") from error
 
     def tables(self) -> tuple[list[str], int]:

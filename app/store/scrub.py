@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
-from app.errors import FleetMapError, Unavailable, reason_of
+from app.errors import FleetMapError, Unavailable, system_reason
 from app.store.store import Store
 from app.store.verify import KINDS, Kind, check_root
 
@@ -102,7 +102,7 @@ class Scrub:
             except BlockingIOError:
                 pass  # another process is at it
             except OSError as error:
-                self._wait_for(reason_of(error))
+                self._wait_for(system_reason(error))
             except FleetMapError as error:
                 self._wait_for(error.detail)
             except Exception:  # the thread must outlive a defect: else nothing is checked any more, unnoticed

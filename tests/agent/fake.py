@@ -227,7 +227,7 @@ class One:
         """Take the folder, sync once, let go."""
         try:
             self.agent.open()
-            return self.agent.once()
+            return self.agent.run_once()
         finally:
             self.agent.close()
 

@@ -38,7 +38,7 @@ class Once:
         )
         try:
             agent.open()
-            self.good = agent.once()
+            self.good = agent.run_once()
         finally:
             agent.close()
 
@@ -310,13 +310,18 @@ def test_endorsements_are_followed_back_to_the_trusted_key(tmp_path: Path) -> No
     name, signature = keys.sign(b"data")
     header = f"{name}:{base64.b64encode(signature).decode()}"
     listed = [k.as_dict() for k in keys.public()]
-    key = signed_manifest.signer(b"data", header, first.public, None, lambda: listed)
+    key = signed_manifest.verify_signature(b"data", header, first.public, None, lambda: listed)
     assert key_id(key) == name == keys.public()[0].id
-    assert signed_manifest.signer(b"data", header, None, first.id, lambda: listed) == key
-    assert signed_manifest.signer(b"data", header, None, base64.b64encode(first.public).decode(), lambda: listed) == key
+    assert signed_manifest.verify_signature(b"data", header, None, first.id, lambda: listed) == key
+    assert (
+        signed_manifest.verify_signature(b"data", header, None, base64.b64encode(first.public).decode(), lambda: listed)
+        == key
+    )
     for left in (0, 1, 6):  # a link of the chain is missing
         with pytest.raises(Untrusted, match=r"vouch|does not tell"):
-            signed_manifest.signer(b"data", header, first.public, None, lambda n=left: listed[:n] + listed[n + 1 :])
+            signed_manifest.verify_signature(
+                b"data", header, first.public, None, lambda n=left: listed[:n] + listed[n + 1 :]
+            )
     circle = [{**listed[0], "endorsed_by": listed[0]["id"]}]
     with pytest.raises(Untrusted, match="vouch"):
-        signed_manifest.signer(b"data", header, first.public, None, lambda: circle)
+        signed_manifest.verify_signature(b"data", header, first.public, None, lambda: circle)

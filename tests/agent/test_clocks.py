@@ -44,16 +44,16 @@ def test_activation_comes_at_the_servers_time(
     channel = f"environments/{place}/channels/production"
     api("PUT", channel, 200, json={"version": 1})
     one = agent(fast)
-    assert one.once()
+    assert one.run_once()
     api.upload(place, {"n.tmap2.yaml": network(1)})
     at = datetime.now(timezone.utc) + timedelta(seconds=4)
     api("PUT", channel, 200, json={"version": 2, "activate_at": at.isoformat()})
-    assert one.once()
+    assert one.run_once()
     assert gate.statuses[-1]["state"] == "ready"
     assert whole(tmp_path / "robot")["version"] == 1, "not by the robot's clock"
     eventually(lambda: _stands(api, channel) == 2)
     assert datetime.now(timezone.utc) >= at
-    assert one.once()
+    assert one.run_once()
     assert whole(tmp_path / "robot")["version"] == 2
     status = api.get(f"robots/robot?environment={place}").json()
     assert status["online"]
@@ -74,5 +74,5 @@ def test_expiry_allows_for_a_minute(
     api.get("keys")
     soon = (datetime.now(timezone.utc) + timedelta(seconds=20)).isoformat()
     gate.change = signed(Keys(folder / "keys"), expires=soon)
-    assert agent(fast).once() is good
+    assert agent(fast).run_once() is good
     assert (tmp_path / "robot" / "current").exists() is good

@@ -54,7 +54,7 @@ def test_closure_comes_and_goes_with_an_event(fake: Fake, robot: Robot, tmp_path
         root, name = whole(one.into)["root"], (one.into / "current").readlink().name
         assert name == f"1-{root[:8]}"
         fake.close_edges("e7")
-        one.agent._heard(event(fake.sequence, type="overlay.accepted", overlay="x"))
+        one.agent._on_event(event(fake.sequence, type="overlay.accepted", overlay="x"))
         eventually(lambda: fake.statuses[-1].get("overlays") == fake.digest and fake.statuses[-1]["state"] == "active")
         data, closures = map_and_closures(one)
         assert data.endswith(b"ae7")
@@ -64,13 +64,13 @@ def test_closure_comes_and_goes_with_an_event(fake: Fake, robot: Robot, tmp_path
         assert (one.into / "current").readlink().name == f"{name}-{fake.digest[:8]}"
         closed = fake.digest
         fake.close_edges()
-        one.agent._heard(event(fake.sequence, type="overlay.ended"))
+        one.agent._on_event(event(fake.sequence, type="overlay.ended"))
         eventually(lambda: fake.statuses[-1]["overlays"] == fake.digest and fake.statuses[-1]["state"] == "active")
         assert map_and_closures(one)[0] == A["kml/map.kml"]
         assert (one.into / "current").readlink().name == name
         fake.asked.clear()
         for kind in ("overlay.created", "overlay.rejected", "overlay.expired"):
-            one.agent._heard(event(fake.sequence + 1, type=kind))
+            one.agent._on_event(event(fake.sequence + 1, type=kind))
         time.sleep(0.3)
         assert not fake.asked, "these change nothing that is in force"
     assert (tmp_path / "log").read_text().split() == [fake.digest, closed, fake.digest]

@@ -145,7 +145,7 @@ def test_folders_are_bounded_while_a_map_waits(fake: Fake, robot: Robot) -> None
     one.agent.open()
     for count in range(8):
         fake.close_edges(f"e{count}")
-        one.agent.once()
+        one.agent.run_once()
     one.agent.close()
     assert len(list((one.into / "versions").iterdir())) <= 5
     assert len(list((one.into / "partial").iterdir())) <= 1
@@ -179,7 +179,7 @@ def test_full_disk_before_the_hooks_puts_the_version_back(
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     with monkeypatch.context() as patch:
-        patch.setattr(activation, "write_whole", write)
+        patch.setattr(activation, "write_durably", write)
         one = robot(hook)
         assert not one.once()
     assert "changed: No space left on device" in one.detail

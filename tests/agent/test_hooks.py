@@ -116,8 +116,8 @@ def current(tmp_path: Path) -> Path:
 
 
 def test_they_are_found_by_name() -> None:
-    assert set(hooks.ready_made()) == {"nav2", "topological"}
-    for path in hooks.ready_made().values():
+    assert set(hooks.bundled_hooks()) == {"nav2", "topological"}
+    for path in hooks.bundled_hooks().values():
         subprocess.run(["sh", "-n", path], check=True)
 
 
@@ -383,7 +383,7 @@ def test_networks_are_read_as_the_server_writes_them(tmp_path: Path) -> None:
     (data,) = converted.files.values()
     (tmp_path / "n.yaml").write_bytes(data)
     network = loading.read_network(tmp_path / "n.yaml")
-    assert network == loading.network_of(json.dumps(yaml.safe_load(data)))
+    assert network == loading.parse_network(json.dumps(yaml.safe_load(data)))
     assert (len(network.nodes), len(network.edges)) == (len(names), len(names) - 1)
 
 

@@ -66,7 +66,7 @@ def test_it_looks_again_where_the_server_knew_less_than_its_event(
     with run(one):
         eventually(lambda: one.saw("active", version=1))
         fake.asked.clear()
-        one.agent._heard(event(2))
+        one.agent._on_event(event(2))
         eventually(lambda: sum("/manifest" in path for path in fake.asked) >= 3)
         assert whole(one.into)["version"] == 1
         assert not one.saw("failed"), "a server behind its own events is no failure"
@@ -83,10 +83,10 @@ def test_a_version_that_the_channel_does_not_follow_is_not_waited_for(
     monkeypatch.setattr(agent, "FIRST_PAUSE_SECONDS", 0.001)
     fake.move("production", 1)
     one = robot(poll_seconds=3600.0)
-    one.agent._heard(event(9))  # before it knows which channel it follows
+    one.agent._on_event(event(9))  # before it knows which channel it follows
     with run(one):
         eventually(lambda: one.saw("active", version=1))
-        one.agent._heard(event(10))
+        one.agent._on_event(event(10))
         time.sleep(0.3)
     assert sum("/manifest" in path for path in fake.asked) == 1
 
@@ -99,7 +99,7 @@ def test_an_event_that_never_comes_true_costs_ever_less(
     with run(one):
         eventually(lambda: one.saw("active", version=1))
         fake.asked.clear()
-        one.agent._heard(event(10**8))
+        one.agent._on_event(event(10**8))
         time.sleep(1.5)
     assert 3 <= sum("/manifest" in path for path in fake.asked) <= 14, "1, 2, 4 … ms"
 
@@ -168,7 +168,7 @@ def test_a_map_that_is_taken_back_during_its_download_is_not_put_in_place(
     def slow(handler: BaseHTTPRequestHandler) -> bool:
         if "/maps/" in handler.path:
             fake.move("latest", 1)
-            one.agent._heard(event(3, type="version.created"))
+            one.agent._on_event(event(3, type="version.created"))
         return False
 
     fake.instead = slow
@@ -187,7 +187,7 @@ def test_where_the_next_map_comes_during_a_download_both_are_taken(fake: Fake, r
     def slow(handler: BaseHTTPRequestHandler) -> bool:
         if "/versions/2/maps/" in handler.path:
             fake.put({"kml/map.kml": b"c" * 7000})
-            one.agent._heard(event(3))
+            one.agent._on_event(event(3))
         return False
 
     fake.instead = slow
@@ -454,7 +454,7 @@ def test_a_disk_that_fails_at_each_step(fake: Fake, tmp_path: Path, error: BaseE
         with pytest.MonkeyPatch.context() as patch:
             nth(patch, number, error)
             with contextlib.suppress(Killed):
-                good = one.agent.once()
+                good = one.agent.run_once()
         assert whole(into)["version"] in (1, 2)
         if not good and isinstance(error, Killed):
             one.agent.close()
@@ -464,7 +464,7 @@ def test_a_disk_that_fails_at_each_step(fake: Fake, tmp_path: Path, error: BaseE
             assert "No space left" in one.detail
             assert fake.statuses[-1]["state"] == "failed"
             assert not list((into / "versions").glob(".new")), "a full disk is not left fuller"
-        assert one.agent.once(), "also without a restart, once there is room"
+        assert one.agent.run_once(), "also without a restart, once there is room"
         one.agent.close()
         assert whole(into)["version"] == 2
         assert taken.read_bytes() == B["kml/map.kml"]
@@ -522,12 +522,12 @@ def test_on_a_full_disk_old_versions_go_before_the_memory(
     one = robot()
     one.agent.open()
     monkeypatch.setattr(os, "fsync", full)
-    assert not one.agent.once(), "there is room for the memory, and not for the map"
+    assert not one.agent.run_once(), "there is room for the memory, and not for the map"
     assert f"{into}: No space left" in one.detail
     assert json.loads((into / "state.json").read_text())["marks"]["latest"]["sequence"] == 3
     assert whole(into)["version"] == 2
     monkeypatch.undo()
-    assert one.agent.once()
+    assert one.agent.run_once()
     one.agent.close()
     assert whole(into)["version"] == 3
 
@@ -596,14 +596,14 @@ def test_a_file_system_without_locks_is_no_other_agent(
 def test_what_is_damaged_while_it_runs_is_told_and_healed(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     one = robot(f"cat $FLEETMAP_CURRENT/kml/map.kml > {tmp_path}/taken")
     one.agent.open()
-    assert one.agent.once()
+    assert one.agent.run_once()
     path = one.into / "current" / "kml" / "map.kml"
     path.chmod(0o644)
     path.write_bytes(b"x" * 5000)
     (tmp_path / "taken").unlink()
     fake.more = {"expires": "2999-01-01T00:00:00Z"}  # the next signature over the same map
     fake.instead = lambda h: bool(h.headers.__delitem__("if-none-match"))
-    assert one.agent.once()
+    assert one.agent.run_once()
     one.agent.close()
     assert one.saw("damaged", version=1, files=["kml/map.kml"])
     assert whole(one.into)["version"] == 1
@@ -681,7 +681,7 @@ def test_layers_come_signed(fake: Fake, robot: Robot, tmp_path: Path) -> None:
         "previous": {"root": whole(one.into)["root"]},
         "root": json.loads(fake.manifest("latest"))["root"],
     }
-    one.agent._heard(event(2, **forged))
+    one.agent._on_event(event(2, **forged))
     assert one.once()
     fake.put(A)
     fake.more = {"layers": {}}
@@ -708,7 +708,7 @@ def test_a_server_tells_routers_by_plain_addresses(fake: Fake, robot: Robot, tol
     with run(one):
         eventually(lambda: one.saw("polling"))
         assert one.agent._ear is not None
-        assert not one.agent._ear.aimed
+        assert not one.agent._ear.has_endpoint
     assert "no plain address" in one.saw("polling")["detail"]  # type: ignore[index]
 
 
@@ -720,7 +720,7 @@ def test_it_says_why_it_hears_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     one = ZenohClient(PLACE, "robot", heard=lambda _: None, back=lambda: None, lost=problems.append)
     try:
-        one.aim(f"tcp/127.0.0.1:{port}", "fleetmap")
+        one.set_endpoint(f"tcp/127.0.0.1:{port}", "fleetmap")
         eventually(lambda: problems)
     finally:
         one.close()

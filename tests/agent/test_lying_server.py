@@ -276,14 +276,14 @@ def test_server_that_gives_less_than_the_bus_announced_is_reported(
     one = robot(poll_seconds=0.1)
     with run(one):
         eventually(lambda: one.saw("active", version=1))
-        one.agent._heard(event(2))
+        one.agent._on_event(event(2))
         eventually(lambda: "the bus announced sequence 2" in fake.statuses[-1].get("detail", ""))
         assert fake.statuses[-1]["state"] == "active", "events are not signed: they make no robot fail"
         fake.put(B)
         eventually(lambda: fake.statuses[-1]["version"] == 2 and "detail" not in fake.statuses[-1])
-        one.agent._heard(event(10**17))
+        one.agent._on_event(event(10**17))
         monkeypatch.setattr(freshness, "FORGET_SECONDS", 0.5)
-        one.agent._heard(event(9))
+        one.agent._on_event(event(9))
         eventually(lambda: "sequence 9" in fake.statuses[-1].get("detail", ""))
         eventually(lambda: "detail" not in fake.statuses[-1])
 
@@ -434,7 +434,7 @@ def test_second_agent_of_a_directory_is_refused(fake: Fake, robot: Robot) -> Non
         with pytest.raises(Conflict, match="another agent keeps"):
             robot().once()
         fake.put(B)
-        one.agent._heard(event(2))
+        one.agent._on_event(event(2))
         eventually(lambda: one.saw("active", version=2))
     assert robot().once(), "and afterwards it is free"
 
@@ -449,6 +449,6 @@ def test_many_forged_events_do_not_make_it_busy(fake: Fake, robot: Robot) -> Non
         sequence = 10
         while not stop.is_set():
             sequence += 1
-            one.agent._heard(event(sequence, type="overlay.accepted"))
+            one.agent._on_event(event(sequence, type="overlay.accepted"))
             time.sleep(0.001)
         assert len([path for path in fake.asked if "/manifest" in path]) < 20

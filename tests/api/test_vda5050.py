@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from app.errors import Invalid
-from app.fleet.vda5050 import VehicleMaps, read_state, whole_site
+from app.fleet.vda5050 import VehicleMaps, merge_levels, read_state
 from tests.api import samples
 from tests.api.conftest import Api
 
@@ -140,9 +140,9 @@ def test_floors_count_together(api: Api, tower: str) -> None:
 
 def test_whole_site_of_floors() -> None:
     floors = (VehicleMaps("a", ("9",), ("10",), ()), VehicleMaps("a/L2", ("10",), ("9", "x"), (("11", "no room"),)))
-    assert whole_site(floors) == VehicleMaps("a", ("9",), ("10",), (("11", "no room"),))
-    assert whole_site(floors[1:]) == floors[1]
-    assert whole_site((VehicleMaps("a", ("x",), (), ()), VehicleMaps("a/b", ("2",), (), ()))).enabled == ("2",)
+    assert merge_levels(floors) == VehicleMaps("a", ("9",), ("10",), (("11", "no room"),))
+    assert merge_levels(floors[1:]) == floors[1]
+    assert merge_levels((VehicleMaps("a", ("x",), (), ()), VehicleMaps("a/b", ("2",), (), ()))).enabled == ("2",)
 
 
 def test_a_state_is_a_status(api: Api, farm: str) -> None:

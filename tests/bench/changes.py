@@ -67,6 +67,6 @@ def _cost(
 def _sync(agent: Agent, events: list[tuple[str, dict[str, Any]]]) -> int:
     received = agent._web.received
     events.clear()
-    if not agent.once() or not any(event == "switched" for event, _ in events):
+    if not agent.run_once() or not any(event == "switched" for event, _ in events):
         raise RuntimeError(f"the agent has not switched: {events}")
     return agent._web.received - received

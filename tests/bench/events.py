@@ -214,9 +214,9 @@ class Light(Agent):
         self.heard: list[int] = []
         super().__init__(options, say)
 
-    def _heard(self, event: messages.Event) -> None:
+    def _on_event(self, event: messages.Event) -> None:
         self.heard.append(event.sequence)
-        super()._heard(event)
+        super()._on_event(event)
 
 
 def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> None:

@@ -121,11 +121,11 @@ def test_reports_wait_for_a_database_that_is_away(api: Api, monkeypatch: pytest.
     monkeypatch.setattr(store, "note_reports", away)
     intake = ReportQueue(store)
     intake.start()
-    intake.heard("farm", "r1", said(1))
-    intake.heard("farm", "r1", said(2))
+    intake.enqueue_status("farm", "r1", said(1))
+    intake.enqueue_status("farm", "r1", said(2))
     eventually(lambda: len(store.robot_history("farm", "r1")) == 2)
     assert len(calls) >= 3
-    intake.heard("farm", "r1", said(3))
+    intake.enqueue_status("farm", "r1", said(3))
     intake.close()
     assert [r.version for _, r in store.robot_history("farm", "r1")] == [3, 2, 1], "what waits is written at the end"
 
@@ -133,12 +133,12 @@ def test_reports_wait_for_a_database_that_is_away(api: Api, monkeypatch: pytest.
 def test_what_comes_too_fast_is_told(
     api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("app.fleet.report_queue.WAITING", 2)
+    monkeypatch.setattr("app.fleet.report_queue.QUEUE_SIZE", 2)
     store: Store = api.app.state.services.store
     store.create_environment("farm")
     intake = ReportQueue(store)
     for n in range(5):
-        intake.heard("farm", "r1", said(n))
+        intake.enqueue_status("farm", "r1", said(n))
     intake.start()
     intake.close()
     assert [r.version for _, r in store.robot_history("farm", "r1")] == [1, 0]
@@ -148,23 +148,23 @@ def test_what_comes_too_fast_is_told(
 def test_who_says_too_much_displaces_nobody(
     api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("app.fleet.report_queue.SHARE", 3)
-    monkeypatch.setattr("app.fleet.report_queue.WAITING", 20)
+    monkeypatch.setattr("app.fleet.report_queue.MAX_QUEUED_PER_ROBOT", 3)
+    monkeypatch.setattr("app.fleet.report_queue.QUEUE_SIZE", 20)
     store: Store = api.app.state.services.store
     store.create_environment("farm")
     intake = ReportQueue(store)
     for n in range(100):
-        intake.heard("farm", "loud", said(n))
-        intake.heard("nowhere", "lost", said(n))
+        intake.enqueue_status("farm", "loud", said(n))
+        intake.enqueue_status("nowhere", "lost", said(n))
     for n in range(3):
-        intake.heard("farm", "calm", said(n))
+        intake.enqueue_status("farm", "calm", said(n))
     intake.start()
     eventually(lambda: len(store.robot_history("farm", "calm")) == 3)
     assert [r.version for _, r in store.robot_history("farm", "loud")] == [2, 1, 0]
     assert "194 reports of robots were left out" in caplog.text
     assert caplog.text.count("of lost was left out") == 1, "one line for all three"
     assert "(and 2 others)" in caplog.text
-    intake.heard("farm", "loud", said(7))
+    intake.enqueue_status("farm", "loud", said(7))
     intake.close()
     assert [r.version for _, r in store.robot_history("farm", "loud")] == [7, 2, 1, 0], "who is quiet again is heard"
 
@@ -173,15 +173,15 @@ def test_nonsense_keeps_nothing_from_being_renewed(
     api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Who was there stays there while somebody else never stops."""
-    monkeypatch.setattr("app.fleet.report_queue.RENEW_SECONDS", 0.2)
+    monkeypatch.setattr("app.fleet.report_queue.PRESENCE_REFRESH_SECONDS", 0.2)
     store: Store = api.app.state.services.store
     intake, renewed, stop = ReportQueue(store), [], threading.Event()
     monkeypatch.setattr(store, "note_presence", lambda on_bus, absent, now: renewed.append(on_bus))
-    intake.alive("calm", on_bus=True)
+    intake.set_presence("calm", on_bus=True)
 
     def shout() -> None:
         while not stop.is_set():
-            intake.heard("farm", "loud", b"nonsense")
+            intake.enqueue_status("farm", "loud", b"nonsense")
 
     loud = threading.Thread(target=shout)
     loud.start()

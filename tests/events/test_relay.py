@@ -16,7 +16,7 @@ import zenoh
 from app.errors import Invalid, Unavailable
 from app.events.bus import Bus, BusOptions, router_configuration
 from app.events.messages import Event, RobotStatus
-from app.events.relay import Relay, state_of
+from app.events.relay import Relay, relay_state
 from app.events.router import Router
 from app.store.store import Store
 from tests.api import samples
@@ -126,10 +126,10 @@ def test_a_taken_port_is_not_tried_all_the_time(monkeypatch: pytest.MonkeyPatch)
         options = BusOptions(listen=f"tcp/127.0.0.1:{taken.getsockname()[1]}")
         bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
         for _ in range(5):
-            assert not bus.tend()
+            assert not bus.ensure_connected()
         assert len(started) == 1
     try:
-        eventually(bus.tend)
+        eventually(bus.ensure_connected)
     finally:
         bus.close()
 
@@ -217,7 +217,7 @@ def test_a_database_that_is_away_is_told_once(
     relay = Relay(store, bus, tmp_path)  # type: ignore[arg-type]
     relay.start()
     try:
-        eventually(lambda: state_of(tmp_path, "router") == {"state": "connected"})
+        eventually(lambda: relay_state(tmp_path, "router") == {"state": "connected"})
         assert bus.put == [1]
         assert caplog.text.count("NO EVENTS GO OUT: the database is away") == 1
     finally:
@@ -290,12 +290,12 @@ def test_router_that_dies_while_it_starts_is_started_again(monkeypatch: pytest.M
     options = BusOptions(mode="router", listen=f"tcp/127.0.0.1:{free_port()}")
     bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
     try:
-        eventually(bus.tend, 30)
+        eventually(bus.ensure_connected, 30)
         started[0]._process.kill()
         started[0]._process.wait()
-        assert not bus.tend()
+        assert not bus.ensure_connected()
         assert started[1].problem is not None
-        eventually(bus.tend, 30)
+        eventually(bus.ensure_connected, 30)
         assert len(started) == 3
     finally:
         bus.close()

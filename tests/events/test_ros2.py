@@ -26,7 +26,7 @@ from zenoh import ext
 from app.errors import Unavailable
 from app.events import cdr, ros_names
 from app.events.bus import BusOptions, router_configuration
-from app.events.ros2 import Ros2Options, Ros2Publisher, TopicContent, state_of
+from app.events.ros2 import Ros2Options, Ros2Publisher, TopicContent, ros2_state
 from app.events.ros_names import EnvironmentSelector
 from app.events.router import Router
 from tests.api import samples
@@ -182,13 +182,13 @@ def test_names_that_ros_takes(name: str, token: str) -> None:
 
 
 def test_which_environments() -> None:
-    chosen = ros_names.parse_chosen(" farm=/, hall=/site/hall ,north-*,")
+    chosen = ros_names.parse_selectors(" farm=/, hall=/site/hall ,north-*,")
     assert [ros_names.namespace_of(n, chosen) for n in ("farm", "hall", "north-1", "south")] == [
         "/", "/site/hall", "/north_1", None,
     ]  # fmt: skip
     for wrong in ("Farm", "farm=site", "farm=/a b", "f-*=/", "a=/x,b=/x", "farm=", "=/", "a=/x__y", "a=/1"):
         with pytest.raises(ValueError, match=r".+"):
-            ros_names.parse_chosen(wrong)
+            ros_names.parse_selectors(wrong)
     assert ros_names.parse_keys("ros2dds, rmw_zenoh") == ("rmw_zenoh", "ros2dds")
     for wrong in ("", "dds", "rmw_zenoh,x"):
         with pytest.raises(ValueError, match="there are"):
@@ -466,7 +466,7 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
     router: tuple[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.events.ros2.RETRY_SECONDS", 0.2)
-    monkeypatch.setattr("app.events.ros2.ASK_SECONDS", 0.1)
+    monkeypatch.setattr("app.events.ros2.VERSION_POLL_SECONDS", 0.1)
     endpoint, port = router
     state = {"root": "a", "fails": 0, "calls": 0}
     (tmp_path / "ros2.json").write_text('{"state": "connected", "topics": 99}')  # of a process that was killed
@@ -491,7 +491,7 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
         with zenoh.open(client_config(port)) as session:
             heard = Heard(session, "map")
             assert grid_of(heard.wait(1))["cells"][1, 2] == ord("a")
-            eventually(lambda: state_of(tmp_path) == {"state": "connected", "topics": 2})
+            eventually(lambda: ros2_state(tmp_path) == {"state": "connected", "topics": 2})
             state["fails"], state["root"] = 2, "b"
             assert grid_of(heard.wait(2))["cells"][1, 2] == ord("b")
             assert caplog.text.count("the pool is busy") == 2
@@ -505,7 +505,7 @@ def test_a_mistake_with_one_environment_is_not_the_others(
     router: tuple[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.events.ros2.RETRY_SECONDS", 0.1)
-    monkeypatch.setattr("app.events.ros2.ASK_SECONDS", 0.1)
+    monkeypatch.setattr("app.events.ros2.VERSION_POLL_SECONDS", 0.1)
     endpoint, port = router
 
     def fetch(request: Any) -> TopicContent:
@@ -527,7 +527,7 @@ def test_a_mistake_with_one_environment_is_not_the_others(
             heard = Heard(session, "good/map")
             heard.wait()
             eventually(lambda: caplog.text.count("ROS 2: bad stays as it is") > 3)
-            assert state_of(tmp_path) == {"state": "connected", "topics": 2}
+            assert ros2_state(tmp_path) == {"state": "connected", "topics": 2}
             assert len(heard.samples) == 1, "the topics of the others stay as they are"
             assert "stumbled" not in caplog.text
     finally:
@@ -548,8 +548,8 @@ def test_without_a_router_it_is_told_and_found_later(tmp_path: Path, monkeypatch
     )
     publishing.start()
     try:
-        eventually(lambda: state_of(tmp_path)["state"] == "down")
-        assert "no router" in state_of(tmp_path)["detail"]
+        eventually(lambda: ros2_state(tmp_path)["state"] == "down")
+        assert "no router" in ros2_state(tmp_path)["detail"]
         new_router = Router(router_configuration(BusOptions(listen=endpoint)))
         try:
             with zenoh.open(client_config(port)) as session:

@@ -20,7 +20,7 @@ from app.cli.server import check
 from app.errors import Invalid, Unavailable
 from app.events.bus import Bus, BusOptions, router_configuration, session_configuration
 from app.events.bus import check as check_bus
-from app.events.credentials import ZenohCredentials, no_router
+from app.events.credentials import ZenohCredentials, describe_connection_failure
 from app.events.router import Router
 from app.events.security import RouterSecurity, access_control, read_users
 from app.main import check_bus as check_settings
@@ -322,12 +322,12 @@ def test_why_a_certificate_is_not_trusted_is_told(
     options = BusOptions(listen=endpoint, security=RouterSecurity(ZenohCredentials(authority.pem, certificate, key)))
     bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
     try:
-        assert not bus.tend()
+        assert not bus.ensure_connected()
         assert bus.state["detail"] == f"no router at {endpoint}: its certificate is not to be trusted: {told}"
         refused(port, ZenohCredentials(authority.pem))
         ear = ZenohClient("farm", "r1", heard=nothing, back=nothing, login=ZenohCredentials(authority.pem))
         monkeypatch.setattr("app.agent.zenoh_client.CONNECT_MS", int(REFUSED_SECONDS * 1000))
-        ear.aim(endpoint, "fleetmap")
+        ear.set_endpoint(endpoint, "fleetmap")
         try:
             eventually(lambda: ear.problem and told in ear.problem)
         finally:
@@ -352,14 +352,14 @@ def test_why_a_robot_is_not_let_in_is_told(authority: Authority, tmp_path: Path)
             (ZenohCredentials(authority.pem, *Authority(tmp_path, "x").sign("r")), "it refuses: "),
             (ZenohCredentials(authority.pem, *authority.sign("r1")), "Unable to connect!"),
         ):
-            assert no_router(f"{endpoint}, tcp/x:1", error, login).startswith(
+            assert describe_connection_failure(f"{endpoint}, tcp/x:1", error, login).startswith(
                 f"no router at {endpoint}, tcp/x:1: {reason}"
             )
     finally:
         router.close()
     for other_endpoint in (endpoint, "tcp/127.0.0.1:1", "tls/[::1]:1", "what is this"):
         assert (
-            no_router(other_endpoint, error, ZenohCredentials(authority.pem))
+            describe_connection_failure(other_endpoint, error, ZenohCredentials(authority.pem))
             == f"no router at {other_endpoint}: Unable to connect!"
         )
 

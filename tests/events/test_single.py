@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from app.errors import Unavailable
-from app.events.leader import LeaderThread, state_of
+from app.events.leader import LeaderThread, read_state
 from tests.events.conftest import eventually
 
 
@@ -24,17 +24,17 @@ class Rounds(LeaderThread):
         super().__init__(folder, "some", well="it goes on", trouble="IT STOPPED")
         self.work, self.rounds, self.stumbles, self.shut = work, 0, 0, 0
 
-    def _round(self) -> None:
+    def _run_once(self) -> None:
         self.work()
         self.rounds += 1
-        self._note({"state": "connected"})
-        self._ending.wait(0.01)
+        self._publish_state({"state": "connected"})
+        self._stopping.wait(0.01)
 
-    def _stumbled(self) -> None:
-        super()._stumbled()
+    def _on_unexpected_error(self) -> None:
+        super()._on_unexpected_error()
         self.stumbles += 1
 
-    def _shut(self) -> None:
+    def _release(self) -> None:
         self.shut += 1
 
 
@@ -45,13 +45,13 @@ def test_what_a_killed_process_said_no_longer_holds(tmp_path: Path, caplog: pyte
     one = Rounds(tmp_path, slow.wait)
     one.start()
     try:
-        assert state_of(tmp_path, "some") == {"state": "starting"}, "at once, before anybody can ask"
+        assert read_state(tmp_path, "some") == {"state": "starting"}, "at once, before anybody can ask"
         assert not caplog.text, "no alarm: nothing has failed yet"
         slow.set()
-        eventually(lambda: state_of(tmp_path, "some") == {"state": "connected"})
+        eventually(lambda: read_state(tmp_path, "some") == {"state": "connected"})
         assert "it goes on" in caplog.text
         (tmp_path / "some.json").unlink()
-        eventually(lambda: state_of(tmp_path, "some") == {"state": "connected"})
+        eventually(lambda: read_state(tmp_path, "some") == {"state": "connected"})
     finally:
         slow.set()
         one.close()
@@ -74,7 +74,7 @@ def test_the_next_one_goes_on_where_one_is_killed(tmp_path: Path, monkeypatch: p
     try:
         threading.Event().wait(0.2)
         assert first.rounds == 0
-        assert state_of(tmp_path, "some") == {"state": "connected"}, "it is the other one's to say"
+        assert read_state(tmp_path, "some") == {"state": "connected"}, "it is the other one's to say"
         other.send_signal(signal.SIGKILL)
         other.communicate()
         eventually(lambda: first.rounds)
@@ -98,7 +98,7 @@ def test_trouble_is_told_once_and_ends(
     def work() -> None:
         if errors:
             if len(errors) == 1:
-                eventually(lambda: state_of(tmp_path, "some")["state"] == "down")
+                eventually(lambda: read_state(tmp_path, "some")["state"] == "down")
             raise errors.pop(0)
 
     one = Rounds(tmp_path, work)
@@ -108,7 +108,7 @@ def test_trouble_is_told_once_and_ends(
         assert caplog.text.count("IT STOPPED: the database is away") == 1
         assert caplog.text.count("fleetmap-some stumbled") == 1
         assert one.stumbles == 1
-        eventually(lambda: state_of(tmp_path, "some") == {"state": "connected"})
+        eventually(lambda: read_state(tmp_path, "some") == {"state": "connected"})
     finally:
         one.close()
 

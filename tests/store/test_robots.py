@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from app.errors import Conflict, NotFound
-from app.fleet import holding, is_online, lag_of
+from app.fleet import channel_convergence, is_online, robot_lag
 from app.store import robots
 from app.store.changes import Replace
 from app.store.store import Store
@@ -205,7 +205,7 @@ def test_convergence_is_proved(farm: Store):
         farm.note_reports([ReceivedReport("farm", robot, report, base + timedelta(seconds=seconds))])
 
     def stand(seconds: float = 60) -> Any:
-        return holding(farm.robots("farm"), channel, base + timedelta(seconds=seconds))
+        return channel_convergence(farm.robots("farm"), channel, base + timedelta(seconds=seconds))
 
     assert stand().as_dict() == {
         "total": 0, "online": 0, "holding": 0, "lagging": 0, "failed": 0, "ready": 0, "since": None,
@@ -231,11 +231,11 @@ def test_convergence_is_proved(farm: Store):
     assert planned.planned is not None
     assert planned.planned.root == old
     say("a", 20, old, "ready")
-    ready = holding(farm.robots("farm"), planned, base, old)
+    ready = channel_convergence(farm.robots("farm"), planned, base, old)
     assert (ready.holding, ready.ready) == (1, 1)
     report = RobotReport("production", 1, old, "ready")
     farm.note_reports([ReceivedReport("farm", "made-up", report, base + timedelta(seconds=21), vouched=False)])
-    ready = holding(farm.robots("farm"), planned, base, old)
+    ready = channel_convergence(farm.robots("farm"), planned, base, old)
     assert (ready.total, ready.ready) == (2, 1), "it is listed, and does not count in the roll-out"
 
 
@@ -249,7 +249,7 @@ def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
     def lag(*reports: ReceivedReport) -> Any:
         farm.note_reports(list(reports))
         (robot,) = farm.robots("farm", reports[0].robot)
-        lag = lag_of(robot, channel, moves)
+        lag = robot_lag(robot, channel, moves)
         return lag.events, lag.differs, lag.since and (lag.since - NOW) / timedelta(minutes=1)
 
     assert lag(heard("in-step", 0, moves[2].root)) == (0, False, None)

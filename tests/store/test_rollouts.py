@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from app.fleet import decide
+from app.fleet import next_step
 from app.store.changes import Replace
 from app.store.store import Store
 from app.store.values import Channel, ReceivedReport, Robot, RobotReport, Rollout
@@ -42,7 +42,7 @@ class Fleet:
     def tick(self, seconds: float) -> tuple[int | None, str]:
         """(version, state of the roll-out) after it."""
         self.store.apply_due(self.at(seconds))
-        self.store.advance_rollouts(self.at(seconds), decide)
+        self.store.advance_rollouts(self.at(seconds), next_step)
         now = self.channel()
         return now.version, now.rollout.state if now.rollout else ""
 
@@ -113,7 +113,7 @@ def test_exactly_the_share_is_enough(count: int, share: float, enough: int):
             Robot(f"r{k}", "farm", RobotReport("production", 1, r, s), now, now, None)
             for k, (s, r) in enumerate(reports)
         ]
-        return decide(rollout, robots, now)
+        return next_step(rollout, robots, now)
 
     for stage, state, then in (("waiting", "ready", "move"), ("watching", "failed", "move_back")):
         assert step(stage, state, enough).do == then
@@ -259,7 +259,7 @@ def test_a_decision_is_taken_again_where_it_is_carried_out(fleet: Fleet):
 
     def changes_its_mind(*about: Any) -> Any:
         calls.append(about)
-        return decide(*about) if len(calls) == 1 else None
+        return next_step(*about) if len(calls) == 1 else None
 
     assert fleet.store.advance_rollouts(fleet.at(2), changes_its_mind) == []
     assert len(calls) == 2

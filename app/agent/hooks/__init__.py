@@ -13,18 +13,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-HERE = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parent
 HOOK_SECONDS = 300.0
-LOOK_SECONDS = 0.5
+STOP_POLL_SECONDS = 0.5
 """Between two looks whether the agent is to end."""
 
-TOLD = 1500
+MAX_OUTPUT_CHARACTERS = 1500
 """Characters of what a failing hook printed that are told."""
 
 
-def ready_made() -> dict[str, Path]:
+def bundled_hooks() -> dict[str, Path]:
     """Name -> script."""
-    return {path.stem: path for path in sorted(HERE.glob("*.sh"))}
+    return {path.stem: path for path in sorted(FOLDER.glob("*.sh"))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ def execute(
     It is ended, with all that it started, after so many seconds, or where ``stopping`` is set meanwhile. What it leaves
     running in the background is left alone, and read from as long as it prints.
     """
-    script = ready_made().get(command)
+    script = bundled_hooks().get(command)
     arguments = ["/bin/sh", str(script)] if script else ["/bin/sh", "-c", command]
     try:
         process = subprocess.Popen(  # noqa: S603  the operator of the robot names the command
@@ -71,15 +71,15 @@ def execute(
     status: int | None = None
     while status is None and time.monotonic() < end and not (stopping is not None and stopping.is_set()):
         with contextlib.suppress(subprocess.TimeoutExpired):
-            status = process.wait(min(LOOK_SECONDS, max(0.0, end - time.monotonic())))
+            status = process.wait(min(STOP_POLL_SECONDS, max(0.0, end - time.monotonic())))
     if status is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)  # with all that it started
         process.wait()
     if status == 0:
         return Outcome(0, "ended with 0")
-    reader.join(LOOK_SECONDS)
-    text = " ".join(bytes(output[-TOLD:]).decode(errors="replace").split())
+    reader.join(STOP_POLL_SECONDS)
+    text = " ".join(bytes(output[-MAX_OUTPUT_CHARACTERS:]).decode(errors="replace").split())
     if status is not None:
         how = f"ended with {status}"
     else:
@@ -92,4 +92,4 @@ def _read(stream: IO[bytes], output: bytearray) -> None:
     with stream:
         while chunk := os.read(stream.fileno(), 1 << 16):
             output += chunk
-            del output[:-TOLD]
+            del output[:-MAX_OUTPUT_CHARACTERS]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from app.errors import Conflict
 
-HERE = Path(__file__).resolve().parent
+FOLDER = Path(__file__).resolve().parent
 FILES = ("package.xml", "setup.py", "setup.cfg", "resource", "launch", "config", "fleetmap_ros")
 
 
@@ -31,7 +31,7 @@ def copy_package(workspace: Path) -> Path:
     target.mkdir(parents=True)
     ignored = shutil.ignore_patterns("__pycache__", "*.pyc")
     for name in FILES:
-        source = HERE / name
+        source = FOLDER / name
         if source.is_dir():
             shutil.copytree(source, target / name, ignore=ignored)
         else:

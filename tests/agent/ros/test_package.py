@@ -65,21 +65,24 @@ def test_it_needs_nothing_of_this_distribution(tmp_path: Path) -> None:
 
 
 def test_files_agree_on_names_and_version() -> None:
-    setup, launch = (ros.HERE / "setup.py").read_text(), (ros.HERE / "launch" / "fleetmap_agent.launch.py").read_text()
-    root = ET.parse(ros.HERE / "package.xml").getroot()
+    setup, launch = (
+        (ros.FOLDER / "setup.py").read_text(),
+        (ros.FOLDER / "launch" / "fleetmap_agent.launch.py").read_text(),
+    )
+    root = ET.parse(ros.FOLDER / "package.xml").getroot()
     assert root.findtext("name") == "fleetmap_ros"
     assert f'version="{root.findtext("version")}"' in setup
     assert 'package="fleetmap_ros"' in launch
     assert 'executable="fleetmap_agent"' in launch
     assert "fleetmap_agent = fleetmap_ros.node:main" in setup
     for name in re.findall(r'\["((?:launch|config)/[^"]+|package\.xml)"\]', setup):
-        assert (ros.HERE / name).is_file()
+        assert (ros.FOLDER / name).is_file()
 
 
 def test_the_sample_parameters_are_parameters() -> None:
     from app.agent.ros.fleetmap_ros.control import Settings
 
-    body = yaml.safe_load((ros.HERE / "config" / "fleetmap_agent.yaml").read_text())
+    body = yaml.safe_load((ros.FOLDER / "config" / "fleetmap_agent.yaml").read_text())
     settings = Settings.from_parameters(body["fleetmap_agent"]["ros__parameters"])
     assert settings.formats == ("occupancy_grid", "nav2_route")
     page = (TOP / "docs" / "how-to" / "nav2.md").read_text()

@@ -375,7 +375,7 @@ def switch_level(settings: Settings, level: str) -> tuple[bool, str]:
     )
 
 
-def standing_site(settings: Settings) -> Site | None:
+def initial_site(settings: Settings) -> Site | None:
     """The current map of a robot that starts, on the level that it was on; None if there is none yet."""
     current = settings.folder / "current"
     try:

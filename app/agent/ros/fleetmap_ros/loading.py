@@ -39,7 +39,7 @@ TOTAL_SECONDS = 240.0
 SETTLE_SECONDS = 2.0
 """A latched topic first delivers its history: its last message is the one before a pause of this length."""
 
-KEPT_BYTES = 8192
+MAX_OUTPUT_BYTES = 8192
 """Bytes of an answer kept from its start, and as many from its end: LoadMap's answer contains the map."""
 
 MAX_CHUNKS = 64
@@ -481,14 +481,14 @@ class TopologicalMap:
             answer = self._ros.call(service, WRITE_TOPOLOGICAL_MAP, {"filename": name, "no_alias": False})
             if answer.get("success") is not True:
                 raise LoadError(f"{service} refused {path}: see the log of the map manager")
-            problem = network.difference(network_of(self._ros.last_text(self._names.topic)))
+            problem = network.difference(parse_network(self._ros.last_text(self._names.topic)))
             if problem is None:
                 self._site.remember(topological_map=path)
                 return f"{self._names.manager} publishes {path}: {len(network.nodes)} nodes, {len(network.edges)} edges"
         raise LoadError(f"{service} reported success, but {self._names.topic} does not hold {path}: {problem}")
 
 
-def network_of(text: str) -> Network:
+def parse_network(text: str) -> Network:
     """The network of the manager's JSON; an empty one if it is none."""
     try:
         body = json.loads(text)
@@ -629,10 +629,10 @@ class Ros2Command:
         head, tail = b"", bytearray()
         try:
             while (chunk := chunks.get(timeout=max(0.0, end - time.monotonic()))) is not None:
-                room = KEPT_BYTES - len(head)
+                room = MAX_OUTPUT_BYTES - len(head)
                 head += chunk[:room]
                 tail += chunk[room:]
-                del tail[:-KEPT_BYTES]
+                del tail[:-MAX_OUTPUT_BYTES]
             status = process.wait(max(0.1, end - time.monotonic()))
         except (queue.Empty, subprocess.TimeoutExpired):
             process.kill()

@@ -22,7 +22,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from .control import AgentProcess, HookServer, Loader, Settings, SettingsError, standing_site, switch_level
+from .control import AgentProcess, HookServer, Loader, Settings, SettingsError, initial_site, switch_level
 from .grids import Grid
 from .loading import SETTLE_SECONDS, WAIT_SECONDS, LoadError, Steps
 
@@ -45,7 +45,7 @@ class RclpyRos:
     def __init__(self, node: Any, call_seconds: float) -> None:
         self._node, self._call_seconds = node, call_seconds
         self._group = ReentrantCallbackGroup()
-        self._known: dict[tuple[str, str], Any] = {}
+        self._clients: dict[tuple[str, str], Any] = {}
 
     def has_service(self, name: str, type: str) -> bool:
         """Whether a service is offered; waits some seconds for it to be discovered."""
@@ -87,14 +87,14 @@ class RclpyRos:
 
     def close(self) -> None:
         """Destroy the clients."""
-        for client in self._known.values():
+        for client in self._clients.values():
             self._node.destroy_client(client)
-        self._known.clear()
+        self._clients.clear()
 
     def _client(self, name: str, type: str) -> Any:
-        if (name, type) not in self._known:
-            self._known[name, type] = self._node.create_client(service_type(type), name, callback_group=self._group)
-        return self._known[name, type]
+        if (name, type) not in self._clients:
+            self._clients[name, type] = self._node.create_client(service_type(type), name, callback_group=self._group)
+        return self._clients[name, type]
 
 
 def service_type(name: str) -> Any:
@@ -150,7 +150,7 @@ class FleetmapAgent(LifecycleNode):
         """Publish the map that is there, and start the agent."""
         assert self._settings is not None
         assert self._loader is not None
-        site = standing_site(self._settings)
+        site = initial_site(self._settings)
         if site is not None and self._topics:
             self._loader.publish(site, Steps(self._report))
         self._hooks = HookServer(self._loader, self._log)
