@@ -82,7 +82,7 @@ from app.fleet import ReportQueue as FleetIntake
 from app.fleet import next_step
 from app.ingest import Ingest, Provider
 from app.links import LinkSecrets
-from app.pool import WARM, Pool
+from app.pool import PRELOADED_MODULES, Pool
 from app.sandbox import SandboxPolicy
 from app.signing import Keys
 from app.store.scrub import Scrub
@@ -114,10 +114,10 @@ def create_app(settings: Settings) -> FleetMapApp:
         app.state.feed = events.EventFeed(services)
         services.fleet.start()
         threading.Thread(target=_prepare, args=(services,), daemon=True).start()
-        publishing = [p for p in (ros2_of(settings, services), relay_of(settings, services)) if p is not None]
+        publishing = [p for p in (start_ros2(settings, services), start_relay(settings, services)) if p is not None]
         app.response_cache = services.response_cache
-        scrub = scrub_of(settings, services)
-        ticker = asyncio.create_task(_tick(services))
+        scrub = start_scrub(settings, services)
+        ticker = asyncio.create_task(_run_housekeeping(services))
         try:
             yield
         finally:
@@ -242,7 +242,7 @@ def open_services(settings: Settings) -> Services:
     store = Store(settings.database, settings.blob_dir)
     pools: list[Pool] = []
     try:
-        with alone(settings.data_dir):
+        with startup_lock(settings.data_dir):
             if settings.database.startswith("sqlite"):
                 store.migrate()
             try:
@@ -258,13 +258,13 @@ def open_services(settings: Settings) -> Services:
             except NoRoom as error:  # maps are served all the same
                 log.error("%s", error.detail)  # noqa: TRY400  a trace shows paths
             if not settings.insecure_no_auth:
-                _first_token(store, settings)
+                _ensure_first_token(store, settings)
             intake = UploadSpool(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
         if settings.models_dir is not None:
             os.environ["FLEETMAP_MODELS_DIR"] = str(settings.models_dir.resolve())  # where derivations look for it
             os.environ["FLEETMAP_MODELS_MAX_BYTES"] = str(settings.models_max_bytes)
         # One more worker, started when it is needed: coverage tables do not wait for maps in the making.
-        pool, spare = pools = [_pool_of(settings, workers) for workers in (settings.conversion_workers, 1)]
+        pool, spare = pools = [_worker_pool(settings, workers) for workers in (settings.conversion_workers, 1)]
         return _services(settings, store, pool, spare, intake)
     except BaseException:
         for opened in pools:
@@ -273,18 +273,18 @@ def open_services(settings: Settings) -> Services:
         raise
 
 
-def _pool_of(settings: Settings, workers: int) -> Pool:
+def _worker_pool(settings: Settings, workers: int) -> Pool:
     return Pool(
         workers,
         memory_bytes=settings.max_memory_bytes,
         seconds=settings.max_seconds,
         waiting=settings.conversion_queue,
-        warm=WARM,
-        allowed=allowed(settings),
+        warm=PRELOADED_MODULES,
+        allowed=sandbox_policy(settings),
     )
 
 
-def allowed(settings: Settings) -> SandboxPolicy:
+def sandbox_policy(settings: Settings) -> SandboxPolicy:
     """What worker processes may do: read the database, and nothing else that anybody would notice."""
     if settings.database.startswith("sqlite"):
         file = make_url(settings.database).database
@@ -338,7 +338,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         store=store,
         pool=pool,
         spare=spare,
-        ingest=Ingest(store, run, settings.limits, provider_of(settings)),
+        ingest=Ingest(store, run, settings.limits, imagery_provider(settings)),
         maps=service,
         access=access,
         jobs=ConversionJobs(store, service, settings.job_seconds, count),
@@ -361,7 +361,7 @@ def _bus_vouches(settings: Settings) -> bool:
     return settings.insecure_no_auth or settings.zenoh_users is not None or settings.zenoh_user is not None
 
 
-def provider_of(settings: Settings) -> Provider | None:
+def imagery_provider(settings: Settings) -> Provider | None:
     """Where pictures of sites are fetched; None where the operator has set up none."""
     if settings.imagery_url is None:
         return None
@@ -380,7 +380,7 @@ def provider_of(settings: Settings) -> Provider | None:
     )
 
 
-def scrub_of(settings: Settings, services: Services) -> Scrub | None:
+def start_scrub(settings: Settings, services: Services) -> Scrub | None:
     """The background check of stored data, begun; None where it is off."""
     if not settings.scrub_hours:
         return None
@@ -391,7 +391,7 @@ def scrub_of(settings: Settings, services: Services) -> Scrub | None:
     return scrub
 
 
-def relay_of(settings: Settings, services: Services) -> Relay | None:
+def start_relay(settings: Settings, services: Services) -> Relay | None:
     """Events to the fleet, begun; None where they are off."""
     if settings.zenoh_mode == "off":
         return None
@@ -410,7 +410,7 @@ def relay_of(settings: Settings, services: Services) -> Relay | None:
     return relay
 
 
-def ros2_of(settings: Settings, services: Services) -> Ros2Publisher | None:
+def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
     """Topics for ROS 2, begun; None where no environment is chosen."""
     chosen = parse_selectors(settings.ros2_environments)
     if not chosen or settings.zenoh_mode == "off":
@@ -477,14 +477,14 @@ def _prepare(services: Services) -> None:
 
 
 @contextlib.contextmanager
-def alone(data_dir: Path) -> Iterator[None]:
+def startup_lock(data_dir: Path) -> Iterator[None]:
     """One process at a time starts on a data folder: migrations, leftovers and the first token are done once."""
     with (data_dir / "start.lock").open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield
 
 
-def _first_token(store: Store, settings: Settings) -> None:
+def _ensure_first_token(store: Store, settings: Settings) -> None:
     """Make sure that somebody can come in."""
     if settings.admin_token is not None:
         text = settings.admin_token.get_secret_value()
@@ -508,7 +508,7 @@ def _note_time(newest: datetime) -> datetime:
     return now
 
 
-async def _tick(services: Services) -> None:
+async def _run_housekeeping(services: Services) -> None:
     """Ends of tokens and overlays, planned moves and roll-outs, signs of life of jobs, and the daily clean-up."""
     beat = 0.0
     newest = datetime.now(UTC)
@@ -520,7 +520,7 @@ async def _tick(services: Services) -> None:
             services.response_cache.flush_counters()
             newest = _note_time(newest)
             await run_in_threadpool(services.store.end_expired_tokens)
-            await run_in_threadpool(services.store.apply_due, datetime.now(UTC))
+            await run_in_threadpool(services.store.apply_due_moves, datetime.now(UTC))
             await run_in_threadpool(services.store.advance_rollouts, datetime.now(UTC), next_step)
             await run_in_threadpool(services.store.end_due_overlays, datetime.now(UTC))
             if beat >= HEARTBEAT_SECONDS:

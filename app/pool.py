@@ -30,14 +30,14 @@ log = logging.getLogger(__name__)
 
 _processes = multiprocessing.get_context("forkserver")
 
-WARM = ("app.ingest.prepare", "app.convert.warm")
+PRELOADED_MODULES = ("app.ingest.prepare", "app.convert.warm")
 """What the server's worker processes import before their first job."""
 
-LOOK_SECONDS = 0.2
+CANCEL_POLL_SECONDS = 0.2
 """How often a job in line looks whether it is still wanted."""
 
 
-def start_beside(warm: tuple[str, ...] = WARM) -> None:
+def preload_in_background(warm: tuple[str, ...] = PRELOADED_MODULES) -> None:
     """Start what workers are forked from; its imports run beside whatever the caller does meanwhile."""
     _processes.set_forkserver_preload(list(warm))
     forkserver.ensure_running()
@@ -63,21 +63,21 @@ class CancelHandle:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._process: BaseProcess | None = None
-        self.called = False
+        self.is_cancelled = False
 
     def __call__(self) -> None:
         """Stop the job; it raises Cancelled unless it has just come to its end."""
         with self._lock:
-            self.called = True
+            self.is_cancelled = True
             if self._process is not None:
                 _kill(self._process)
 
     def check(self) -> None:
         """Cancelled where it was called."""
-        if self.called:
+        if self.is_cancelled:
             raise Cancelled("it was cancelled: ask for it again")
 
-    def hold(self, process: BaseProcess | None) -> None:
+    def attach(self, process: BaseProcess | None) -> None:
         """From now on the job is at work in this process (None: no longer); Cancelled where it was called before."""
         with self._lock:
             self._process = process
@@ -126,7 +126,7 @@ class Pool:
         for taken in [self._idle.get() for _ in range(self._count)]:
             worker = taken
             try:
-                worker = taken or self._new()
+                worker = taken or self._start_worker()
             except FleetMapError as error:
                 log.warning("a worker could not be started: %s", error.detail)
             finally:
@@ -147,19 +147,19 @@ class Pool:
             try:
                 if self._closed:
                     raise Unavailable("the server is stopping")
-                worker = worker or self._new()
+                worker = worker or self._start_worker()
                 if stop is not None:
-                    stop.hold(worker.process)
+                    stop.attach(worker.process)
                 try:
-                    ok, value = _ask(worker, function, args, self._seconds if seconds is None else seconds)
+                    ok, value = _call_worker(worker, function, args, self._seconds if seconds is None else seconds)
                 finally:
                     if stop is not None:
-                        stop.hold(None)  # Cancelled comes before what its death looks like
+                        stop.attach(None)  # Cancelled comes before what its death looks like
                 healthy = True
             finally:
                 healthy = healthy and not self._closed
                 if not healthy:
-                    self._end(worker)
+                    self._stop_worker(worker)
                 self._idle.put(worker if healthy else None)
         finally:
             self._slots.release()
@@ -174,7 +174,7 @@ class Pool:
         while True:
             stop.check()
             with contextlib.suppress(queue.Empty):
-                return self._idle.get(timeout=LOOK_SECONDS)
+                return self._idle.get(timeout=CANCEL_POLL_SECONDS)
 
     def close(self) -> None:
         """End all workers.
@@ -189,12 +189,12 @@ class Pool:
             _kill(worker.process)
         for _ in range(self._count):
             with contextlib.suppress(queue.Empty):
-                self._end(self._idle.get_nowait())
+                self._stop_worker(self._idle.get_nowait())
                 self._idle.put_nowait(None)  # who waits for a worker wakes up and is told
         for worker in workers:
             worker.process.join(5.0)
 
-    def _new(self) -> _Worker:
+    def _start_worker(self) -> _Worker:
         try:
             ours, theirs = _processes.Pipe()
         except OSError as error:
@@ -213,11 +213,11 @@ class Pool:
             self._workers[id(worker)] = worker
             closed = self._closed
         if closed:  # close() did not see it
-            self._end(worker)
+            self._stop_worker(worker)
             raise Unavailable("the server is stopping")
         return worker
 
-    def _end(self, worker: _Worker | None) -> None:
+    def _stop_worker(self, worker: _Worker | None) -> None:
         if worker is None:
             return
         with self._lock:
@@ -233,7 +233,9 @@ def _kill(process: BaseProcess) -> None:
         process.kill()
 
 
-def _ask(worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], seconds: float) -> tuple[bool, Any]:
+def _call_worker(
+    worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], seconds: float
+) -> tuple[bool, Any]:
     """Whether the function returned, and what it returned or raised."""
     try:
         worker.pipe.send((function.__module__, function.__qualname__, args))

@@ -35,7 +35,7 @@ class SandboxPolicy:
     ports: tuple[int, ...] = ()
 
 
-def supported() -> int:
+def landlock_version() -> int:
     """The kernel's Landlock version, 0 where there is none."""
     abi_version = _syscall(_CREATE, None, 0, 1)
     return max(0, abi_version)
@@ -43,7 +43,7 @@ def supported() -> int:
 
 def confine(allowed: SandboxPolicy) -> bool:
     """Confine the calling thread and all that it starts, for good. False where the kernel cannot."""
-    version = supported()
+    version = landlock_version()
     if version < 1:
         return False
     files = _EXECUTE | _CHANGES | (_TRUNCATE if version >= 3 else 0) | (1 << 13 if version >= 2 else 0)

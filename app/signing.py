@@ -22,7 +22,7 @@ from typing import Any
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-KEPT = 32
+MAX_PUBLISHED_KEYS = 32
 """Keys of which the public part is still told: a robot that was away for as many rotations follows."""
 
 
@@ -70,7 +70,7 @@ class Keys:
     def rotate(self) -> PublicKey:
         """A new key from now on, vouched for by the old one."""
         self._load()
-        with self._alone():
+        with self._exclusive():
             keys, private = self._read()
             key = self._create(keys, private)
         self._known = None
@@ -78,24 +78,24 @@ class Keys:
 
     def _load(self) -> tuple[list[PublicKey], Ed25519PrivateKey]:
         with self._lock:
-            changed = self._changed()
+            changed = self._modified_at()
             if self._known is None or self._known[0] != changed:
                 if changed == 0.0:
-                    with self._alone():
-                        if self._changed() == 0.0:
+                    with self._exclusive():
+                        if self._modified_at() == 0.0:
                             self._create([], None)
                 keys, private = self._read()
-                self._known = (self._changed(), keys, private)
+                self._known = (self._modified_at(), keys, private)
             return self._known[1], self._known[2]
 
-    def _changed(self) -> float:
+    def _modified_at(self) -> float:
         try:
             return (self._folder / "keys.json").stat().st_mtime_ns / 1.0
         except OSError:
             return 0.0
 
     @contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _exclusive(self) -> Iterator[None]:
         self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         with (self._folder / "lock").open("w") as handle:
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -134,7 +134,7 @@ class Keys:
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
         _write(self._folder / f"{key.id}.pem", pem)
-        stored_keys = [key, *keys][:KEPT]
+        stored_keys = [key, *keys][:MAX_PUBLISHED_KEYS]
         _write(self._folder / "keys.json", json.dumps([k.as_dict() for k in stored_keys], indent=1).encode())
         for path in self._folder.glob("*.pem"):
             if path.stem != key.id:

@@ -170,7 +170,7 @@ def has_parameters(fmt: Format) -> bool:
     return bool(dataclasses.fields(fmt.write_options))
 
 
-def with_own(templates: Templates, name: str, format_template: FormatTemplate) -> Templates:
+def with_format_template(templates: Templates, name: str, format_template: FormatTemplate) -> Templates:
     """The same with something else said of one format; nothing is said of it where ``format_template`` is empty."""
     others = {format_name: template for format_name, template in templates.formats.items() if format_name != name}
     return Templates(templates.set, {**others, name: format_template} if format_template.as_dict() else others)

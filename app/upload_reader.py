@@ -39,7 +39,7 @@ _OF_FILES = re.compile(rf"^line \d+: ({'|'.join(sorted(_shell.OF_FILES))}) is le
 
 DRAWN_LAYERS: tuple[Layer, ...] = ("objects", "topology", "location", "zones")
 
-_QUIET = re.compile(r"(^|/)(\.|license|licence|copying|readme|notice|authors|changelog)", re.IGNORECASE)
+_UNREPORTED_FILES = re.compile(r"(^|/)(\.|license|licence|copying|readme|notice|authors|changelog)", re.IGNORECASE)
 _LICENCE = re.compile(r"(licen[cs]e|copying|notice|attribution|copyright)([-.].*)?", re.IGNORECASE)
 _COPYRIGHT = re.compile(r"(copyright|©|\(c\)).*\d{4}", re.IGNORECASE)
 _NOTICE_BYTES, _NOTICE_LINE = 2**14, 160
@@ -51,7 +51,7 @@ SAME_PLACE_DEGREES = 1e-7
 """About a centimetre: two fences whose corners are nearer are one."""
 
 
-def drawn_layer(name: str | None) -> Layer | None:
+def parse_drawn_layer(name: str | None) -> Layer | None:
     """Check the layer that a drawing is meant for. Raises Invalid with the layers that it may be."""
     for layer in DRAWN_LAYERS:
         if layer == name:
@@ -142,7 +142,7 @@ def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
     for name, data in files.items():
         members = {name: data}
         if name.lower().endswith(".zip") and data[:2] == b"PK":
-            with _blamed_on(name):
+            with _errors_in_file(name):
                 members = _archive.unpack(data, dataclasses.replace(limits, unpacked_bytes=left))
             left -= sum(map(len, members.values()))
         for member, content in members.items():
@@ -158,7 +158,7 @@ def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
 
 
 @contextlib.contextmanager
-def _blamed_on(name: str) -> Iterator[None]:
+def _errors_in_file(name: str) -> Iterator[None]:
     """Errors within are told as this file's."""
     try:
         yield
@@ -174,12 +174,12 @@ def read(
 
     Raises BadUpload with every place that is wrong; Invalid for hints that cannot be used.
     """
-    drawn_layer(hints.layer)
+    parse_drawn_layer(hints.layer)
     if not files:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
     bundle = Bundle(files={name: FileUse() for name in files}, inner=inner)
     if (content := _content.find(files)) is not None:
-        if _take_content(files, content, hints, limits, bundle):
+        if _read_exact_content(files, content, hints, limits, bundle):
             return bundle
         files = {name: data for name, data in files.items() if name not in _content.owned(files, content)}
     if hints.format is not None and formats.get_format(hints.format).holds:
@@ -190,7 +190,7 @@ def read(
     variables = _read_variables(files, bundle)
     others = {n: d for n, d in files.items() if n not in variables}
     groups, rest = _group(others, hints) if any(others.values()) or not variables else ([], sorted(others))
-    taken = _set_aside(groups, bundle)
+    taken = _skip_superseded(groups, bundle)
     _check_options(groups, hints)
     parsed_parts: list[ParsedPart] = []
     problems: list[Problem] = []
@@ -205,14 +205,16 @@ def read(
             errors.append(type(error))
     if errors:
         raise errors[0](details[0] if len(details) == 1 else "; ".join(details), problems)
-    _keep_unread({name: files[name] for name in rest}, bundle)
-    _compete(parsed_parts, bundle)
+    _report_unread_files({name: files[name] for name in rest}, bundle)
+    _resolve_conflicts(parsed_parts, bundle)
     if hints.format is None and not any(u.format for u in bundle.files.values()) and not variables:
-        lacks = {name: text for name in sorted(files) if (text := _lacking(name, files[name]))}
+        lacks = {name: text for name in sorted(files) if (text := _missing_metadata(name, files[name]))}
         known_formats = ", ".join(f.name for f in formats.all_formats().values() if f.read)
         detail = f"none of the files is a map that is known here; name the format, one of: {known_formats}"
         detail += "".join(f"; {name}: {text}" for name, text in list(lacks.items())[:1])
-        problems = [Problem(lacks[n], n) if n in lacks else _unknown(n, files[n], limits) for n in sorted(files)]
+        problems = [
+            Problem(lacks[n], n) if n in lacks else _unread_file_warnings(n, files[n], limits) for n in sorted(files)
+        ]
         broken = next((p for p in problems if p.line is not None), None)
         detail += f"; {broken.file}, line {broken.line}: {broken.problem}" if broken else ""
         raise UnreadableFile(detail, problems)
@@ -220,31 +222,31 @@ def read(
     return bundle
 
 
-def _keep_unread(files: Files, bundle: Bundle) -> None:
+def _report_unread_files(files: Files, bundle: Bundle) -> None:
     """Take the credits of files that no format reads, and warn of those that may have been meant as maps."""
     bundle.notices = {name: text for name, data in files.items() if (text := _notice(name, data))}
     for name, data in files.items():
-        if data and not _QUIET.search(PurePosixPath(name).name):
-            lacking = _lacking(name, data)
+        if data and not _UNREPORTED_FILES.search(PurePosixPath(name).name):
+            lacking = _missing_metadata(name, data)
             reason = "no format reads this file: it is kept as a source" + (f" ({lacking})" if lacking else "")
             bundle.warnings.append(Problem(reason, name))
 
 
-def _unread(files: Files) -> set[str]:
+def _unread_files(files: Files) -> set[str]:
     """The names of files that are neither a map nor belong to one."""
     others = {n: d for n, d in files.items() if d and PurePosixPath(n).name not in VARIABLES_FILES}
     empty = {n for n, d in files.items() if not d}
     return empty | set(formats.group(others)[1] if others else ())
 
 
-def _take_content(files: Files, main: str, hints: UploadHints, limits: Limits, bundle: Bundle) -> bool:
+def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Limits, bundle: Bundle) -> bool:
     """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
     if dataclasses.replace(hints, format=None) != UploadHints() or hints.format not in (None, "environment"):
         content: _content.Content | str = "the upload says how its maps are to be read"
     else:
         try:
-            with _blamed_on(main):
-                content = _content.read(files, main, limits, lambda: _unread(files))
+            with _errors_in_file(main):
+                content = _content.read(files, main, limits, lambda: _unread_files(files))
         except BadUpload:
             raise
         except (*formats.BAD_INPUT, FleetMapError, shapely.errors.ShapelyError) as error:
@@ -256,14 +258,14 @@ def _take_content(files: Files, main: str, hints: UploadHints, limits: Limits, b
         bundle.warnings.append(Problem(f"not used, the maps of the package count: {content}", main))
         return False
     bundle.files |= {name: FileUse("environment", used=True) for name in files if name not in content.added}
-    _keep_unread({name: files[name] for name in sorted(content.added)}, bundle)
+    _report_unread_files({name: files[name] for name in sorted(content.added)}, bundle)
     bundle.parts, bundle.datum, bundle.levels = dict(content.layers.parts), content.layers.datum, content.layers.levels
     bundle.origin = dict.fromkeys(bundle.parts, ((main,), "environment"))
     bundle.credits = content.credits
     return True
 
 
-def _unknown(name: str, data: bytes, limits: Limits) -> Problem:
+def _unread_file_warnings(name: str, data: bytes, limits: Limits) -> Problem:
     """Why nobody knows a file: where its name or first bytes tell a syntax in which it does not parse, the line."""
     end = PurePosixPath(name).suffix.lower()
     first = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
@@ -332,14 +334,14 @@ def _group(files: Files, hints: UploadHints) -> tuple[list[FileGroup], list[str]
     groups, rest = formats.group(present, hints.format)
     for fmt in formats.all_formats().values():
         if hints.format in (None, fmt.name) and fmt.completing & hints.options.keys():
-            completed = _completed(fmt, groups, rest, present, hints.options.get("file"))
+            completed = _complete_group(fmt, groups, rest, present, hints.options.get("file"))
             if completed is not None:
                 groups = [*(g for g in groups if g.main not in completed.files), completed]
                 rest = sorted(set(rest) - completed.files.keys())
     return groups, sorted({*rest, *(files.keys() - present.keys())})
 
 
-def _completed(
+def _complete_group(
     fmt: Format, groups: list[FileGroup], rest: list[str], files: Files, main_name: str | None
 ) -> FileGroup | None:
     """The file that options of the upload make a map, where it says too little by itself: a picture and its place."""
@@ -361,7 +363,7 @@ def _completed(
     return FileGroup(fmt, main, {n: files[n] for n in [main, *others]})
 
 
-def _lacking(name: str, data: bytes) -> str:
+def _missing_metadata(name: str, data: bytes) -> str:
     """What a file would need to be a map, where a format knows it."""
     return next((text for f in formats.all_formats().values() if data and (text := f.lacking(name, data))), "")
 
@@ -371,7 +373,7 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
     variables: dict[str, str] = {}
     names = sorted(n for n in files if PurePosixPath(n).name in VARIABLES_FILES and files[n])
     for name in names:
-        with _blamed_on(name):
+        with _errors_in_file(name):
             assigned, doubts = _shell.assignments(files[name])
         variables.update({n: v for n, v in assigned.items() if v or n not in _shell.OF_FILES})
         bundle.files[name] = FileUse("environment", used=True)
@@ -384,7 +386,7 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
     return set(names)
 
 
-def _set_aside(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]:
+def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]:
     """Leave out what another file tells better, without reading it: ``X_autogen`` beside ``X``, a drawn network beside
     a real one in ``topological/``, a drawn fence beside a datum in ``location/``."""
     mains = {g.main: g for g in groups}
@@ -417,7 +419,7 @@ def _set_aside(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]:
     return out
 
 
-def _known_options(group: FileGroup, hints: UploadHints) -> dict[str, str]:
+def _applicable_options(group: FileGroup, hints: UploadHints) -> dict[str, str]:
     names = {f.name for f in dataclasses.fields(group.format.read_options)}
     return {name: value for name, value in hints.options.items() if name in names}
 
@@ -454,7 +456,7 @@ def _read_group(
         level=hints.level,
         grid=grid,
         layer=layer,
-        options=formats.read_options(group.format, _known_options(group, hints)),
+        options=formats.read_options(group.format, _applicable_options(group, hints)),
         wanted=None if group.format.drawing else upload_context.wanted,
         cells=upload_context.cells,
         whole=upload_context.whole,
@@ -521,7 +523,7 @@ def _assign(
         elif layer == "zones":
             _move(out, key, part, areas, PartKey("zones", level, ZONES), "keepout")
         elif layer == "location":
-            fence = _own_fence(part, areas, context, bundle, file)
+            fence = _is_own_fence(part, areas, context, bundle, file)
             _move(out, key, part, fence, PartKey("location", level, SITE), "fence")
     return out
 
@@ -539,7 +541,7 @@ def _move(
     parts[key] = part.take(~mask)
 
 
-def _own_fence(
+def _is_own_fence(
     part: Features, areas: NDArray[np.bool_], context: EnvironmentContext, bundle: Bundle, file: str
 ) -> NDArray[np.bool_]:
     """Which of the polygons is the environment's own fence: a mask with at most one True."""
@@ -560,7 +562,7 @@ def _own_fence(
     return chosen
 
 
-def _compete(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
+def _resolve_conflicts(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
     """Join what belongs together; where two files tell the same network, site or grid, believe one of them."""
     by_key: dict[PartKey, list[ParsedPart]] = {}
     for one in parsed_parts:
@@ -569,14 +571,14 @@ def _compete(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
     renamed: dict[str, dict[str, str]] = {}
     for key, rivals in sorted(by_key.items()):  # objects come before the topology that was drawn from them
         winners = rivals
-        if key.layer in _ONE_TELLER and len(rivals) > 1:
-            rivals.sort(key=_trust)
+        if key.layer in _SINGLE_SOURCE_LAYERS and len(rivals) > 1:
+            rivals.sort(key=_priority)
             winners = rivals[:1]
             for loser in rivals[1:]:
-                if key.layer == "location" and _take_drawing(winners, loser):
+                if key.layer == "location" and _merge_fence_style(winners, loser):
                     useful.add(loser.group.main)
                     continue
-                noun = _ONE_TELLER[key.layer].format(name=key.name)
+                noun = _SINGLE_SOURCE_LAYERS[key.layer].format(name=key.name)
                 reason = f"its {noun} is not used: {winners[0].group.main} tells it"
                 bundle.warnings.append(Problem(reason, loser.group.main))
         useful.update(w.group.main for w in winners)
@@ -589,7 +591,7 @@ def _compete(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
                 bundle.files[name].used = False
 
 
-_ONE_TELLER: Mapping[str, str] = {
+_SINGLE_SOURCE_LAYERS: Mapping[str, str] = {
     "topology": "network",
     "location": "location",
     "occupancy": "grid {name}",
@@ -599,7 +601,7 @@ _ONE_TELLER: Mapping[str, str] = {
 """Layers of which one file's word is enough, as a user calls them."""
 
 
-def _take_drawing(winners: list[ParsedPart], loser: ParsedPart) -> bool:
+def _merge_fence_style(winners: list[ParsedPart], loser: ParsedPart) -> bool:
     """A drawn fence in the same place as the believed one: its name and style go along, and nothing is lost."""
     site, drawn = winners[0].part, loser.part
     if not (isinstance(site, Features) and isinstance(drawn, Features) and len(site) == len(drawn) == 1):
@@ -614,7 +616,7 @@ def _take_drawing(winners: list[ParsedPart], loser: ParsedPart) -> bool:
     return True
 
 
-def _trust(one: ParsedPart) -> tuple[object, ...]:
+def _priority(one: ParsedPart) -> tuple[object, ...]:
     name = PurePosixPath(one.group.main).name
     return (-one.group.format.rank, name.startswith("."), "_autogen" in name, len(name), one.group.main)
 

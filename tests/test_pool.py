@@ -105,7 +105,7 @@ def test_a_worker_that_ended_is_not_killed(pool: Pool, monkeypatch: pytest.Monke
     (worker,) = pool._workers.values()
     monkeypatch.setattr(type(worker.process), "kill", lambda process: killed.append(process.pid))
     stop = CancelHandle()
-    stop.hold(worker.process)
+    stop.attach(worker.process)
     assert worker.process.pid is not None
     os.kill(worker.process.pid, signal.SIGKILL)
     worker.process.join(20)
@@ -246,7 +246,9 @@ def confined(tmp_path: Path) -> Iterator[Pool]:
     new_pool.close()
 
 
-needs_landlock = pytest.mark.skipif(sandbox.supported() < 4, reason="the kernel has no Landlock with network rules")
+needs_landlock = pytest.mark.skipif(
+    sandbox.landlock_version() < 4, reason="the kernel has no Landlock with network rules"
+)
 
 
 @needs_landlock

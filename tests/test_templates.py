@@ -49,9 +49,9 @@ def test_what_holds() -> None:
     assert resolved_template.origin["verts_radius"] == "set outdoor"
     assert "action" not in resolved_template.values
     assert resolved_template.ignored == ()
-    updated_templates = templates.with_own(environment_templates, "tmap2", FormatTemplate("default"))
+    updated_templates = templates.with_format_template(environment_templates, "tmap2", FormatTemplate("default"))
     assert templates.resolve(updated_templates, TMAP2).values == {}, "the default set on purpose"
-    assert templates.with_own(updated_templates, "tmap2", FormatTemplate()).formats.keys() == {"lif"}
+    assert templates.with_format_template(updated_templates, "tmap2", FormatTemplate()).formats.keys() == {"lif"}
     assert Templates.from_dict(environment_templates.as_dict()) == environment_templates
     assert Templates.from_dict({}) == NO_TEMPLATES
     assert Templates("default", {"tmap2": FormatTemplate()}) == NO_TEMPLATES

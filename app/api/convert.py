@@ -22,12 +22,12 @@ from app.api.schemas import DatumBody, problem_responses
 from app.api.uploads import UploadForm
 from app.api.versions import check_names, parse_format_name, truth
 from app.convert.files import Converted
-from app.convert.worker import media_type, zipped
+from app.convert.worker import media_type, zip_files
 from app.errors import Invalid, Problem
 from app.ingest.service import check_grid_name
 from app.model.frame import GROUND, Datum, Level
 from app.model.names import did_you_mean
-from app.upload_reader import DRAWN_LAYERS, UploadHints, drawn_layer
+from app.upload_reader import DRAWN_LAYERS, UploadHints, parse_drawn_layer
 
 router = APIRouter(tags=["formats"], route_class=StrictRoute)
 
@@ -94,7 +94,7 @@ def _convert(services: Services, form: UploadForm) -> Response:
         raise Invalid("say in the field 'to' which format is wanted", [Problem("missing", where="to")])
     fmt = formats.get_format(to)
     check_names(form.files)
-    layer = drawn_layer(fields.pop("layer", "") or None)
+    layer = parse_drawn_layer(fields.pop("layer", "") or None)
     source = parse_format_name(fields.pop("format", ""), "format")
     level = fields.pop("level", "") or GROUND
     Level(level)
@@ -127,7 +127,7 @@ def _answer(done: Converted, to: str, only_report: bool) -> Response:
         name, data = next(iter(done.files.items()))
         kind = media_type(fmt, name)
     else:
-        name, data, kind = f"{to}.zip", zipped(done.files), "application/zip"
+        name, data, kind = f"{to}.zip", zip_files(done.files), "application/zip"
     return Response(data, headers={**headers, "content-disposition": content_disposition(name)}, media_type=kind)
 
 

@@ -50,7 +50,7 @@ class Deltas:
         return await self._running.run(key, self._between, key, body)
 
     def _between(self, key: tuple[str, str], body: bytes | CachedFile) -> bytes | None:
-        before = self._cache.by_hash(key[0], MAX_BYTES)
+        before = self._cache.find_by_hash(key[0], MAX_BYTES)
         if before is None:
             return None  # not remembered: it may be made (again) at any moment, and anybody can ask for any hash
         delta = _smaller(before, body if isinstance(body, bytes) else body.read(), bytes.fromhex(key[0]))

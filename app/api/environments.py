@@ -26,7 +26,7 @@ from app.errors import Conflict, Gone, Invalid, NotFound, Problem
 from app.ingest.service import check_if_match
 from app.model.frame import Datum
 from app.store.area import DATUM_METRES, MARGIN_METRES, NEIGHBOURHOOD_METRES
-from app.store.audit import about
+from app.store.audit import set_audit_target
 from app.store.values import Box, Environment, Match, rfc3339
 
 CONTAINS: Final = f"""\
@@ -170,7 +170,7 @@ def create_environment(body: EnvironmentBody, services: ServicesDep, principal: 
             raise Invalid("a clone has the datum of what it is cloned from: give datum or clone, and PATCH it later")
         principal.require_environment(body.clone.environment)
         clone = services.store.version(body.clone.environment, body.clone.version)
-    about(environment=body.name, target=f"environment {body.name}")
+    set_audit_target(environment=body.name, target=f"environment {body.name}")
     environment = services.store.create_environment(
         body.name,
         title=body.title,

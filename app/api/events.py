@@ -28,7 +28,7 @@ from app.api.responses import StrictRoute
 from app.api.schemas import problem_responses
 from app.api.single_flight import SingleFlight
 from app.convert.cache import CachedFile
-from app.convert.maps import file_of
+from app.convert.maps import select_file
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable
 from app.events import messages
 from app.events.bus import DeferredReply, Reply
@@ -286,12 +286,12 @@ def answer_zenoh_query(
     if derive not in ("true", "false"):
         raise Invalid("derive must be true or false", [Problem("true or false", where="derive")])
     mode = closure_mode(values.pop("closures", None))
-    version, _ = services.store.standing(environment, parse_version_ref(pieces[0]), mode)
+    version, _ = services.store.channel_target(environment, parse_version_ref(pieces[0]), mode)
     name, file = pieces[2], "/".join(pieces[3:]) or None
     recipe = services.maps.recipe(version, name, values, derive=derive == "true", file=file)
-    cached_map = services.maps.ready(recipe)
+    cached_map = services.maps.get_cached(recipe)
     if cached_map is not None:
-        return _reply_from(file_of(recipe, cached_map, file), max_bytes)
+        return _reply_from(select_file(recipe, cached_map, file), max_bytes)
     return lambda: _reply_from(
         services.maps.fetch(version, name, values, derive=derive == "true", file=file), max_bytes
     )

@@ -108,7 +108,7 @@ class ConversionJobs:
 
     def _start(self, recipe: Recipe) -> _RunningConversion:
         stop = CancelHandle()
-        future = asyncio.get_running_loop().run_in_executor(self._threads, self._maps.make, recipe, stop)
+        future = asyncio.get_running_loop().run_in_executor(self._threads, self._maps.get_or_convert, recipe, stop)
         running = self._running[recipe.key] = _RunningConversion(future, stop)
         future.add_done_callback(lambda _: self._on_done(recipe, running))
         return running

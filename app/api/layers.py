@@ -307,8 +307,8 @@ def _voxels(services: Services, version: Version, key: PartKey, box: Box | None,
         options = {"kind": "bt", "name": key.name, "level": key.level}
         if column is not None:
             options["bbox"] = ",".join(map(repr, column))
-        cached_map = services.maps.make(services.maps.recipe(version, "octomap", options))
-        return Response(cached_map.whole().read(), media_type=kind)
+        cached_map = services.maps.get_or_convert(services.maps.recipe(version, "octomap", options))
+        return Response(cached_map.single_file().read(), media_type=kind)
     part = services.store.load(version, [key]).parts[key]
     assert isinstance(part, VoxelMap)
     if column is not None:

@@ -17,8 +17,8 @@ from app.api.responses import API, StrictRoute, json_response
 from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, problem_responses
 from app.api.signed import Grant
 from app.convert.cache import CachedFile
-from app.convert.maps import file_of
-from app.store.audit import about
+from app.convert.maps import select_file
+from app.store.audit import set_audit_target
 from app.store.values import Version, rfc3339
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
@@ -48,7 +48,7 @@ async def create_link(
     linked = await link_to(services, request, principal, version, body.format, body.file, values, body.seconds)
     if isinstance(linked, JobStarted):
         return job_started_response(linked.job)
-    about(target=f"link to {body.format} of version {version.number}, until {linked.expires}")
+    set_audit_target(target=f"link to {body.format} of version {version.number}, until {linked.expires}")
     await run_in_threadpool(services.store.record_change)
     out = {
         "url": linked.url,
@@ -96,7 +96,7 @@ async def link_to(
     outcome = await convert_at_address(services, map_request, urlencode(sorted(values.items())).encode(), principal)
     if isinstance(outcome, JobStarted):
         return outcome
-    map_file = file_of(*outcome, file)
+    map_file = select_file(*outcome, file)
     path = f"{API}/environments/{version.environment}/versions/{version.number}/maps/{format}"
     path += "" if file is None else f"/{file}"
 

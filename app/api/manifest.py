@@ -25,11 +25,11 @@ from app.api.responses import StrictRoute, json_bytes, json_response
 from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, problem_responses
 from app.convert import site
 from app.convert.cache import CachedMap
-from app.convert.recipe import Recipe, own_options
+from app.convert.recipe import Recipe, writer_options
 from app.errors import CannotConvert, CannotDerive, FleetMapError, Invalid, NotFound, Problem
 from app.events.messages import SIGNATURE
 from app.model.closures import NO_CLOSURES, ClosureMode
-from app.store.values import Version, frame_line
+from app.store.values import Version, frame_input
 
 STEP_SECONDS = 600
 """The time of expiry moves in steps, so that a robot that polls gets the same bytes, and 304."""
@@ -174,7 +174,7 @@ def _sign_manifest(
     """
     channel = None if isinstance(parse_version_ref(v), int) else v
     generation = services.response_cache.generation()
-    version, sequence = services.store.standing(env, parse_version_ref(v), mode)
+    version, sequence = services.store.channel_target(env, parse_version_ref(v), mode)
     closures = version.closures or NO_CLOSURES
     listed = _list_files(services, version, entries, cached_maps)
     if isinstance(listed, _PendingConversion):
@@ -230,7 +230,7 @@ def _list_files(
     for entry in entries:
         try:
             recipe = _recipe(services, version, entry)
-            cached_map = services.maps.ready(recipe) or cached_maps.get(recipe.key)
+            cached_map = services.maps.get_cached(recipe) or cached_maps.get(recipe.key)
             failure = None if cached_map is not None or entry.required else services.maps.failure(recipe)
             if failure is not None:
                 raise failure
@@ -249,7 +249,7 @@ def _list_files(
 
 def _recipe(services: Services, version: Version, entry: _Entry) -> Recipe:
     """Plan the whole site in a format, or what the entry's parameters select of it."""
-    values = {**site.everything(formats.get_format(entry.format)), **entry.values}
+    values = {**site.whole_site_options(formats.get_format(entry.format)), **entry.values}
     if entry.closures is not None:
         in_force = version.closures or services.store.closures(version.environment)
         version = replace(version, closures=in_force.in_mode(entry.closures))
@@ -274,7 +274,7 @@ def _layers(version: Version) -> dict[str, str]:
     parts: dict[str, list[Any]] = {}
     for entry in version.parts:
         parts.setdefault(entry.key.layer, []).append([entry.key.level, entry.key.name, entry.hash])
-    frame = frame_line(version.datum, version.levels)
+    frame = frame_input(version.datum, version.levels)
     if version.datum is not None or "location" in parts:
         parts.setdefault("location", []).append(frame)
     return {name: hashlib.sha256(json_bytes(lines)).hexdigest()[:LAYER_DIGITS] for name, lines in sorted(parts.items())}
@@ -306,7 +306,7 @@ def _entry(text: str, location: str, *, required: bool) -> _Entry:
         raise Invalid(f"{name} is not served", [Problem("not served", where=location)])
     try:
         values, derive, closures = parse_options(query)
-        own_options(fmt, values)
+        writer_options(fmt, values)
     except Invalid as error:
         raise Invalid(f"{name}: {error.detail}", error.problems) from None
     return _Entry(name, values, derive, closures, required, dict(parse_qsl(query, keep_blank_values=True)))

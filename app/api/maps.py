@@ -38,7 +38,7 @@ from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut,
 from app.api.signed import LINK
 from app.api.single_flight import SingleFlight
 from app.convert.cache import CachedFile, CachedMap, LostMap
-from app.convert.maps import file_of
+from app.convert.maps import select_file
 from app.convert.recipe import Recipe
 from app.errors import CannotDerive, Invalid, NotFound, Problem, Unavailable
 from app.links import SignedAddress
@@ -173,7 +173,7 @@ class ResponseCache:
 
     def _ready(self, services: Services, key: Key, empty: CachedResponse) -> CachedResponse | None:
         assert empty.recipe is not None
-        cached_map = services.maps.ready(empty.recipe)
+        cached_map = services.maps.get_cached(empty.recipe)
         if cached_map is None:
             return None
         self._metrics.disk_hits.inc()
@@ -330,13 +330,13 @@ def resolve_version(services: Services, map_request: MapRequest) -> Version:
     one, else the head.
     """
     if map_request.version is not None:
-        return services.store.standing(
+        return services.store.channel_target(
             map_request.environment, parse_version_ref(map_request.version), map_request.closures
         )[0]
     try:
-        return services.store.standing(map_request.environment, PRODUCTION, map_request.closures)[0]
+        return services.store.channel_target(map_request.environment, PRODUCTION, map_request.closures)[0]
     except NotFound:
-        return services.store.standing(map_request.environment, LATEST, map_request.closures)[0]
+        return services.store.channel_target(map_request.environment, LATEST, map_request.closures)[0]
 
 
 def parse_version_ref(ref: str) -> str | int:
@@ -347,7 +347,7 @@ def parse_version_ref(ref: str) -> str | int:
 def _with_body(empty: CachedResponse, cached_map: CachedMap) -> CachedResponse:
     """With headers and content of the made map. NotFound where it has no such file."""
     assert empty.recipe is not None
-    file = file_of(empty.recipe, cached_map, empty.wanted.file)
+    file = select_file(empty.recipe, cached_map, empty.wanted.file)
     headers = [
         (b"content-type", _media_type(file).encode()),
         (b"accept-ranges", b"bytes"),
@@ -595,7 +595,7 @@ async def _from_disk(request: Request, entry: CachedResponse) -> Response:
     try:
         file = await run_in_threadpool(entry.file.path.open, "rb")
     except OSError as error:
-        raise entry.file.lost(error) from error
+        raise entry.file.lost_error(error) from error
     return stream_file(file, start, end, status, headers, None if part else entry.file.check)
 
 
@@ -667,7 +667,7 @@ async def convert_plan(
     """
     while True:
         recipe = await run_in_threadpool(plan)
-        cached_map = await run_in_threadpool(services.maps.ready, recipe)
+        cached_map = await run_in_threadpool(services.maps.get_cached, recipe)
         if cached_map is not None:
             return recipe, cached_map
         try:

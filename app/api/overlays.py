@@ -32,7 +32,7 @@ from app.convert.cache import CachedMap
 from app.convert.closures import place_problem
 from app.errors import Conflict, Denied, Invalid, NotFound, Problem
 from app.fleet import live, overlays
-from app.ingest.edits import shape_of
+from app.ingest.edits import parse_geometry
 from app.model.closures import Closures
 from app.model.frame import GROUND
 from app.store.values import Overlay, Version
@@ -158,7 +158,7 @@ def _shown_versions(services: Services, env: str) -> Iterator[Version]:
 
 def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
     """A valid GeoJSON polygon and nothing else that came with it. Raises Invalid."""
-    shape = shape_of(given)
+    shape = parse_geometry(given)
     if shape.geom_type not in ("Polygon", "MultiPolygon") or shape.is_empty or not shape.is_valid:
         reason = shapely.is_valid_reason(shape)
         problem = f"must be a valid GeoJSON Polygon or MultiPolygon, got {shape.geom_type}: {reason}"
@@ -307,10 +307,10 @@ def _as_json(services: Services, env: str, ref: str | None) -> Version:
     refs: list[str | int] = ["production", "latest"] if ref is None else [int(ref) if ref.isdigit() else ref]
     for name in refs[:-1]:
         try:
-            return services.store.standing(env, name, "mark")[0]
+            return services.store.channel_target(env, name, "mark")[0]
         except NotFound:
             continue
-    return services.store.standing(env, refs[-1], "mark")[0]
+    return services.store.channel_target(env, refs[-1], "mark")[0]
 
 
 async def _files_with_marks(

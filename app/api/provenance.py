@@ -63,7 +63,7 @@ def graph(maps: Maps, version: Version) -> dict[str, Any]:
         map_lines.append({"id": name, "format": line["format"], "state": line["state"], "chain": line["chain"]})
         if line["state"] == "missing":
             continue
-        used = maps.parts_of(version, line["format"])
+        used = maps.source_parts(version, line["format"])
         links += [
             {"from": f"part:{k.layer}/{k.level}/{k.name}", "to": name}
             for k in used

@@ -27,7 +27,7 @@ from app.api.schemas import (
     problem_responses,
 )
 from app.errors import Denied, Invalid, NotFound, Problem
-from app.store.audit import about
+from app.store.audit import set_audit_target
 from app.store.values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport, rfc3339
 
 router = APIRouter(prefix="/robots", tags=["robots"], route_class=StrictRoute)
@@ -129,7 +129,7 @@ def forget_robot(
 ) -> Response:
     """It no longer counts among its channel's robots. It comes back with its next report."""
     principal.require_environment(environment)
-    about(environment=environment)
+    set_audit_target(environment=environment)
     services.store.forget_robot(environment, robot)
     return Response(status_code=204)
 
@@ -209,4 +209,4 @@ def _report(report: RobotReport, heard: datetime) -> dict[str, Any]:
         body["sequence"] = report.sequence
     if report.overlays is not None:
         body["overlays"] = report.overlays
-    return body | {"time": rfc3339(report.said or heard)}
+    return body | {"time": rfc3339(report.reported_at or heard)}

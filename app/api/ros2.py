@@ -33,7 +33,7 @@ def channel_versions(services: Services, chosen: tuple[EnvironmentSelector, ...]
     for name in dict.fromkeys(names):
         for ref in [channel] if channel else [PRODUCTION, LATEST]:
             try:
-                out[name], _ = services.store.standing(name, ref)
+                out[name], _ = services.store.channel_target(name, ref)
                 break
             except NotFound:
                 continue
@@ -83,7 +83,7 @@ def _grids(version: Version, derive: bool) -> list[dict[str, str]]:
 
 
 def _grid(services: Services, version: Version, values: Mapping[str, str], derive: bool) -> cdr.Grid:
-    cached_map = services.maps.at_once(version, "occupancy_grid", values, derive=derive)
+    cached_map = services.maps.get_blocking(version, "occupancy_grid", values, derive=derive)
     files = {file.name: file.read() for file in cached_map.files}
     fmt = formats.get_format("occupancy_grid")
     assert fmt.read is not None
@@ -96,6 +96,6 @@ def _grid(services: Services, version: Version, values: Mapping[str, str], deriv
 
 def _network(services: Services, version: Version, derive: bool) -> str:
     """The tmap2 as JSON: topological_navigation publishes it so, and who reads YAML reads JSON."""
-    cached_map = services.maps.at_once(version, "tmap2", {}, derive=derive)
+    cached_map = services.maps.get_blocking(version, "tmap2", {}, derive=derive)
     document = _yaml.load(cached_map.files[0].read(), services.options.limits)
     return json.dumps(document, ensure_ascii=False)

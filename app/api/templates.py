@@ -96,7 +96,7 @@ def put_templates(
 ) -> Response:
     """A version in which another set holds, or other values of several formats at once. What is left out stays."""
     format_templates = {name: FormatTemplate(template.set, template.values) for name, template in body.formats.items()}
-    update = TemplateUpdate(body.set, format_templates, dry_run=body.dry_run).checked()
+    update = TemplateUpdate(body.set, format_templates, dry_run=body.dry_run).validated()
     return _commit_templates(services, env, update, body.message, principal, if_match, idempotency_key)
 
 
@@ -150,7 +150,9 @@ def put_format_templates(
 
     Maps of the new version are made with them; old versions keep answering as they did.
     """
-    update = TemplateUpdate(None, {format: FormatTemplate(body.set, body.values)}, dry_run=body.dry_run).checked("body")
+    update = TemplateUpdate(None, {format: FormatTemplate(body.set, body.values)}, dry_run=body.dry_run).validated(
+        "body"
+    )
     return _commit_templates(services, env, update, body.message, principal, if_match, idempotency_key)
 
 
@@ -171,7 +173,7 @@ def delete_format_templates(
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which the environment's set holds for the format again."""
-    update = TemplateUpdate(None, {format: FormatTemplate()}, dry_run=dry_run).checked()
+    update = TemplateUpdate(None, {format: FormatTemplate()}, dry_run=dry_run).validated()
     return _commit_templates(services, env, update, message, principal, if_match, idempotency_key)
 
 

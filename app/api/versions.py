@@ -34,10 +34,10 @@ from app.api.schemas import (
 from app.api.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
 from app.ingest import CommitResult, SpooledFile, Upload
-from app.ingest.service import bad_name
+from app.ingest.service import name_problem
 from app.model.frame import GROUND, Level
 from app.store.values import Source
-from app.upload_reader import DRAWN_LAYERS, drawn_layer
+from app.upload_reader import DRAWN_LAYERS, parse_drawn_layer
 
 router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=StrictRoute)
 
@@ -273,7 +273,7 @@ def _upload(form: UploadForm, request: Request) -> Upload:
         if name in fields:
             raise Invalid(f"{name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
         fields[name] = value
-    layer = drawn_layer(fields.pop("layer", "") or None)
+    layer = parse_drawn_layer(fields.pop("layer", "") or None)
     mode = fields.pop("mode", "") or "replace"
     if mode not in ("replace", "merge"):
         raise Invalid("mode must be replace or merge", [Problem("unknown", where="mode")])
@@ -309,7 +309,7 @@ def check_names(files: list[SpooledFile]) -> None:
         raise Invalid("there is no file: send at least one in the field 'files'", [Problem("missing", where="files")])
     seen: set[str] = set()
     for file in files:
-        problem = bad_name(file.name) or ("this name is used twice" if file.name in seen else None)
+        problem = name_problem(file.name) or ("this name is used twice" if file.name in seen else None)
         if problem:
             shown = file.name[:200]
             raise Invalid(f"the file name {shown!r} cannot be used: {problem}", [Problem(problem, shown)])

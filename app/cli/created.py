@@ -15,12 +15,12 @@ from app.model.frame import Datum
 LABEL = 2
 """Characters: words of a name up to this length distinguish siblings (``hall-a``, ``hall-b``); they are no slips."""
 
-LONG_WORD = 8
+MIN_LONG_WORD_CHARACTERS = 8
 """Characters from which a word may have two slips instead of one."""
 
 
 @contextmanager
-def ensured(
+def ensure_environment(
     client: Client,
     name: str,
     *,
@@ -48,9 +48,9 @@ def ensured(
             raise RequestFailed(
                 {"title": "No such environment", "detail": detail}, status=404, hint=refused.hint
             ) from None
-        _check_new(client, name, create, refused)
+        _check_new_name(client, name, create, refused)
         new_environment = client.post("/environments", {"name": name, "title": title, "datum": datum_values})
-        with _undone(
+        with _undo_on_error(
             lambda: _remove(client, new_environment), f"The environment {name}, created for this, could not be removed"
         ):
             yield True
@@ -59,11 +59,11 @@ def ensured(
         yield False
         return
     client.patch(path_of("environments", name), {"datum": datum_values})
-    with _undone(lambda: _take_back(client, environment), f"The new datum of {name} could not be taken back"):
+    with _undo_on_error(lambda: _undo_datum(client, environment), f"The new datum of {name} could not be taken back"):
         yield False
 
 
-def _check_new(client: Client, name: str, create: bool | None, refused: RequestFailed) -> None:
+def _check_new_name(client: Client, name: str, create: bool | None, refused: RequestFailed) -> None:
     """Raise Refused or Invalid unless an environment of this name may be created."""
     if create is False:
         raise refused
@@ -74,7 +74,7 @@ def _check_new(client: Client, name: str, create: bool | None, refused: RequestF
 
 
 @contextmanager
-def _undone(undo: Any, failure: str) -> Iterator[None]:
+def _undo_on_error(undo: Any, failure: str) -> Iterator[None]:
     """Undo the preparation if the block fails or is interrupted; report it if that fails as well."""
     try:
         yield
@@ -95,7 +95,7 @@ def _remove(client: Client, environment: Mapping[str, Any]) -> None:
         client.post(f"{place}/purge", {})
 
 
-def _take_back(client: Client, environment: Mapping[str, Any]) -> None:
+def _undo_datum(client: Client, environment: Mapping[str, Any]) -> None:
     """Return to the version before the datum was set, unless another client has made a version since."""
     place = path_of("environments", environment["name"])
     if client.get(place)["version"] == environment["version"] + 1:
@@ -119,11 +119,11 @@ def _is_slip(words: list[str], others: list[str]) -> bool:
     if len(words) != len(others) or words == others:
         return "".join(words) == "".join(others)
     pairs = [(a, b) for a, b in zip(words, others, strict=True) if a != b]
-    return all(max(len(a), len(b)) > LABEL and not (a + b).isdigit() and _is_near(a, b) for a, b in pairs)
+    return all(max(len(a), len(b)) > LABEL and not (a + b).isdigit() and _is_similar(a, b) for a, b in pairs)
 
 
-def _is_near(a: str, b: str) -> bool:
-    return _slips(a, b) <= (1 if max(len(a), len(b)) < LONG_WORD else 2)
+def _is_similar(a: str, b: str) -> bool:
+    return _slips(a, b) <= (1 if max(len(a), len(b)) < MIN_LONG_WORD_CHARACTERS else 2)
 
 
 def _slips(a: str, b: str) -> int:

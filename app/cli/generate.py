@@ -10,7 +10,7 @@ import typer
 
 from app.cli import completion, local, options, output, output_files
 from app.cli.client import Client, path_of
-from app.cli.created import ensured
+from app.cli.created import ensure_environment
 from app.cli.folder import check_name, environment_name
 from app.cli.maps import show_parameters, show_report
 from app.cli.versions import show_made
@@ -86,7 +86,7 @@ def generate(
         with (
             Client(server, token) as client,
             output.progress_bar(f"generating {site}"),
-            ensured(client, name, datum=place, create=create if environment else True),
+            ensure_environment(client, name, datum=place, create=create if environment else True),
         ):
             result = client.post(path_of("environments", name, "generations"), body, repeat=True)
         show_made(name, result, as_json=as_json)
@@ -162,7 +162,7 @@ def _write(
 ) -> None:
     local.require_server_python("generate --to")
     from app import formats, generate, parameters
-    from app.convert.files import written
+    from app.convert.files import write_layers
     from app.derive import DerivationNotes
     from app.model.layers import Layers
     from app.store.values import Provenance
@@ -181,7 +181,7 @@ def _write(
         layers = generate.run(site, seed, generator_values, Layers(datum=datum), notes)
         how = generate.step(site, seed, generator_values, {}, layers.datum if datum is None else None)
         came = Provenance("generated", steps=(how,))
-        result = written(layers, to, {n: v for n, v in values.items() if n not in ours}, came)
+        result = write_layers(layers, to, {n: v for n, v in values.items() if n not in ours}, came)
     report: dict[str, Any] = {**result.report}
     report["warnings"] = [w.as_dict() for w in notes.warnings] + report["warnings"]
     report["dropped"] = notes.dropped + report["dropped"]

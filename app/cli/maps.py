@@ -12,7 +12,7 @@ from app.cli import completion, local, options, output, output_files
 from app.cli import folder as folders
 from app.cli.client import Client, Download, LocalFile, path_of
 from app.cli.companions import with_companions
-from app.cli.created import ensured
+from app.cli.created import ensure_environment
 from app.cli.versions import change_line, channel_rows
 from app.errors import Invalid, NotFound
 from app.model.frame import GROUND
@@ -69,7 +69,7 @@ def import_maps(
     fields |= {"dry_run": "true"} if dry_run else {}
     with Client(server, token) as client:
         title = paths[0].resolve().name if len(paths) == 1 and paths[0].is_dir() else None
-        with ensured(
+        with ensure_environment(
             client,
             name,
             datum=new_datum,
@@ -189,7 +189,7 @@ def convert(
     from app import formats, parameters
     from app.convert.files import offline
     from app.derive import all_derivations, takes
-    from app.upload_reader import UploadHints, drawn_layer
+    from app.upload_reader import UploadHints, parse_drawn_layer
 
     if out == "-" and as_json:
         raise typer.BadParameter("--json and -o - both want standard output")
@@ -199,7 +199,9 @@ def convert(
     values = options.pairs(option)
     files, _, notes = _collect(paths)
     files = with_companions(files)
-    hints = UploadHints(format, drawn_layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
+    hints = UploadHints(
+        format, parse_drawn_layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours}
+    )
     format_options = {k: v for k, v in values.items() if k in ours}
     with output.progress_bar(f"converting to {to}"):
         data = {f.name: f.path.read_bytes() for f in files}

@@ -74,9 +74,9 @@ def serve(*, demo: bool = False, **values: Any) -> None:
         settings = with_demo_token(settings)
     listener = listen(settings.host, settings.port)
     if settings.workers == 1:
-        from app.pool import start_beside
+        from app.pool import preload_in_background
 
-        start_beside()
+        preload_in_background()
     gc.disable()  # until the application is made: what is loaded by then stays
     try:
         address = address_of(listener, secure=settings.tls_certificate is not None)

@@ -120,11 +120,11 @@ def _repair(
     store: Store, findings: list[Finding], donors: list[Donor], settings: Settings
 ) -> dict[tuple[str, str], str]:
     from app.ingest.repair import repair
-    from app.main import allowed
+    from app.main import sandbox_policy
     from app.pool import Pool
 
     seconds, memory = settings.max_seconds, settings.max_memory_bytes
-    pool = Pool(1, memory_bytes=memory, seconds=seconds, allowed=allowed(settings))
+    pool = Pool(1, memory_bytes=memory, seconds=seconds, allowed=sandbox_policy(settings))
     try:
         with output.progress_bar("repairing"):
             return repair(store, findings, donors, pool.run, settings.limits)

@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 FRESH_SECONDS = 60.0
 """A map is marked as used at most this often: its age decides what goes when room is needed."""
 
-SPARE_BYTES = 64 * 2**20
+MAX_MEMORY_BYTES = 64 * 2**20
 """Room in memory for maps that the disk refused; the newest stays, whatever its size."""
 
 MAX_CHECKED = 100_000
@@ -73,16 +73,16 @@ class CachedFile:
         try:
             data = self.path.read_bytes()
         except OSError as error:
-            raise self.lost(error) from error
+            raise self.lost_error(error) from error
         self.check(hashlib.sha256(data).hexdigest())
         return data
 
     def check(self, sha256: str) -> None:
         """LostMap unless this is the content's hash."""
         if sha256 != self.sha256:
-            raise self.lost(None)
+            raise self.lost_error(None)
 
-    def lost(self, error: OSError | None) -> LostMap:
+    def lost_error(self, error: OSError | None) -> LostMap:
         """The error for content that cannot be read (or has another hash), which is reported as damage."""
         if error is None:
             self.on_damage(f"{self.name!r} does not match its hash")
@@ -103,13 +103,13 @@ class CachedMap:
     @property
     def size(self) -> int:
         """Bytes of all its files."""
-        return sum(file.size for file in self.every())
+        return sum(file.size for file in self.all_files())
 
-    def every(self) -> tuple[CachedFile, ...]:
+    def all_files(self) -> tuple[CachedFile, ...]:
         """All files, and the archive of them."""
         return (*self.files, *([self.archive] if self.archive else []))
 
-    def whole(self) -> CachedFile:
+    def single_file(self) -> CachedFile:
         """The file itself where the map is one file, else the zip of all."""
         return self.archive or self.files[0]
 
@@ -131,7 +131,7 @@ class ConvertedMap:
     places: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 
-ABANDONED_SECONDS = 3600.0
+STALE_AFTER_SECONDS = 3600.0
 """A map in the making that nobody touched for so long was left by a killed process."""
 
 
@@ -146,7 +146,7 @@ class Cache:
         self._locks: dict[str, threading.Lock] = {}
         self._guard = threading.Lock()
         self._checked: OrderedDict[str, tuple[int, int, int]] = OrderedDict()
-        self._spare: OrderedDict[str, CachedMap] = OrderedDict()
+        self._in_memory: OrderedDict[str, CachedMap] = OrderedDict()
         self._syncing: ThreadPoolExecutor | None = None
         self.hits = self.misses = self.damaged = 0
         self.on_damage: Callable[[], None] = lambda: None
@@ -157,19 +157,19 @@ class Cache:
             self._note_problem(system_reason(error))
         for old in folder.glob("making-*"):
             with contextlib.suppress(OSError):
-                if time.time() - old.stat().st_mtime > ABANDONED_SECONDS:
+                if time.time() - old.stat().st_mtime > STALE_AFTER_SECONDS:
                     shutil.rmtree(old, ignore_errors=True)
         self._total = sum(size for _, size, _ in self._entries())
 
     def get(self, key: str) -> CachedMap | None:
         """The map, if it is made and intact."""
-        cached_map = self._stored(key)
+        cached_map = self._read_checked(key)
         if cached_map is not None:
             return cached_map
         with self._guard:
-            return self._spare.get(key)
+            return self._in_memory.get(key)
 
-    def _stored(self, key: str) -> CachedMap | None:
+    def _read_checked(self, key: str) -> CachedMap | None:
         """The entry on disk, hashed when this process first meets it; a bad one is removed."""
         entry = self._read_entry(key)
         if entry is None:
@@ -182,7 +182,7 @@ class Cache:
                 _check_files(cached_map)
             except LostMap:
                 return None
-            self._note_checked(key, stamp)
+            self._mark_checked(key, stamp)
         with contextlib.suppress(OSError):
             folder = self._path(key)
             if time.time() - folder.stat().st_mtime > FRESH_SECONDS:
@@ -208,13 +208,13 @@ class Cache:
             self.discard(key, None if earlier else "map.json does not match its hash")
             return None
         damaged = partial(self.discard, key)
-        files = tuple(_described(folder, f, damaged) for f in described["files"])
-        archive = _described(folder, described["archive"], damaged) if described["archive"] else None
+        files = tuple(_file_from_entry(folder, f, damaged) for f in described["files"])
+        archive = _file_from_entry(folder, described["archive"], damaged) if described["archive"] else None
         cached_map = CachedMap(files, archive, described["report"])
-        times = [status.st_mtime_ns, *(_written(file) for file in cached_map.every())]
+        times = [status.st_mtime_ns, *(_write_file(file) for file in cached_map.all_files())]
         return cached_map, (status.st_ino, min(times), max(times))
 
-    def _note_checked(self, key: str, stamp: tuple[int, int, int]) -> None:
+    def _mark_checked(self, key: str, stamp: tuple[int, int, int]) -> None:
         with self._guard:
             self._checked[key] = stamp
             while len(self._checked) > MAX_CHECKED:
@@ -252,8 +252,8 @@ class Cache:
             _check_files(cached_map)
         except LostMap:
             return 0, self.damaged == before
-        self._note_checked(key, stamp)
-        return sum(f.size for f in cached_map.every()), True
+        self._mark_checked(key, stamp)
+        return sum(f.size for f in cached_map.all_files()), True
 
     def sample(self, share: float) -> Iterator[tuple[str, int, bool]]:
         """Hash some of the entries, chosen at random: (key, bytes, whether it was intact)."""
@@ -267,7 +267,7 @@ class Cache:
         if cached_map is not None:
             self.hits += 1
             return cached_map
-        with self._only(key):
+        with self._key_lock(key):
             cached_map = self.get(key)
             if cached_map is not None:
                 self.hits += 1
@@ -276,7 +276,7 @@ class Cache:
             return replace(self._store(key, maker()), fresh=True)
 
     @contextlib.contextmanager
-    def holding(self) -> Iterator[Callable[[CachedMap], CachedMap]]:
+    def hold_files(self) -> Iterator[Callable[[CachedMap], CachedMap]]:
         """A function that keeps a made map's files until the block ends, whatever room the cache needs meanwhile.
 
         It raises LostMap where they are gone already.
@@ -304,7 +304,7 @@ class Cache:
                         _link(file.path, folder / str(count))
                         files.append(replace(file, path=folder / str(count)))
                     except FileNotFoundError as error:
-                        raise file.lost(error) from error
+                        raise file.lost_error(error) from error
                     except OSError:  # no room for a name
                         files.append(replace(file, path=None, data=file.read()))
             return replace(cached_map, files=tuple(files), archive=None)
@@ -320,15 +320,15 @@ class Cache:
             cached_map = self._write(key, product)
         except OSError as error:
             self._note_problem(system_reason(error))
-            return self._keep_spare(key, product)
+            return self._keep_in_memory(key, product)
         self._note_problem(None)
         if cached_map is None:
-            return self._keep_spare(key, product)
-        for file in cached_map.every():
+            return self._keep_in_memory(key, product)
+        for file in cached_map.all_files():
             self._note_hash(file)
-        self._total += sum(f.size for f in cached_map.every())
+        self._total += sum(f.size for f in cached_map.all_files())
         if self._total > self._limit:
-            self._make_room()
+            self._evict()
         return cached_map
 
     def _write(self, key: str, product: ConvertedMap) -> CachedMap | None:
@@ -349,7 +349,7 @@ class Cache:
             try:
                 making.rename(target)
             except OSError:  # another host on the same disk may have been first: equal bytes
-                first = self._stored(key)  # a damaged one is removed by this
+                first = self._read_checked(key)  # a damaged one is removed by this
                 if first is not None:
                     return first
                 self._remove(target)  # what was left of an entry
@@ -360,7 +360,7 @@ class Cache:
         if entry is None:  # another process needed the room, or it does not match its hash, which is reported
             return None
         cached_map, stamp = entry
-        self._note_checked(key, stamp)  # the hashes are of the bytes as they were made, not as the disk has them
+        self._mark_checked(key, stamp)  # the hashes are of the bytes as they were made, not as the disk has them
         self._sync_later(key)
         return cached_map
 
@@ -381,7 +381,7 @@ class Cache:
             if error.errno in BROKEN_STORAGE_ERRNOS | DISK_FULL_ERRNOS:
                 self.discard(key, f"it could not be written: {system_reason(error)}")
 
-    def _keep_spare(self, key: str, product: ConvertedMap) -> CachedMap:
+    def _keep_in_memory(self, key: str, product: ConvertedMap) -> CachedMap:
         """The map in memory."""
 
         def described(name: str, content: bytes | CachedFile, media_type: str) -> CachedFile:
@@ -393,9 +393,9 @@ class Cache:
         archive = described(*product.archive, "application/zip") if product.archive else None
         cached_map = CachedMap(files, archive, product.report)
         with self._guard:
-            self._spare[key] = cached_map
-            while len(self._spare) > 1 and sum(m.size for m in self._spare.values()) > SPARE_BYTES:
-                self._spare.popitem(last=False)
+            self._in_memory[key] = cached_map
+            while len(self._in_memory) > 1 and sum(m.size for m in self._in_memory.values()) > MAX_MEMORY_BYTES:
+                self._in_memory.popitem(last=False)
         return cached_map
 
     def _note_problem(self, reason: str | None) -> None:
@@ -408,9 +408,9 @@ class Cache:
         self.problem = reason
         if reason is None:
             with self._guard:
-                self._spare.clear()
+                self._in_memory.clear()
 
-    def by_hash(self, sha256: str, max_bytes: int) -> bytes | None:
+    def find_by_hash(self, sha256: str, max_bytes: int) -> bytes | None:
         """The content of a made file that is still here, by its SHA-256; None where it is gone or larger."""
         try:
             path = self._folder / self._hash_path(sha256).read_text()
@@ -434,20 +434,20 @@ class Cache:
     def _hash_path(self, sha256: str) -> Path:
         return self._folder / "hashes" / sha256[:2] / sha256
 
-    def _make_room(self) -> None:
+    def _evict(self) -> None:
         """Called when there is too much; other processes may be doing the same, which does no harm."""
         entries = sorted(self._entries())
         total = sum(size for _, size, _ in entries)
         for _, size, folder in entries[:-1]:  # the newest stays, whatever its size
             if total <= self._limit:
                 break
-            for line in self._described_hashes(folder):
+            for line in self._hashes_of_folder(folder):
                 self._hash_path(line).unlink(missing_ok=True)
             self._remove(folder)
             total -= size
         self._total = total
 
-    def _described_hashes(self, folder: Path) -> list[str]:
+    def _hashes_of_folder(self, folder: Path) -> list[str]:
         """The hashes that lead to this folder."""
         try:
             described = orjson.loads((folder / "map.json").read_bytes().partition(b"\n")[2])
@@ -466,7 +466,7 @@ class Cache:
         return out
 
     @contextlib.contextmanager
-    def _only(self, key: str) -> Iterator[None]:
+    def _key_lock(self, key: str) -> Iterator[None]:
         """One caller at a time for a key, among threads and processes."""
         with self._guard:
             lock = self._locks.setdefault(key, threading.Lock())
@@ -492,7 +492,7 @@ def _write(folder: Path, stored: str, name: str, data: bytes | CachedFile, media
         try:
             _link(data.path, target)
         except FileNotFoundError as error:
-            raise data.lost(error) from error
+            raise data.lost_error(error) from error
         digest, size = _hash(target), target.stat().st_size
         data.check(digest)
     else:
@@ -512,7 +512,7 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _written(file: CachedFile) -> int:
+def _write_file(file: CachedFile) -> int:
     try:
         return 0 if file.path is None else file.path.stat().st_mtime_ns
     except OSError:
@@ -526,16 +526,16 @@ def _hash(path: Path) -> str:
 
 def _check_files(cached_map: CachedMap) -> None:
     """LostMap unless all files of an entry match their hashes; what is wrong is reported as damage."""
-    for file in cached_map.every():
+    for file in cached_map.all_files():
         assert file.path is not None
         try:
             digest = _hash(file.path)
         except FileNotFoundError as error:
             if (file.path.parent / "map.json").exists():  # else the whole entry was removed meanwhile
                 file.on_damage(f"{file.name!r} is missing")
-            raise file.lost(error) from error
+            raise file.lost_error(error) from error
         except OSError as error:
-            raise file.lost(error) from error
+            raise file.lost_error(error) from error
         file.check(digest)
 
 
@@ -548,7 +548,7 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def _described(folder: Path, f: dict[str, Any], on_damage: Callable[[str], None]) -> CachedFile:
+def _file_from_entry(folder: Path, f: dict[str, Any], on_damage: Callable[[str], None]) -> CachedFile:
     level, name = f.get("place") or (None, None)
     place = None if level is None or name is None else (level, name)
     path = folder / f["stored"]

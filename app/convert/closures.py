@@ -50,7 +50,7 @@ MAX_LISTED = 100
 # --- versions with closures ---
 
 
-def with_areas(version: Version) -> Version:
+def add_areas(version: Version) -> Version:
     """Add the closed areas to a version's parts, as one part of the layer zones for each level."""
     if version.closures is None or not version.closures.items or any(map(_is_area_part, version.parts)):
         return version
@@ -58,7 +58,7 @@ def with_areas(version: Version) -> Version:
     return replace(version, parts=tuple(sorted((*version.parts, *entries), key=lambda e: e.key)))
 
 
-def without_areas(version: Version) -> Version:
+def drop_areas(version: Version) -> Version:
     """Take them out again: the version as it is stored."""
     return replace(version, parts=tuple(entry for entry in version.parts if not _is_area_part(entry)))
 
@@ -68,10 +68,10 @@ def load(store: Store, version: Version, keys: Collection[PartKey]) -> Layers:
     areas = {} if version.closures is None else {k: closed for k, closed in _areas(version).items() if k in keys}
     loaded = store.load(version, [key for key in keys if key not in areas])
     parts: dict[PartKey, Part] = {**loaded.parts, **{key: _zones(closed) for key, closed in areas.items()}}
-    return without_timed_marks(replace(loaded, parts=parts), areas)
+    return drop_timed_marks(replace(loaded, parts=parts), areas)
 
 
-def without_timed_marks(layers: Layers, areas: Collection[PartKey] = ()) -> Layers:
+def drop_timed_marks(layers: Layers, areas: Collection[PartKey] = ()) -> Layers:
     """Drop what is blocked until a time in the layers themselves: closures alone say what is blocked for a time.
 
     Releases before closures put such marks into versions, and maps with closures in them may be uploaded again. areas:
@@ -80,13 +80,13 @@ def without_timed_marks(layers: Layers, areas: Collection[PartKey] = ()) -> Laye
     return replace(
         layers,
         parts={
-            key: _without_timed_marks(part) if isinstance(part, Features) and key not in areas else part
+            key: _drop_timed_marks(part) if isinstance(part, Features) and key not in areas else part
             for key, part in layers.parts.items()
         },
     )
 
 
-def _without_timed_marks(part: Features) -> Features:
+def _drop_timed_marks(part: Features) -> Features:
     timed = [UNTIL in p or ("overlay" in p and "expires" in p) for p in part.properties]
     if not any(timed):
         return part
@@ -133,9 +133,9 @@ def place_problem(closure: Closure, version: Version) -> str | None:
 
 # --- areas ---
 
-_placed: OrderedDict[tuple[str, Any, Any], list[Closure]] = OrderedDict()
+_placed_cache: OrderedDict[tuple[str, Any, Any], list[Closure]] = OrderedDict()
 _placed_lock = threading.Lock()
-MAX_PLACED = 64
+MAX_CACHED_PLACES = 64
 
 
 def _areas(version: Version) -> dict[PartKey, list[Closure]]:
@@ -145,13 +145,13 @@ def _areas(version: Version) -> dict[PartKey, list[Closure]]:
         return {}
     cache_key = (closures.digest, version.levels, version.datum)
     with _placed_lock:
-        chosen = _placed.get(cache_key)
+        chosen = _placed_cache.get(cache_key)
     if chosen is None:
         chosen = [c for c in closures.items if c.polygon is not None and place_problem(c, version) is None]
         with _placed_lock:
-            _placed[cache_key] = chosen
-            while len(_placed) > MAX_PLACED:
-                _placed.popitem(last=False)
+            _placed_cache[cache_key] = chosen
+            while len(_placed_cache) > MAX_CACHED_PLACES:
+                _placed_cache.popitem(last=False)
     taken = {entry.key for entry in version.parts if not _is_area_part(entry)}
     out: dict[PartKey, list[Closure]] = {}
     for closure in chosen:
@@ -208,12 +208,12 @@ def _frame(datum: Datum | None) -> LocalFrame | None:
 class ClosureReport:
     """What closures did to one map.
 
-    lines: one for each closure with an effect. left_out: number of edges that were taken out. kept: number of blocked
+    lines: one for each closure with an effect. omitted: number of edges that were taken out. kept: number of blocked
     edges that stay in a format that cannot express it. emptied: whether no edge would have been left.
     """
 
     lines: list[dict[str, Any]] = field(default_factory=list)
-    left_out: int = 0
+    omitted: int = 0
     kept: int = 0
     emptied: bool = False
 
@@ -292,7 +292,7 @@ def report_lines(version: Version, stored: Iterable[Mapping[str, Any]]) -> list[
     return out
 
 
-def merged_lines(reports: Iterable[Iterable[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+def merge_report_lines(reports: Iterable[Iterable[Mapping[str, Any]]]) -> list[dict[str, Any]]:
     """Join the lines of several maps' reports: one line for each closure, with all its effects and edges."""
     out: dict[str, dict[str, Any]] = {}
     for one in (one for report in reports for one in report):
@@ -321,14 +321,14 @@ def _close_edges(
 ) -> Features:
     """A network without its closed edges, or with a mark on them."""
     until: dict[int, str] = {}
-    for closure, places in _closed(key, part, items, frame):
+    for closure, places in _find_closed_edges(key, part, items, frame):
         for k in places:
             until[k] = max(until.get(k, ""), closure.expires)
         effects[closure.id].edges += [part.ids[k] for k in places]
     if not mark:
         blocked = np.array([_is_blocked(p) for p in part.properties], bool)
         blocked[list(until)] = True
-        report.left_out += int(blocked.sum())
+        report.omitted += int(blocked.sum())
         left = part.take(~blocked) if blocked.any() else part
         report.emptied |= bool(blocked.any()) and not any(p.get("kind") == "edge" for p in left.properties)
         return left
@@ -344,7 +344,7 @@ def _close_edges(
     return replace(part, properties=tuple(properties))
 
 
-def _closed(
+def _find_closed_edges(
     key: PartKey, part: Features, items: Sequence[Closure], frame: LocalFrame | None
 ) -> Iterator[tuple[Closure, list[int]]]:
     """Closures of a network with the positions of the edges that each closes: by id, or by crossing its area."""
@@ -363,7 +363,7 @@ def _closed(
         tree = shapely.STRtree(part.take(places).in_local(frame))
         for closure in areas:
             try:
-                area = _in_metres(closure, frame)
+                area = _area_in_metres(closure, frame)
             except FleetMapError:
                 continue  # without a place here, which the report says
             hit = np.sort(tree.query(area, predicate="intersects"))
@@ -371,7 +371,7 @@ def _closed(
                 yield closure, places[hit].tolist()
 
 
-def _in_metres(closure: Closure, frame: LocalFrame | None) -> Any:
+def _area_in_metres(closure: Closure, frame: LocalFrame | None) -> Any:
     """A closed area in local metres. Raises MissingDatum."""
     return _zones([closure]).in_local(frame)[0]
 
@@ -394,7 +394,7 @@ def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | Non
     shapes = []
     for area in areas:
         try:
-            shapes.append(shapely.affinity.affine_transform(_in_metres(area, frame), [*to_cells, *shift]))
+            shapes.append(shapely.affinity.affine_transform(_area_in_metres(area, frame), [*to_cells, *shift]))
         except FleetMapError:
             continue  # without a place here, which the report says
     if not shapes:

@@ -43,7 +43,7 @@ def offline(
 
     options: the wanted format's own, and the parameters of derivations on the way.
 
-    Raises what reading and planning raise; see ``app.upload_reader.read`` and ``app.convert.recipe.chain``.
+    Raises what reading and planning raise; see ``app.upload_reader.read`` and ``app.convert.recipe.plan_chain``.
     """
     return _offline(lambda: files, to, hints or UploadHints(), datum, options or {}, limits or Limits(), derived)
 
@@ -60,19 +60,19 @@ def _offline(
     """``offline`` of files that are loaded when they are read, and not held while the map is made."""
     fmt = formats.get_format(to)
     option_values = dict(options)
-    recipes.own_options(fmt, option_values)
+    recipes.writer_options(fmt, option_values)
     needed: frozenset[Layer] = fmt.carries | fmt.needs.also.union(*fmt.needs.one_of)
     if "topology" in fmt.carries:
         needed |= {"occupancy"}  # edges may lead through what it shows
     required_layers = None if "objects" in needed else needed  # whatever can be read can be an object
-    if site.asks_for_all(fmt, option_values):
+    if site.selects_all(fmt, option_values):
         required_layers = None  # further parts may be derived from any layer
     cells = bool(option_values) or not fmt.outlines  # an option may ask for the images, too
     complete = required_layers is None and cells
     knowing = EnvironmentContext(datum, None, required_layers, cells, fmt.drawing or fmt.holds)
     upload_bundle = upload_reader.read(upload_reader.unpack(load(), limits), hints, knowing, limits)
     try:
-        written = _made(fmt, upload_bundle, datum, option_values, derived=derived and complete)
+        written = _convert_layers(fmt, upload_bundle, datum, option_values, derived=derived and complete)
     except (CannotConvert, Invalid, NotFound):
         if complete:
             raise
@@ -80,14 +80,14 @@ def _offline(
         upload_bundle = upload_reader.read(
             upload_reader.unpack(load(), limits), hints, replace(knowing, wanted=None, cells=True), limits
         )
-        written = _made(fmt, upload_bundle, datum, option_values, derived=derived)
-    filled = making.labelled(written.report["template"], dict.fromkeys(option_values, REQUEST))
+        written = _convert_layers(fmt, upload_bundle, datum, option_values, derived=derived)
+    filled = making.with_value_origin(written.report["template"], dict.fromkeys(option_values, REQUEST))
     report = {**written.report, "template": filled}
     report |= {"warnings": [p.as_dict() for p in upload_bundle.warnings] + written.report["warnings"]}
     return Converted(written.files, report, upload_bundle.warnings)
 
 
-def _made(
+def _convert_layers(
     fmt: Format,
     upload_bundle: upload_reader.Bundle,
     datum: Datum | None,
@@ -100,17 +100,17 @@ def _made(
     return making.from_layers(fmt, layers, option_values, derived=derived, origin=upload_bundle.origin, credit=credit)
 
 
-def written(layers: Layers, to: str, options: Mapping[str, str], came: Provenance) -> Converted:
+def write_layers(layers: Layers, to: str, options: Mapping[str, str], came: Provenance) -> Converted:
     """Layers -> files: what the wanted format lacks is derived.
 
     options: the format's, and those of derivations on the way. came: how the layers came, for the report.
     """
     fmt = formats.get_format(to)
-    recipes.own_options(fmt, options)
+    recipes.writer_options(fmt, options)
     entries = {key: PartEntry(key, "", 1, {}, came) for key in layers.parts}
     written_map = making.from_layers(fmt, layers, options, derived=True, entries=entries)
-    left = making.not_carried(fmt, None, layers)
-    filled = making.labelled(written_map.report["template"], dict.fromkeys(options, REQUEST))
+    left = making.unsupported_layers(fmt, None, layers)
+    filled = making.with_value_origin(written_map.report["template"], dict.fromkeys(options, REQUEST))
     return Converted(
         written_map.files, {**written_map.report, "template": filled, "dropped": written_map.report["dropped"] + left}
     )

@@ -49,13 +49,13 @@ Run = Callable[..., Any]
 """``run(function, *args, stop=…)``: call a module-level function somewhere safe, return its result (``Pool.run``)."""
 
 
-HOLD_ATTEMPTS = 5
+MAX_HOLD_ATTEMPTS = 5
 """How often a map that left the cache at once is made again, before there is no room for it."""
 
 FAILURE_SECONDS = 60.0
 """How long an optional map that could not be made is not tried again."""
 
-REMEMBERED = 1000
+MAX_CACHED_RESULTS = 1000
 """Of how many maps it is remembered why they could not be made, or which edges lead through obstacles."""
 
 
@@ -77,7 +77,7 @@ class Maps:
         self._run_trial = run_trial or run
         self.cache = Cache(cache_dir, cache_bytes)
         self._trials = Trials(cache_dir / "trials")
-        self._crossed: dict[Any, list[Problem]] = {}
+        self._crossings_cache: dict[Any, list[Problem]] = {}
         self._failures: OrderedDict[str, tuple[float, FleetMapError]] = OrderedDict()
         self._guard = threading.Lock()
 
@@ -97,7 +97,7 @@ class Maps:
         wanted; its name may say more (``keepout.yaml`` is the grid keepout, ``L2/map.yaml`` the one of the level L2).
         listed: as in a manifest: files are named as those of the whole site, and no zip of them is made.
         """
-        version = applied_closures.with_areas(version)
+        version = applied_closures.add_areas(version)
         fmt = formats.get_format(name)
         values = values or {}
         filled = templates.resolve(version.templates, fmt)
@@ -111,16 +111,18 @@ class Maps:
                     recipe = site.file_recipe(version, fmt, option_values, file, derived=derive, without=without)
                     if recipe is not None:
                         return recipe
-                elif listed or site.asks_for_all(fmt, values):
+                elif listed or site.selects_all(fmt, values):
                     option_values = {**filled.values, **values}
                     return site.recipe(version, fmt, option_values, derived=derive, without=without, archive=not listed)
-            option_values = {**filled.values, **hints, **site.one_of(fmt, values)}
+            option_values = {**filled.values, **hints, **site.single_part_options(fmt, values)}
             return recipes.recipe(version, name, option_values, derived=derive, without=without)
 
         origin = {**filled.origin, **dict.fromkeys({**hints, **values}, templates.REQUEST)}
-        return self._planned(version, plan, origin)
+        return self._plan_working_recipe(version, plan, origin)
 
-    def _planned(self, version: Version, plan: Callable[[frozenset[str]], Recipe], origin: Mapping[str, str]) -> Recipe:
+    def _plan_working_recipe(
+        self, version: Version, plan: Callable[[frozenset[str]], Recipe], origin: Mapping[str, str]
+    ) -> Recipe:
         """The cheapest recipe whose derivations are not known to fail. plan: a recipe without these derivations."""
         without: frozenset[str] = frozenset()
         failed: list[ChainFailure] = []
@@ -128,14 +130,14 @@ class Maps:
             try:
                 recipe = plan(without)
             except MissingLayer as error:
-                raise recipes.exhausted(error, failed) from error
-            tried = self._hindered(version, recipe)
+                raise recipes.no_chain_error(error, failed) from error
+            tried = self._known_failure(version, recipe)
             if tried is None:
                 return replace(_with_origin(recipe, origin), failed=tuple(failed))
             without |= {tried.step}
             failed.append(tried)
 
-    def _hindered(self, version: Version, recipe: Recipe) -> ChainFailure | None:
+    def _known_failure(self, version: Version, recipe: Recipe) -> ChainFailure | None:
         """The step that is known to fail on this content. A map that may be empty is planned all the same."""
         for one in [recipe, *(member.recipe for member in recipe.members)]:
             if one.members or not one.steps or (one.spread is not None and one.spread.optional):
@@ -146,19 +148,19 @@ class Maps:
                     return tried
         return None
 
-    def ready(self, recipe: Recipe) -> CachedMap | None:
+    def get_cached(self, recipe: Recipe) -> CachedMap | None:
         """The map, only if it is made already."""
         return self.cache.get(recipe.key)
 
-    def make(self, recipe: Recipe, stop: CancelHandle | None = None) -> CachedMap:
+    def get_or_convert(self, recipe: Recipe, stop: CancelHandle | None = None) -> CachedMap:
         """The map; blocks until it is made. stop: ends the making from another thread, with Cancelled.
 
         CannotDerive where a step finds nothing to use: then ``recipe`` gives another way, if there is one.
         """
         try:
             if recipe.members:
-                return self.ready(recipe) or self._put_together(recipe, stop)
-            return self.cache.get_or_make(recipe.key, lambda: self._made(recipe, stop))
+                return self.get_cached(recipe) or self._assemble(recipe, stop)
+            return self.cache.get_or_make(recipe.key, lambda: self._run_conversion(recipe, stop))
         except CannotDerive as error:
             if not recipe.members:  # else it is the member's
                 failure = ChainFailure(error.step, error.detail, error.choose)
@@ -179,22 +181,24 @@ class Maps:
         with self._guard:
             self._failures[key] = (time.monotonic(), error)
             self._failures.move_to_end(key)
-            while len(self._failures) > REMEMBERED:
+            while len(self._failures) > MAX_CACHED_RESULTS:
                 self._failures.popitem(last=False)
 
-    def _put_together(self, recipe: Recipe, stop: CancelHandle | None) -> CachedMap:
+    def _assemble(self, recipe: Recipe, stop: CancelHandle | None) -> CachedMap:
         """A map of several: each is made by itself. Those that are there already stay while the others are made."""
-        for _ in range(HOLD_ATTEMPTS):
+        for _ in range(MAX_HOLD_ATTEMPTS):
             # A member whose file turns out to be damaged leaves the cache, and is made again.
-            with contextlib.suppress(LostMap), self.cache.holding() as hold:
-                cached_maps = [self._held(member.recipe, hold, stop) for member in recipe.members]
-                return self.cache.get_or_make(recipe.key, partial(joined, recipe, cached_maps))
+            with contextlib.suppress(LostMap), self.cache.hold_files() as hold:
+                cached_maps = [self._convert_and_hold(member.recipe, hold, stop) for member in recipe.members]
+                return self.cache.get_or_make(recipe.key, partial(join_members, recipe, cached_maps))
         raise Unavailable("cached maps are damaged repeatedly: check the disk of the cache")
 
-    def _held(self, recipe: Recipe, hold: Callable[[CachedMap], CachedMap], stop: CancelHandle | None) -> CachedMap:
-        for _ in range(HOLD_ATTEMPTS):
+    def _convert_and_hold(
+        self, recipe: Recipe, hold: Callable[[CachedMap], CachedMap], stop: CancelHandle | None
+    ) -> CachedMap:
+        for _ in range(MAX_HOLD_ATTEMPTS):
             with contextlib.suppress(LostMap):  # the cache needed the room in this very moment
-                return hold(self.make(recipe, stop))
+                return hold(self.get_or_convert(recipe, stop))
         raise Unavailable("the cache of maps is too small for what is made at once: try again, or enlarge it")
 
     def fetch(
@@ -208,11 +212,11 @@ class Maps:
     ) -> CachedFile:
         """The map's wanted file, or the zip of all; blocks until it is made.
 
-        Raises what ``recipe`` and ``make`` do; NotFound where the map has no such file.
+        Raises what ``recipe`` and ``get_or_convert`` do; NotFound where the map has no such file.
         """
-        return file_of(*self._by_any_chain(version, name, values, derive=derive, file=file), file)
+        return select_file(*self._convert_by_any_chain(version, name, values, derive=derive, file=file), file)
 
-    def at_once(
+    def get_blocking(
         self,
         version: Version,
         name: str,
@@ -221,27 +225,28 @@ class Maps:
         derive: bool = True,
         file: str | None = None,
     ) -> CachedMap:
-        """The map, by whichever way works; blocks until it is made. Raises what ``recipe`` and ``make`` do."""
-        return self._by_any_chain(version, name, values, derive=derive, file=file)[1]
+        """The map, by whichever way works; blocks until it is made. Raises what ``recipe`` and ``get_or_convert``
+        do."""
+        return self._convert_by_any_chain(version, name, values, derive=derive, file=file)[1]
 
-    def _by_any_chain(
+    def _convert_by_any_chain(
         self, version: Version, name: str, values: Mapping[str, str] | None, *, derive: bool, file: str | None
     ) -> tuple[Recipe, CachedMap]:
         """The first recipe whose derivations find something to use, and its map."""
         while True:
             recipe = self.recipe(version, name, values, derive=derive, file=file)
             try:
-                return recipe, self.ready(recipe) or self.make(recipe)
+                return recipe, self.get_cached(recipe) or self.get_or_convert(recipe)
             except CannotDerive:
                 continue  # it is remembered: the next recipe goes another way, or says that there is none
 
     def report(self, recipe: Recipe) -> dict[str, Any]:
         """The report for this version: what was raw, derived, filled in and dropped."""
         if recipe.members:
-            clashes = {**making.empty_report(recipe.format), "dropped": self.make(recipe).report["dropped"]}
+            clashes = {**making.empty_report(recipe.format), "dropped": self.get_or_convert(recipe).report["dropped"]}
             members = [(member.folder, self.report(member.recipe)) for member in recipe.members]
-            return site.merged_report([*members, ("", clashes)])
-        map_report = self.make(recipe).report
+            return site.merge_reports([*members, ("", clashes)])
+        map_report = self.get_or_convert(recipe).report
         entries = {(e.key.layer, e.key.level, e.key.name): e.provenance for e in recipe.version.parts}
         anew = {step.gives for step in recipe.steps}
         lines = []
@@ -258,9 +263,9 @@ class Maps:
                 }
             lines.append(line)
         stored = {e.key: e for e in recipe.version.parts}
-        dropped = map_report["dropped"] + making.not_carried(recipe.format, stored, Layers())
-        version, credit = recipe.version.number, making.credits_of(lines)
-        stored_version = applied_closures.without_areas(recipe.version)
+        dropped = map_report["dropped"] + making.unsupported_layers(recipe.format, stored, Layers())
+        version, credit = recipe.version.number, making.report_credits(lines)
+        stored_version = applied_closures.drop_areas(recipe.version)
         used = {k: why for k, why in stored_version.stale.items() if k in recipe.chain.keys}
         stale = [
             {
@@ -269,11 +274,11 @@ class Maps:
             }
             for k, why in used.items()
         ]
-        ignored = [{"problem": reason} for reason in self._ignored(recipe)]
+        ignored = [{"problem": reason} for reason in self._unused_templates(recipe)]
         warnings = [*recipes.detours(recipe.failed), *map_report["warnings"], *stale, *ignored]
         texts = {line["problem"] for line in warnings}
         warnings += [p.as_dict() for p in self._crossings(recipe) if p.problem not in texts]
-        filled = making.labelled(map_report["template"], recipe.origin, recipe.version.templates)
+        filled = making.with_value_origin(map_report["template"], recipe.origin, recipe.version.templates)
         more = {"layers": lines, "attribution": credit, "template": filled, "dropped": dropped, "warnings": warnings}
         closures = applied_closures.report_lines(recipe.version, map_report["closures"])
         return {**map_report, "version": version, "closures": closures, **more}
@@ -287,7 +292,7 @@ class Maps:
         beside = [(e.key, e.hash) for e in version.parts if e.key.layer in ("occupancy", "objects")]
         key = ("crossings", recipe.key, version.datum, tuple(beside))
         with self._guard:
-            problems = self._crossed.get(key)
+            problems = self._crossings_cache.get(key)
         if problems is None:
             store_location = (self._store.database_url, str(self._store.blob_dir))
             try:
@@ -295,12 +300,12 @@ class Maps:
             except (FleetMapError, WorkerDied) as error:
                 problems = [Problem(f"edges were not checked against obstacles: {error.detail}")]
             with self._guard:
-                self._crossed[key] = problems
-                while len(self._crossed) > REMEMBERED:
-                    self._crossed.pop(next(iter(self._crossed)))
+                self._crossings_cache[key] = problems
+                while len(self._crossings_cache) > MAX_CACHED_RESULTS:
+                    self._crossings_cache.pop(next(iter(self._crossings_cache)))
         return problems
 
-    def _ignored(self, recipe: Recipe) -> list[str]:
+    def _unused_templates(self, recipe: Recipe) -> list[str]:
         """What the environment's templates say and this release cannot use."""
         used = formats.all_formats().values() if recipe.format.holds else [recipe.format]
         reasons = [reason for fmt in used for reason in templates.resolve(recipe.version.templates, fmt).ignored]
@@ -317,18 +322,18 @@ class Maps:
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:
         """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""
-        available = recipes.stock(version)
+        available = recipes.available_layers(version)
         out = []
         for fmt in formats.all_formats().values():
             if fmt.write is None:
                 continue
             line: dict[str, Any] = {"format": fmt.name, "state": "missing", "chain": [], "missing": []}
             try:
-                chain, choose = self._way(version, fmt, available)
+                chain, choose = self._find_chain(version, fmt, available)
             except Ambiguous as error:  # it can be made, once the caller says which one
                 line |= {"state": "direct", "choose": error.detail}
             except FleetMapError as error:
-                line["missing"] = [*recipes.missing(fmt, available), *(p.problem for p in error.problems)]
+                line["missing"] = [*recipes.missing_layers(fmt, available), *(p.problem for p in error.problems)]
                 line["missing"] = line["missing"] or [error.detail]
             else:
                 line["state"] = "derivable" if chain.steps else "direct"
@@ -337,14 +342,14 @@ class Maps:
             out.append(line)
         return out
 
-    def parts_of(self, version: Version, name: str) -> tuple[PartKey, ...]:
+    def source_parts(self, version: Version, name: str) -> tuple[PartKey, ...]:
         """The stored parts that a format's map would be made of; empty where it cannot be made."""
         try:
-            return self._way(version, formats.get_format(name), recipes.stock(version))[0].keys
+            return self._find_chain(version, formats.get_format(name), recipes.available_layers(version))[0].keys
         except FleetMapError:
             return ()
 
-    def _way(
+    def _find_chain(
         self, version: Version, fmt: formats.Format, available: recipes.AvailableLayers
     ) -> tuple[recipes.DerivationChain, str | None]:
         """The cheapest chain whose derivations work on what is stored, found by doing them once for each content; and
@@ -356,7 +361,7 @@ class Maps:
             try:
                 template_values = templates.resolve(version.templates, fmt).values
                 options = formats.write_options(fmt, template_values)
-                chain = recipes.chain(fmt, available, options, values=template_values, without=without)
+                chain = recipes.plan_chain(fmt, available, options, values=template_values, without=without)
             except MissingLayer as error:
                 if unnamed is not None:
                     return unnamed
@@ -378,16 +383,18 @@ class Maps:
         """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
         if fmt.lacks is None:
             return
-        failure = self._try(_trial_key(version, chain, fmt), chain, making.lacking, version, fmt.name, chain)
+        failure = self._find_failure(
+            _trial_key(version, chain, fmt), chain, making.find_missing_content, version, fmt.name, chain
+        )
         if failure is not None:
             raise CannotConvert(failure.reason, [Problem(failure.reason)])
 
     def _hindrance(self, version: Version, chain: recipes.DerivationChain) -> ChainFailure | None:
         """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""
-        chain = recipes.needed(chain)
-        return self._try(_trial_key(version, chain), chain, making.hindrance, version, chain)
+        chain = recipes.reduce_chain(chain)
+        return self._find_failure(_trial_key(version, chain), chain, making.find_chain_failure, version, chain)
 
-    def _try(
+    def _find_failure(
         self, key: str, chain: recipes.DerivationChain, function: Callable[..., Any], *args: Any
     ) -> ChainFailure | None:
         """What a worker finds in the way, if it was not found before."""
@@ -412,7 +419,7 @@ class Maps:
         options: Mapping[str, str] | None = None,
     ) -> direct.Converted:
         """Convert spooled files without storing anything."""
-        recipes.own_options(formats.get_format(to), options or {})
+        recipes.writer_options(formats.get_format(to), options or {})
         arguments = (dict(files), to, hints or UploadHints(), datum, dict(options or {}), self._limits)
         try:
             converted: direct.Converted = self._run(direct.offline_paths, *arguments)
@@ -420,13 +427,13 @@ class Maps:
             raise UnreadableFile(f"the files could not be converted: {error.detail}") from error
         return converted
 
-    def _made(self, recipe: Recipe, stop: CancelHandle | None) -> ConvertedMap:
+    def _run_conversion(self, recipe: Recipe, stop: CancelHandle | None) -> ConvertedMap:
         values = parameters.canonical(recipe.options)
         store_location = (self._store.database_url, str(self._store.blob_dir))
         cancel_arguments = {} if stop is None else {"stop": stop}
         try:
             written: making.WrittenMap = self._run(
-                making.make,
+                making.convert_version,
                 *store_location,
                 recipe.version,
                 recipe.format.name,
@@ -442,14 +449,14 @@ class Maps:
         }
         archive = None
         if len(typed) > 1 and recipe.spread is None:
-            archive = (f"{recipe.format.name}.zip", making.zipped(written.files))
+            archive = (f"{recipe.format.name}.zip", making.zip_files(written.files))
         return ConvertedMap(typed, archive, written.report, written.places)
 
 
-def file_of(recipe: Recipe, cached_map: CachedMap, file: str | None) -> CachedFile:
+def select_file(recipe: Recipe, cached_map: CachedMap, file: str | None) -> CachedFile:
     """The wanted file of a made map, or the zip of all. file: as the request names it. NotFound where it has none."""
     if file is None:
-        return cached_map.whole()
+        return cached_map.single_file()
     file_name = recipe.file or file
     cached_file = cached_map.file(file_name)
     if cached_file is None and recipe.spread is not None and "/" not in file_name:
@@ -462,7 +469,7 @@ def file_of(recipe: Recipe, cached_map: CachedMap, file: str | None) -> CachedFi
     return cached_file
 
 
-def joined(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedMap:
+def join_members(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedMap:
     """The files of all members, each at its place; of two of one name the first stays, and the report says so."""
     files: dict[str, tuple[bytes | CachedFile, str]] = {}
     places: dict[str, tuple[str, str]] = {}
@@ -479,11 +486,11 @@ def joined(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedMap:
             if place is not None:
                 places[name] = place
     if not files:
-        raise site.nothing_made(recipe)
+        raise site.no_parts_error(recipe)
     archive = None
     if recipe.archive and len(files) > 1:
-        archive = (f"{recipe.format.name}.zip", making.zipped(_LazyFiles({n: p for n, (p, _) in files.items()})))
-    report = site.merged_report(
+        archive = (f"{recipe.format.name}.zip", making.zip_files(_LazyFiles({n: p for n, (p, _) in files.items()})))
+    report = site.merge_reports(
         [(m.folder, cached_map.report) for m, cached_map in zip(recipe.members, cached_maps, strict=True)]
     )
     return ConvertedMap(files, archive, {**report, "dropped": [*report["dropped"], *clashes]}, places)
@@ -513,7 +520,7 @@ def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:
 
 def _trial_key(version: Version, chain: recipes.DerivationChain, fmt: formats.Format | None = None) -> str:
     """The hash of what the outcome of a trial depends on: a chain's steps and, with ``fmt``, what a format lacks."""
-    keys = recipes.needed(chain).keys if fmt is None else chain.keys
+    keys = recipes.reduce_chain(chain).keys if fmt is None else chain.keys
     entries = {e.key: e.hash for e in version.parts}
     ingredients = {
         "server": __version__,

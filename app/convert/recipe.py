@@ -26,7 +26,7 @@ from app.model.templates import Templates
 from app.model.voxels import VoxelMap
 from app.store.values import PartEntry, Version
 
-SUPPLY: Mapping[Layer, str] = {
+HOW_TO_SUPPLY: Mapping[Layer, str] = {
     "location": 'a datum: upload a datum.yaml, or PATCH the environment with {"datum": {…}}',
     "objects": "objects: upload an OSM, KML or GeoJSON file",
     "topology": "a network: upload a tmap2 or OSM file, or a drawing (KML, GeoJSON) with layer=topology",
@@ -43,7 +43,8 @@ SUPPLY: Mapping[Layer, str] = {
 class AvailableLayers:
     """What there is to make maps from: the parts that have content, and whether there is a datum.
 
-    anchors: of each part, which of ``local`` and ``wgs84`` its items are. blank: parts without items; an empty file is
+    anchors: of each part, which of ``local`` and ``wgs84`` its items are. empty_parts: parts without items; an empty
+        file is
     a map of its own format, and of no other. pinned: by layer, the derivations and parameters that a version was
     given its content by; where that content is stale, it is left out of ``keys`` and made anew by them. drawn: parts
     that a step made for maps alone (see ``Derivation.last``), which are no evidence for other derivations.
@@ -52,18 +53,18 @@ class AvailableLayers:
     keys: frozenset[PartKey]
     datum: bool
     anchors: Mapping[PartKey, frozenset[str]] = field(default_factory=dict)
-    blank: frozenset[PartKey] = frozenset()
+    empty_parts: frozenset[PartKey] = frozenset()
     pinned: Mapping[Layer, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
     drawn: frozenset[PartKey] = frozenset()
 
-    def seen_by(self, fmt: Format) -> AvailableLayers:
+    def for_format(self, fmt: Format) -> AvailableLayers:
         """The same with the blank parts that came from this format; a folder of maps holds all of them."""
         if fmt.holds:
-            return replace(self, keys=self.keys | self.blank, blank=frozenset())
+            return replace(self, keys=self.keys | self.empty_parts, empty_parts=frozenset())
         format_keys = {
-            k for k in self.blank if k.name == fmt.family or (k.layer == "voxels" and k.layer in fmt.carries)
+            k for k in self.empty_parts if k.name == fmt.family or (k.layer == "voxels" and k.layer in fmt.carries)
         }
-        return replace(self, keys=self.keys | format_keys, blank=frozenset()) if format_keys else self
+        return replace(self, keys=self.keys | format_keys, empty_parts=frozenset()) if format_keys else self
 
     @property
     def layers(self) -> frozenset[Layer]:
@@ -148,18 +149,18 @@ class Member:
     only_default: bool = False
 
 
-def stock(version: Version) -> AvailableLayers:
+def available_layers(version: Version) -> AvailableLayers:
     """What a version holds."""
     entries = [e for e in version.parts if e.count > 0]
-    pinned = _pinned(version, entries)
+    pinned = _pinned_layers(version, entries)
     entries = [e for e in entries if e.key.layer not in pinned]
     anchors = {e.key: frozenset(name for name, box in (e.bounds or {}).items() if box) for e in entries}
     blank = frozenset(e.key for e in version.parts if not e.count)
-    drawn = frozenset(e.key for e in entries if not e.provenance.edited and derive.is_drawn(e.provenance.steps))
+    drawn = frozenset(e.key for e in entries if not e.provenance.is_edited and derive.is_drawn(e.provenance.steps))
     return AvailableLayers(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned, drawn)
 
 
-def stock_of(layers: Layers) -> AvailableLayers:
+def available_in(layers: Layers) -> AvailableLayers:
     """What layers at hand hold."""
     keys: set[PartKey] = set()
     blank: set[PartKey] = set()
@@ -175,7 +176,7 @@ def stock_of(layers: Layers) -> AvailableLayers:
     return AvailableLayers(frozenset(keys), layers.datum is not None, anchors, frozenset(blank))
 
 
-def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mapping[str, Mapping[str, Any]]]:
+def _pinned_layers(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mapping[str, Mapping[str, Any]]]:
     """The layers all of whose parts were derived and are stale: they are made anew, as they were made before.
 
     What people have edited, or what lies beside parts that a source has told, stays as it is (the version says that it
@@ -186,7 +187,7 @@ def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mappi
     out: dict[Layer, Mapping[str, Mapping[str, Any]]] = {}
     for layer in {key.layer for key in stale}:
         parts = [e for e in entries if e.key.layer == layer]
-        if all(e.key in stale and e.provenance.information == "derived" and not e.provenance.edited for e in parts):
+        if all(e.key in stale and e.provenance.information == "derived" and not e.provenance.is_edited for e in parts):
             steps = [step for e in parts for step in e.provenance.steps]
             if any(step.get("step") not in derivations for step in steps):
                 continue  # fetched from the net: no map does that by itself
@@ -194,7 +195,7 @@ def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mappi
     return out
 
 
-def chain(
+def plan_chain(
     fmt: Format,
     available: AvailableLayers,
     options: Any,
@@ -210,29 +211,29 @@ def chain(
     grid). without: derivations that are known to find nothing to use.
     """
     option_values = dict(values or {})
-    available = available.seen_by(fmt)
+    available = available.for_format(fmt)
     for layer, before in available.pinned.items():
         rivals = {n for n, d in derive.all_derivations().items() if d.gives == layer and n not in before}
         if not without & before.keys():  # else what made it finds nothing any more: any other way will do
             without |= rivals
     if fmt.needs.datum and not available.datum:
-        raise MissingDatum(f"{fmt.name} needs {SUPPLY['location']}")
-    named = _named(fmt, available, options, option_values, without) if derived else None
+        raise MissingDatum(f"{fmt.name} needs {HOW_TO_SUPPLY['location']}")
+    named = _chain_to_named_part(fmt, available, options, option_values, without) if derived else None
     if named is not None:
         return named
-    best = _best(fmt, available, without, derived=derived)
+    best = _best_chain(fmt, available, without, derived=derived)
     rest = option_values.keys() - {f.name for f in dataclasses.fields(fmt.write_options)}
-    if rest and (best is None or not rest <= _taken(best)):
-        available, best = _forced(fmt, available, without, frozenset(rest), derived=derived)
+    if rest and (best is None or not rest <= _parameters_of(best)):
+        available, best = _plan_with_parameters(fmt, available, without, frozenset(rest), derived=derived)
     if best is None:
-        raise MissingLayer(f"{fmt.name} cannot be made: supply {' or '.join(missing(fmt, available))}")
+        raise MissingLayer(f"{fmt.name} cannot be made: supply {' or '.join(missing_layers(fmt, available))}")
     carried = fmt.carries | {layer for step in best.steps for layer in step.reads}
     keys = sorted(k for k in available.keys if k.layer in carried)
     chosen: Sequence[PartKey] = [k for k in keys if k.layer in fmt.carries]
     if not any(step.gives in fmt.carries for step in best.steps):  # else it is chosen once all parts are there
         chosen = fmt.choose(chosen, options)
     needed = {layer for step in best.steps for layer in step.needs}
-    if not _is_whole(fmt, available):
+    if not _has_complete_map(fmt, available):
         _check_anchor(fmt, available, sorted({*chosen, *(k for k in keys if k.layer in needed)}))
     read = {layer for step in best.steps for layer in step.reads}
     keys = sorted({*chosen, *(k for k in keys if k.layer in read and k not in available.drawn)})
@@ -241,7 +242,7 @@ def chain(
     return DerivationChain(tuple(steps), tuple(keys))
 
 
-def _named(
+def _chain_to_named_part(
     fmt: Format, available: AvailableLayers, options: Any, option_values: Mapping[str, str], without: frozenset[str]
 ) -> DerivationChain | None:
     """The way to a part that is asked for by name and not stored, where a derivation makes parts of that name."""
@@ -269,10 +270,10 @@ def _named(
     return None
 
 
-def _best(
+def _best_chain(
     fmt: Format, available: AvailableLayers, without: frozenset[str], *, derived: bool = True
 ) -> derive.Plan | None:
-    best: derive.Plan | None = derive.Plan((), 0.0) if _is_whole(fmt, available) else None
+    best: derive.Plan | None = derive.Plan((), 0.0) if _has_complete_map(fmt, available) else None
     for required in fmt.needs.one_of:
         plan = derive.plan(available.layers, required, without, available.dead)
         if plan is not None and (derived or not plan.steps) and (best is None or plan.cost < best.cost):
@@ -280,17 +281,17 @@ def _best(
     return best
 
 
-def _is_whole(fmt: Format, available: AvailableLayers) -> bool:
+def _has_complete_map(fmt: Format, available: AvailableLayers) -> bool:
     """Whether a map of this very format is stored, so that nothing else is needed."""
     return fmt.needs.own and any(k.layer == "objects" and k.name == fmt.family for k in available.keys)
 
 
-def _taken(plan: derive.Plan) -> frozenset[str]:
+def _parameters_of(plan: derive.Plan) -> frozenset[str]:
     """The names of all parameters on a way."""
     return frozenset().union(*(derive.takes(step.name) for step in plan.steps))
 
 
-def _forced(
+def _plan_with_parameters(
     fmt: Format, available: AvailableLayers, without: frozenset[str], names: frozenset[str], *, derived: bool
 ) -> tuple[AvailableLayers, derive.Plan]:
     """A way with a step that knows all these parameters, and the stock without what that step makes anew."""
@@ -318,7 +319,7 @@ def _forced(
         _, _, less, plan = min(candidates, key=lambda f: f[:2])
         return less, plan
     if any(names <= derive.takes(name) for name in without):
-        lacking = " or ".join(missing(fmt, available)) or "other layers"
+        lacking = " or ".join(missing_layers(fmt, available)) or "other layers"
         raise MissingLayer(f"{fmt.name} cannot be made with {', '.join(sorted(names))}: supply {lacking}")
     derivation_parameters = sorted(
         {n for d, step in everything.items() if step.gives in useful for n in derive.takes(d)}
@@ -332,17 +333,17 @@ def _forced(
     raise Invalid(f"{', '.join(wrong)}: {problem}", [Problem(problem, where=name) for name in wrong])
 
 
-def needed(chain: DerivationChain) -> DerivationChain:
+def reduce_chain(chain: DerivationChain) -> DerivationChain:
     """The same with only those parts that its steps read."""
     read = {layer for step in chain.steps for layer in step.reads}
     return replace(chain, keys=tuple(k for k in chain.keys if k.layer in read))
 
 
-def missing(fmt: Format, available: AvailableLayers) -> list[str]:
+def missing_layers(fmt: Format, available: AvailableLayers) -> list[str]:
     """What to supply for a format, one text for each alternative."""
     out = []
     for required in fmt.needs.one_of:
-        lacking = [SUPPLY[layer] for layer in LAYERS if layer in required - available.layers]
+        lacking = [HOW_TO_SUPPLY[layer] for layer in LAYERS if layer in required - available.layers]
         out.append(" and ".join(lacking))
     return [text for text in dict.fromkeys(out) if text]
 
@@ -362,7 +363,7 @@ def detours(failed: Sequence[ChainFailure]) -> list[dict[str, Any]]:
     return [{"problem": f"made another way, since {one.step} failed: {one.reason}"} for one in failed if one.step]
 
 
-def exhausted(error: MissingLayer, failed: Sequence[ChainFailure]) -> CannotConvert:
+def no_chain_error(error: MissingLayer, failed: Sequence[ChainFailure]) -> CannotConvert:
     """Nothing is left to try: what to name or to supply, and why the derivations that were tried found nothing."""
     unnamed = next((one for one in failed if one.choose), None)
     if unnamed is not None:
@@ -383,15 +384,17 @@ def recipe(
 ) -> Recipe:
     """The recipe of a version's map. NotFound, Invalid, MissingLayer, MissingDatum or Ambiguous if there is none.
 
-    values: the format's options and the parameters of derivations on the way, as texts. without: see ``chain``.
+    values: the format's options and the parameters of derivations on the way, as texts. without: see ``plan_chain``.
     """
     fmt = formats.get_format(name)
-    options = own_options(fmt, values)
-    derivation_chain = chain(fmt, stock(version), options, derived=derived, values=values, without=without)
-    return of_chain(version, fmt, options, derivation_chain)
+    options = writer_options(fmt, values)
+    derivation_chain = plan_chain(
+        fmt, available_layers(version), options, derived=derived, values=values, without=without
+    )
+    return recipe_of_chain(version, fmt, options, derivation_chain)
 
 
-def of_chain(
+def recipe_of_chain(
     version: Version, fmt: Format, options: Any, chain: DerivationChain, spread: Spread | None = None
 ) -> Recipe:
     """The recipe of a map by this chain. spread: see ``Recipe``."""
@@ -399,7 +402,7 @@ def of_chain(
     return Recipe(version, fmt, options, chain, _key(version, fmt, options, chain, entries, spread), spread=spread)
 
 
-def own_options(fmt: Format, values: Mapping[str, str]) -> Any:
+def writer_options(fmt: Format, values: Mapping[str, str]) -> Any:
     """The format's own options among what was asked for; Invalid for a name that nothing on any way could mean."""
     option_names = {f.name for f in dataclasses.fields(fmt.write_options)}
     steps = frozenset().union(*(derive.takes(name) for name in derive.all_derivations()))
@@ -457,5 +460,6 @@ def _check_anchor(fmt: Format, available: AvailableLayers, keys: list[PartKey]) 
             part_frame = "places on earth" if other == "wgs84" else "local metres"
             fmt_frame = "local metres" if other == "wgs84" else "places on earth"
             raise MissingDatum(
-                f"the {key.layer} are {part_frame} and {fmt.name} speaks of {fmt_frame}: supply {SUPPLY['location']}"
+                f"the {key.layer} are {part_frame} and {fmt.name} speaks of {fmt_frame}: supply "
+                f"{HOW_TO_SUPPLY['location']}"
             )

@@ -28,10 +28,10 @@ from app.model.frame import GROUND
 from app.model.layers import MAP, Layer, PartKey
 from app.store.values import Version
 
-EVERY = "*"
+ALL = "*"
 """The value of an option that selects all: levels, or parts by name."""
 
-SITE_WIDE: frozenset[Layer] = frozenset({"location", "resources"})
+SITE_WIDE_LAYERS: frozenset[Layer] = frozenset({"location", "resources"})
 """Layers that are of all levels, whichever one they are stored on."""
 
 MAX_FOLDER_BYTES = 120
@@ -40,45 +40,45 @@ DIGEST_DIGITS = 16
 _SAFE = re.compile(r"[A-Za-z0-9_-](?:[A-Za-z0-9_ -]*[A-Za-z0-9_-])?")
 
 
-def folder_of(level: str) -> str:
+def level_folder_name(level: str) -> str:
     """Name the folder of a level's files: letters, digits, ``_``, ``-`` and inner spaces stay, all else is
     percent-encoded, as in an address.
 
     No folder holds a dot and every file does, so none has the name of a file. A name that becomes too long is cut,
     and ends in ``~`` and the start of its SHA-256.
     """
-    text = level if _SAFE.fullmatch(level) else "".join(map(_encoded, level))
+    text = level if _SAFE.fullmatch(level) else "".join(map(_encode_character, level))
     if len(text) > MAX_FOLDER_BYTES:
         digest = hashlib.sha256(level.encode()).hexdigest()[:DIGEST_DIGITS]
         text = f"{text[:MAX_FOLDER_BYTES].rstrip('%')}~{digest}"
     return text
 
 
-def _encoded(character: str) -> str:
+def _encode_character(character: str) -> str:
     if character.isascii() and (character.isalnum() or character in "_-"):
         return character
     return "".join(f"%{byte:02X}" for byte in character.encode())
 
 
-def level_of(folder: str, levels: Iterable[str]) -> str | None:
+def level_of_folder(folder: str, levels: Iterable[str]) -> str | None:
     """Find the level that a folder is named after."""
-    return next((level for level in levels if folder_of(level) == folder), None)
+    return next((level for level in levels if level_folder_name(level) == folder), None)
 
 
-def asks_for_all(fmt: Format, values: Mapping[str, Any]) -> bool:
+def selects_all(fmt: Format, values: Mapping[str, Any]) -> bool:
     """Whether several parts are selected."""
-    return fmt.parts is not None and EVERY in (values.get(fmt.parts.name), values.get(fmt.parts.level))
+    return fmt.parts is not None and ALL in (values.get(fmt.parts.name), values.get(fmt.parts.level))
 
 
-def everything(fmt: Format) -> dict[str, str]:
+def whole_site_options(fmt: Format) -> dict[str, str]:
     """Build the options that select the whole site; none where one map is of all levels anyway."""
-    return {} if fmt.parts is None else {fmt.parts.level: EVERY, fmt.parts.name: EVERY}
+    return {} if fmt.parts is None else {fmt.parts.level: ALL, fmt.parts.name: ALL}
 
 
-def one_of(fmt: Format, values: Mapping[str, Any]) -> dict[str, Any]:
+def single_part_options(fmt: Format, values: Mapping[str, Any]) -> dict[str, Any]:
     """Take the options that select one part; those that are ``*`` are left to the default."""
     selectors = () if fmt.parts is None else (fmt.parts.name, fmt.parts.level)
-    return {option: value for option, value in values.items() if option not in selectors or value != EVERY}
+    return {option: value for option, value in values.items() if option not in selectors or value != ALL}
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +111,9 @@ class _Site:
 
     def prefix(self, level: str) -> str:
         """The folder of a level's files, with its slash."""
-        return "" if level == self.default else folder_of(level) + "/"
+        return "" if level == self.default else level_folder_name(level) + "/"
 
-    def maker_of(self, name: str, level: str) -> Derivation | None:
+    def derivation_for(self, name: str, level: str) -> Derivation | None:
         """The derivation that may make this part; whether it does depends on what the zones are."""
         if any((key.level, key.name) == (level, name) for key in self.stored):
             return None
@@ -126,7 +126,7 @@ class _Site:
 def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: bool, without: frozenset[str]) -> _Site:
     """Find out what is stored and what can be derived. values: without the options that select parts."""
     assert fmt.parts is not None
-    available = recipes.stock(version).seen_by(fmt)
+    available = recipes.available_layers(version).for_format(fmt)
     stored = tuple(sorted(key for key in available.keys if key.layer == fmt.parts.layer))
     makers = tuple(
         d
@@ -138,9 +138,9 @@ def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: 
     own_values = {name: value for name, value in values.items() if name not in only_makers}
     main, lacking = None, None
     if not stored or own_values.keys() - option_names:  # not stored, or to be derived with these parameters
-        options = recipes.own_options(fmt, own_values)
+        options = recipes.writer_options(fmt, own_values)
         try:
-            main = recipes.chain(fmt, available, options, derived=derived, values=own_values, without=without)
+            main = recipes.plan_chain(fmt, available, options, derived=derived, values=own_values, without=without)
         except MissingLayer as error:
             lacking = error
         if main is not None and main.steps:
@@ -155,7 +155,7 @@ def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: 
 
 def _default_level(version: Version, keys: Iterable[PartKey]) -> str:
     """``ground`` where the parts that files are made of are there (too), else the lowest level that has one."""
-    placed = {key.level for key in keys if key.layer not in SITE_WIDE}
+    placed = {key.level for key in keys if key.layer not in SITE_WIDE_LAYERS}
     levels = placed or {key.level for key in keys}
     if not levels or GROUND in levels:
         return GROUND
@@ -182,8 +182,8 @@ def recipe(
     level, name = values.get(parts.level), values.get(parts.name)
     rest = {option: value for option, value in values.items() if option not in (parts.level, parts.name)}
     site = _site(version, fmt, rest, derived=derived, without=without)
-    levels = None if level == EVERY else frozenset({site.default if level is None else level})
-    names = None if name in (EVERY, None) else frozenset({name})
+    levels = None if level == ALL else frozenset({site.default if level is None else level})
+    names = None if name in (ALL, None) else frozenset({name})
     if site.lacking is not None and not (names and any(names <= maker.makes for maker in site.makers)):
         raise site.lacking
     members: list[Member] = []
@@ -193,11 +193,11 @@ def recipe(
         members.append(_spread(site, site.main, levels, names, only_default=name is None))
     if name is not None:
         for maker in site.makers:
-            if (names is None or names & maker.makes) and _may_add(site, maker, levels):
-                members.append(_made_by(site, maker, levels, names))
+            if (names is None or names & maker.makes) and _can_add_part(site, maker, levels):
+                members.append(_derived_member(site, maker, levels, names))
     if not members:
         _raise_missing(site, level, name, derived=derived)
-    return _assembled(site, members, archive=archive)
+    return _assemble_recipe(site, members, archive=archive)
 
 
 def _stored_members(site: _Site, levels: frozenset[str] | None, name: str | None, *, derived: bool) -> Iterable[Member]:
@@ -208,7 +208,7 @@ def _stored_members(site: _Site, levels: frozenset[str] | None, name: str | None
         names = [key.name for key in site.stored if key.level == level]
         names.sort(key=lambda one: (site.parts.stem(one) != one, one))  # of two with equal file names the first is kept
         selection: list[str | None] = [None]
-        if name == EVERY:
+        if name == ALL:
             default = default_name(site.parts, names)
             selection = [None if one == default else one for one in names]
         elif name is not None:
@@ -243,26 +243,33 @@ def _spread(
     spread = Spread(site.default, makes, stored_parts, optional=maker is not None)
     values = site.own_values if maker is None else site.values
     option_names = {f.name for f in dataclasses.fields(site.format.write_options)}
-    options = recipes.own_options(
+    options = recipes.writer_options(
         site.format, {option: value for option, value in values.items() if option in option_names}
     )
     return Member(
-        recipes.of_chain(site.version, site.format, options, chain, spread), "", None, levels, names, only_default
+        recipes.recipe_of_chain(site.version, site.format, options, chain, spread),
+        "",
+        None,
+        levels,
+        names,
+        only_default,
     )
 
 
-def _way_of(site: _Site, maker: Derivation) -> DerivationChain:
+def _chain_of_derivation(site: _Site, maker: Derivation) -> DerivationChain:
     """The chain of a derivation that makes named parts: it may take the frame of the layer's usual part."""
     keys = (k for k in site.available.keys if k.layer in maker.needs or (k.layer, k.name) == (maker.gives, MAP))
     before = site.available.pinned.get(maker.gives, {}).get(maker.name, {})
     return DerivationChain(derive.with_values([maker.step()], {**before, **site.values}), tuple(sorted(keys)))
 
 
-def _made_by(site: _Site, maker: Derivation, levels: frozenset[str] | None, names: frozenset[str] | None) -> Member:
-    return _spread(site, _way_of(site, maker), levels, names, maker=maker)
+def _derived_member(
+    site: _Site, maker: Derivation, levels: frozenset[str] | None, names: frozenset[str] | None
+) -> Member:
+    return _spread(site, _chain_of_derivation(site, maker), levels, names, maker=maker)
 
 
-def _may_add(site: _Site, maker: Derivation, levels: frozenset[str] | None) -> bool:
+def _can_add_part(site: _Site, maker: Derivation, levels: frozenset[str] | None) -> bool:
     """Whether a level that has what the derivation needs lacks one of the parts that it makes."""
     stored_parts = {(key.level, key.name) for key in site.stored}
     able = {key.level for key in site.available.keys if key.layer in maker.needs}
@@ -275,14 +282,15 @@ def _may_add(site: _Site, maker: Derivation, levels: frozenset[str] | None) -> b
 def _raise_missing(site: _Site, level: str | None, name: str | None, *, derived: bool) -> None:
     """Say what there is instead, in the words of a request for one part."""
     selected = {site.parts.level: level, site.parts.name: name}
-    values = {**site.own_values, **{k: v for k, v in selected.items() if v not in (None, EVERY)}}
+    values = {**site.own_values, **{k: v for k, v in selected.items() if v not in (None, ALL)}}
     recipes.recipe(site.version, site.format.name, values, derived=derived)
     raise NotFound(f"{site.format.name}: nothing that is stored fits these levels and names")
 
 
-def _assembled(site: _Site, members: Sequence[Member], *, archive: bool) -> Recipe:
+def _assemble_recipe(site: _Site, members: Sequence[Member], *, archive: bool) -> Recipe:
     ingredients = [
-        [m.recipe.key, m.folder, m.place, _sorted(m.levels), _sorted(m.names), m.only_default] for m in members
+        [m.recipe.key, m.folder, m.place, _sort_values(m.levels), _sort_values(m.names), m.only_default]
+        for m in members
     ]
     text = orjson.dumps(["site", site.format.name, archive, ingredients])
     steps = tuple(dict.fromkeys(step for m in members for step in m.recipe.steps))
@@ -294,7 +302,7 @@ def _assembled(site: _Site, members: Sequence[Member], *, archive: bool) -> Reci
     )
 
 
-def _sorted(values: frozenset[str] | None) -> list[str] | None:
+def _sort_values(values: frozenset[str] | None) -> list[str] | None:
     return None if values is None else sorted(values)
 
 
@@ -315,26 +323,26 @@ def file_recipe(
     parts = fmt.parts
     assert parts is not None
     rest = {option: value for option, value in values.items() if option not in (parts.level, parts.name)}
-    level, name = (None if values.get(o) == EVERY else values.get(o) for o in (parts.level, parts.name))
+    level, name = (None if values.get(o) == ALL else values.get(o) for o in (parts.level, parts.name))
     folder, _, base = file.rpartition("/")
     if not folder and level is not None:
         return None  # as a file of that level's own map
     site = _site(version, fmt, rest, derived=derived, without=without)
-    of_file = level_of(folder, site.levels) if folder else site.default
+    of_file = level_of_folder(folder, site.levels) if folder else site.default
     if of_file is None or (level is not None and level != of_file):
         levels = ", ".join(sorted(site.levels))
         raise NotFound(f"{fmt.name} has no file {file!r}: no level has this folder; there are the levels {levels}")
     hints = dict(fmt.by_file(base))
     if name is None and parts.name in hints:
-        name = _named_like(site, of_file, hints[parts.name])
+        name = _part_with_stem(site, of_file, hints[parts.name])
     kinds = {o: v for o, v in hints.items() if o != parts.name and _default_kinds(fmt).get(o) != v}
-    maker = site.maker_of(name, of_file) if name is not None else None
+    maker = site.derivation_for(name, of_file) if name is not None else None
     if maker is not None:
         site = replace(site, values={**kinds, **site.values})
-        return replace(_made_by(site, maker, None, None).recipe, file=file)
+        return replace(_derived_member(site, maker, None, None).recipe, file=file)
     if site.main is not None and not kinds:  # as the manifest lists it, made once
         return replace(_spread(site, site.main, None, None).recipe, file=file)
-    if not folder and not _is_at_top(site, name):
+    if not folder and not _is_on_default_level(site, name):
         return None
     selected: dict[str, Any] = {parts.level: of_file} | ({} if name is None else {parts.name: name})
     part_recipe = recipes.recipe(
@@ -350,7 +358,7 @@ def _default_kinds(fmt: Format) -> dict[str, str]:
     return {option: next(iter(choices)) for option, choices in values.items() if len(choices) == 1}
 
 
-def _named_like(site: _Site, level: str, stem: str) -> str:
+def _part_with_stem(site: _Site, level: str, stem: str) -> str:
     """The stored part of a level whose files have this name: its own name, where it may stand in a file's."""
     names = [key.name for key in site.stored if key.level == level]
     if stem in names:
@@ -358,7 +366,7 @@ def _named_like(site: _Site, level: str, stem: str) -> str:
     return next((name for name in names if site.parts.stem(name) == stem), stem)
 
 
-def _is_at_top(site: _Site, name: str | None) -> bool:
+def _is_on_default_level(site: _Site, name: str | None) -> bool:
     """Whether the default level has a part of this name (None: any)."""
     if site.main is not None:
         return site.default != GROUND  # else the rule for one part finds it by itself
@@ -386,7 +394,7 @@ def _fits(place: tuple[str, str] | None, member: Member) -> bool:
     return (member.levels is None or level in member.levels) and (member.names is None or name in member.names)
 
 
-def merged_report(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+def merge_reports(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
     """Join the reports of several maps, each with the folder of its files; what several say is said once."""
     out: dict[str, Any] = {**reports[0][1]}
     for member in ("layers", "attribution", "template", "dropped", "warnings"):
@@ -395,15 +403,15 @@ def merged_report(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str,
             for line in report[member]:
                 named = folder and isinstance(line, Mapping) and "file" in line
                 lines.append({**line, "file": folder + line["file"]} if named else line)
-        out[member] = _once(lines)
-    out["closures"] = applied_closures.merged_lines([report["closures"] for _, report in reports])
+        out[member] = _unique(lines)
+    out["closures"] = applied_closures.merge_report_lines([report["closures"] for _, report in reports])
     return out
 
 
-def _once(lines: Iterable[Any]) -> list[Any]:
+def _unique(lines: Iterable[Any]) -> list[Any]:
     return list({orjson.dumps(line, option=orjson.OPT_SORT_KEYS): line for line in lines}.values())
 
 
-def nothing_made(recipe: Recipe) -> NotFound:
+def no_parts_error(recipe: Recipe) -> NotFound:
     """The error for a site whose derivations gave no part that fits."""
     return NotFound(f"{recipe.format.name}: no part has this level and name, and none of them can be derived")

@@ -18,7 +18,7 @@ import orjson
 
 from app.convert.recipe import ChainFailure
 
-MOST = 10_000
+MAX_TRIALS = 10_000
 """Trials that are remembered; the file is written anew at twice as many lines."""
 
 
@@ -31,7 +31,7 @@ class Trials:
         self._found: dict[str, ChainFailure | None] = {}
         self._lines = 0
         for key, failure in self._read():
-            self._put(key, failure)
+            self._set(key, failure)
 
     def __getitem__(self, key: str) -> ChainFailure | None:
         """KeyError where it was not tried."""
@@ -41,21 +41,21 @@ class Trials:
     def add(self, key: str, failure: ChainFailure | None, *, lasting: bool) -> None:
         """Remember an outcome. lasting: also for the next start."""
         with self._guard:
-            self._put(key, failure)
+            self._set(key, failure)
             if not lasting:
                 return
             self._lines += 1
             with contextlib.suppress(OSError):
-                if self._lines > 2 * MOST:
+                if self._lines > 2 * MAX_TRIALS:
                     self._rewrite()
                 else:
                     with self._path.open("ab", buffering=0) as file:  # one write: whole lines, whoever else writes
                         file.write(_line(key, failure))
 
-    def _put(self, key: str, failure: ChainFailure | None) -> None:
+    def _set(self, key: str, failure: ChainFailure | None) -> None:
         self._found.pop(key, None)  # the latest last: the oldest goes first
         self._found[key] = failure
-        while len(self._found) > MOST:
+        while len(self._found) > MAX_TRIALS:
             self._found.pop(next(iter(self._found)))
 
     def _read(self) -> Iterator[tuple[str, ChainFailure | None]]:

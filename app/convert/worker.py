@@ -49,7 +49,7 @@ def open_store(database_url: str, blob_dir: str) -> Store:
     return Store(database_url, Path(blob_dir), readonly=True)
 
 
-def make(
+def convert_version(
     database_url: str,
     blob_dir: str,
     version: Version,
@@ -70,7 +70,9 @@ def make(
     )
 
 
-def hindrance(database_url: str, blob_dir: str, version: Version, chain: DerivationChain) -> ChainFailure | None:
+def find_chain_failure(
+    database_url: str, blob_dir: str, version: Version, chain: DerivationChain
+) -> ChainFailure | None:
     """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
     layers = applied_closures.load(open_store(database_url, blob_dir), version, chain.keys)
     try:
@@ -94,7 +96,7 @@ def stored_crossings(
     return crossing_edges(fmt, applied_closures.close(fmt, used, version.closures)[0], layers)
 
 
-def lacking(
+def find_missing_content(
     database_url: str, blob_dir: str, version: Version, name: str, chain: DerivationChain
 ) -> ChainFailure | None:
     """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
@@ -128,12 +130,12 @@ def write(
     environment's name, for formats with a place for one.
     """
     notes = derive.DerivationNotes()
-    options = recipes.own_options(fmt, values)
+    options = recipes.writer_options(fmt, values)
     if entries is None:  # of files; what is stored was loaded without them
-        layers = applied_closures.without_timed_marks(layers)
+        layers = applied_closures.drop_timed_marks(layers)
     source = _Source(layers, chain, entries, origin, credit, templates, closures, around or Layers(), title)
     if spread is None:
-        return _written(fmt, derive.run(chain.steps, layers, notes), options, source, notes)
+        return _write_one(fmt, derive.run(chain.steps, layers, notes), options, source, notes)
     try:
         derived_layers = derive.run(chain.steps, layers, notes)
     except CannotDerive as error:
@@ -142,7 +144,7 @@ def write(
         if isinstance(error.__cause__, MissingLayer):
             return WrittenMap({}, empty_report(fmt))
         raise CannotConvert(error.detail, error.problems) from error
-    return _written_each(fmt, derived_layers, options, source, notes, spread)
+    return _write_each(fmt, derived_layers, options, source, notes, spread)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +162,7 @@ class _Source:
     title: str
 
 
-def _written_each(
+def _write_each(
     fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.DerivationNotes, spread: Spread
 ) -> WrittenMap:
     """One map of every part that was derived, each written as it would be by itself."""
@@ -180,13 +182,13 @@ def _written_each(
         names = [k.name for k in keys if k.level == key.level]
         usual = not spread.names and key.name == site.default_name(parts, names)
         chosen = replace(options, **{parts.level: key.level, parts.name: None if usual else key.name})
-        one = _written(fmt, derived_layers, chosen, source, notes)
-        folder = "" if key.level == spread.default else site.folder_of(key.level) + "/"
+        one = _write_one(fmt, derived_layers, chosen, source, notes)
+        folder = "" if key.level == spread.default else site.level_folder_name(key.level) + "/"
         reports.append((folder, one.report))
         for name, data in one.files.items():
             files.setdefault(folder + name, data)
             places.setdefault(folder + name, (key.level, key.name))
-    return WrittenMap(files, site.merged_report(reports) if reports else empty_report(fmt), places)
+    return WrittenMap(files, site.merge_reports(reports) if reports else empty_report(fmt), places)
 
 
 def empty_report(fmt: Format) -> dict[str, Any]:
@@ -196,7 +198,7 @@ def empty_report(fmt: Format) -> dict[str, Any]:
     return {"format": fmt.name, **empty}
 
 
-def _written(
+def _write_one(
     fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.DerivationNotes
 ) -> WrittenMap:
     """One map of what was derived and what was there."""
@@ -214,13 +216,13 @@ def _written(
     if not fmt.holds:  # a folder's inner maps apply closures themselves
         drawn = derived_layers.parts.keys() - layers.parts.keys()
         applied, closed = applied_closures.close(fmt, used, closures, drawn)
-        if closed.emptied and _lacks_edges(fmt, applied):
+        if closed.emptied and _has_no_edges(fmt, applied):
             applied, closed = applied_closures.close(fmt, used, closures, drawn, mark=True)
         used = applied
-    lines = _told(used, layers, chain, entries or {}, origin or {}, noted)
-    context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
+    lines = _report_layers(used, layers, chain, entries or {}, origin or {}, noted)
+    context.attribution = tuple(sorted(report_credits(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(fmt, used, context)
-    _report_blocked(fmt, closed, context)
+    _report_blocked_edges(fmt, closed, context)
     if not fmt.holds:  # as above
         context.warnings += crossing_edges(
             fmt, used, replace(derived_layers, parts={**source.around.parts, **derived_layers.parts})
@@ -230,12 +232,12 @@ def _written(
     report = {
         "format": fmt.name,
         "layers": lines,
-        "attribution": credits_of(lines),
+        "attribution": report_credits(lines),
         "template": notes.template + context.template,
         # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
-        "dropped": notes.dropped + context.dropped + (not_carried(fmt, None, layers) if entries is None else []),
+        "dropped": notes.dropped + context.dropped + (unsupported_layers(fmt, None, layers) if entries is None else []),
         "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
-        "closures": applied_closures.merged_lines([closed.lines, *inner_closures]),
+        "closures": applied_closures.merge_report_lines([closed.lines, *inner_closures]),
     }
     return WrittenMap(files, report)
 
@@ -245,14 +247,14 @@ def crossing_edges(fmt: Format, written: Layers, around: Layers) -> list[Problem
     return crossings(written, around, shape_of=fmt.name if fmt.bends == "foreign" else None)
 
 
-def _lacks_edges(fmt: Format, layers: Layers) -> bool:
+def _has_no_edges(fmt: Format, layers: Layers) -> bool:
     """Whether the format cannot be written without an edge."""
     return fmt.lacks is not None and fmt.lacks(layers) is not None
 
 
-def _report_blocked(fmt: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
+def _report_blocked_edges(fmt: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
     """Report edges that nobody may use: those left out, and those that stay open to who plans on this map."""
-    context.drop("blocked edges", closed.left_out, f"{fmt.name} cannot mark an edge as blocked for its planners")
+    context.drop("blocked edges", closed.omitted, f"{fmt.name} cannot mark an edge as blocked for its planners")
     if closed.kept:
         edges = "1 blocked edge stays" if closed.kept == 1 else f"{closed.kept} blocked edges stay"
         why = "it was requested with closures=mark, or no edge would be left"
@@ -276,17 +278,21 @@ def from_layers(
 
     around: the layers in which edges may meet obstacles, if there are more than these.
     """
-    if site.asks_for_all(fmt, option_values):
-        return _every_part(fmt, layers, option_values, derived=derived, entries=entries, origin=origin, credit=credit)
-    writer_options = recipes.own_options(fmt, option_values)
+    if site.selects_all(fmt, option_values):
+        return _write_every_part(
+            fmt, layers, option_values, derived=derived, entries=entries, origin=origin, credit=credit
+        )
+    writer_options = recipes.writer_options(fmt, option_values)
     without: frozenset[str] = frozenset()
     failed: list[ChainFailure] = []
-    stock = recipes.stock_of(layers)
+    stock = recipes.available_in(layers)
     while True:
         try:
-            chain = recipes.chain(fmt, stock, writer_options, derived=derived, values=option_values, without=without)
+            chain = recipes.plan_chain(
+                fmt, stock, writer_options, derived=derived, values=option_values, without=without
+            )
         except MissingLayer as error:
-            raise recipes.exhausted(error, failed) from error
+            raise recipes.no_chain_error(error, failed) from error
         chain_layers = Layers({k: layers.parts[k] for k in chain.keys}, layers.datum, layers.levels)
         try:
             beside = around or layers
@@ -309,7 +315,7 @@ def from_layers(
             failed.append(ChainFailure(error.step, error.detail, error.choose))
 
 
-def _every_part(
+def _write_every_part(
     fmt: Format,
     layers: Layers,
     option_values: Mapping[str, Any],
@@ -327,7 +333,7 @@ def _every_part(
         try:
             recipe = site.recipe(version, fmt, option_values, derived=derived, without=without, archive=False)
         except MissingLayer as error:
-            raise recipes.exhausted(error, failed) from error
+            raise recipes.no_chain_error(error, failed) from error
         files: dict[str, bytes] = {}
         places: dict[str, tuple[str, str]] = {}
         reports: list[tuple[str, Mapping[str, Any]]] = []
@@ -346,8 +352,8 @@ def _every_part(
             failed.append(ChainFailure(error.step, error.detail, error.choose))
             continue
         if not files:
-            raise site.nothing_made(recipe)
-        return WrittenMap(files, site.merged_report(reports), places)
+            raise site.no_parts_error(recipe)
+        return WrittenMap(files, site.merge_reports(reports), places)
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,11 +366,11 @@ class _PlacedFile:
 
 def _as_version(layers: Layers) -> Version:
     """What planning needs to know of layers that no store has."""
-    stock = recipes.stock_of(layers)
+    stock = recipes.available_in(layers)
     parts = []
     for key in sorted(layers.parts):
         bounds: Any = dict.fromkeys(stock.anchors.get(key, ()), (0.0, 0.0, 0.0, 0.0))
-        parts.append(PartEntry(key, "", int(key not in stock.blank), bounds, Provenance("raw")))
+        parts.append(PartEntry(key, "", int(key not in stock.empty_parts), bounds, Provenance("raw")))
     now = datetime.fromtimestamp(0, UTC)
     return Version("", 0, "", None, "", "", now, {}, (), (), layers.datum, layers.levels, tuple(parts))
 
@@ -401,7 +407,7 @@ def _inner(
         tuple(report["layers"]),
         tuple(report["dropped"]),
         tuple({**line, "format": fmt.name} for line in report["template"]),
-        tuple(warnings_of(report)),
+        tuple(report_warnings(report)),
     )
 
 
@@ -414,12 +420,12 @@ def media_type(fmt: Format, name: str) -> str:
     return mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
-def zipped(files: Mapping[str, bytes]) -> bytes:
+def zip_files(files: Mapping[str, bytes]) -> bytes:
     """Several files as one archive, the same bytes each time."""
     return _archive.pack(files)
 
 
-def _told(
+def _report_layers(
     used: Layers,
     before: Layers,
     chain: DerivationChain,
@@ -473,12 +479,12 @@ def _ancestry(layer: Layer, steps: Mapping[Layer, Step]) -> tuple[set[Step], set
     return done, roots
 
 
-def credits_of(lines: Iterable[Mapping[str, Any]]) -> list[str]:
+def report_credits(lines: Iterable[Mapping[str, Any]]) -> list[str]:
     """The licences and credits of all layers of a report, each once."""
     return list(dict.fromkeys(text for line in lines for text in line.get("attribution", ())))
 
 
-def labelled(
+def with_value_origin(
     lines: Iterable[Mapping[str, Any]], origin: Mapping[str, str], templates: Templates = NO_TEMPLATES
 ) -> list[dict[str, Any]]:
     """A report's template lines, each with where its value came ``from``. origin: of the map's own parameters; those of
@@ -491,7 +497,9 @@ def labelled(
     return out
 
 
-def not_carried(fmt: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> list[dict[str, Any]]:
+def unsupported_layers(
+    fmt: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers
+) -> list[dict[str, Any]]:
     """Stored layers that this format has no words for."""
     counts: dict[str, int] = {}
     if entries is not None:
@@ -507,7 +515,7 @@ def not_carried(fmt: Format, entries: Mapping[PartKey, PartEntry] | None, layers
     return [{"what": layer, "count": counts[layer], "why": why} for layer in LAYERS if counts.get(layer)]
 
 
-def warnings_of(report: Mapping[str, Any]) -> list[Problem]:
+def report_warnings(report: Mapping[str, Any]) -> list[Problem]:
     """A report's warnings as values."""
     return [
         Problem(w["problem"], w.get("file"), w.get("line"), w.get("where"), w.get("level")) for w in report["warnings"]

@@ -59,7 +59,7 @@ class Relay(LeaderThread):
                 return
 
     def _publish_new(self) -> None:
-        position = self._store.relayed()
+        position = self._store.relay_position()
         while not self._stopping.is_set():
             page = self._store.events(None, position, PAGE)
             if not page:
@@ -73,7 +73,7 @@ class Relay(LeaderThread):
 
     def _replay(self) -> None:
         """A new session's caches are empty: put the last events of each environment again, oldest first."""
-        position = self._store.relayed()
+        position = self._store.relay_position()
         for event in self._store.last_events(position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS):
             if self._stopping.is_set():
                 return

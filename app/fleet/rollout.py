@@ -21,7 +21,7 @@ def next_step(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Rollo
     """The next step of a roll-out, None for waiting on. robots: of its channel; only those vouched for count."""
     robots = [robot for robot in robots if robot.vouched]
     begun = rollout.started if rollout.moved is None else rollout.moved
-    failed = [r for r in robots if r.failed_with(rollout.root)]
+    failed = [r for r in robots if r.has_failed_with(rollout.root)]
     names = {r.robot for r in failed if rollout.said_before.get(r.robot) != rfc3339(r.time)}
     counted = len(names | {r.robot for r in robots if is_online(r, now)})
     broken = f"{len(names)} of {counted} robots failed"

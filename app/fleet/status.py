@@ -21,10 +21,10 @@ PRESENCE_FRESH = timedelta(seconds=60)
 
 def is_online(robot: Robot, now: datetime) -> bool:
     """By its liveliness on the bus where that is newer than its last report, else by a recent report."""
-    if robot.seen is not None:
-        if robot.there and now - robot.seen < PRESENCE_FRESH:
+    if robot.presence_at is not None:
+        if robot.on_bus and now - robot.presence_at < PRESENCE_FRESH:
             return True
-        if not robot.there and robot.seen >= robot.time:
+        if not robot.on_bus and robot.presence_at >= robot.time:
             return False
     return now - robot.time < REPORT_FRESH
 

@@ -24,7 +24,7 @@ from app.store.values import Version
 ALIGNED = "aligned"
 """The step in a part's provenance that tells of it."""
 
-WAYS: Mapping[str, str] = {"objects": "objects_to_occupancy", "voxels": "voxels_to_occupancy"}
+GRID_DERIVATIONS: Mapping[str, str] = {"objects": "objects_to_occupancy", "voxels": "voxels_to_occupancy"}
 """The derivation by which a layer is looked at as a grid."""
 
 
@@ -83,10 +83,10 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
     assert isinstance(grid, OccupancyGrid)
     notes = DerivationNotes()
     if request.pairs:
-        fit, report = _by_points(request, notes)
+        fit, report = _fit_by_points(request, notes)
     else:
         target_grid = (
-            loaded.parts.get(target) if request.layer == "occupancy" else _seen(loaded, request, target, notes)
+            loaded.parts.get(target) if request.layer == "occupancy" else _derive_target(loaded, request, target, notes)
         )
         assert isinstance(target_grid, OccupancyGrid)
         fits = alignment.of_grids(grid, target_grid, angle=request.angle, reach=request.reach, near=request.near)
@@ -113,13 +113,13 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
         notes.warn("other layers keep their place: what was drawn on the grid in local metres does not move with it")
     if request.dry_run:
         return AlignmentResult(report, tuple(notes.warnings), None)
-    old = entries[key].provenance.marked()
+    old = entries[key].provenance.with_edit_step()
     provenance = replace(old, steps=(*old.steps, {"step": ALIGNED, "parameters": report}))
     prepared = store.prepare(base, Changes((Replace(key, moved, provenance),)))
     return AlignmentResult(report, tuple(notes.warnings), prepared)
 
 
-def told_before(version: Version, request: AlignmentRequest) -> dict[str, Any] | None:
+def previous_alignment(version: Version, request: AlignmentRequest) -> dict[str, Any] | None:
     """What a version's provenance says of such an alignment, for a request that is sent again."""
     for entry in version.parts:
         if entry.key == PartKey("occupancy", request.level, request.grid):
@@ -128,7 +128,7 @@ def told_before(version: Version, request: AlignmentRequest) -> dict[str, Any] |
     return None
 
 
-def _by_points(request: AlignmentRequest, notes: DerivationNotes) -> tuple[alignment.Fit, dict[str, Any]]:
+def _fit_by_points(request: AlignmentRequest, notes: DerivationNotes) -> tuple[alignment.Fit, dict[str, Any]]:
     fit, disagreeing, scale = alignment.of_pairs(
         np.array(request.pairs, np.float64).reshape(-1, 2, 2), near=request.near
     )
@@ -139,9 +139,9 @@ def _by_points(request: AlignmentRequest, notes: DerivationNotes) -> tuple[align
     return fit, {"disagreeing": disagreeing, "scale": round(scale, 6)}
 
 
-def _seen(loaded: Layers, request: AlignmentRequest, target: PartKey, notes: DerivationNotes) -> OccupancyGrid:
+def _derive_target(loaded: Layers, request: AlignmentRequest, target: PartKey, notes: DerivationNotes) -> OccupancyGrid:
     """The layer as the grid that a derivation makes of it."""
-    step = derive.all_derivations()[WAYS[request.layer]].step()
+    step = derive.all_derivations()[GRID_DERIVATIONS[request.layer]].step()
     unknown = request.values.keys() - derive.takes(step.name)
     if unknown:
         accepted = ", ".join(sorted(derive.takes(step.name)))

@@ -13,7 +13,7 @@ from app.ingest.prepare import open_store
 from app.model.layers import MAP, Layer, Layers, PartKey, is_empty
 from app.model.names import did_you_mean
 from app.store.changes import Changes, Prepared, Provenance, Replace
-from app.store.values import PartEntry, Version, frame_line
+from app.store.values import PartEntry, Version, frame_input
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,9 @@ def prepare_derivation(
     """
     store = open_store(database_url, blob_dir)
     derivation = derive.all_derivations()[request.method]
-    stored = {e.key: e for e in base.parts if e.count > 0 and e.key.layer != derivation.gives and not _is_drawn(e)}
+    stored = {
+        e.key: e for e in base.parts if e.count > 0 and e.key.layer != derivation.gives and not _is_display_only(e)
+    }
     existing_parts = {e.key: e for e in base.parts if e.count > 0 and e.key.layer == derivation.gives}
     without: frozenset[str] = frozenset({request.method})
     failed: list[str] = []
@@ -94,7 +96,7 @@ def prepare_derivation(
         None,
         tuple(step.as_dict() for step in chain),
         tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution)),
-        (*(input_line(e) for k, e in sorted(used.items())), frame_line(base.datum, base.levels)),
+        (*(input_line(e) for k, e in sorted(used.items())), frame_input(base.datum, base.levels)),
     )
     operations = tuple(Replace(key, part, provenance) for key, part in sorted(fresh.items()))
     warnings = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
@@ -102,9 +104,9 @@ def prepare_derivation(
     return store.prepare(base, Changes(operations)), (*notes.warnings, *warnings)
 
 
-def _is_drawn(entry: PartEntry) -> bool:
+def _is_display_only(entry: PartEntry) -> bool:
     """Whether a part was made for people to look at, so that it is no evidence."""
-    return not entry.provenance.edited and derive.is_drawn(entry.provenance.steps)
+    return not entry.provenance.is_edited and derive.is_drawn(entry.provenance.steps)
 
 
 def _steps(
@@ -139,9 +141,9 @@ def _check_free(request: DerivationRequest, keys: Any, existing_parts: Mapping[P
         entry = existing_parts.get(key)
         if entry is None or request.replace:
             continue
-        if entry.provenance.information == "derived" and not entry.provenance.edited:
+        if entry.provenance.information == "derived" and not entry.provenance.is_edited:
             continue
-        edited = entry.provenance.edited
+        edited = entry.provenance.is_edited
         why = "was derived and then edited" if edited else f"is {entry.provenance.information}"
         raise Conflict(
             f"the {key.layer} {key.level}/{key.name} {why}: to put a derived one in its place, ask with replace=true"

@@ -18,7 +18,7 @@ import shapely.geometry
 
 from app import formats
 from app.errors import Invalid, MissingDatum, NotFound, Problem
-from app.ingest.prepare import moved
+from app.ingest.prepare import datum_moved_warnings
 from app.model.features import NO_GEOMETRY, Features, Properties
 from app.model.frame import GROUND, MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
@@ -42,7 +42,7 @@ _SHAPES: Mapping[str, frozenset[str]] = {
 }
 """Which geometries each item may have; objects may have any."""
 
-_USUAL_NAME: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "objects": "edit"}
+_DEFAULT_NAME: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "objects": "edit"}
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ class _Draft:
     def __post_init__(self) -> None:
         self.place = {} if self.stored is None else {item: k for k, item in enumerate(self.stored.ids)}
 
-    def holds(self, item: str) -> bool:
+    def has_item(self, item: str) -> bool:
         if item in self.puts:
             return True
         return item not in self.deletes and item in self.place
@@ -73,7 +73,7 @@ class _Draft:
         k = self.place[item]
         return self.stored.geometry[k], self.stored.properties[k], bool(self.stored.local[k])
 
-    def edges_at(self, node: str) -> list[str]:
+    def connected_edges(self, node: str) -> list[str]:
         """The stored edges that start or end at a node."""
         if self._edges is None:
             self._edges = defaultdict(list)
@@ -83,7 +83,7 @@ class _Draft:
                         self._edges[end].append(item)
         return self._edges.get(node, [])
 
-    def edited(self) -> set[str]:
+    def edited_ids(self) -> set[str]:
         """The stored items that go, or become something else."""
         return self.deletes | {i for i, new in self.puts.items() if i in self.place and not _equal(self.before(i), new)}
 
@@ -106,7 +106,9 @@ def edit_changes(
         raise Invalid("; ".join(p.problem for p in problems), problems)
     session.loosen()
     change_set = session.changes()
-    return change_set, tuple(moved(base, change_set.datum)) if isinstance(change_set.datum, Datum) else ()
+    return change_set, tuple(datum_moved_warnings(base, change_set.datum)) if isinstance(
+        change_set.datum, Datum
+    ) else ()
 
 
 class _Session:
@@ -117,7 +119,7 @@ class _Session:
         self._grids: dict[PartKey, OccupancyGrid] = {}
         self._keys = {e.key for e in base.parts}
         self._datum = base.datum
-        self._known = {level.name for level in base.levels}
+        self._known_ids = {level.name for level in base.levels}
 
     def apply(self, change: Mapping[str, Any]) -> None:
         """One edit: op put, delete or cells."""
@@ -132,7 +134,7 @@ class _Session:
         extra = set(change) - members_by_operation[operation]
         if extra:
             raise Invalid(f"{operation} has no member {sorted(extra)[0]!r}")
-        {"put": self._put, "delete": self._delete, "cells": self._cells}[operation](change)
+        {"put": self._apply_put, "delete": self._apply_delete, "cells": self._apply_cells}[operation](change)
 
     def dangling(self) -> list[Problem]:
         """Edges that these edits leave without a node at one end. A lift's edge may end in another level's network.
@@ -144,14 +146,16 @@ class _Session:
             if key.layer != "topology":
                 continue
             put = {i for i, (_, p, _) in draft.puts.items() if p.get("kind") == "edge"}
-            cut = {i for node in draft.deletes for i in draft.edges_at(node) if draft.holds(i)}
+            cut = {i for node in draft.deletes for i in draft.connected_edges(node) if draft.has_item(i)}
             for item in sorted(put | cut):
                 properties = draft.row(item)[1]
                 if properties.get("kind") != "edge":
                     continue
                 for end in ("source", "target"):
                     node = properties.get(end)
-                    if not self._is_node(draft, node) and not (item in put and self._dangled(draft, item, end, node)):
+                    if not self._is_node(draft, node) and not (
+                        item in put and self._was_dangling(draft, item, end, node)
+                    ):
                         problem = f"edge {item} has {end} {node!r}, which is no node: put the node, or delete the edge"
                         out.append(Problem(problem, where=item))
         return out
@@ -160,15 +164,15 @@ class _Session:
         """Whether a node of this id is in the network, or in that of another level."""
         if not isinstance(item, str):
             return False
-        if draft.holds(item):
+        if draft.has_item(item):
             return draft.row(item)[1].get("kind") == "node"
         networks = [key for key in sorted({*self._keys, *self._drafts}) if key.layer == "topology"]
         return any(
-            self._draft(key).holds(item) and self._draft(key).row(item)[1].get("kind") == "node" for key in networks
+            self._draft(key).has_item(item) and self._draft(key).row(item)[1].get("kind") == "node" for key in networks
         )
 
     @staticmethod
-    def _dangled(draft: _Draft, item: str, end: str, node: Any) -> bool:
+    def _was_dangling(draft: _Draft, item: str, end: str, node: Any) -> bool:
         """Whether the stored edge ended there already, in nothing, and not by these edits."""
         return item in draft.place and draft.before(item)[1].get(end) == node and node not in draft.deletes
 
@@ -181,11 +185,13 @@ class _Session:
         touched: dict[str, set[str]] = defaultdict(set)
         for key, draft in list(self._drafts.items()):
             if key.layer == "objects" and key.name in families:
-                touched[key.level] |= draft.edited()
+                touched[key.level] |= draft.edited_ids()
             elif key.layer == "topology" and draft.stored is not None:
                 positions = {i: k for k, i in enumerate(draft.stored.ids)}
                 sources = {
-                    draft.stored.properties[positions[i]].get("drawn_from") for i in draft.edited() if i in positions
+                    draft.stored.properties[positions[i]].get("drawn_from")
+                    for i in draft.edited_ids()
+                    if i in positions
                 }
                 touched[key.level] |= {s for s in sources if isinstance(s, str)}
         for key in sorted(self._keys):
@@ -216,7 +222,7 @@ class _Session:
         for key, grid in sorted(self._grids.items()):
             operations.append(Replace(key, grid, self._provenance(key)))
         levels = join_levels(
-            self._base.levels, [Level(o.key.level) for o in operations if o.key.level not in self._known]
+            self._base.levels, [Level(o.key.level) for o in operations if o.key.level not in self._known_ids]
         )
         return Changes(
             tuple(operations),
@@ -226,7 +232,7 @@ class _Session:
 
     def _provenance(self, key: PartKey) -> Provenance:
         """An edited part stays what it was made of: raw, derived …; what was derived is no longer made anew."""
-        return next((e.provenance for e in self._base.parts if e.key == key), EDITED).marked()
+        return next((e.provenance for e in self._base.parts if e.key == key), EDITED).with_edit_step()
 
     def _draft(self, key: PartKey) -> _Draft:
         if key not in self._drafts:
@@ -241,7 +247,7 @@ class _Session:
                 return layer
         raise Invalid(f"layer must be one of {', '.join(sorted(VECTOR_LAYERS))}, got {layer_name!r}")
 
-    def _put(self, change: Mapping[str, Any]) -> None:
+    def _apply_put(self, change: Mapping[str, Any]) -> None:
         layer, feature = self._layer(change), change.get("feature")
         if not isinstance(feature, Mapping) or feature.get("type") != "Feature":
             raise Invalid("put needs 'feature', a GeoJSON Feature")
@@ -258,7 +264,7 @@ class _Session:
             properties = self._take_datum(properties)
             if properties.get("kind") == "datum":
                 return
-        key = self._key_of(layer, item, change)
+        key = self._find_part(layer, item, change)
         draft = self._draft(key)
         geometry, local = self._geometry(feature, change)
         kind: str = layer
@@ -267,7 +273,7 @@ class _Session:
             kind = str(properties["kind"])
             if geometry is None and kind == "edge":
                 geometry, local = self._straight(draft, properties)
-        before = draft.row(item) if draft.holds(item) else None
+        before = draft.row(item) if draft.has_item(item) else None
         if geometry is None:
             geometry = NO_GEOMETRY
         elif before is not None:
@@ -300,7 +306,7 @@ class _Session:
         if anchored != local and self._frame is None:
             return geometry, local
         shown = stored if anchored == local else self._other(stored, anchored)
-        if _near(shown, geometry, SAME_METRES if local else SAME_DEGREES):
+        if _is_nearly_equal(shown, geometry, SAME_METRES if local else SAME_DEGREES):
             return stored, anchored
         return (geometry if anchored == local else self._other(geometry, local)), anchored
 
@@ -308,7 +314,7 @@ class _Session:
         """An edge without a geometry runs straight from node to node."""
         ends = []
         for end in ("source", "target"):
-            if not draft.holds(properties[end]):
+            if not draft.has_item(properties[end]):
                 return NO_GEOMETRY, True  # told as dangling when all edits are known
             ends.append(draft.row(properties[end]))
             if ends[-1][0].geom_type != "Point" or ends[-1][0].is_empty:
@@ -329,7 +335,7 @@ class _Session:
         """Edges that ended at a node's old place end at its new one, unless this change puts them itself."""
         if draft.stored is None or before[0].equals_exact(now[0], 0.0):
             return
-        for item in draft.edges_at(node):
+        for item in draft.connected_edges(node):
             if item in draft.deletes or (item in draft.puts and item not in draft.dragged):
                 continue
             line, properties, local = draft.row(item)  # its other end may have been dragged before
@@ -346,19 +352,19 @@ class _Session:
                 vertices[-1] = target
             draft.puts[item] = (shapely.LineString(vertices), properties, local)
 
-    def _delete(self, change: Mapping[str, Any]) -> None:
+    def _apply_delete(self, change: Mapping[str, Any]) -> None:
         layer, item = self._layer(change), change.get("id")
         if not isinstance(item, str) or not item:
             raise Invalid("delete needs 'id', the id of a feature")
-        key = self._key_of(layer, item, change)
+        key = self._find_part(layer, item, change)
         draft = self._draft(key)
-        if not draft.holds(item):
+        if not draft.has_item(item):
             raise NotFound(f"there is no feature {item!r} in {layer}")
         draft.puts.pop(item, None)
         if item in draft.place:
             draft.deletes.add(item)
 
-    def _key_of(self, layer: Layer, item: str, change: Mapping[str, Any]) -> PartKey:
+    def _find_part(self, layer: Layer, item: str, change: Mapping[str, Any]) -> PartKey:
         """The part that an edit means: the named one, else the one that holds the id, else the usual one."""
         level, name = change.get("level"), change.get("name")
         fitting = sorted(
@@ -366,13 +372,13 @@ class _Session:
             for k in {*self._keys, *self._drafts}
             if k.layer == layer and level in (None, k.level) and name in (None, k.name)
         )
-        holding = [k for k in fitting if self._draft(k).holds(item)]
+        holding = [k for k in fitting if self._draft(k).has_item(item)]
         if len(holding) > 1:
             choices = ", ".join(f"level {k.level} name {k.name}" for k in holding)
             raise Invalid(f"several parts of {layer} hold {item!r}: give 'level' and 'name', one of: {choices}")
         if holding:
             return holding[0]
-        usual = PartKey(layer, level or GROUND, name or _USUAL_NAME[layer])
+        usual = PartKey(layer, level or GROUND, name or _DEFAULT_NAME[layer])
         same = [k for k in fitting if k.level == usual.level]
         return same[0] if layer == "topology" and len(same) == 1 else usual
 
@@ -383,7 +389,7 @@ class _Session:
         shape = place if place is not None else feature.get("geometry")
         if shape is None:
             return None, local
-        return shape_of(shape), local
+        return parse_geometry(shape), local
 
     def _is_local(self, change: Mapping[str, Any]) -> bool:
         crs = change.get("crs") or ("wgs84" if self._base.datum is not None else "local")
@@ -391,7 +397,7 @@ class _Session:
             raise Invalid(f"crs must be local or wgs84, got {crs!r}")
         return bool(crs == "local")
 
-    def _cells(self, change: Mapping[str, Any]) -> None:
+    def _apply_cells(self, change: Mapping[str, Any]) -> None:
         key = self._grid_key(change)
         if key not in self._grids:
             stored = self._store.load(self._base, [key]).parts[key]
@@ -400,7 +406,7 @@ class _Session:
         grid, value = self._grids[key], change.get("value")
         if isinstance(value, bool) or not isinstance(value, int) or not (0 <= value <= OCCUPIED or value == UNKNOWN):
             raise Invalid(f"value must be 0 to 100, or 255 for unknown, got {value!r}")
-        polygon = shape_of(change.get("polygon"))
+        polygon = parse_geometry(change.get("polygon"))
         if polygon.geom_type not in ("Polygon", "MultiPolygon") or not polygon.is_valid:
             reason = shapely.is_valid_reason(polygon)
             raise Invalid(f"polygon must be a valid GeoJSON Polygon or MultiPolygon, got {polygon.geom_type}: {reason}")
@@ -465,7 +471,7 @@ def cells_within(grid: OccupancyGrid, polygon: Any) -> np.ndarray[Any, np.dtype[
     return mask
 
 
-def shape_of(geometry: Any) -> Any:
+def parse_geometry(geometry: Any) -> Any:
     """A GeoJSON geometry; Invalid where it is none."""
     if not isinstance(geometry, Mapping):
         raise Invalid(f"a geometry must be a GeoJSON object, got {type(geometry).__name__}")
@@ -479,7 +485,7 @@ def _equal(a: tuple[Any, Properties, bool], b: tuple[Any, Properties, bool]) -> 
     return a[2] == b[2] and a[1] == b[1] and bool(shapely.equals_identical(a[0], b[0]))
 
 
-def _near(a: Any, b: Any, tolerance: float) -> bool:
+def _is_nearly_equal(a: Any, b: Any, tolerance: float) -> bool:
     """Whether two geometries are built alike, each coordinate within the tolerance; heights within two nanometres."""
     if a.geom_type != b.geom_type or a.has_z != b.has_z or not a.equals_exact(b, 0.0 if a.is_empty else tolerance):
         return False

@@ -38,7 +38,7 @@ def prepare_generation(
     generator, _ = generate.check(order.generator, order.seed, order.values)
     used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in generator.reads}
     if not generator.works_on:
-        used = {k: e for k, e in used.items() if not _made_up(e)}
+        used = {k: e for k, e in used.items() if not _is_generated(e)}
     loaded = store.load(base, sorted(used))
     given = Layers(loaded.parts, base.datum, base.levels)
     notes = DerivationNotes()
@@ -57,7 +57,7 @@ def prepare_generation(
         operations += [
             Drop(key)
             for key in sorted(existing_parts)
-            if key not in generated_layers.parts and _made_up(existing_parts[key])
+            if key not in generated_layers.parts and _is_generated(existing_parts[key])
         ]
     datum = generated_layers.datum if generated_layers.datum != base.datum else KEEP
     levels = generated_layers.levels if generated_layers.levels != base.levels else KEEP
@@ -66,9 +66,9 @@ def prepare_generation(
     return store.prepare(base, Changes(tuple(operations), datum, levels)), (*notes.warnings, *warnings)
 
 
-def _made_up(entry: PartEntry) -> bool:
+def _is_generated(entry: PartEntry) -> bool:
     """Whether it is a generator's work and nobody's since."""
-    return entry.provenance.information == "generated" and not entry.provenance.edited
+    return entry.provenance.information == "generated" and not entry.provenance.is_edited
 
 
 def _check_free(
@@ -80,9 +80,9 @@ def _check_free(
     """A generator may replace what it was made to work on, and its like's work; the rest only where asked."""
     for key in sorted(generated_layers.parts):
         entry = existing_parts.get(key)
-        if entry is None or order.replace or key.layer in generator.works_on or _made_up(entry):
+        if entry is None or order.replace or key.layer in generator.works_on or _is_generated(entry):
             continue
-        edited, kind = entry.provenance.edited, entry.provenance.information
+        edited, kind = entry.provenance.is_edited, entry.provenance.information
         why = f"was {kind} and then edited" if edited else f"is {kind}"
         raise Conflict(
             f"the {key.layer} {key.level}/{key.name} {why}: to put a made-up one in its place, ask with replace=true"

@@ -62,11 +62,11 @@ BLOCK: Mapping[str, int] = {"wms": 2048, "mapbox": 1280}
 MAPBOX_TILE = 512
 """Pixels of a tile by which Mapbox counts its zoom levels."""
 
-MOST_REQUESTS = 400
-MOST_PIXELS = 2**26
-AT_ONCE = 4
-REDIRECTS = 3
-LONGEST_WAIT = 10.0
+MAX_REQUESTS = 400
+MAX_PIXELS = 2**26
+MAX_CONCURRENT_REQUESTS = 4
+MAX_REDIRECTS = 3
+MAX_WAIT_SECONDS = 10.0
 
 MAGIC: Mapping[bytes, str] = {b"\x89PNG\r\n\x1a\n": "png", b"\xff\xd8\xff": "jpg"}
 
@@ -94,7 +94,7 @@ class Provider:
         """The only host that is asked."""
         return urlsplit(self.url).netloc.rpartition("@")[2]
 
-    def told(self, chosen: Parameters) -> dict[str, Any]:
+    def provenance_step(self, chosen: Parameters) -> dict[str, Any]:
         """The step as a version's provenance says it."""
         parameters = {p["name"]: getattr(chosen, p["name"]) for p in describe(Parameters)}
         parameters |= {"provider": self.host, "kind": self.kind}
@@ -146,7 +146,7 @@ class Mosaic:
 def check_free(base: Version, chosen: Parameters, *, replace: bool) -> None:
     """Conflict where a source has told a picture of that name."""
     old = {e.key: e for e in base.parts if e.count > 0}.get(chosen.key)
-    if old is not None and not replace and (old.provenance.information != "derived" or old.provenance.edited):
+    if old is not None and not replace and (old.provenance.information != "derived" or old.provenance.is_edited):
         raise Conflict(
             f"the picture {chosen.level}/{chosen.picture} is {old.provenance.information}: to put a fetched one in its "
             "place, ask with replace=true, or name another picture"
@@ -173,7 +173,7 @@ def site_box(site: Layers, chosen: Parameters) -> tuple[float, float, float, flo
 
 
 # --- what to ask for -------------------------------------------------------------------------------------------------
-def sheet(provider: Provider, box: tuple[float, float, float, float], resolution: float) -> Mosaic:
+def plan_mosaic(provider: Provider, box: tuple[float, float, float, float], resolution: float) -> Mosaic:
     """The requests that cover a box (west, south, east, north in degrees). Invalid where they would be too many."""
     west, south, east, north = box
     if not (-180 <= west < east <= 180 and -85.05 <= south < north <= 85.05):
@@ -190,10 +190,10 @@ def sheet(provider: Provider, box: tuple[float, float, float, float], resolution
     width, height = right - left, bottom - top
     side = provider.tile if provider.kind == "xyz" else BLOCK[provider.kind]
     count = (math.ceil(width / side) + 1) * (math.ceil(height / side) + 1)
-    if count > MOST_REQUESTS or width * height > MOST_PIXELS:
+    if count > MAX_REQUESTS or width * height > MAX_PIXELS:
         cost = f"{width} × {height} pixels in about {count} requests"
         raise Invalid(
-            f"the picture would have {cost}; at most {MOST_PIXELS} pixels and {MOST_REQUESTS} requests are made: give "
+            f"the picture would have {cost}; at most {MAX_PIXELS} pixels and {MAX_REQUESTS} requests are made: give "
             "a coarser resolution",
             [Problem("too fine for a site of this size", where="resolution")],
         )
@@ -290,9 +290,9 @@ class Fetcher:
         headers = {"Accept": "image/png, image/jpeg", "Accept-Encoding": "identity", "User-Agent": "fleet-map-server"}
         with (
             httpx.Client(timeout=timeout, headers=headers, follow_redirects=False) as client,
-            ThreadPoolExecutor(AT_ONCE) as threads,
+            ThreadPoolExecutor(MAX_CONCURRENT_REQUESTS) as threads,
         ):
-            waiting = [threads.submit(self._one, client, block, deadline, room) for block in blocks]
+            waiting = [threads.submit(self._fetch_tile, client, block, deadline, room) for block in blocks]
             try:
                 return [one.result() for one in waiting]
             except BaseException:
@@ -301,31 +301,33 @@ class Fetcher:
                 room.stopped.set()
                 raise
 
-    def _one(self, client: httpx.Client, block: TileRequest, deadline: float, room: _ByteBudget) -> bytes | None:
-        cached = self._cached(block)
+    def _fetch_tile(self, client: httpx.Client, block: TileRequest, deadline: float, room: _ByteBudget) -> bytes | None:
+        cached = self._read_cache(block)
         if cached is not None:
             return cached
         for k in range(self.provider.tries):
             try:
-                data = self._asked(client, block, deadline, room)
+                data = self._request_tile(client, block, deadline, room)
                 break
             except _RetryableError as error:
-                wait = max(0.5 * 2**k, min(error.wait, LONGEST_WAIT))
+                wait = max(0.5 * 2**k, min(error.wait, MAX_WAIT_SECONDS))
                 last = k + 1 == self.provider.tries
                 if last or room.stopped.is_set() or time.monotonic() + wait > deadline:
                     raise Unavailable(f"the imagery provider {self.provider.host} {error}: try again later") from None
                 self._sleep(wait)
         if data is not None:
-            self._keep(block, data)
+            self._write_cache(block, data)
         return data
 
-    def _asked(self, client: httpx.Client, block: TileRequest, deadline: float, room: _ByteBudget) -> bytes | None:
+    def _request_tile(
+        self, client: httpx.Client, block: TileRequest, deadline: float, room: _ByteBudget
+    ) -> bytes | None:
         """One answer. The address with the token is in no message."""
         import httpx
 
         url = self._address(block.url)
         try:
-            for _ in range(REDIRECTS + 1):
+            for _ in range(MAX_REDIRECTS + 1):
                 with client.stream("GET", url) as answer:
                     if answer.is_redirect:
                         url = self._led_to(url, answer.headers.get("location", ""))
@@ -334,10 +336,10 @@ class Fetcher:
         except httpx.TimeoutException:
             raise _RetryableError("does not answer in time") from None
         except httpx.InvalidURL:
-            raise self._wrong("leads to an address that is none") from None
+            raise self._provider_error("leads to an address that is none") from None
         except httpx.HTTPError as error:
             raise _RetryableError(f"cannot be reached ({type(error).__name__})") from None
-        raise self._wrong(f"redirects more than {REDIRECTS} times")
+        raise self._provider_error(f"redirects more than {MAX_REDIRECTS} times")
 
     def _address(self, url: str) -> str:
         """The address with the token in it."""
@@ -350,7 +352,7 @@ class Fetcher:
         target = urljoin(url, location)
         old, new = urlsplit(url), urlsplit(target)
         if (old.scheme, old.netloc) != (new.scheme, new.netloc):
-            raise self._wrong("redirects to another host, which is not followed")
+            raise self._provider_error("redirects to another host, which is not followed")
         return target
 
     def _body(self, answer: httpx.Response, deadline: float, room: _ByteBudget) -> bytes | None:
@@ -358,19 +360,19 @@ class Fetcher:
         if status == 404:
             return None
         if status in (401, 403):
-            raise self._wrong(f"refuses ({status}): check FLEETMAP_IMAGERY_TOKEN and what it allows")
+            raise self._provider_error(f"refuses ({status}): check FLEETMAP_IMAGERY_TOKEN and what it allows")
         if status == 429 or status >= 500:
             retry_after = answer.headers.get("retry-after", "")
             raise _RetryableError(
                 f"answers {status}", float(retry_after) if retry_after.isascii() and retry_after.isdigit() else 0.0
             )
         if status != 200:
-            raise self._wrong(f"answers {status}")
+            raise self._provider_error(f"answers {status}")
         kind = answer.headers.get("content-type", "").partition(";")[0].strip().lower()[:80]
         if kind and not kind.startswith("image/") and kind != "application/octet-stream":
-            raise self._wrong(f"sends {kind!r} instead of a picture: check FLEETMAP_IMAGERY_URL")
+            raise self._provider_error(f"sends {kind!r} instead of a picture: check FLEETMAP_IMAGERY_URL")
         if answer.headers.get("content-encoding", "identity").lower() != "identity":
-            raise self._wrong("sends a compressed answer that was not asked for")
+            raise self._provider_error("sends a compressed answer that was not asked for")
         length = answer.headers.get("content-length", "")
         if length.isascii() and length.isdigit() and int(length) > self.provider.max_bytes:
             raise self._too_large()
@@ -384,22 +386,24 @@ class Fetcher:
                 raise _RetryableError(f"has not sent everything within {self.provider.seconds:g} s")
         data = bytes(out)
         if not any(data.startswith(magic) for magic in MAGIC):
-            raise self._wrong("sends what is neither PNG nor JPEG: check FLEETMAP_IMAGERY_URL")
+            raise self._provider_error("sends what is neither PNG nor JPEG: check FLEETMAP_IMAGERY_URL")
         return data
 
-    def _wrong(self, problem: str) -> CannotDerive:
+    def _provider_error(self, problem: str) -> CannotDerive:
         return CannotDerive(f"the imagery provider {self.provider.host} {problem}", step=METHOD)
 
     def _too_large(self) -> CannotDerive:
         max_bytes = self.provider.max_bytes
-        return self._wrong(f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({max_bytes}): ask for a coarser resolution")
+        return self._provider_error(
+            f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({max_bytes}): ask for a coarser resolution"
+        )
 
     # --- what was fetched before ---
     def _file(self, block: TileRequest) -> Path | None:
         folder = self.provider.cache_dir
         return None if folder is None else folder / hashlib.sha256(block.url.encode()).hexdigest()
 
-    def _cached(self, block: TileRequest) -> bytes | None:
+    def _read_cache(self, block: TileRequest) -> bytes | None:
         file = self._file(block)
         if file is None:
             return None
@@ -410,7 +414,7 @@ class Fetcher:
             return None
         return data if any(data.startswith(magic) for magic in MAGIC) else None
 
-    def _keep(self, block: TileRequest, data: bytes) -> None:
+    def _write_cache(self, block: TileRequest, data: bytes) -> None:
         """Remember an answer; what was not used for the longest time goes. A full disk is no reason to fail."""
         file = self._file(block)
         if file is None or len(data) > self.provider.cache_bytes:
@@ -455,13 +459,13 @@ def _trim(folder: Path, max_bytes: int) -> None:
 # --- in a worker ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class FetchedImagery:
-    """What a provider sent, and what is to become of it. told: the step as the version's provenance says it. site: the
-    fences that it was fetched for, as the provenance's inputs."""
+    """What a provider sent, and what is to become of it. provenance_step: the step as the version's provenance says it.
+    site: the fences that it was fetched for, as the provenance's inputs."""
 
     sheet: Mosaic
     answers: tuple[bytes | None, ...]
-    chosen: Parameters
-    told: Mapping[str, Any]
+    parameters: Parameters
+    provenance_step: Mapping[str, Any]
     attribution: tuple[str, ...]
     site: tuple[Mapping[str, Any], ...] = ()
 
@@ -473,18 +477,18 @@ def prepare_picture(
 
     Raises CannotDerive for an answer that is no picture of the size that was asked for.
     """
-    picture, missing = put_together(fetched.sheet, fetched.answers, fetched.attribution, limits)
+    picture, missing = assemble_image(fetched.sheet, fetched.answers, fetched.attribution, limits)
     warnings = []
     if missing:
         why = f"the provider has no picture for {missing} of {len(fetched.answers)} parts: they are transparent"
         warnings.append(Problem(why))
     inputs = (*fetched.site, {"datum": base.datum.as_dict() if base.datum else None})
-    provenance = Provenance("derived", None, (), None, (dict(fetched.told),), fetched.attribution, inputs)
+    provenance = Provenance("derived", None, (), None, (dict(fetched.provenance_step),), fetched.attribution, inputs)
     store = open_store(database_url, blob_dir)
-    return store.prepare(base, Changes((Replace(fetched.chosen.key, picture, provenance),))), tuple(warnings)
+    return store.prepare(base, Changes((Replace(fetched.parameters.key, picture, provenance),))), tuple(warnings)
 
 
-def put_together(
+def assemble_image(
     mosaic: Mosaic, answers: Iterable[bytes | None], attribution: tuple[str, ...], limits: Limits
 ) -> tuple[GeoImage, int]:
     """(the picture, how many of its parts the provider does not have). CannotDerive where it has none."""
@@ -494,7 +498,7 @@ def put_together(
         if data is None:
             missing += 1
             continue
-        shown = _decoded(block, data, limits)
+        shown = _decode_tile(block, data, limits)
         row, column = max(block.row, 0), max(block.column, 0)
         end, right = min(block.row + block.height, mosaic.height), min(block.column + block.width, mosaic.width)
         inner = shown[row - block.row : end - block.row, column - block.column : right - block.column]
@@ -506,7 +510,7 @@ def put_together(
     return GeoImage(image, mosaic.transform, MERCATOR, properties), missing
 
 
-def _decoded(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.uint8]:
+def _decode_tile(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.uint8]:
     """An answer's pixels as RGBA: uint8 [height, width, 4]. It is read as an upload is."""
     end = next(kind for magic, kind in MAGIC.items() if data.startswith(magic))
     name = f"answer.{end}"

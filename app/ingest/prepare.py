@@ -71,19 +71,19 @@ def prepare_upload(
     store = open_store(database_url, blob_dir)
     uploaded = {name: path.read_bytes() for name, path in paths.items()}
     files = upload_reader.unpack(uploaded, limits)
-    upload_bundle = upload_reader.read(files, hints, EnvironmentContext(base.datum, fence_of(store, base)), limits)
+    upload_bundle = upload_reader.read(files, hints, EnvironmentContext(base.datum, read_fence(store, base)), limits)
     renamed: dict[str, dict[str, str]] = {}
     # Sorted, so objects come before the topology that was drawn from them.
     operations: list[Operation] = [
         operation_for(store, base, upload_bundle, key, mode, files, renamed) for key in sorted(upload_bundle.parts)
     ]
     operations += _stale_clouds(base, upload_bundle)
-    warnings = [*upload_bundle.warnings, *_idle(hints, upload_bundle)]
-    warnings += far_away(upload_bundle, upload_bundle.datum or base.datum)
+    warnings = [*upload_bundle.warnings, *_unused_hints(hints, upload_bundle)]
+    warnings += distance_warnings(upload_bundle, upload_bundle.datum or base.datum)
     datum: Any = KEEP
     if upload_bundle.datum is not None and upload_bundle.datum != base.datum:
         datum = upload_bundle.datum
-        warnings += moved(base, upload_bundle.datum)
+        warnings += datum_moved_warnings(base, upload_bundle.datum)
     levels: Any = KEEP
     joined_levels = join_levels(base.levels, upload_bundle.levels)
     listed = {level.name for level in joined_levels}
@@ -109,7 +109,7 @@ def _stale_clouds(base: Version, upload_bundle: Bundle) -> list[Drop]:
     return [Drop(key) for key in clouds if key in existing_keys and key not in upload_bundle.parts]
 
 
-def _idle(hints: UploadHints, upload_bundle: Bundle) -> list[Problem]:
+def _unused_hints(hints: UploadHints, upload_bundle: Bundle) -> list[Problem]:
     """What the sender said and nothing came of, so that a misunderstanding is noticed."""
     out = []
     drawings = {f.name for f in formats.all_formats().values() if f.drawing}
@@ -126,12 +126,12 @@ def prepare_changes(database_url: str, blob_dir: str, base: Version, changes: Ch
     return open_store(database_url, blob_dir).prepare(base, changes)
 
 
-FAR_METRES = 100_000.0
+MAX_USUAL_METRES = 100_000.0
 """From the datum. The local frame is exact to a millimetre in 10 km; what lies so far away is most often a mistake."""
 _EARTH_RADIUS = 6_371_000.0
 
 
-def far_away(upload_bundle: Bundle, datum: Datum | None) -> list[Problem]:
+def distance_warnings(upload_bundle: Bundle, datum: Datum | None) -> list[Problem]:
     """Parts whose nearest corner is far from the datum: swapped coordinates, or the wrong environment."""
     out = []
     for key, part in sorted(upload_bundle.parts.items()):
@@ -144,7 +144,7 @@ def far_away(upload_bundle: Bundle, datum: Datum | None) -> list[Problem]:
         if datum is not None and not part.local.all():
             metres.append(_metres_to(shapely.total_bounds(part.geometry[~part.local]), datum))
         distances = [m for m in metres if np.isfinite(m)]
-        if distances and min(distances) > FAR_METRES:
+        if distances and min(distances) > MAX_USUAL_METRES:
             location = f"{key.layer} {key.level}/{key.name}"
             reason = (
                 f"lies about {min(distances) / 1000:.0f} km from the datum: is it the right environment, and are no "
@@ -168,7 +168,7 @@ def _metres_to(box: NDArray[np.float64], datum: Datum) -> float:
     return float(2 * _EARTH_RADIUS * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0))))
 
 
-def moved(base: Version, datum: Datum) -> list[Problem]:
+def datum_moved_warnings(base: Version, datum: Datum) -> list[Problem]:
     """The warning that belongs to a new datum."""
     if base.datum is None:
         return []
@@ -181,7 +181,7 @@ def moved(base: Version, datum: Datum) -> list[Problem]:
     ]
 
 
-def fence_of(store: Store, base: Version) -> shapely.Polygon | None:
+def read_fence(store: Store, base: Version) -> shapely.Polygon | None:
     """The fence of a version's location."""
     keys = [e.key for e in base.parts if e.key.layer == "location" and e.count]
     with contextlib.suppress(Damaged):  # the upload may be the one that heals it
@@ -212,7 +212,7 @@ def operation_for(
     is_stored = any(e.key == key for e in base.parts)
     if isinstance(part, Features):
         if key.layer == "topology" and key.level in renamed:
-            part = _drawn_from(part, renamed[key.level])
+            part = _rename_drawn_from(part, renamed[key.level])
         if is_stored and key.layer in ("topology", "objects", "zones") and origin not in OWN_IDS:
             ids = part.ids
             with contextlib.suppress(Damaged):  # then nothing is there to compare with, and the upload's ids stay
@@ -220,7 +220,7 @@ def operation_for(
             if key.layer == "objects":
                 renamed.setdefault(key.level, {}).update((a, b) for a, b in zip(ids, part.ids, strict=True) if a != b)
         if mode == "merge":
-            return Put(key, _joined(store, base, key, part) if is_stored else part, provenance)
+            return Put(key, _merge_with_stored(store, base, key, part) if is_stored else part, provenance)
     elif mode == "merge" and is_stored:
         old = store.load(base, [key]).parts[key]
         if isinstance(part, OccupancyGrid) and isinstance(old, OccupancyGrid):
@@ -230,7 +230,7 @@ def operation_for(
     return Replace(key, part, provenance)
 
 
-def _drawn_from(part: Features, renamed: Mapping[str, str]) -> Features:
+def _rename_drawn_from(part: Features, renamed: Mapping[str, str]) -> Features:
     """A network whose drawing has other ids now."""
     properties = tuple(
         {**p, "drawn_from": renamed[p["drawn_from"]]} if p.get("drawn_from") in renamed else p for p in part.properties
@@ -238,7 +238,7 @@ def _drawn_from(part: Features, renamed: Mapping[str, str]) -> Features:
     return replace(part, properties=properties)
 
 
-def _joined(store: Store, base: Version, key: PartKey, part: Features) -> Features:
+def _merge_with_stored(store: Store, base: Version, key: PartKey, part: Features) -> Features:
     """An upload to be merged, with a document that says what the stored part's and its own say: credits of both,
     bounds around both, and the drawings of both with their styles, also where two have one name."""
     old = store.load(base, [key]).parts[key]

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from app import upload_reader
 from app.errors import Damaged, FleetMapError, NotFound
 from app.formats import Limits
-from app.ingest.prepare import fence_of, open_store, operation_for
+from app.ingest.prepare import open_store, operation_for, read_fence
 from app.model.layers import PartKey
 from app.store.changes import Put
 from app.store.prepare import compose_operation
@@ -179,7 +179,7 @@ def _compose_parts(
     """The chunks and blobs of the parts that files are read as, replaced or merged."""
     start = version if base is None else base
     upload_bundle = upload_reader.read(
-        files, hints, EnvironmentContext(start.datum or version.datum, fence_of(store, start)), limits
+        files, hints, EnvironmentContext(start.datum or version.datum, read_fence(store, start)), limits
     )
     entries: Mapping[PartKey, PartEntry] = {} if base is None else {e.key: e for e in base.parts}
     for mode in ("replace", "merge"):

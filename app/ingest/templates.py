@@ -20,7 +20,7 @@ class TemplateUpdate:
     clear: bool = False
     dry_run: bool = False
 
-    def checked(self, location: str = "body.formats.{}") -> TemplateUpdate:
+    def validated(self, location: str = "body.formats.{}") -> TemplateUpdate:
         """The same with typed values. NotFound for a format, Invalid for a set or values that there are none of.
 
         location: the place of a format's templates in the request.
@@ -37,15 +37,15 @@ class TemplateUpdate:
             )
         return TemplateUpdate(self.set, out, self.clear, self.dry_run)
 
-    def applied(self, old: Templates) -> Templates:
+    def apply_to(self, old: Templates) -> Templates:
         """What holds then."""
         new = Templates() if self.clear else old
         new = Templates(self.set or new.set, new.formats)
         for name, format_template in self.formats.items():
-            new = templates.with_own(new, name, format_template)
+            new = templates.with_format_template(new, name, format_template)
         return new
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """In a few words, for the history."""
         parts = [] if self.set is None else [f"the set {self.set}"]
         parts += [

@@ -76,16 +76,16 @@ def area_after(
         return KEEP
     fence = _fence(draft, after, datum)
     if fence is not None:
-        return KEEP if old_datum == datum and "location" not in changed else area_on_earth(FENCE, fence)
+        return KEEP if old_datum == datum and "location" not in changed else area_in_degrees(FENCE, fence)
     if any(e.count > (MAX_CELLS if e.key.layer == "occupancy" else MAX_FEATURES) for e in _floors(after, datum)):
         return None
-    return _guess(draft, after, datum)
+    return _estimate_extent(draft, after, datum)
 
 
-def area_of(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
+def compute_area(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
     """Compute the area of a version's content, whatever it takes."""
     fence = _fence(draft, entries, datum)
-    return _guess(draft, entries, datum) if fence is None else area_on_earth(FENCE, fence)
+    return _estimate_extent(draft, entries, datum) if fence is None else area_in_degrees(FENCE, fence)
 
 
 def _hashes(entries: Iterable[PartEntry]) -> set[tuple[PartKey, str]]:
@@ -107,10 +107,10 @@ def _load(draft: ChunkStage, entries: Iterable[PartEntry]) -> list[Features]:
 def _fence(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Any:
     """The fence as a valid (Multi)Polygon in degrees, beyond ±180 across the antimeridian; None if it has no area."""
     sites = _load(draft, (e for e in entries if e.key.layer == "location" and e.count))
-    return fence_of(sites, _frame(datum))
+    return fence_polygon(sites, _frame(datum))
 
 
-def fence_of(sites: Sequence[Features], frame: LocalFrame | None) -> Any:
+def fence_polygon(sites: Sequence[Features], frame: LocalFrame | None) -> Any:
     """The polygons of location parts as one, see ``_fence``; local ones only with a frame."""
     polygons: list[Any] = []
     fences: list[Any] = []
@@ -118,7 +118,7 @@ def fence_of(sites: Sequence[Features], frame: LocalFrame | None) -> Any:
         flat = np.isin(shapely.get_type_id(site.geometry), (3, 6)) & ~shapely.is_empty(site.geometry)
         chosen = site.take(flat & ~site.local if frame is None else flat)
         for place, properties in zip(chosen.in_wgs84(frame), chosen.properties, strict=True):
-            pieces = [_unwrapped(p) for p in shapely.get_parts(shapely.force_2d(place))]
+            pieces = [_unwrap(p) for p in shapely.get_parts(shapely.force_2d(place))]
             (fences if properties.get("kind") == FENCE else polygons).extend(p for p in pieces if p is not None)
     for group in (fences, polygons):
         joined = _polygonal(shapely.union_all(group))
@@ -127,7 +127,7 @@ def fence_of(sites: Sequence[Features], frame: LocalFrame | None) -> Any:
     return None
 
 
-def _unwrapped(polygon: Any) -> Any:
+def _unwrap(polygon: Any) -> Any:
     """A polygon in degrees as a valid one; wider than half the globe it crosses the antimeridian, and goes on there."""
     if not np.isfinite(shapely.get_coordinates(polygon)).all():
         return None
@@ -154,7 +154,7 @@ def _floors(entries: Iterable[PartEntry], datum: Datum | None) -> list[PartEntry
     return [e for e in floor_entries if e.key.layer != "occupancy" or e.key.name not in masks.MASKS]
 
 
-def _guess(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
+def _estimate_extent(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
     """The area of an environment without a fence."""
     frame = _frame(datum)
     if frame is None:
@@ -174,12 +174,12 @@ def _guess(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None)
     wide = [shapely.buffer(s, MARGIN_METRES, quad_segs=4) for s in shapes if s is not None]
     floor = _polygonal(shapely.intersection(shapely.union_all(wide), near)) if wide else None
     if floor is not None:
-        return area_on_earth(FLOOR, _on_earth(floor, frame))
+        return area_in_degrees(FLOOR, _shape_in_degrees(floor, frame))
     circle = shapely.Point(0.0, 0.0).buffer(DATUM_METRES, quad_segs=CIRCLE_SEGMENTS)
-    return area_on_earth("datum", _on_earth(circle, frame), size=round(math.pi * DATUM_METRES**2, 1))
+    return area_in_degrees("datum", _shape_in_degrees(circle, frame), size=round(math.pi * DATUM_METRES**2, 1))
 
 
-def _in_metres(part: Features, frame: LocalFrame) -> NDArray[np.object_]:
+def _geometries_in_metres(part: Features, frame: LocalFrame) -> NDArray[np.object_]:
     """A part's geometries in metres, without those that are too far away for the local frame."""
     out = np.asarray(shapely.force_2d(part.geometry), object).copy()
     distant = ~part.local
@@ -191,7 +191,7 @@ def _in_metres(part: Features, frame: LocalFrame) -> NDArray[np.object_]:
 
 def _hull(network: Features, frame: LocalFrame, near: Any) -> Any:
     """The convex hull, in metres, of what a network has in the neighbourhood; None if that is nothing."""
-    shapes = _in_metres(network, frame)
+    shapes = _geometries_in_metres(network, frame)
     inside = np.abs(shapely.bounds(shapes)).max(axis=1, initial=0.0) <= NEIGHBOURHOOD_METRES
     shapes[~inside] = shapely.intersection(shapely.make_valid(shapes[~inside]), near)
     points = shapely.get_coordinates(shapes)
@@ -200,7 +200,7 @@ def _hull(network: Features, frame: LocalFrame, near: Any) -> Any:
 
 def _floor_objects(part: Features, frame: LocalFrame) -> list[Any]:
     floors = part.take([k for k, p in enumerate(part.properties) if p.get("kind") == FLOOR])
-    flat = [s for s in _in_metres(floors, frame) if s.geom_type in ("Polygon", "MultiPolygon")]
+    flat = [s for s in _geometries_in_metres(floors, frame) if s.geom_type in ("Polygon", "MultiPolygon")]
     return [p for p in (_polygonal(shapely.make_valid(s)) for s in flat) if p is not None]
 
 
@@ -247,7 +247,7 @@ def _free_boxes(header: Mapping[str, Any], free: NDArray[np.bool_], codes: Seque
     return out
 
 
-def _on_earth(shape: Any, frame: LocalFrame) -> Any:
+def _shape_in_degrees(shape: Any, frame: LocalFrame) -> Any:
     """A shape in metres as one in degrees that goes on beyond ±180 across the antimeridian."""
     around = frame.datum.longitude
 
@@ -259,7 +259,7 @@ def _on_earth(shape: Any, frame: LocalFrame) -> Any:
     return _polygonal(shapely.make_valid(shapely.transform(shape, change)))
 
 
-def area_on_earth(by: Literal["fence", "floor", "datum"], shape: Any, size: float | None = None) -> Area:
+def area_in_degrees(by: Literal["fence", "floor", "datum"], shape: Any, size: float | None = None) -> Area:
     """An area from a (Multi)Polygon in degrees that goes on beyond ±180, cut there and, if that leaves pieces on both
     sides of the globe, into its eastern and western half.
     """
@@ -293,7 +293,7 @@ def _box(shape: Any) -> Box:
 # --- rows ---
 
 
-def put_area(connection: Connection, environment_id: str, area: Area) -> None:
+def write_area(connection: Connection, environment_id: str, area: Area) -> None:
     """Write an environment's area in place of what was there. The caller holds the environment's row."""
     table = tables.area
     connection.execute(delete(table).where(table.c.environment_id == environment_id))

@@ -56,7 +56,7 @@ class AuditEntry:
     target: str | None
 
 
-def about(*, environment: str | None = None, target: str | None = None) -> None:
+def set_audit_target(*, environment: str | None = None, target: str | None = None) -> None:
     """Say what the current request changes, where its path does not."""
     caller = CALLER.get()
     if caller is not None:
@@ -64,7 +64,7 @@ def about(*, environment: str | None = None, target: str | None = None) -> None:
         caller.target = target or caller.target
 
 
-def changes_nothing() -> None:
+def skip_audit() -> None:
     """Say that the current request is an earlier one that was sent again: it gets no entry of its own."""
     caller = CALLER.get()
     if caller is not None:

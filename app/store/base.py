@@ -42,14 +42,14 @@ def utcnow() -> datetime:
     return datetime.now(UTC)
 
 
-def text(value: str, label: str, longest: int = MAX_TEXT) -> str:
+def checked_text(value: str, label: str, longest: int = MAX_TEXT) -> str:
     """A text that both databases can keep: no NUL, no lone surrogate, not too long; else Invalid."""
     if len(value) > longest or "\x00" in value or any("\ud800" <= c <= "\udfff" for c in value):
         raise Invalid(f"{label} must have at most {longest} characters, none of them NUL or half of a surrogate pair")
     return value
 
 
-def clean(value: str) -> str:
+def storable_text(value: str) -> str:
     """A text from a file's content, with what databases refuse replaced by U+FFFD."""
     return value.replace("\x00", "\ufffd").encode("utf-8", "replace").decode()
 
@@ -57,10 +57,10 @@ def clean(value: str) -> str:
 def clean_problem(problem: Problem) -> Problem:
     """A problem whose texts can be kept."""
     return Problem(
-        clean(problem.problem),
-        None if problem.file is None else clean(problem.file),
+        storable_text(problem.problem),
+        None if problem.file is None else storable_text(problem.file),
         problem.line,
-        None if problem.where is None else clean(problem.where),
+        None if problem.where is None else storable_text(problem.where),
     )
 
 
@@ -92,7 +92,7 @@ def nearest_channel(connection: Connection, environment: Row[Any], name: str) ->
     return did_you_mean(name, [LATEST, *names])
 
 
-def datum_of(members: dict[str, float] | None) -> Datum | None:
+def datum_from_row(members: dict[str, float] | None) -> Datum | None:
     """A stored datum."""
     return None if members is None else Datum(**members)
 
@@ -107,7 +107,7 @@ def as_environment(row: Row[Any]) -> Environment:
         tags=tuple(row.tags),
         head=row.head,
         root=row.root,
-        datum=datum_of(row.datum),
+        datum=datum_from_row(row.datum),
         bounds=None if row.west is None else (row.west, row.south, row.east, row.north),
         created=row.created,
         updated=row.updated,
@@ -118,4 +118,4 @@ def as_environment(row: Row[Any]) -> Environment:
 
 def check_tags(tags: Sequence[str]) -> list[str]:
     """Tags as they are kept: no repeats, in the order given."""
-    return [text(tag, "a tag", 256) for tag in dict.fromkeys(tags)]
+    return [checked_text(tag, "a tag", 256) for tag in dict.fromkeys(tags)]

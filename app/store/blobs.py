@@ -87,7 +87,7 @@ class Blobs:
     def _workspace(self) -> Iterator[Path]:
         """A folder for temporary names, locked as long as this process works in it."""
         folder = self._temporary / secrets.token_hex(16)
-        with self._census(shared=True):
+        with self._workspaces_lock(shared=True):
             folder.mkdir()
             lock = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -98,7 +98,7 @@ class Blobs:
             os.close(lock)
 
     @contextmanager
-    def _census(self, *, shared: bool) -> Iterator[None]:
+    def _workspaces_lock(self, *, shared: bool) -> Iterator[None]:
         """Keeps the search for abandoned workspaces away from one that is just being made."""
         lock = os.open(self._temporary / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
         try:
@@ -124,7 +124,7 @@ class Blobs:
         try:
             return self._put_many(files)
         except OSError as error:
-            raise _refusal(error) from error
+            raise _unavailable_error(error) from error
 
     def _put_many(self, files: Sequence[bytes | Path]) -> list[str]:
         names: list[str] = []
@@ -191,7 +191,7 @@ class Blobs:
             return "lost"
         except OSError as error:
             if error.errno not in BROKEN_STORAGE_ERRNOS:
-                raise _unreadable(error) from error
+                raise _unreadable_error(error) from error
             return "damaged"
         return None if complete and digest.hexdigest() == name else "damaged"
 
@@ -350,16 +350,16 @@ class Blobs:
             with self._workspace() as workspace:
                 check_room(workspace)
         except OSError as error:
-            raise _refusal(error) from error
+            raise _unavailable_error(error) from error
 
     def recover(self, older_than: float) -> int:
         """Remove workspaces of processes that are gone, and packs that no row knows if older (seconds); how many."""
         self.prepare()
         limit = time.time() - older_than
         count = 0
-        with self._census(shared=False):
+        with self._workspaces_lock(shared=False):
             for folder in self._temporary.iterdir():
-                count += folder.is_dir() and _remove_abandoned(folder)
+                count += folder.is_dir() and _remove_workspace(folder)
         with self._database.read() as connection:
             packs = set(connection.execute(select(blob.c.pack).where(blob.c.pack.is_not(None)).distinct()).scalars())
         for path in self._packs.iterdir():
@@ -429,9 +429,9 @@ class Blobs:
 
     def verify(self) -> list[str]:
         """Hash everything; the names of what is damaged or lost."""
-        return [name for name, _, problem in self.checked() if problem is not None]
+        return [name for name, _, problem in self.iterate_checks() if problem is not None]
 
-    def checked(
+    def iterate_checks(
         self, after: str = "", skip: Callable[[str, Unavailable], None] | None = None
     ) -> Iterator[tuple[str, int, str | None]]:
         """Hash one file after the other, by their names: (name, bytes, ``lost``, ``damaged`` or None).
@@ -464,18 +464,18 @@ def _read_error(sha256: str, error: OSError) -> FleetMapError:
     """Damaged for broken storage; Unavailable for what may work later, like too many open files."""
     if error.errno in BROKEN_STORAGE_ERRNOS:
         return Damaged(f"the stored file {sha256} cannot be read ({system_reason(error)}): {REPAIR}")
-    return _unreadable(error)
+    return _unreadable_error(error)
 
 
 class _Unreadable(Unavailable):
     """A file that cannot be read at the moment, in contrast to a database that does not answer."""
 
 
-def _unreadable(error: OSError) -> _Unreadable:
+def _unreadable_error(error: OSError) -> _Unreadable:
     return _Unreadable(f"the blob folder cannot be read: {system_reason(error)}. Try again later")
 
 
-def _refusal(error: OSError) -> Unavailable:
+def _unavailable_error(error: OSError) -> Unavailable:
     if error.errno in DISK_FULL_ERRNOS:
         return NoRoom(
             f"the server has no room left for files ({system_reason(error)}); nothing was stored. Try again after its "
@@ -520,7 +520,7 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _remove_abandoned(folder: Path) -> bool:
+def _remove_workspace(folder: Path) -> bool:
     """Remove a workspace unless a living process has it locked."""
     try:
         lock = os.open(folder / LOCK, os.O_RDWR)

@@ -12,10 +12,10 @@ from sqlalchemy import Connection, Row, insert, select, update
 from app.errors import Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
-from app.store.base import CHANNEL_NAME, StoreBase, environment_row, nearest_channel, text, utcnow
+from app.store.base import CHANNEL_NAME, StoreBase, checked_text, environment_row, nearest_channel, utcnow
 from app.store.manifest import read_version
-from app.store.overlays import closures_in_force
-from app.store.robots import robots_of
+from app.store.overlays import read_closures
+from app.store.robots import channel_robots
 from app.store.values import (
     LATEST,
     OPEN_ROLLOUTS,
@@ -60,13 +60,15 @@ class Channels(StoreBase):
                 .where(table.c.environment_id == row.id)
                 .order_by(table.c.name)
             )
-            closures = closures_in_force(connection, row)
+            closures = read_closures(connection, row)
             rows = connection.execute(query).all()
         others = [_as_channel(r, r.root, r.planned_root, row, closures) for r in rows]
         latest = Channel(LATEST, row.head, row.root, head.sequence, None, head.author, head.time)
         return [replace(latest, closures=closures, closures_sequence=row.closures_sequence), *others]
 
-    def standing(self, environment: str, ref: str | int, closures: ClosureMode | None = None) -> tuple[Version, int]:
+    def channel_target(
+        self, environment: str, ref: str | int, closures: ClosureMode | None = None
+    ) -> tuple[Version, int]:
         """Read a version by number or channel as maps of it are made, and the sequence of what it shows.
 
         closures: how its maps show the closures in force; default: applied for a channel, ignored for a number, which
@@ -94,7 +96,7 @@ class Channels(StoreBase):
             stored_version, sequence = read_version(connection, row, number), int(sequence or 0)
             if mode == "ignore":
                 return stored_version, sequence
-            in_force = closures_in_force(connection, row).in_mode(mode)
+            in_force = read_closures(connection, row).in_mode(mode)
             return replace(stored_version, closures=in_force), max(sequence, int(row.closures_sequence))
 
     def set_channel(
@@ -118,7 +120,7 @@ class Channels(StoreBase):
             raise Invalid("activate_at needs a time zone, for example 2026-05-01T04:00:00Z")
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            now, author_name = utcnow(), text(author, "an author")
+            now, author_name = utcnow(), checked_text(author, "an author")
             if rollout is not None:
                 root = read_version(connection, row, version).root
                 rollout = replace(rollout, version=version, root=root, activate_at=activate_at, started=now)
@@ -135,15 +137,15 @@ class Channels(StoreBase):
             channel_row = _row(connection, row, channel)
             if channel_row is None or channel_row.planned_version is None:
                 raise NotFound(f"channel {channel!r} of {environment} has no planned move")
-            why, author_name = "the plan was cancelled", text(author, "an author")
+            why, author_name = "the plan was cancelled", checked_text(author, "an author")
             if channel_row.rollout_state == "waiting":
-                _end(connection, row, channel_row, "cancelled", why, author_name)
+                _end_rollout(connection, row, channel_row, "cancelled", why, author_name)
             else:
                 _store(connection, row, channel, channel_row, **_NO_PLAN)
-                _tell_dropped(connection, row, channel_row, why, author_name)
+                _append_cancelled_event(connection, row, channel_row, why, author_name)
             return _read(connection, row, channel)
 
-    def apply_due(self, now: datetime) -> list[tuple[str, Channel]]:
+    def apply_due_moves(self, now: datetime) -> list[tuple[str, Channel]]:
         """Carry out the planned moves whose time has come: (environment, channel), in the order of their times."""
         table, owner = tables.channel, tables.environment
         query = (
@@ -193,7 +195,7 @@ class Channels(StoreBase):
                     continue
                 step = _next(connection, channel_row, now, decide)
                 if step is not None:
-                    _take(connection, row, channel_row, step, now)
+                    _apply_step(connection, row, channel_row, step, now)
                     out.append((due_row.environment, _read(connection, row, due_row.name)))
         return out
 
@@ -202,16 +204,20 @@ Decide = Callable[[Rollout, Sequence[Robot], datetime], RolloutStep | None]
 
 
 def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Decide) -> RolloutStep | None:
-    return decide(Rollout.from_row(channel.rollout), robots_of(connection, channel.environment_id, channel.name), now)
+    return decide(
+        Rollout.from_row(channel.rollout), channel_robots(connection, channel.environment_id, channel.name), now
+    )
 
 
-def _marked(connection: Connection, environment: Row[Any], channel: str, rollout: Rollout) -> Rollout:
+def _with_prior_failures(connection: Connection, environment: Row[Any], channel: str, rollout: Rollout) -> Rollout:
     """The roll-out at the beginning of a stage: which robots said before it that they failed with this version."""
-    failed_robots = (r for r in robots_of(connection, environment.id, channel) if r.failed_with(rollout.root))
+    failed_robots = (r for r in channel_robots(connection, environment.id, channel) if r.has_failed_with(rollout.root))
     return replace(rollout, said_before={r.robot: rfc3339(r.time) for r in failed_robots})
 
 
-def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step: RolloutStep, now: datetime) -> None:
+def _apply_step(
+    connection: Connection, environment: Row[Any], channel: Row[Any], step: RolloutStep, now: datetime
+) -> None:
     """One step of a roll-out: the move or the way back with its event, or the end."""
     rollout = Rollout.from_row(channel.rollout)
     ended = replace(rollout, state=step.state, detail=step.detail)
@@ -231,10 +237,10 @@ def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step
             rollback=True,
         )
     else:
-        _end(connection, environment, channel, step.state, step.detail, channel.planned_author or "")
+        _end_rollout(connection, environment, channel, step.state, step.detail, channel.planned_author or "")
 
 
-def _end(
+def _end_rollout(
     connection: Connection, environment: Row[Any], channel: Row[Any], state: RolloutState, detail: str, author: str
 ) -> None:
     """A roll-out is over; a move that still waits for it is dropped, which is told."""
@@ -243,7 +249,7 @@ def _end(
     dropped = channel.rollout_state == "waiting" and channel.planned_version is not None
     _store(connection, environment, channel.name, channel, **values, **(_NO_PLAN if dropped else {}))
     if dropped:
-        _tell_dropped(connection, environment, channel, detail, author)
+        _append_cancelled_event(connection, environment, channel, detail, author)
 
 
 def _check_name(channel: str) -> None:
@@ -271,7 +277,7 @@ def _read(connection: Connection, environment: Row[Any], channel: str) -> Channe
     planned = None
     if row.planned_version is not None:
         planned = read_version(connection, environment, row.planned_version).root
-    return _as_channel(row, root, planned, environment, closures_in_force(connection, environment))
+    return _as_channel(row, root, planned, environment, read_closures(connection, environment))
 
 
 def _as_channel(
@@ -318,14 +324,14 @@ def _move(
         watched = rollout.failed is not None and before is not None and before.number != number
         state: RolloutState = "watching" if watched else "done"
         rollout = replace(rollout, state=state, moved=now, before=before.number if before else None)
-        rollout = _marked(connection, environment, channel, rollout)
+        rollout = _with_prior_failures(connection, environment, channel, rollout)
     nothing |= {"rollout": None, "rollout_state": None}
     if rollout is not None:
         nothing |= {"rollout": rollout.as_row(), "rollout_state": rollout.state}
     if before is not None and before.number == number:
         _store(connection, environment, channel, channel_row, **nothing)
         if channel_row is not None and channel_row.planned_version not in (None, number):
-            _tell_dropped(connection, environment, channel_row, "the channel stays where it is", author)
+            _append_cancelled_event(connection, environment, channel_row, "the channel stays where it is", author)
         return
     sequence = environment.sequence + 1
     _store(
@@ -343,7 +349,7 @@ def _move(
     about: dict[str, Any] = {"sequence": sequence, "author": author, "time": now}
     if reason:
         about["reason"] = reason
-    _tell(connection, environment, "channel.moved", channel, before, target, rollback=rollback, **about)
+    _append_event(connection, environment, "channel.moved", channel, before, target, rollback=rollback, **about)
 
 
 def _plan(
@@ -362,7 +368,7 @@ def _plan(
     if channel_row is not None and channel_row.version is not None:
         before = read_version(connection, environment, channel_row.version)
     if rollout is not None:
-        rollout = _marked(connection, environment, channel, rollout)
+        rollout = _with_prior_failures(connection, environment, channel, rollout)
     sequence = environment.sequence + 1
     plan: dict[str, Any] = {"planned_version": number, "planned_at": at, "planned_author": author}
     plan |= {"rollout": rollout and rollout.as_row(), "rollout_state": rollout and rollout.state}
@@ -379,20 +385,22 @@ def _plan(
             "failed": rollout.failed,
             "deadline": None if rollout.deadline is None else rfc3339(rollout.deadline),
         }
-    _tell(connection, environment, "channel.planned", channel, before, target, **about)
+    _append_event(connection, environment, "channel.planned", channel, before, target, **about)
 
 
-def _tell_dropped(connection: Connection, environment: Row[Any], channel: Row[Any], reason: str, author: str) -> None:
+def _append_cancelled_event(
+    connection: Connection, environment: Row[Any], channel: Row[Any], reason: str, author: str
+) -> None:
     """A plan that no longer holds, and that no move replaces: whoever heard of it is told. channel: with the plan."""
     before = None if channel.version is None else read_version(connection, environment, channel.version)
     target = read_version(connection, environment, channel.planned_version)
     sequence = environment.sequence + 1
     _bump(connection, environment, sequence)
     about = {"sequence": sequence, "author": author, "time": utcnow(), "reason": reason}
-    _tell(connection, environment, "channel.cancelled", channel.name, before, target, **about)
+    _append_event(connection, environment, "channel.cancelled", channel.name, before, target, **about)
 
 
-def _tell(
+def _append_event(
     connection: Connection,
     environment: Row[Any],
     kind: Literal["channel.planned", "channel.cancelled", "channel.moved"],
@@ -404,7 +412,7 @@ def _tell(
     **about: Any,
 ) -> None:
     """The event of a channel that goes, is planned to go, or does not go after all, from one version to another."""
-    outbox.append(
+    outbox.append_event(
         connection,
         environment_id=environment.id,
         environment=environment.name,

@@ -17,7 +17,7 @@ from app.store.encode import decompress, digest
 BATCH = 500
 REPAIR = "run `fleetmap verify --repair`, or restore a backup"
 CACHE_BYTES = 64 * 2**20
-BIGGEST_CACHED = 2**20
+MAX_CACHED_CHUNK_BYTES = 2**20
 
 
 class Chunks:
@@ -43,10 +43,10 @@ class Chunks:
         if missing:
             read = self._query(missing)
             out.update(read)
-            self._keep(read)
+            self._cache_chunks(read)
         return out
 
-    def damaged(self, hashes: Sequence[bytes]) -> dict[bytes, str]:
+    def find_damaged(self, hashes: Sequence[bytes]) -> dict[bytes, str]:
         """Those that the database has not whole, whatever is in memory: hash -> ``lost`` or ``damaged``."""
         out = dict.fromkeys(hashes, "lost")
         for start in range(0, len(hashes), BATCH):
@@ -57,7 +57,7 @@ class Chunks:
                     out[name] = "damaged"
         return out
 
-    def checked(self, after: bytes = b"") -> Iterator[tuple[bytes, int, str | None]]:
+    def iterate_checks(self, after: bytes = b"") -> Iterator[tuple[bytes, int, str | None]]:
         """Hash one stored chunk after the other, by their hashes: (hash, bytes, ``damaged`` or None)."""
         table = tables.chunk
         while True:
@@ -88,10 +88,10 @@ class Chunks:
                 raise Damaged(f"the stored chunk {h.hex()} is missing: {REPAIR}")
         return out
 
-    def _keep(self, read: Mapping[bytes, bytes]) -> None:
+    def _cache_chunks(self, read: Mapping[bytes, bytes]) -> None:
         with self._lock:
             for h, raw in read.items():
-                if h in self._cache or len(raw) > BIGGEST_CACHED:
+                if h in self._cache or len(raw) > MAX_CACHED_CHUNK_BYTES:
                     continue
                 self._cache[h] = raw
                 self._bytes += len(raw)

@@ -14,7 +14,7 @@ from app.model.templates import template_changes
 from app.store import diff, parts
 from app.store.base import StoreBase
 from app.store.parts import PartRoot
-from app.store.prepare import differing_keys, frame_changes, part_names, roots_of
+from app.store.prepare import differing_keys, frame_changes, part_names, read_roots
 from app.store.tree import ChunkStage
 from app.store.values import Box, Delta, FeatureDelta, GridDelta, Version
 
@@ -66,7 +66,7 @@ class ContentReader(StoreBase):
             if ids is not None:
                 selected_ids = set(ids)
                 items = {i: item for i, item in items.items() if i in selected_ids}
-        return parts.features_of(items, parts.read_document(draft, root))
+        return parts.features_from_items(items, parts.read_document(draft, root))
 
     def get(self, version: Version, key: PartKey, ids: Collection[str]) -> Features:
         """The features with these ids, as far as they exist; reads only the leaves they are in."""
@@ -82,7 +82,7 @@ class ContentReader(StoreBase):
     def _root(self, draft: ChunkStage, version: Version, key: PartKey) -> PartRoot:
         if key.layer not in VECTOR_LAYERS:
             raise Invalid(f"{key.layer} has no features; there are {', '.join(sorted(VECTOR_LAYERS))}")
-        root = roots_of(draft, key, {e.key: e for e in version.parts})
+        root = read_roots(draft, key, {e.key: e for e in version.parts})
         if root is None:
             raise NotFound(_missing(version, key))
         return root
@@ -100,7 +100,7 @@ class ContentReader(StoreBase):
         names = part_names(sorted(before.keys() | after.keys()))
         out: dict[str, Any] = {}
         for key in differing_keys(before, after):
-            old, new = roots_of(draft, key, before), roots_of(draft, key, after)
+            old, new = read_roots(draft, key, before), read_roots(draft, key, after)
             if key.layer in VECTOR_LAYERS:
                 changed = diff.features(draft, old, new)
                 layer = out.setdefault(key.layer, {"added": [], "changed": [], "deleted": []})
@@ -111,7 +111,7 @@ class ContentReader(StoreBase):
             elif key.layer == "occupancy":
                 out.setdefault(key.layer, {})[names[key]] = diff.cells(draft, old, new).as_dict()
             else:
-                out.setdefault(key.layer, {})[names[key]] = diff.others(draft, old, new)
+                out.setdefault(key.layer, {})[names[key]] = diff.diff_other_parts(draft, old, new)
         out |= frame_changes(a.datum, b.datum, a.levels, b.levels)
         return out | template_changes(a.templates, b.templates)
 
@@ -121,12 +121,12 @@ class ContentReader(StoreBase):
         before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
         features, grids, other = [], [], []
         for key in differing_keys(before, after):
-            old, new = roots_of(draft, key, before), roots_of(draft, key, after)
+            old, new = read_roots(draft, key, before), read_roots(draft, key, after)
             if key.layer in VECTOR_LAYERS:
                 changed = diff.features(draft, old, new)
                 items = {i: changed.after[i] for i in (*changed.added, *changed.changed)}
                 document = parts.read_document(draft, new) if new is not None and changed.document else {}
-                features.append(FeatureDelta(key, parts.features_of(items, document), tuple(changed.deleted)))
+                features.append(FeatureDelta(key, parts.features_from_items(items, document), tuple(changed.deleted)))
             elif key.layer == "occupancy":
                 grids.append(_grid_delta(draft, key, old, new))
             else:

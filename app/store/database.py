@@ -72,8 +72,8 @@ def engine(url: str, *, readonly: bool) -> Engine:
         if parsed.database and parsed.database != ":memory:" and not readonly:
             Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
         sql_engine = create_engine(parsed, **options)
-        event.listen(sql_engine, "connect", _sqlite_connected(readonly))
-        event.listen(sql_engine, "begin", _sqlite_begin)
+        event.listen(sql_engine, "connect", _sqlite_on_connect(readonly))
+        event.listen(sql_engine, "begin", _sqlite_on_begin)
         return sql_engine
     if parsed.get_backend_name() == "postgresql":
         settings = "-c synchronous_commit=on -c jit=off" + (" -c default_transaction_read_only=on" if readonly else "")
@@ -86,7 +86,7 @@ def engine(url: str, *, readonly: bool) -> Engine:
     )
 
 
-def _sqlite_connected(readonly: bool) -> Any:
+def _sqlite_on_connect(readonly: bool) -> Any:
     def connected(connection: sqlite3.Connection, record: object) -> None:
         del record
         # The driver would begin transactions by itself, too late for BEGIN IMMEDIATE.
@@ -104,7 +104,7 @@ def _sqlite_connected(readonly: bool) -> Any:
     return connected
 
 
-def _sqlite_begin(connection: Connection) -> None:
+def _sqlite_on_begin(connection: Connection) -> None:
     write = connection.get_execution_options().get("write")
     connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
@@ -147,13 +147,13 @@ class Database:
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """A transaction that only reads."""
-        with self.connected() as connection:
+        with self.connection() as connection:
             yield connection
 
     @contextmanager
     def snapshot(self) -> Iterator[Connection]:
         """A transaction that only reads, all of it from one state."""
-        with self.connected() as connection:
+        with self.connection() as connection:
             if not self.sqlite:
                 connection.execution_options(isolation_level="REPEATABLE READ")
             yield connection
@@ -163,7 +163,7 @@ class Database:
         """A transaction that writes: all or nothing, and on disk when it ends. tell: whether caches are to know.
         upkeep: it is no change that anybody asked for, so that the audit log has nothing of it.
         """
-        with self._in_turn(), self.connected() as connection:
+        with self._write_turn(), self.connection() as connection:
             connection.execution_options(write=True)
             with connection.begin():
                 yield connection
@@ -174,7 +174,7 @@ class Database:
             self._written()
 
     @contextmanager
-    def connected(self) -> Iterator[Connection]:
+    def connection(self) -> Iterator[Connection]:
         """A connection whose errors are ours: Unavailable, NoRoom, DatabaseDamaged; Invalid for a NUL that somebody
         requests, which PostgreSQL has no text with.
         """
@@ -229,7 +229,7 @@ class Database:
         """SQLite's tables by name, and the bytes of its pages; none on PostgreSQL."""
         if not self.sqlite:
             return [], 0
-        with self.connected() as connection:
+        with self.connection() as connection:
             names = connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'").scalars()
             sizes = [connection.exec_driver_sql(f"PRAGMA {name}").scalar_one() for name in ("page_count", "page_size")]
             return sorted(["sqlite_master", *names]), sizes[0] * sizes[1]
@@ -242,7 +242,7 @@ class Database:
         if not self.sqlite:
             return None
         try:
-            with self.connected() as connection:
+            with self.connection() as connection:
                 check = "quick_check" if quick else "integrity_check"
                 of = limit if table is None else f'"{table}"'
                 lines = list(connection.exec_driver_sql(f"PRAGMA {check}({of})").scalars())[:limit]
@@ -250,7 +250,7 @@ class Database:
             return error.detail
         return None if lines == ["ok"] else "; ".join(map(str, lines))
 
-    def note_damage_of(self, error: DatabaseDamaged) -> None:
+    def note_damage_from(self, error: DatabaseDamaged) -> None:
         """Report damage that another process met. A file that is missing is checked anew for each request."""
         if not isinstance(error, _FileGone):
             self.note_damage(error.detail)
@@ -335,7 +335,7 @@ class Database:
             return False
 
     @contextmanager
-    def _in_turn(self) -> Iterator[None]:
+    def _write_turn(self) -> Iterator[None]:
         """One writer of this process after the other, where the database lets only one write."""
         if not self.sqlite:
             yield

@@ -63,7 +63,7 @@ def features(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> Featu
     """Changes between two collections; None is one without items."""
     before: dict[str, Item] = {}
     after: dict[str, Item] = {}
-    with parts.no_garbage_collection():
+    with parts.gc_paused():
         for anchor, name in enumerate(("local", "wgs84")):
             left, right = tree.differing(draft, a.trees[name] if a else None, b.trees[name] if b else None)
             before.update(parts.leaf_items(draft, left, anchor))
@@ -98,7 +98,7 @@ def same_frame(a: PartRoot, b: PartRoot) -> bool:
     return all(a.header[name] == b.header[name] for name in FRAME)
 
 
-def changed_tiles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> Iterator[TileChange]:
+def diff_tiles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> Iterator[TileChange]:
     """The tiles that differ between two grids of the same frame."""
     left, right = tree.differing(draft, a.trees["tiles"], b.trees["tiles"])
     raws = draft.read_many([*left, *right])
@@ -168,7 +168,7 @@ def cells(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> CellChan
         if same_frame(a, b):
             low = np.array([math.inf, math.inf])
             high = -low
-            for change in changed_tiles(draft, a, b):
+            for change in diff_tiles(draft, a, b):
                 rows, columns = np.nonzero(out.add(change.before, change.after))
                 if len(rows):
                     low = np.minimum(low, [columns.min() + change.column, rows.min() + change.row])
@@ -179,15 +179,15 @@ def cells(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> CellChan
         if _offset(a.header, b.header) is None:
             out.box = cell_box(b.header, 0, 0, b.header["width"], b.header["height"])
             return out
-    return _laid_over(draft, a, b, out)
+    return _diff_aligned(draft, a, b, out)
 
 
-def _laid_over(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None, out: CellChanges) -> CellChanges:
+def _diff_aligned(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None, out: CellChanges) -> CellChanges:
     """Compare grids of one raster on the rectangle around both, in blocks of rows."""
     header = b.header if b else a.header if a else {}
     place = (0, 0) if a is None or b is None else (_offset(a.header, b.header) or (0, 0))
-    old = _all_cells(draft, a)
-    new = _all_cells(draft, b)
+    old = _read_all_cells(draft, a)
+    new = _read_all_cells(draft, b)
     # (row, column) of each grid's first cell in cells of the new one.
     old_row, old_column = place if b is not None else (0, 0)
     spans = [(old_row, old_column, old)] * (a is not None) + [(0, 0, new)] * (b is not None)
@@ -222,7 +222,7 @@ def _window(
     return out
 
 
-def _all_cells(draft: ChunkStage, root: PartRoot | None) -> NDArray[np.uint8]:
+def _read_all_cells(draft: ChunkStage, root: PartRoot | None) -> NDArray[np.uint8]:
     return parts.grid_cells(draft, root) if root else np.empty((0, 0), np.uint8)
 
 
@@ -255,7 +255,7 @@ def cell_box(header: Mapping[str, Any], x0: float, y0: float, x1: float, y1: flo
 def rectangles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> tuple[ChangedCells, ...]:
     """The changed cells between two grids of one frame: the smallest rectangle in each tile that differs."""
     out = []
-    for change in changed_tiles(draft, a, b):
+    for change in diff_tiles(draft, a, b):
         rows, columns = np.nonzero(change.before != change.after)
         r0, r1, c0, c1 = int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
         block = np.ascontiguousarray(change.after[r0:r1, c0:c1])
@@ -266,7 +266,7 @@ def rectangles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> tuple[ChangedCell
 # --- the other layers ---
 
 
-def others(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> dict[str, Any]:
+def diff_other_parts(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> dict[str, Any]:
     """Voxels, tiles of a picture, or files that came, changed and went, and the header members that differ."""
     if a is not None and b is not None and a.type != b.type:
         a = None

@@ -92,7 +92,7 @@ _BINARY: Final = re.compile(rb"[\xc4-\xc6]")
 LEVEL: Final = 1
 MAX_CHUNK: Final = 2**31 - 1
 
-NOWHERE: Final = (np.inf, np.inf, -np.inf, -np.inf)
+EMPTY_BOX: Final = (np.inf, np.inf, -np.inf, -np.inf)
 """The box of nothing: any box joined with it stays what it is."""
 
 
@@ -164,7 +164,7 @@ def pack_value(value: Any, location: str) -> bytes:
             reason = f"this cannot be stored: {error}"
             raise Invalid(f"{location}: {reason}", [Problem(reason, where=location)]) from error
     if _SUSPECT.search(packed):
-        packed = ormsgpack.packb(_normalised(value, location), default=_plain, option=OPTIONS)
+        packed = ormsgpack.packb(_normalise(value, location), default=_plain, option=OPTIONS)
     return packed
 
 
@@ -195,7 +195,7 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is no JSON value")
 
 
-def _normalised(value: Any, location: str) -> Any:
+def _normalise(value: Any, location: str) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
@@ -204,9 +204,9 @@ def _normalised(value: Any, location: str) -> Any:
             raise Invalid(f"{location}: {reason}", [Problem(reason, where=location)])
         return value + 0.0
     if isinstance(value, Mapping):
-        return {key: _normalised(member, location) for key, member in value.items()}
+        return {key: _normalise(member, location) for key, member in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_normalised(member, location) for member in value]
+        return [_normalise(member, location) for member in value]
     return value
 
 
@@ -283,7 +283,7 @@ def wkb_bounds(wkb: Sequence[bytes]) -> NDArray[np.float64]:
         out[others] = bounds(from_wkb([wkb[k] for k in others.tolist()]))
     nowhere = np.isnan(out).any(axis=1)
     if nowhere.any():
-        out[nowhere] = NOWHERE
+        out[nowhere] = EMPTY_BOX
     return out
 
 
@@ -292,7 +292,7 @@ def bounds(geometry: NDArray[np.object_]) -> NDArray[np.float64]:
     out = np.asarray(shapely.bounds(geometry), np.float64).reshape(len(geometry), 4)
     nowhere = np.isnan(out).any(axis=1)
     if nowhere.any():
-        out[nowhere] = NOWHERE
+        out[nowhere] = EMPTY_BOX
     return out
 
 

@@ -22,12 +22,12 @@ from app.store.base import (
     as_environment,
     check_environment_name,
     check_tags,
+    checked_text,
     environment_row,
-    text,
     utcnow,
 )
 from app.store.changes import KEEP
-from app.store.index import meets
+from app.store.index import intersects
 from app.store.manifest import read_version
 from app.store.prepare import frame_changes, summarise, version_root
 from app.store.tree import ChunkStage
@@ -58,7 +58,7 @@ class Environments(StoreBase):
         """
         check_environment_name(name)
         empty = version_root((), None, (Level(),))
-        changes = self._first_changes(datum, clone)
+        changes = self._initial_changes(datum, clone)
         area = area_after(
             ChunkStage(self._chunks), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
         )
@@ -72,8 +72,8 @@ class Environments(StoreBase):
             values = {
                 "id": new,
                 "name": name,
-                "title": text(title, "a title"),
-                "description": text(description, "a description"),
+                "title": checked_text(title, "a title"),
+                "description": checked_text(description, "a description"),
                 "tags": check_tags(tags),
                 "head": 0,
                 "root": empty,
@@ -86,7 +86,12 @@ class Environments(StoreBase):
             }
             _insert_environment(connection, name, values)
             row = environment_row(connection, name)
-            frame: dict[str, Any] = {"author": text(author, "an author"), "time": now, "sources": (), "warnings": ()}
+            frame: dict[str, Any] = {
+                "author": checked_text(author, "an author"),
+                "time": now,
+                "sources": (),
+                "warnings": (),
+            }
             insert_version(
                 connection,
                 row,
@@ -108,7 +113,7 @@ class Environments(StoreBase):
             ]
             events[0] |= {"previous": None, "layers": [], "message": ""}
             if datum is not None or clone is not None:
-                first, message = _first_version(connection, row, datum, clone)
+                first, message = _insert_first_version(connection, row, datum, clone)
                 frame["sources"] = first.sources
                 insert_version(
                     connection,
@@ -138,10 +143,10 @@ class Environments(StoreBase):
                     }
                 )
             for one in events:
-                outbox.append(connection, environment_id=new, environment=name, author=author, time=now, **one)
+                outbox.append_event(connection, environment_id=new, environment=name, author=author, time=now, **one)
             return as_environment(environment_row(connection, name))
 
-    def _first_changes(self, datum: Datum | None, clone: Version | None) -> dict[str, Any]:
+    def _initial_changes(self, datum: Datum | None, clone: Version | None) -> dict[str, Any]:
         changes: dict[str, Any] = {}
         if clone is not None:
             changes, _ = summarise(ChunkStage(self._chunks), {}, {e.key: e for e in clone.parts})
@@ -203,9 +208,9 @@ class Environments(StoreBase):
             row = environment_row(connection, name, lock=True)
             values: dict[str, Any] = {"updated": now}
             if title is not None:
-                values["title"] = text(title, "a title")
+                values["title"] = checked_text(title, "a title")
             if description is not None:
-                values["description"] = text(description, "a description")
+                values["description"] = checked_text(description, "a description")
             if tags is not None:
                 values["tags"] = check_tags(tags)
             table = tables.environment
@@ -232,7 +237,7 @@ class Environments(StoreBase):
             (ended, row.name, "environment.deleted"),
             (begun, new_name, "environment.created"),
         ):
-            _tell(
+            _append_event(
                 connection,
                 row,
                 kind,
@@ -266,7 +271,7 @@ class Environments(StoreBase):
             )
             kind = "environment.deleted" if deleted else "environment.created"
             message = "deleted" if deleted else "restored"
-            _tell(connection, row, kind, sequence=sequence, name=name, author=author, time=now, message=message)
+            _append_event(connection, row, kind, sequence=sequence, name=name, author=author, time=now, message=message)
             return as_environment(environment_row(connection, name, deleted=True))
 
     def purge_environment(self, name: str) -> None:
@@ -295,7 +300,7 @@ def _insert_environment(connection: Connection, name: str, values: dict[str, Any
         raise Conflict(f"the name {name!r} is taken") from error
 
 
-def _first_version(
+def _insert_first_version(
     connection: Connection, row: Row[Any], datum: Datum | None, clone: Version | None
 ) -> tuple[Version, str]:
     """What version 1 holds. A clone is read again in this transaction, so that its chunks are surely still there."""
@@ -326,7 +331,7 @@ def _first_version(
     return version, message
 
 
-def _tell(
+def _append_event(
     connection: Connection,
     row: Row[Any],
     kind: Any,
@@ -337,7 +342,7 @@ def _tell(
     time: datetime,
     message: str,
 ) -> None:
-    outbox.append(
+    outbox.append_event(
         connection,
         environment_id=row.id,
         environment=name,
@@ -348,7 +353,7 @@ def _tell(
         previous=(row.head, row.root),
         layers=(),
         message=message,
-        author=text(author, "an author"),
+        author=checked_text(author, "an author"),
         time=time,
     )
 
@@ -372,7 +377,7 @@ def filters(*, q: str | None, bbox: Box | None, deleted: bool, dialect: str) -> 
         conditions.append(func.lower(cast(table.c.tags, Text)).contains(q.lower(), autoescape=True))
         out.append(or_(*conditions))
     if bbox is not None:
-        out.append(meets(table, table.c.extent, _checked(bbox), dialect))
+        out.append(intersects(table, table.c.extent, _check_bounds(bbox), dialect))
     return out
 
 
@@ -381,7 +386,7 @@ def reaches(allowed: str | None, name: str) -> bool:
     return allowed is None or fnmatchcase(name, allowed)
 
 
-def _checked(box: Box) -> Box:
+def _check_bounds(box: Box) -> Box:
     west, south, east, north = box
     if not (-180.0 <= west <= 180.0 and -180.0 <= east <= 180.0 and -90.0 <= south <= north <= 90.0):
         raise Invalid(

@@ -31,7 +31,7 @@ from app.store.changes import IndexRows
 from app.store.extent import geometry as to_geometry
 from app.store.manifest import read_version
 from app.store.parts import split_box
-from app.store.prepare import differing_keys, index_rows, roots_of
+from app.store.prepare import differing_keys, index_rows, read_roots
 from app.store.tree import ChunkStage
 from app.store.values import Box, FeatureHit, PartEntry, Version
 
@@ -72,7 +72,7 @@ def apply(connection: Connection, environment_id: str, rows: Sequence[IndexRows]
             )
 
 
-def meets(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str) -> ColumnElement[bool]:
+def intersects(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str) -> ColumnElement[bool]:
     """A condition: the row's box, or on PostgreSQL its geometry's, meets a box in degrees."""
     conditions: list[ColumnElement[bool]] = []
     for part in split_box(box):
@@ -103,7 +103,7 @@ class SpatialIndex(StoreBase):
             .join(owner, owner.c.id == table.c.environment_id)
             .where(
                 owner.c.deleted.is_(None),
-                meets(table, table.c.geometry, bbox, self._database.engine.dialect.name),
+                intersects(table, table.c.geometry, bbox, self._database.engine.dialect.name),
             )
             .order_by(owner.c.name, table.c.layer, table.c.level, table.c.name, table.c.feature)
         )
@@ -147,7 +147,7 @@ class SpatialIndex(StoreBase):
         for key in differing_keys(old, new):
             if key.layer not in VECTOR_LAYERS:
                 continue
-            changed = diff.features(draft, roots_of(draft, key, old), roots_of(draft, key, new))
+            changed = diff.features(draft, read_roots(draft, key, old), read_roots(draft, key, new))
             apply(connection, row.id, index_rows({key: changed}, head.datum, None) or ())
 
     def rebuild_index(self) -> None:

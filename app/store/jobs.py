@@ -9,7 +9,7 @@ from sqlalchemy import Row, delete, insert, select, update
 
 from app.errors import NotFound
 from app.store import tables
-from app.store.base import StoreBase, clean, text, utcnow
+from app.store.base import StoreBase, checked_text, storable_text, utcnow
 from app.store.values import Job, State
 
 
@@ -26,10 +26,10 @@ class Jobs(StoreBase):
                     id=new,
                     state="queued",
                     progress=0.0,
-                    detail=clean(detail),
+                    detail=storable_text(detail),
                     result=None,
                     problem=None,
-                    owner=text(owner, "an owner"),
+                    owner=checked_text(owner, "an owner"),
                     created=now,
                     updated=now,
                 )
@@ -51,7 +51,7 @@ class Jobs(StoreBase):
         given = {
             "state": state,
             "progress": None if progress is None else min(1.0, max(0.0, progress)),
-            "detail": None if detail is None else clean(detail),
+            "detail": None if detail is None else storable_text(detail),
             "result": result,
             "problem": problem,
         }

@@ -34,8 +34,8 @@ def pack_manifest(
             e.key.name,
             bytes.fromhex(e.hash),
             e.count,
-            _listed(e.bounds.get("local")),
-            _listed(e.bounds.get("wgs84")),
+            _box_as_list(e.bounds.get("local")),
+            _box_as_list(e.bounds.get("wgs84")),
             bytes.fromhex(e.digest),
             e.provenance.as_dict(),
         ]
@@ -53,7 +53,7 @@ def pack_manifest(
     )
 
 
-def _listed(box: Box | None) -> list[float] | None:
+def _box_as_list(box: Box | None) -> list[float] | None:
     return None if box is None else list(box)
 
 

@@ -14,7 +14,7 @@ from app.store import tables
 from app.store.base import StoreBase, environment_row
 from app.store.values import Event, PartEntry, rfc3339
 
-REACH = 100_000
+LOG_SEARCH_WINDOW = 100_000
 """So far back in the log the last events of environments, and of names that are gone, are looked for."""
 
 
@@ -31,7 +31,7 @@ def layer_changes(before: Sequence[PartEntry], after: Sequence[PartEntry]) -> li
     return out
 
 
-def append(
+def append_event(
     connection: Connection,
     *,
     environment_id: str,
@@ -84,7 +84,10 @@ def append(
 
 def _reach(connection: Connection) -> int:
     """Before this position the log is not searched without an index."""
-    return int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one()) - REACH
+    return (
+        int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one())
+        - LOG_SEARCH_WINDOW
+    )
 
 
 class Outbox(StoreBase):
@@ -117,7 +120,7 @@ class Outbox(StoreBase):
         with self._database.read() as connection:
             return int(environment_row(connection, environment, deleted=True).sequence)
 
-    def relayed(self) -> int:
+    def relay_position(self) -> int:
         """The position up to which events were handed to the bus."""
         with self._database.read() as connection:
             position = connection.execute(select(tables.relay.c.position).where(tables.relay.c.id == 1)).scalar()
@@ -143,7 +146,7 @@ class Outbox(StoreBase):
         rank = func.row_number().over(partition_by=table.c.environment_id, order_by=table.c.sequence.desc())
         recent = (
             select(table.c.position, rank.label("rank"))
-            .where(table.c.position <= position, table.c.position > position - REACH)
+            .where(table.c.position <= position, table.c.position > position - LOG_SEARCH_WINDOW)
             .subquery()
         )
         chosen = (

@@ -21,13 +21,13 @@ from app.errors import Conflict, NotFound
 from app.event_types import EventType
 from app.model.closures import Closures
 from app.store import outbox, tables
-from app.store.base import StoreBase, environment_row, text
+from app.store.base import StoreBase, checked_text, environment_row
 from app.store.values import Overlay, OverlayState
 
 MAX_PENDING: Final = 1000
 """Maximum number of an environment's overlays that wait for a decision."""
 
-MAX_OF_ONE: Final = 100
+MAX_PENDING_PER_REPORTER: Final = 100
 """Maximum number of them from one reporter: one that goes wild leaves room for the others."""
 
 MAX_IN_FORCE: Final = 1000
@@ -47,7 +47,7 @@ EVENTS: Final[Mapping[OverlayState, EventType]] = {
 CHANGE_CLOSURES: Final = frozenset({"overlay.accepted", "overlay.ended"})
 """Events after which other closures are in force."""
 
-MAX_AT_ONCE: Final = 100
+MAX_ENDED_PER_CALL: Final = 100
 """Maximum number of overlays that are ended in one call."""
 
 
@@ -81,8 +81,8 @@ class Overlays(StoreBase):
                     polygon=overlay.polygon,
                     edge=overlay.edge,
                     crs=overlay.crs,
-                    detail=None if overlay.detail is None else text(overlay.detail, "a detail"),
-                    reporter=text(overlay.reporter, "a reporter"),
+                    detail=None if overlay.detail is None else checked_text(overlay.detail, "a detail"),
+                    reporter=checked_text(overlay.reporter, "a reporter"),
                     created=overlay.created,
                     expires=overlay.expires,
                     decided_by=overlay.decided_by,
@@ -114,7 +114,7 @@ class Overlays(StoreBase):
     def closures(self, environment: str) -> Closures:
         """Read the closures in force. Raises NotFound for an unknown environment."""
         with self._database.read() as connection:
-            return closures_in_force(connection, environment_row(connection, environment))
+            return read_closures(connection, environment_row(connection, environment))
 
     def decide_overlay(
         self,
@@ -134,7 +134,7 @@ class Overlays(StoreBase):
                 raise Conflict(f"the overlay {id} is {stored.state}, not {before}")
             if state == "accepted":
                 _require_room(connection, row, stored)
-            values: dict[str, Any] = {"state": state, "decided_by": text(author, "an author"), "decided": now}
+            values: dict[str, Any] = {"state": state, "decided_by": checked_text(author, "an author"), "decided": now}
             connection.execute(update(table).where(table.c.id == id).values(values))
             decided = _read(connection, row, id)
             if (event := EVENTS.get(state)) is not None:
@@ -149,7 +149,7 @@ class Overlays(StoreBase):
             .join(owner, owner.c.id == table.c.environment_id)
             .where(table.c.expires <= now, table.c.state.in_(("pending", "accepted")), owner.c.deleted.is_(None))
             .order_by(table.c.expires, table.c.id)
-            .limit(MAX_AT_ONCE)
+            .limit(MAX_ENDED_PER_CALL)
         )
         with self._database.read() as connection:
             due = connection.execute(query).all()
@@ -173,25 +173,25 @@ class Overlays(StoreBase):
             return _read(connection, row, id)
 
 
-_known: OrderedDict[tuple[str, int], Closures] = OrderedDict()
-_known_lock = threading.Lock()
-MAX_KNOWN: Final = 256
+_closure_cache: OrderedDict[tuple[str, int], Closures] = OrderedDict()
+_closure_cache_lock = threading.Lock()
+MAX_CACHED_CLOSURES: Final = 256
 
 
-def closures_in_force(connection: Connection, environment: Row[Any]) -> Closures:
+def read_closures(connection: Connection, environment: Row[Any]) -> Closures:
     """Read the closures in force of an environment, in the caller's transaction.
 
     They are cached by the sequence of the event that changed them last, which the environment's row has.
     """
     key = (str(environment.id), int(environment.closures_sequence))
-    with _known_lock:
-        closures = _known.get(key)
+    with _closure_cache_lock:
+        closures = _closure_cache.get(key)
     if closures is None:
         closures = _read_closures(connection, environment)
-        with _known_lock:
-            _known[key] = closures
-            while len(_known) > MAX_KNOWN:
-                _known.popitem(last=False)
+        with _closure_cache_lock:
+            _closure_cache[key] = closures
+            while len(_closure_cache) > MAX_CACHED_CLOSURES:
+                _closure_cache.popitem(last=False)
     return closures
 
 
@@ -223,8 +223,10 @@ def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overla
         same = (row.kind, row.level, row.polygon, row.edge, row.crs)
         if same == (overlay.kind, overlay.level, overlay.polygon, overlay.edge, overlay.crs):
             return str(row.id)
-    if len(rows) >= MAX_OF_ONE:
-        raise Conflict(f"{overlay.reporter} has {MAX_OF_ONE} pending overlays, the maximum: wait for an editor")
+    if len(rows) >= MAX_PENDING_PER_REPORTER:
+        raise Conflict(
+            f"{overlay.reporter} has {MAX_PENDING_PER_REPORTER} pending overlays, the maximum: wait for an editor"
+        )
     waiting = select(func.count()).select_from(table).where(*pending)
     if connection.execute(waiting).scalar_one() >= MAX_PENDING:
         raise Conflict(f"{MAX_PENDING} overlays of {environment.name} wait: accept or reject some")
@@ -244,7 +246,7 @@ def _append_event(
         more["overlays_digest"] = _read_closures(connection, environment).digest
     connection.execute(update(owner).where(owner.c.id == environment.id).values(values))
     obstruction = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
-    outbox.append(
+    outbox.append_event(
         connection,
         environment_id=environment.id,
         environment=environment.name,

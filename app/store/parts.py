@@ -28,8 +28,8 @@ from app.model.layers import Part, Resources
 from app.model.voxels import VoxelMap
 from app.store import tree
 from app.store.encode import (
+    EMPTY_BOX,
     ENCODING,
-    NOWHERE,
     Columns,
     array_header,
     bounds,
@@ -310,7 +310,7 @@ def _compose_grid(draft: ChunkStage, part: OccupancyGrid, base: PartRoot | None)
     }
     tiles = _build_tiles(draft, part.cells, _tile_names(draft, base))
     name = put_root(draft, "grid", header, {"tiles": tiles})
-    return EncodedPart(name, int(part.cells.size), {"local": _around(part.corners()), "wgs84": None})
+    return EncodedPart(name, int(part.cells.size), {"local": _bounding_box(part.corners()), "wgs84": None})
 
 
 def _compose_picture(draft: ChunkStage, part: GeoImage, base: PartRoot | None) -> EncodedPart:
@@ -347,7 +347,7 @@ def _build_tiles(draft: ChunkStage, cells: NDArray[Any], existing_names: Contain
         r, c = divmod(k, cols)
         block = cells[r * TILE : (r + 1) * TILE, c * TILE : (c + 1) * TILE]
         raw = pack([ENCODING, "tile", np.ascontiguousarray(block, little).tobytes()])
-        names.append(draft.put_big(raw, existing_names))
+        names.append(draft.put_compressed(raw, existing_names))
     codes = code[order].astype(">u8").tobytes()
     keys = [codes[8 * k : 8 * k + 8] for k in range(len(names))]
     return tree.build(
@@ -396,12 +396,12 @@ def _compose_voxels(draft: ChunkStage, part: VoxelMap) -> EncodedPart:
         "colour": part.colour is not None,
         "properties": ormsgpack.unpackb(pack_value(part.properties, "properties")),
     }
-    leaves = tree.build(draft, _EvenKeys(flat.tobytes(), VOXEL_KEY), 12, encode)
+    leaves = tree.build(draft, _FixedWidthKeys(flat.tobytes(), VOXEL_KEY), 12, encode)
     name = put_root(draft, "voxels", header, {"voxels": leaves})
     return EncodedPart(name, len(code), {"local": _voxel_box(part), "wgs84": None})
 
 
-class _EvenKeys(Sequence[bytes]):
+class _FixedWidthKeys(Sequence[bytes]):
     """Keys of one length, cut from one text when they are asked for: millions of objects would take their time."""
 
     def __init__(self, flat: bytes, width: int) -> None:
@@ -455,7 +455,7 @@ def file_leaf(raw: bytes) -> list[tuple[str, int, str]]:
 # --- bounds ---
 
 
-def _around(points: NDArray[np.float64]) -> Box:
+def _bounding_box(points: NDArray[np.float64]) -> Box:
     x0, y0 = points.min(axis=0).tolist()
     x1, y1 = points.max(axis=0).tolist()
     return (x0, y0, x1, y1)
@@ -467,7 +467,7 @@ def picture_bounds(header: Mapping[str, Any]) -> Bounds:
     w, h = header["width"], header["height"]
     corners = np.array([[a * u + b * v + c, d * u + e * v + f] for u, v in ((0, 0), (w, 0), (w, h), (0, h))])
     if header["crs"] == "local":
-        return {"local": _around(corners), "wgs84": None}
+        return {"local": _bounding_box(corners), "wgs84": None}
     return {"local": None, "wgs84": crs_bounds(header["crs"], corners)}
 
 
@@ -475,8 +475,8 @@ def feature_bounds(draft: ChunkStage, trees: Mapping[str, Node | None], part: Fe
     """Where a collection's items lie; the box of wgs84 items crosses the antimeridian where that makes it smaller."""
     local, wgs84 = trees["local"], trees["wgs84"]
     out: dict[Literal["local", "wgs84"], Box | None] = {
-        "local": local.box if local and local.box != NOWHERE else None,
-        "wgs84": wgs84.box if wgs84 and wgs84.box != NOWHERE else None,
+        "local": local.box if local and local.box != EMPTY_BOX else None,
+        "wgs84": wgs84.box if wgs84 and wgs84.box != EMPTY_BOX else None,
     }
     box = out["wgs84"]
     if box is not None and box[2] - box[0] > 180.0 and wgs84 is not None:
@@ -581,11 +581,11 @@ def leaf_items(draft: ChunkStage, names: Sequence[bytes], anchor: int) -> Iterat
                 yield i, Item(anchor, w, p)
 
 
-def features_of(items: Mapping[str, Item], document: Mapping[str, Any]) -> Features:
+def features_from_items(items: Mapping[str, Item], document: Mapping[str, Any]) -> Features:
     """Stored items as a collection, in the order of their ids."""
     ids = sorted(items)
     rows = [items[i] for i in ids]
-    return trusted(
+    return unchecked_features(
         tuple(ids),
         from_wkb([r.wkb for r in rows]),
         tuple(r.properties for r in rows),
@@ -594,7 +594,7 @@ def features_of(items: Mapping[str, Item], document: Mapping[str, Any]) -> Featu
     )
 
 
-def trusted(
+def unchecked_features(
     ids: tuple[str, ...],
     geometry: NDArray[np.object_],
     properties: tuple[Mapping[str, Any], ...],
@@ -618,7 +618,7 @@ def features_in_box(draft: ChunkStage, root: PartRoot, box: Box, crs: str, frame
     out: dict[str, Item] = {}
     for anchor, name in enumerate(("local", "wgs84")):
         node = root.trees[name]
-        if node is None or node.box == NOWHERE:
+        if node is None or node.box == EMPTY_BOX:
             continue
         same = crs == name
         if not same and frame is None:
@@ -678,7 +678,7 @@ def _other_boxes(box: Box, crs: str, frame: LocalFrame | None) -> list[Box]:
         points = frame.to_local(ring(box))
         if not np.isfinite(points).all():
             return [(-math.inf, -math.inf, math.inf, math.inf)]
-        return [_wider(_around(points))]
+        return [_wider(_bounding_box(points))]
     return split_box(_wider(local_box_to_wgs84(box, frame)))
 
 
@@ -716,7 +716,7 @@ _gc_was_on = False
 
 
 @contextmanager
-def no_garbage_collection() -> Iterator[None]:
+def gc_paused() -> Iterator[None]:
     """Without Python's cycle collector, for work that makes very many objects and no cycles.
 
     It would look at all of them again and again (a whole layer loads two to three times slower with it). At the end
@@ -753,7 +753,7 @@ def load(draft: ChunkStage, root_hashes: Mapping[Any, bytes], fetch: FetchBlobs)
     """Parts by their hashes, with few queries for all of them together."""
     draft.read_many(list(root_hashes.values()))
     roots = {key: read_root(draft, name) for key, name in root_hashes.items()}
-    with no_garbage_collection():
+    with gc_paused():
         out: dict[Any, Part] = dict(_load_collections(draft, {k: r for k, r in roots.items() if r.type == "features"}))
     for key, root in roots.items():
         if root.type == "grid":
@@ -794,7 +794,7 @@ def _load_collections(draft: ChunkStage, roots: Mapping[Any, PartRoot]) -> Itera
         local[: c.local] = True
         yield (
             key,
-            trusted(
+            unchecked_features(
                 tuple([c.ids[k] for k in order]),
                 from_wkb([c.wkb[k] for k in order]),
                 tuple([c.properties[k] for k in order]),

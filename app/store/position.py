@@ -14,8 +14,8 @@ from sqlalchemy import Boolean, ColumnElement, Connection, LargeBinary, and_, fu
 from app.errors import Damaged, Invalid, Problem
 from app.model.geodesy import distance
 from app.store import tables
-from app.store.area import area_of, put_area
-from app.store.base import StoreBase, as_environment, datum_of
+from app.store.area import compute_area, write_area
+from app.store.base import StoreBase, as_environment, datum_from_row
 from app.store.encode import from_wkb, to_wkb
 from app.store.environments import filters, reaches
 from app.store.manifest import read_version
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 BATCH: Final = 100
 """Environments that are read, or whose areas are written, at once."""
 
-TRIES: Final = 5
+MAX_ATTEMPTS: Final = 5
 """How often an area is computed again because the head has moved meanwhile."""
 
 Rank = tuple[int, float, float, str]
@@ -74,7 +74,9 @@ class Position(StoreBase):
         conditions = filters(q=q, bbox=bbox, deleted=deleted, dialect=self._database.engine.dialect.name)
 
         def page(connection: Connection) -> tuple[list[tuple[Environment, Match]], str | None]:
-            hits = [h for h in self._hits(connection, latitude, longitude, conditions) if reaches(allowed, h.rank[3])]
+            hits = [
+                h for h in self._find_hits(connection, latitude, longitude, conditions) if reaches(allowed, h.rank[3])
+            ]
             hits = sorted((h for h in hits if after is None or h.rank > after), key=lambda h: h.rank)
             environments = _environments(connection, [h.id for h in hits[:limit]])
             following = _cursor(hits[limit - 1].rank) if len(hits) > limit else None
@@ -87,7 +89,7 @@ class Position(StoreBase):
         with self._database.read() as connection:
             return page(connection)
 
-    def _hits(
+    def _find_hits(
         self, connection: Connection, latitude: float, longitude: float, conditions: list[ColumnElement[bool]]
     ) -> list[_Hit]:
         environment, area = tables.environment, tables.area
@@ -107,7 +109,7 @@ class Position(StoreBase):
             rows = [row for row, hit in zip(rows, inside.tolist(), strict=True) if hit]
         hits: dict[str, _Hit] = {}
         for row in rows:
-            datum = datum_of(row.datum)
+            datum = datum_from_row(row.datum)
             away = None if datum is None else round(distance((datum.longitude, datum.latitude), places[0]), 1)
             rank = (int(row.basis != "fence"), row.size, math.inf if away is None else away, row.name)
             hits[row.id] = _Hit(row.id, rank, Match(row.basis, row.size, away))
@@ -132,7 +134,7 @@ class Position(StoreBase):
             stale = _stale(connection)
         for start in range(0, len(stale), BATCH):
             todo = stale[start : start + BATCH]
-            for _ in range(TRIES):
+            for _ in range(MAX_ATTEMPTS):
                 todo = self._refresh_some(todo)
                 if not todo:
                     break
@@ -149,7 +151,7 @@ class Position(StoreBase):
             if head is None:
                 continue
             try:
-                computed[environment_id] = head.number, area_of(ChunkStage(self._chunks), head.parts, head.datum)
+                computed[environment_id] = head.number, compute_area(ChunkStage(self._chunks), head.parts, head.datum)
             except Damaged as error:
                 log.critical("area of %s: not computed, its last one stays: %s", head.environment, error.detail)
         moved: list[str] = []
@@ -163,7 +165,7 @@ class Position(StoreBase):
                 if row.head != number:
                     moved.append(environment_id)
                     continue
-                put_area(connection, environment_id, area)
+                write_area(connection, environment_id, area)
                 connection.execute(update(table).where(table.c.id == environment_id).values(area_stale=False))
         return moved
 

@@ -34,7 +34,7 @@ IsIntact = Callable[[str], bool]
 
 def prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
     """A version on top of a base. What is damaged of a part that is replaced is stored again."""
-    with parts.no_garbage_collection():
+    with parts.gc_paused():
         return _prepare(draft, base, changes, is_intact)
 
 
@@ -60,8 +60,8 @@ def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIn
     listed = tuple(entries[key] for key in sorted(entries))
     root = version_root(listed, datum, levels, templates)
     damaged = {entry.key for entry in base.parts} - before.keys()
-    fresh = _fresh(draft, before, entries)
-    renewed = _renewed(before, entries, replaced)
+    fresh = _new_chunks(draft, before, entries)
+    renewed = _rederived_parts(before, entries, replaced)
     if root == base.root and not renewed:
         same = Prepared(base.number, root, fresh, base.parts, datum, levels, templates, {}, changed=False, area=KEEP)
         return replace(same, blobs=blobs)
@@ -96,7 +96,7 @@ def version_root(
     return root_hash(named, datum, levels, templates.as_dict())
 
 
-def _renewed(
+def _rederived_parts(
     before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry], replaced: Mapping[PartKey, Replace]
 ) -> list[dict[str, str]]:
     """The derived parts whose content was given anew and is the same, by another way or from other inputs than before.
@@ -106,7 +106,13 @@ def _renewed(
     out = []
     for key in sorted(replaced):
         a, b = before.get(key), after.get(key)
-        if a is None or b is None or a.hash != b.hash or a.provenance.information != "derived" or b.provenance.edited:
+        if (
+            a is None
+            or b is None
+            or a.hash != b.hash
+            or a.provenance.information != "derived"
+            or b.provenance.is_edited
+        ):
             continue
         # Packed, since what is stored has lists where a step just made may have tuples.
         old, new = (pack([p.information, list(p.steps), list(p.inputs)]) for p in (a.provenance, b.provenance))
@@ -156,11 +162,11 @@ def compose_operation(draft: ChunkStage, entries: dict[PartKey, PartEntry], oper
         if entry is None or root is None:
             raise NotFound(f"there is no {label}")
         encoded_part = parts.edit_features(draft, root, None, set(operation.ids), label)
-        provenance = entry.provenance.marked()
+        provenance = entry.provenance.with_edit_step()
     else:
         root = root or parts.read_root(draft, parts.empty_features(draft))
         encoded_part = parts.edit_features(draft, root, operation.features, (), label)
-        provenance = joined(entry.provenance, operation.provenance) if entry else operation.provenance
+        provenance = merge_provenance(entry.provenance, operation.provenance) if entry else operation.provenance
     digest = entry.digest if entry and encoded_part.hash.hex() == entry.hash else ""
     entries[key] = PartEntry(
         key, encoded_part.hash.hex(), encoded_part.count, encoded_part.bounds, provenance, digest=digest
@@ -168,7 +174,7 @@ def compose_operation(draft: ChunkStage, entries: dict[PartKey, PartEntry], oper
     return encoded_part
 
 
-def joined(old: Provenance, new: Provenance) -> Provenance:
+def merge_provenance(old: Provenance, new: Provenance) -> Provenance:
     """Of a part to which features were added: raw where anything in it is, and all sources, steps and credits."""
     return Provenance(
         information="raw" if "raw" in (old.information, new.information) else new.information,
@@ -184,7 +190,7 @@ def joined(old: Provenance, new: Provenance) -> Provenance:
 # --- what changed ---
 
 
-def roots_of(draft: ChunkStage, key: PartKey, entries: Mapping[PartKey, PartEntry]) -> PartRoot | None:
+def read_roots(draft: ChunkStage, key: PartKey, entries: Mapping[PartKey, PartEntry]) -> PartRoot | None:
     """The decoded root of a part, or None."""
     entry = entries.get(key)
     return parts.read_root(draft, bytes.fromhex(entry.hash)) if entry else None
@@ -232,7 +238,7 @@ def summarise(
                 total["deleted"] += a.count
                 features = None
                 continue
-            changed = diff.features(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+            changed = diff.features(draft, read_roots(draft, key, before), read_roots(draft, key, after))
             for name, count in changed.counts().items():
                 total[name] += count
             if changed.document:
@@ -243,17 +249,17 @@ def summarise(
             operation = (replaced or {}).get(key)
             new = operation.part if operation else None
             if a is None and isinstance(new, OccupancyGrid):
-                cells = cells_added(new)
+                cells = cells_of_new_grid(new)
             else:
-                cells = diff.cells(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+                cells = diff.cells(draft, read_roots(draft, key, before), read_roots(draft, key, after))
             out.setdefault(key.layer, {})[names[key]] = cells.as_dict()
         else:
-            other = diff.others(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+            other = diff.diff_other_parts(draft, read_roots(draft, key, before), read_roots(draft, key, after))
             out.setdefault(key.layer, {})[names[key]] = other
     return out, features
 
 
-def cells_added(grid: OccupancyGrid) -> CellChanges:
+def cells_of_new_grid(grid: OccupancyGrid) -> CellChanges:
     """The changes that a new grid is: every known cell was unknown before."""
     out = CellChanges()
     known_cells = grid.cells != UNKNOWN
@@ -300,11 +306,11 @@ def index_rows(
     for key in sorted(changed):
         c = changed[key]
         items = {i: c.after[i] for i in (*c.added, *c.changed)}
-        out.append(IndexRows(key, (*c.changed, *c.deleted), placed(items, datum)))
+        out.append(IndexRows(key, (*c.changed, *c.deleted), located_items(items, datum)))
     return tuple(out)
 
 
-def placed(
+def located_items(
     items: Mapping[str, Item], datum: Datum | None
 ) -> tuple[tuple[str, tuple[float, float, float, float], bytes], ...]:
     """(id, box in degrees, WKB in degrees) of the items that have a place on earth."""
@@ -329,7 +335,7 @@ def placed(
 # --- chunks that the base does not have ---
 
 
-def _fresh(
+def _new_chunks(
     draft: ChunkStage, before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry]
 ) -> dict[str, bytes]:
     """Hash (hex) -> stored bytes of the chunks of changed parts that were not read from the store."""
@@ -338,7 +344,7 @@ def _fresh(
         entry = after.get(key)
         if entry is None:
             continue
-        old = roots_of(draft, key, before)
+        old = read_roots(draft, key, before)
         existing_names: set[bytes] = set()
         if old is not None:
             for node in old.trees.values():

@@ -12,7 +12,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
-from app.store.base import StoreBase, clean, environment_row
+from app.store.base import StoreBase, environment_row, storable_text
 from app.store.overlays import CHANGE_CLOSURES
 from app.store.values import LATEST, NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, Robot, RobotReport
 
@@ -173,13 +173,13 @@ def _note(connection: Connection, environment_id: str, heard: ReceivedReport) ->
         "version": report.version,
         "root": report.root,
         "state": report.state,
-        "detail": None if report.detail is None else clean(report.detail),
+        "detail": None if report.detail is None else storable_text(report.detail),
         "sequence": report.sequence,
         "overlays": report.overlays,
     }
-    values: dict[str, Any] = {**report_columns, "said": report.said, "time": heard.time}
+    values: dict[str, Any] = {**report_columns, "said": report.reported_at, "time": heard.time}
     again = row is not None and all(getattr(row, name) == value for name, value in report_columns.items())
-    if row is not None and not again and _told_before(connection, environment_id, heard, report_columns):
+    if row is not None and not again and _is_duplicate_report(connection, environment_id, heard, report_columns):
         connection.execute(
             update(table).where(*conditions).values(time=heard.time, vouched=row.vouched or heard.vouched)
         )
@@ -220,17 +220,17 @@ def _held_values(report: RobotReport, row: Row[Any] | None, time: datetime) -> d
     return {**values, "held_overlays": report.overlays}
 
 
-def _told_before(
+def _is_duplicate_report(
     connection: Connection, environment_id: str, heard: ReceivedReport, report_columns: dict[str, Any]
 ) -> bool:
     """Whether this very report came before, by another way: robots tell over Zenoh and HTTP, and one may be late."""
     table = tables.robot_history
-    if heard.report.said is None:
+    if heard.report.reported_at is None:
         return False
     query = select(table.c.id).where(
         table.c.environment_id == environment_id,
         table.c.robot == heard.robot,
-        table.c.said == heard.report.said,
+        table.c.said == heard.report.reported_at,
         *(table.c[name].is_not_distinct_from(value) for name, value in report_columns.items()),
     )
     return connection.execute(query.limit(1)).scalar_one_or_none() is not None
@@ -242,7 +242,11 @@ def _remember(
     table = tables.robot_history
     connection.execute(
         insert(table).values(
-            environment_id=environment_id, robot=heard.robot, said=heard.report.said, time=heard.time, **report_columns
+            environment_id=environment_id,
+            robot=heard.robot,
+            said=heard.report.reported_at,
+            time=heard.time,
+            **report_columns,
         )
     )
     conditions = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
@@ -261,7 +265,7 @@ def _robots() -> Select[Any]:
     )
 
 
-def robots_of(connection: Connection, environment_id: str, channel: str) -> list[Robot]:
+def channel_robots(connection: Connection, environment_id: str, channel: str) -> list[Robot]:
     """The robots of a channel, within a transaction."""
     table = tables.robot
     query = _robots().where(table.c.environment_id == environment_id, table.c.channel == channel)

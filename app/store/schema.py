@@ -58,7 +58,7 @@ def newest() -> str:
 
 def _present(database: Database) -> str | None:
     """The revision of the database's schema; None where it has none. (Alembic's own look takes ten times as long.)"""
-    with database.connected() as connection:
+    with database.connection() as connection:
         if not inspect(connection).has_table("alembic_version"):
             return None
         return connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
@@ -72,7 +72,7 @@ def upgrade(database: Database) -> None:
     from alembic.util import CommandError
 
     settings = config()
-    with database.connected() as connection:
+    with database.connection() as connection:
         connection.execution_options(write=True)
         try:
             with connection.begin():

@@ -140,23 +140,23 @@ class Scrub:
 
     def _pages(self) -> None:
         for name, size, problem in self._store.check_pages(self._state.after):
-            if not self._checked("database", name, size, problem):
+            if not self._note_checked("database", name, size, problem):
                 return
 
     def _chunks(self) -> None:
         for name, size, problem in self._store.verifier().chunks(self._state.after):
-            if not self._checked("chunk", name, size, problem):
+            if not self._note_checked("chunk", name, size, problem):
                 return
 
     def _versions(self) -> None:
         for environment, row in self._store.verifier().versions():
             problem, _ = check_root(row)
-            if not self._checked("version", f"{environment} {row.number}", len(row.manifest), problem):
+            if not self._note_checked("version", f"{environment} {row.number}", len(row.manifest), problem):
                 return
 
     def _blobs(self) -> None:
-        for name, size, problem in self._store.blobs.checked(self._state.after, self._skip):
-            if not self._checked("blob", name, size, problem):
+        for name, size, problem in self._store.blobs.iterate_checks(self._state.after, self._skip):
+            if not self._note_checked("blob", name, size, problem):
                 return
 
     def _skip(self, name: str, error: Unavailable) -> None:
@@ -165,10 +165,10 @@ class Scrub:
 
     def _cache(self) -> None:
         for key, size, intact in self._check_cache():
-            if not self._checked("cache", key, size, None if intact else "damaged; it is made again"):
+            if not self._note_checked("cache", key, size, None if intact else "damaged; it is made again"):
                 return
 
-    def _checked(self, kind: Kind, name: str, size: int, problem: str | None) -> bool:
+    def _note_checked(self, kind: Kind, name: str, size: int, problem: str | None) -> bool:
         """Note what was checked and take the time for it; False where the scrub was stopped."""
         if problem is not None:
             self._note(kind, name, problem)

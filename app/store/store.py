@@ -89,7 +89,7 @@ class Store(
 
     def note_damage(self, error: DatabaseDamaged) -> None:
         """Report that another process found the database damaged: from now on ``check`` fails."""
-        self._database.note_damage_of(error)
+        self._database.note_damage_from(error)
 
     def verifier(self, progress: Progress = lambda kind, size: None) -> Verifier:
         """Checks of everything that is stored."""

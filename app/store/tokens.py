@@ -14,8 +14,8 @@ from sqlalchemy.exc import IntegrityError
 
 from app.errors import Conflict, Invalid, NotFound, Unavailable
 from app.store import tables
-from app.store.audit import about
-from app.store.base import StoreBase, text, utcnow
+from app.store.audit import set_audit_target
+from app.store.base import StoreBase, checked_text, utcnow
 from app.store.values import Role, Token, rfc3339
 
 log = logging.getLogger(__name__)
@@ -51,14 +51,14 @@ class Tokens(StoreBase):
         secret = token or secrets.token_urlsafe(SECRET_BYTES)
         values: dict[str, Any] = {
             "id": secrets.token_hex(8),
-            "name": text(name, "a token's name", 256),
+            "name": checked_text(name, "a token's name", 256),
             "role": role,
-            "environments": None if environments is None else text(environments, "a name pattern", 256),
-            "robot": None if robot is None else text(robot, "a robot's name", 256),
+            "environments": None if environments is None else checked_text(environments, "a name pattern", 256),
+            "robot": None if robot is None else checked_text(robot, "a robot's name", 256),
             "expires": expires,
             "created": utcnow(),
         }
-        about(target=f"token {values['id']}")
+        set_audit_target(target=f"token {values['id']}")
         try:
             with self._database.write() as connection:
                 connection.execute(insert(tables.token).values(hash=_hash(secret), **values))

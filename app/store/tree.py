@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import Damaged, Invalid
-from app.store.encode import ENCODING, NOWHERE, compress, decompress, digest, pack, unpack
+from app.store.encode import EMPTY_BOX, ENCODING, compress, decompress, digest, pack, unpack
 
 FANOUT_BITS: Final = 6
 """An inner node has 64 children on average."""
@@ -30,7 +30,7 @@ FANOUT_BITS: Final = 6
 OVERSIZE: Final = 4
 """Nodes with more than this many times the average are cut again."""
 
-TOP: Final = 12
+MAX_LEVEL: Final = 12
 """A level at which everything goes into one node, so that no choice of keys makes an endless tower."""
 
 Box = tuple[float, float, float, float]
@@ -57,7 +57,7 @@ class Node:
 
     def as_list(self) -> list[Any]:
         """For a part's chunk."""
-        box = None if self.box == NOWHERE else list(self.box)
+        box = None if self.box == EMPTY_BOX else list(self.box)
         return [self.hash, self.level, self.count, self.leaves, box]
 
     @classmethod
@@ -66,7 +66,7 @@ class Node:
         if members is None:
             return None
         h, level, count, leaves, box = members
-        return cls(h, level, count, leaves, NOWHERE if box is None else tuple(box))
+        return cls(h, level, count, leaves, EMPTY_BOX if box is None else tuple(box))
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class ChunkStage:
         self.new[name] = raw
         return name
 
-    def put_big(self, raw: bytes, existing_names: Container[bytes]) -> bytes:
+    def put_compressed(self, raw: bytes, existing_names: Container[bytes]) -> bytes:
         """Keep a chunk compressed, unless its hash is among the known ones; its hash."""
         name = digest(raw)
         if name not in existing_names and name not in self.stored:
@@ -215,7 +215,7 @@ def cut(hashes: NDArray[np.uint32], bits: int, limit: int | None = None) -> list
 
 def ends_node(key: bytes, level: int, bits: int) -> bool:
     """Whether this key ends its node (by the full number of bits), so that nothing before touches what is after."""
-    return level < TOP and not int(key_hashes((key,), level)[0]) & ((1 << bits) - 1)
+    return level < MAX_LEVEL and not int(key_hashes((key,), level)[0]) & ((1 << bits) - 1)
 
 
 # --- building ---
@@ -233,7 +233,7 @@ def build(
         return None
     ends = cut(key_hashes(keys, 0), bits)
     starts = [0, *ends[:-1]]
-    around = join_boxes(boxes, starts) if boxes is not None else [NOWHERE] * len(ends)
+    around = join_boxes(boxes, starts) if boxes is not None else [EMPTY_BOX] * len(ends)
     leaves = [
         Node(draft.put(encode(s, e)), 0, e - s, 1, box, key=keys[e - 1])
         for s, e, box in zip(starts, ends, around, strict=True)
@@ -252,7 +252,7 @@ def join_boxes(boxes: NDArray[np.float64], starts: Sequence[int]) -> list[Box]:
 
 def inner_nodes(draft: ChunkStage, children: Sequence[Node], level: int) -> list[Node]:
     """Group the nodes of the level below into inner nodes of this level."""
-    ends = cut(key_hashes((c.key for c in children), level), FANOUT_BITS) if level < TOP else [len(children)]
+    ends = cut(key_hashes((c.key for c in children), level), FANOUT_BITS) if level < MAX_LEVEL else [len(children)]
     out = []
     start = 0
     for end in ends:
@@ -420,7 +420,7 @@ def edit(
         ends = cut(key_hashes(keys, 0), codec.bits)
         starts = [0, *ends[:-1]]
         boxes = codec.boxes(items)
-        around = join_boxes(boxes, starts) if boxes is not None else [NOWHERE] * len(ends)
+        around = join_boxes(boxes, starts) if boxes is not None else [EMPTY_BOX] * len(ends)
         return [
             Node(draft.put(codec.encode(keys[s:e], items[s:e])), 0, e - s, 1, box, key=keys[e - 1])
             for s, e, box in zip(starts, ends, around, strict=True)
@@ -495,24 +495,24 @@ def _edit_level(
     for key in touched:
         if finished or (done is not None and key <= done):
             continue
-        first = _first(draft, root, level, key) or _last(draft, root, level)
+        first = _first_node(draft, root, level, key) or _last_node(draft, root, level)
         run = [first]
-        while (before := _before(draft, root, level, run[0].key)) and not ends_node(before.key, level, bits):
+        while (before := _is_before(draft, root, level, run[0].key)) and not ends_node(before.key, level, bits):
             run.insert(0, before)
         while not (ends_node(run[-1].key, level, bits) and run[-1].key not in deletions):
-            after = _first(draft, root, level, run[-1].key, strict=True)
+            after = _first_node(draft, root, level, run[-1].key, strict=True)
             if after is None:
                 break
             run.append(after)
-        before = _before(draft, root, level, run[0].key)
-        finished = _first(draft, root, level, run[-1].key, strict=True) is None
+        before = _is_before(draft, root, level, run[0].key)
+        finished = _first_node(draft, root, level, run[-1].key, strict=True) is None
         done = run[-1].key
         new.extend(regroup(run, before.key if before else None, None if finished else done))
         old_keys.update(n.key for n in run)
     return new, old_keys, False
 
 
-def _first(draft: ChunkStage, root: Node, level: int, key: bytes, *, strict: bool = False) -> Node | None:
+def _first_node(draft: ChunkStage, root: Node, level: int, key: bytes, *, strict: bool = False) -> Node | None:
     """The first node of a level whose last key is not before (strict: is after) this key."""
     node = draft.inner(root.hash)
     while True:
@@ -524,14 +524,14 @@ def _first(draft: ChunkStage, root: Node, level: int, key: bytes, *, strict: boo
         node = draft.inner(node.hashes[k])
 
 
-def _last(draft: ChunkStage, root: Node, level: int) -> Node:
+def _last_node(draft: ChunkStage, root: Node, level: int) -> Node:
     node = draft.inner(root.hash)
     while node.level > level + 1:
         node = draft.inner(node.hashes[-1])
     return node.child(len(node.keys) - 1)
 
 
-def _before(draft: ChunkStage, root: Node, level: int, key: bytes) -> Node | None:
+def _is_before(draft: ChunkStage, root: Node, level: int, key: bytes) -> Node | None:
     """The last node of a level whose last key is before this key."""
 
     def search(node: Inner) -> Node | None:
@@ -542,6 +542,6 @@ def _before(draft: ChunkStage, root: Node, level: int, key: bytes) -> Node | Non
             last_node = search(draft.inner(node.hashes[k]))
             if last_node:
                 return last_node
-        return _last(draft, node.child(k - 1), level) if k else None
+        return _last_node(draft, node.child(k - 1), level) if k else None
 
     return search(draft.inner(root.hash))

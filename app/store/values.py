@@ -135,13 +135,13 @@ class Provenance:
     inputs: tuple[Mapping[str, Any], ...] = ()
 
     @property
-    def edited(self) -> bool:
+    def is_edited(self) -> bool:
         """Whether people have changed what was derived."""
         return any(step.get("step") == EDIT for step in self.steps)
 
-    def marked(self) -> Provenance:
+    def with_edit_step(self) -> Provenance:
         """After people's changes: what was derived or generated is no longer made anew without a word."""
-        if not (self.inputs or self.information == "generated") or self.edited:
+        if not (self.inputs or self.information == "generated") or self.is_edited:
             return self
         return replace(self, steps=(*self.steps, {"step": EDIT}))
 
@@ -234,7 +234,7 @@ class Version:
             changed = []
             for line in entry.provenance.inputs:
                 if "layer" not in line:
-                    frame = frame_line(self.datum, self.levels)
+                    frame = frame_input(self.datum, self.levels)
                     if line != {name: frame.get(name) for name in line}:
                         changed.append("datum or levels" if "levels" in line else "datum")
                 elif now.get((line["layer"], line["level"], line["name"])) != line["hash"]:
@@ -289,7 +289,7 @@ class Version:
         }
 
 
-def frame_line(datum: Datum | None, levels: Sequence[Level]) -> dict[str, Any]:
+def frame_input(datum: Datum | None, levels: Sequence[Level]) -> dict[str, Any]:
     """Datum and levels as a line among a derivation's inputs."""
     return {
         "datum": datum.as_dict() if datum else None,
@@ -442,7 +442,8 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class RobotReport:
-    """What a robot says of itself. said: when, by its own clock. sequence: of the last event that it has processed.
+    """What a robot says of itself. reported_at: when, by its own clock. sequence: of the last event that it has
+    processed.
 
     holds: version and root that it has loaded, ``NO_ROOT`` for none; None where it does not say. It is not part of the
     history. overlays: digest of the closures in the map that it has loaded; None from robots that know of none.
@@ -454,7 +455,7 @@ class RobotReport:
     state: RobotState
     detail: str | None = None
     sequence: int | None = None
-    said: datetime | None = None
+    reported_at: datetime | None = None
     overlays: str | None = None
     holds: tuple[int, str] | None = None
 
@@ -494,7 +495,8 @@ class ActiveMap:
 class Robot:
     """A robot in one environment, as it is now.
 
-    time: of its last report. since: when it first said the same. there: its liveliness on the bus, as of ``seen``;
+    time: of its last report. since: when it first said the same. on_bus: its liveliness on the bus, as of
+        ``presence_at``;
     None where it never was on the bus. vouched: whether any of its reports came with authority, so that it counts in
     roll-outs.
     """
@@ -505,11 +507,11 @@ class Robot:
     time: datetime
     since: datetime
     held: ActiveMap | None
-    there: bool | None = None
-    seen: datetime | None = None
+    on_bus: bool | None = None
+    presence_at: datetime | None = None
     vouched: bool = True
 
-    def failed_with(self, root: str) -> bool:
+    def has_failed_with(self, root: str) -> bool:
         """Whether it says that it failed with a version."""
         return self.report.state == "failed" and self.report.root == root
 

@@ -95,7 +95,7 @@ class Verifier:
     def _content(self, out: VerifyResult) -> None:
         bad: dict[str, str] = {}
         present: set[bytes] = set()
-        for name, size, problem in self._chunks.checked():
+        for name, size, problem in self._chunks.iterate_checks():
             self._count(out, "chunk", size)
             present.add(name)
             if problem is not None:
@@ -123,7 +123,7 @@ class Verifier:
 
     def _check_blobs(self, out: VerifyResult, users: Mapping[str, list[VersionName]]) -> None:
         missing = dict.fromkeys(users)
-        for name, size, problem in self._blobs.checked():
+        for name, size, problem in self._blobs.iterate_checks():
             self._count(out, "blob", size)
             missing.pop(name, None)
             if problem is not None:
@@ -139,7 +139,7 @@ class Verifier:
 
     def chunks(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
         """Hash one chunk after the other: (hash in hex, bytes, what is wrong with it or None)."""
-        for name, size, problem in self._chunks.checked(bytes.fromhex(after)):
+        for name, size, problem in self._chunks.iterate_checks(bytes.fromhex(after)):
             yield name.hex(), size, problem
 
     def versions(self) -> Iterator[tuple[str, Any]]:
@@ -196,7 +196,7 @@ class _Walk:
         return self._parts[part]
 
     def _is_bad(self, name: bytes) -> bool:
-        if name not in self._present and not self._chunks.damaged([name]):
+        if name not in self._present and not self._chunks.find_damaged([name]):
             self._present.add(name)  # it was stored after its turn had come
         return name not in self._present or name.hex() in self._bad
 
@@ -207,7 +207,7 @@ class _Walk:
         root = parts.read_root(draft, name)
         subtrees = [self._node(draft, node, root.type) for node in root.trees.values() if node is not None]
         documents = {h.hex() for h in parts.document_chunks(root) if self._is_bad(h)}
-        return _joined(subtrees, documents)
+        return _merge_references(subtrees, documents)
 
     def _node(self, draft: ChunkStage, node: Node, kind: str) -> _PartReferences:
         cached = self._nodes.get(node.hash)
@@ -217,10 +217,10 @@ class _Walk:
             below = _PartReferences(frozenset({node.hash.hex()}), _NOTHING)
         elif node.level:
             children = draft.inner(node.hash).children()
-            below = _joined([self._node(draft, child, kind) for child in children], set())
+            below = _merge_references([self._node(draft, child, kind) for child in children], set())
         elif kind in ("grid", "picture"):
             (raw,) = draft.stream([node.hash]).values()
-            below = _joined([], {tile.hex() for _, tile in parts.tile_leaf(raw) if self._is_bad(tile)})
+            below = _merge_references([], {tile.hex() for _, tile in parts.tile_leaf(raw) if self._is_bad(tile)})
         elif kind == "resources":
             (raw,) = draft.stream([node.hash]).values()
             below = _PartReferences(_NOTHING, frozenset(h for _, _, h in parts.file_leaf(raw)))
@@ -230,7 +230,7 @@ class _Walk:
         return below
 
 
-def _joined(subtrees: list[_PartReferences], bad: set[str]) -> _PartReferences:
+def _merge_references(subtrees: list[_PartReferences], bad: set[str]) -> _PartReferences:
     return _PartReferences(
         frozenset(bad).union(*(b.bad for b in subtrees)), _NOTHING.union(*(b.blobs for b in subtrees))
     )

@@ -13,9 +13,17 @@ from app.errors import Conflict, Damaged, Invalid, NotFound, Problem, StaleParen
 from app.model.frame import Datum, Level
 from app.model.templates import Templates, template_changes
 from app.store import chunks, index, outbox, parts, tables
-from app.store.area import area_after, put_area
-from app.store.audit import changes_nothing
-from app.store.base import StoreBase, clean, clean_problem, environment_row, nearest_channel, text, utcnow
+from app.store.area import area_after, write_area
+from app.store.audit import skip_audit
+from app.store.base import (
+    StoreBase,
+    checked_text,
+    clean_problem,
+    environment_row,
+    nearest_channel,
+    storable_text,
+    utcnow,
+)
 from app.store.changes import KEEP, Changes, Keep, Prepared
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
@@ -23,7 +31,7 @@ from app.store.prepare import frame_changes, prepare, summarise
 from app.store.tree import ChunkStage
 from app.store.values import LATEST, Area, Idempotency, PartEntry, Source, Version
 
-REVERT_TRIES: Final = 8
+MAX_REVERT_ATTEMPTS: Final = 8
 
 
 def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> int:
@@ -107,7 +115,7 @@ def insert_version(
         )
     )
     if isinstance(area, Area):
-        put_area(connection, environment.id, area)
+        write_area(connection, environment.id, area)
 
 
 def insert_sources(
@@ -116,7 +124,7 @@ def insert_sources(
     """Write source rows; their blobs must be there and are marked as used."""
     if not sources:
         return
-    hold_blobs(connection, {s.sha256 for s in sources})
+    lock_blobs(connection, {s.sha256 for s in sources})
     connection.execute(
         insert(tables.source),
         [
@@ -124,7 +132,7 @@ def insert_sources(
                 "environment_id": environment_id,
                 "number": number,
                 "position": first + k,
-                "name": clean(s.name),
+                "name": storable_text(s.name),
                 "size": s.size,
                 "sha256": s.sha256,
                 "format": s.format,
@@ -135,7 +143,7 @@ def insert_sources(
     )
 
 
-def hold_blobs(connection: Connection, hashes: set[str]) -> None:
+def lock_blobs(connection: Connection, hashes: set[str]) -> None:
     """Keep a collection in progress away from blobs that this transaction refers to; Unavailable where one is gone."""
     now = int(utcnow().timestamp())
     names = sorted(hashes)
@@ -183,7 +191,7 @@ class Versions(StoreBase):
             names, _ = parts.all_chunks(ChunkStage(self._chunks), bytes.fromhex(part), ())
         except Damaged:
             return False
-        return not self._chunks.damaged(sorted(names))
+        return not self._chunks.find_damaged(sorted(names))
 
     def commit(
         self,
@@ -202,15 +210,15 @@ class Versions(StoreBase):
         then, or Conflict with another fingerprint. A prepared version that changes nothing adds the sources to the
         head and returns it.
         """
-        text(author, "an author")
-        text(message, "a message")
+        checked_text(author, "an author")
+        checked_text(message, "a message")
         if prepared.blobs:
             self.blobs.put_many(list(prepared.blobs.values()))
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            previous_number = _replayed(connection, row, idempotency)
+            previous_number = _previous_version(connection, row, idempotency)
             if previous_number is not None:
-                changes_nothing()
+                skip_audit()
                 return read_version(connection, row, previous_number)
             _check_head(row, prepared.base)
             now = utcnow()
@@ -221,7 +229,7 @@ class Versions(StoreBase):
                 return read_version(connection, row, row.head)
             before = read_version(connection, row, row.head)
             chunks.insert(connection, prepared.chunks)
-            hold_blobs(connection, set(prepared.blobs))
+            lock_blobs(connection, set(prepared.blobs))
             number, sequence = row.head + 1, row.sequence + 1
             in_step = prepared.index is not None and row.indexed == row.head
             if in_step and prepared.index:
@@ -247,7 +255,7 @@ class Versions(StoreBase):
             )
             _remember(connection, row.id, idempotency, number, now)
             version = read_version(connection, row, number)
-            outbox.append(
+            outbox.append_event(
                 connection,
                 environment_id=row.id,
                 environment=row.name,
@@ -285,7 +293,7 @@ class Versions(StoreBase):
 
         expected: StaleParent where the head is another one; without it the head may move meanwhile.
         """
-        for attempt in range(REVERT_TRIES):
+        for attempt in range(MAX_REVERT_ATTEMPTS):
             target = self.version(environment, to)
             head = self.version(environment)
             if expected is not None and head.number != expected:
@@ -295,17 +303,17 @@ class Versions(StoreBase):
             try:
                 return self.commit(
                     environment,
-                    self._reverted(head, target),
+                    self._prepare_revert(head, target),
                     author=author,
                     message=message,
                     idempotency=idempotency,
                 )
             except StaleParent:
-                if attempt == REVERT_TRIES - 1 or expected is not None:
+                if attempt == MAX_REVERT_ATTEMPTS - 1 or expected is not None:
                     raise
         raise AssertionError("unreachable")
 
-    def _reverted(self, head: Version, target: Version) -> Prepared:
+    def _prepare_revert(self, head: Version, target: Version) -> Prepared:
         changed = head.root != target.root
         changes: dict[str, Any] = {}
         area: Area | Literal[Keep.KEEP] | None = KEEP
@@ -338,7 +346,7 @@ def _check_head(row: Row[Any], base: int) -> None:
         )
 
 
-def _replayed(connection: Connection, row: Row[Any], idempotency: Idempotency | None) -> int | None:
+def _previous_version(connection: Connection, row: Row[Any], idempotency: Idempotency | None) -> int | None:
     if idempotency is None:
         return None
     table = tables.idempotency
@@ -360,7 +368,7 @@ def _remember(
         connection.execute(
             insert(tables.idempotency).values(
                 environment_id=environment_id,
-                key=text(idempotency.key, "an Idempotency-Key", 255),
+                key=checked_text(idempotency.key, "an Idempotency-Key", 255),
                 fingerprint=idempotency.fingerprint,
                 version=version,
                 time=now,

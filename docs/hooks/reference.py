@@ -611,7 +611,7 @@ def chunk_tree() -> str:
     numbers = [
         ("children of an inner node, on average", str(2**tree.FANOUT_BITS)),
         ("a node is cut again beyond this many times the average", str(tree.OVERSIZE)),
-        ("level at which everything goes into one node", str(tree.TOP)),
+        ("level at which everything goes into one node", str(tree.MAX_LEVEL)),
         ("version of the encoding", str(encode.ENCODING)),
     ]
     return f"{prose(text.partition(chr(10))[2])}\n{table(('number', 'value'), numbers)}"

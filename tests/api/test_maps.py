@@ -87,7 +87,7 @@ def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeyp
     api.get(path)
     time.sleep(1.1)
     first = api.get(path)
-    monkeypatch.setattr(Store, "standing", away)
+    monkeypatch.setattr(Store, "channel_target", away)
     monkeypatch.setattr(Store, "find_token", away)
     for _ in range(5):
         again = api.get(path)
@@ -346,13 +346,13 @@ def test_memory_is_bounded(tmp_path: Path) -> None:
 def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.convert.maps import Maps
 
-    quick, gate = Maps.make, threading.Event()
+    quick, gate = Maps.get_or_convert, threading.Event()
 
     def slow(self: Maps, recipe: object, stop: object) -> object:
         assert gate.wait(30)
         return quick(self, recipe, stop)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Maps, "make", slow)
+    monkeypatch.setattr(Maps, "get_or_convert", slow)
     with running(settings_for(tmp_path, job_seconds=0.2)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
@@ -394,7 +394,7 @@ def test_a_job_is_cancelled_or_fails(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert gate.wait(30)
         raise CannotConvert("it cannot be done")
 
-    monkeypatch.setattr(Maps, "make", broken)
+    monkeypatch.setattr(Maps, "get_or_convert", broken)
     with running(settings_for(tmp_path, job_seconds=0.1)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2(), "datum.yaml": samples.DATUM})
@@ -465,13 +465,13 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
 
     def endless(self: Maps, recipe: object, stop: CancelHandle) -> object:
         for _ in range(600):
-            if stop.called:
+            if stop.is_cancelled:
                 stopped.set()
             stop.check()
             time.sleep(0.05)
         raise AssertionError("nobody stopped it")
 
-    monkeypatch.setattr(Maps, "make", endless)
+    monkeypatch.setattr(Maps, "get_or_convert", endless)
     with running(settings_for(tmp_path, job_seconds=0.1)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})

@@ -23,7 +23,7 @@ from PIL import Image
 from app.errors import CannotDerive, Invalid, Unavailable
 from app.formats import Limits
 from app.ingest import online
-from app.ingest.online import Fetcher, Provider, put_together, sheet
+from app.ingest.online import Fetcher, Provider, assemble_image, plan_mosaic
 from app.model.geodesy import WGS84, between
 from app.model.imagery import GeoImage, placed
 from tests.api.conftest import Api, running, settings_for
@@ -194,8 +194,8 @@ def tiles(at: Misbehaving, **more: Any) -> Provider:
 
 
 def fetched(provider: Provider, resolution: float = 0.5) -> tuple[GeoImage, int]:
-    mosaic = sheet(provider, BOX, resolution)
-    return put_together(
+    mosaic = plan_mosaic(provider, BOX, resolution)
+    return assemble_image(
         mosaic, Fetcher(provider, sleep=lambda _: None).fetch(mosaic.blocks), provider.attribution, Limits()
     )
 
@@ -241,9 +241,9 @@ def test_large_pictures_come_in_parts(provider: Misbehaving) -> None:
 
 def test_rows_from_below_and_wmts_names() -> None:
     box, size = (-0.5251, 53.2682, -0.5250, 53.2683), 0.5
-    plain = sheet(Provider("https://a/{z}/{x}/{y}", "xyz"), box, size).blocks[0]
-    below = sheet(Provider("https://a/{z}/{x}/{-y}", "xyz"), box, size).blocks[0]
-    wmts = sheet(Provider("https://a/{TileMatrix}/{TileCol}/{TileRow}", "xyz"), box, size).blocks[0]
+    plain = plan_mosaic(Provider("https://a/{z}/{x}/{y}", "xyz"), box, size).blocks[0]
+    below = plan_mosaic(Provider("https://a/{z}/{x}/{-y}", "xyz"), box, size).blocks[0]
+    wmts = plan_mosaic(Provider("https://a/{TileMatrix}/{TileCol}/{TileRow}", "xyz"), box, size).blocks[0]
     z, x, y = (int(v) for v in plain.url.removeprefix("https://a/").split("/"))
     assert below.url == f"https://a/{z}/{x}/{2**z - 1 - y}"
     assert wmts.url == plain.url
@@ -298,10 +298,10 @@ def test_a_busy_provider_is_asked_again(provider: Misbehaving) -> None:
     provider.mood, provider.asked[:] = "busy", []
     waits: list[float] = []
     tile_provider = tiles(provider, tries=4)
-    mosaic = sheet(tile_provider, BOX, 0.5)
+    mosaic = plan_mosaic(tile_provider, BOX, 0.5)
     Fetcher(tile_provider, sleep=waits.append).fetch(mosaic.blocks)
     assert waits
-    assert max(waits) <= online.LONGEST_WAIT
+    assert max(waits) <= online.MAX_WAIT_SECONDS
 
 
 def test_a_redirect_on_the_host_is_followed(provider: Misbehaving) -> None:
@@ -345,7 +345,7 @@ def test_what_was_fetched_is_kept_for_a_while(provider: Misbehaving, tmp_path: P
 )
 def test_what_is_not_even_asked_for(box: Any, resolution: float, says: str) -> None:
     with pytest.raises(Invalid, match=says):
-        sheet(Provider("https://a/{z}/{x}/{y}", "xyz"), box, resolution)
+        plan_mosaic(Provider("https://a/{z}/{x}/{y}", "xyz"), box, resolution)
 
 
 @pytest.mark.parametrize(

@@ -240,7 +240,7 @@ def test_a_polygon_is_kept_without_what_came_along(api: Api, farm: str, bare: st
 
 
 def test_one_that_goes_wild_leaves_room(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.store.overlays.MAX_OF_ONE", 3)
+    monkeypatch.setattr("app.store.overlays.MAX_PENDING_PER_REPORTER", 3)
     url = f"environments/{farm}/overlays"
     wild, calm = (api.token_for("robot", robot=name) for name in ("wild", "calm"))
     squares = [{"type": "Polygon", "coordinates": [[[k, 0], [k + 1, 0], [k, 1], [k, 0]]]} for k in range(4)]

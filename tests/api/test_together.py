@@ -128,7 +128,7 @@ def test_no_map_is_older_than_a_commit_that_was_told(api: Api, bare: str, monkey
     api.get(f"environments/{bare}/versions/2/maps/tmap2/network.tmap2.yaml")
     services = api.app.state.services
     gate, began = Gate(), threading.Event()
-    find, ready = maps._resolve, services.maps.ready
+    find, ready = maps._resolve, services.maps.get_cached
 
     def resolve(*args: Any) -> Any:
         result = find(*args)
@@ -144,7 +144,7 @@ def test_no_map_is_older_than_a_commit_that_was_told(api: Api, bare: str, monkey
         return ready(recipe)
 
     monkeypatch.setattr(maps, "_resolve", resolve)
-    monkeypatch.setattr(services.maps, "ready", slow)
+    monkeypatch.setattr(services.maps, "get_cached", slow)
     with at_once(2) as ask:
         first = ask(api.get, path)
         assert gate.reached.wait(20)
@@ -184,7 +184,7 @@ def test_what_robots_say_is_in_the_next_answer(api: Api, farm: str, monkeypatch:
 
 
 def test_one_look_for_a_fleet_but_none_for_strangers(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    gate, quick = Gate(), Store.standing
+    gate, quick = Gate(), Store.channel_target
 
     def slow(self: Store, *args: Any) -> Any:
         gate()
@@ -195,7 +195,7 @@ def test_one_look_for_a_fleet_but_none_for_strangers(api: Api, farm: str, monkey
     api.upload(farm, network("next"))
     robots = [api.token_for("robot", robot=f"r{k}", environments=farm) for k in range(6)]
     stranger = api.token_for("viewer", environments="other-*")
-    monkeypatch.setattr(Store, "standing", slow)
+    monkeypatch.setattr(Store, "channel_target", slow)
     with at_once(8) as ask:
         futures = [ask(robot.get, path) for robot in robots]
         assert gate.reached.wait(20)

@@ -246,8 +246,8 @@ def test_lowest_level_is_at_the_top_where_no_ground_is(api: Api, bare: str) -> N
 
 @pytest.mark.parametrize("level", ODD_LEVELS)
 def test_level_folders_are_safe_and_reversible(level: str) -> None:
-    folder = site.folder_of(level)
-    assert site.level_of(folder, ODD_LEVELS) == level
+    folder = site.level_folder_name(level)
+    assert site.level_of_folder(folder, ODD_LEVELS) == level
     assert folder.isprintable()
     assert folder.isascii()
     assert len(folder) <= 160
@@ -256,7 +256,7 @@ def test_level_folders_are_safe_and_reversible(level: str) -> None:
 
 
 def test_level_folders_never_collide() -> None:
-    folders = [site.folder_of(level) for level in (*ODD_LEVELS, "L2", "%61", "a")]
+    folders = [site.level_folder_name(level) for level in (*ODD_LEVELS, "L2", "%61", "a")]
     assert len(set(folders)) == len(folders)
 
 
@@ -345,13 +345,13 @@ def test_optional_format_whose_making_fails_is_not_tried_again_at_once(
     api.upload(house, {"network.tmap2.yaml": samples.tmap2()})
     maps = api.app.state.services.maps
     tried = []
-    make = maps._made
+    make = maps._run_conversion
 
     def counted(recipe: Any, stop: Any) -> Any:
         tried.append(recipe.format.name)
         return make(recipe, stop)
 
-    monkeypatch.setattr(maps, "_made", counted)
+    monkeypatch.setattr(maps, "_run_conversion", counted)
     for _ in range(3):
         body = listed(api, house, "tmap2", optional="occupancy_grid")
         (line,) = body["missing"]
@@ -375,13 +375,13 @@ def test_masks_are_made_once_for_manifest_and_files(api: Api, house: str, monkey
     draw(api, house, zone("low", "keepout"), zone("slow", "speed", 0.5, x=1.0))
     maps = api.app.state.services.maps
     steps = []
-    make = maps._made
+    make = maps._run_conversion
 
     def counted(recipe: Any, stop: Any) -> Any:
         steps.extend(step.name for step in recipe.steps)
         return make(recipe, stop)
 
-    monkeypatch.setattr(maps, "_made", counted)
+    monkeypatch.setattr(maps, "_run_conversion", counted)
     body = listed(api, house, "occupancy_grid")
     check_files(api, house, body)
     assert steps == ["zones_to_occupancy"]

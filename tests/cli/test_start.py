@@ -13,7 +13,7 @@ import pytest
 
 from app.cli import server
 from app.errors import Unavailable
-from app.pool import WARM
+from app.pool import PRELOADED_MODULES
 
 LATE = ("geoalchemy2", "alembic", "httpx", "numba", "cv2", "scipy")
 
@@ -26,7 +26,7 @@ def loaded(statement: str) -> list[str]:
     return done.stdout.split()
 
 
-@pytest.mark.parametrize("statement", ["import app.cli.server, app.main", f"import {', '.join(WARM)}"])
+@pytest.mark.parametrize("statement", ["import app.cli.server, app.main", f"import {', '.join(PRELOADED_MODULES)}"])
 def test_start_loads_nothing_that_only_others_need(statement: str) -> None:
     assert loaded(statement) == []
 
@@ -55,7 +55,7 @@ def test_workers_are_prepared_beside_the_start(workers: str, tmp_path: Path, mon
         done.append("check")
         raise Unavailable("the database is away")
 
-    monkeypatch.setattr("app.pool.start_beside", lambda: done.append("beside"))
+    monkeypatch.setattr("app.pool.preload_in_background", lambda: done.append("beside"))
     monkeypatch.setattr(server, "check", check)
     with pytest.raises(Unavailable, match="away"):
         server.serve(data_dir=str(tmp_path), port="0", workers=workers)

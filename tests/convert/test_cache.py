@@ -31,7 +31,7 @@ def test_a_made_map_comes_back_with_its_bytes_hash_and_report(tmp_path: Path) ->
     cache = Cache(tmp_path, 10**6)
     assert cache.get(key("a")) is None
     cached_map = cache.get_or_make(key("a"), product)
-    file = cached_map.whole()
+    file = cached_map.single_file()
     assert (file.name, file.size, file.media_type) == ("map.kml", 5, "text/xml")
     assert file.path.read_bytes() == b"hello"
     assert file.sha256 == hashlib.sha256(b"hello").hexdigest()
@@ -42,7 +42,7 @@ def test_a_made_map_comes_back_with_its_bytes_hash_and_report(tmp_path: Path) ->
 
 def test_several_files_come_with_an_archive(tmp_path: Path) -> None:
     cached_map = Cache(tmp_path, 10**6).get_or_make(key("a"), lambda: product(archive=b"PK.."))
-    assert cached_map.whole().name == "kml.zip"
+    assert cached_map.single_file().name == "kml.zip"
     assert cached_map.file("map.kml") is not None
     assert cached_map.file("other") is None
 
@@ -59,7 +59,7 @@ def test_one_of_many_askers_makes_it(tmp_path: Path) -> None:
     with ThreadPoolExecutor(20) as many:
         cached_maps = list(many.map(lambda _: cache.get_or_make(key("a"), slow), range(20)))
     assert len(count) == 1
-    assert len({m.whole().sha256 for m in cached_maps}) == 1
+    assert len({m.single_file().sha256 for m in cached_maps}) == 1
     assert (cache.misses, cache.hits) == (1, 19)
 
 
@@ -73,7 +73,7 @@ def test_a_failed_maker_leaves_nothing_and_the_next_one_tries(tmp_path: Path) ->
         cache.get_or_make(key("a"), fail)
     assert cache.get(key("a")) is None
     assert not list(tmp_path.glob("making-*"))
-    assert cache.get_or_make(key("a"), product).whole().size == 5
+    assert cache.get_or_make(key("a"), product).single_file().size == 5
 
 
 def test_room_is_made_by_dropping_the_longest_unused(tmp_path: Path) -> None:
@@ -208,14 +208,14 @@ def test_a_full_disk_does_not_stop_maps(
     monkeypatch.setattr(Path, "mkdir", mkdir)
     for _ in range(2):
         cached_map = cache.get_or_make(key("a"), lambda: product(archive=b"PK"))
-        assert (cached_map.files[0].read(), cached_map.whole().read(), cached_map.files[0].path) == (
+        assert (cached_map.files[0].read(), cached_map.single_file().read(), cached_map.files[0].path) == (
             b"hello",
             b"PK",
             None,
         )
     assert cache.misses == 2, "it was made once"
     assert cache.get(key("before")) == stored
-    with cache.holding() as hold:
+    with cache.hold_files() as hold:
         assert [f.read() for f in (*hold(cached_map).files, *hold(stored).files)] == [b"hello", b"before"]
     assert cache.problem == "No space left on device"
     assert [r.levelname for r in caplog.records] == ["ERROR"], "it is logged once"

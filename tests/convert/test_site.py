@@ -13,7 +13,7 @@ import shapely
 from app import formats
 from app.convert import site, worker
 from app.convert.cache import Cache, ConvertedMap, LostMap
-from app.convert.maps import file_of, joined
+from app.convert.maps import join_members, select_file
 from app.convert.recipe import DerivationChain, Member, Recipe, Spread
 from app.errors import MissingLayer, NotFound
 from app.model.features import features
@@ -38,7 +38,7 @@ def test_files_of_one_name_are_reported(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     members = tuple(Member(recipe(str(n)), "L2/", ("L2", name)) for n, name in enumerate(("a_b", "a/b")))
     cached_maps = [cache.get_or_make(f"{n:064}", lambda: product("a_b.tif")) for n in range(2)]
-    out = joined(recipe("all", members=members), cached_maps)
+    out = join_members(recipe("all", members=members), cached_maps)
     assert list(out.files) == ["L2/a_b.tif"]
     assert out.places == {"L2/a_b.tif": ("L2", "a_b")}
     (line,) = out.report["dropped"]
@@ -50,7 +50,7 @@ def test_reports_are_joined_with_the_folders_of_their_files() -> None:
     lost = {"what": "zones", "count": 1, "why": "no place"}
     warned = {"problem": "turned", "file": "map.yaml"}
     reports = [(folder, {**EMPTY, "dropped": [lost], "warnings": [warned]}) for folder in ("", "L2/")]
-    report = site.merged_report(reports)
+    report = site.merge_reports(reports)
     assert report["dropped"] == [lost]
     assert [w["file"] for w in report["warnings"]] == ["map.yaml", "L2/map.yaml"]
 
@@ -58,7 +58,7 @@ def test_reports_are_joined_with_the_folders_of_their_files() -> None:
 def test_held_files_outlive_the_cache(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 1)
     first = cache.get_or_make("0" * 64, lambda: product("a.tif"))
-    with cache.holding() as hold:
+    with cache.hold_files() as hold:
         open_map = hold(first)
         cache.get_or_make("1" * 64, lambda: product("b.tif"))
         assert cache.get("0" * 64) is None
@@ -100,12 +100,12 @@ def test_file_of_a_map_of_several_parts_is_found_on_its_only_level(tmp_path: Pat
     files: dict[str, Any] = dict.fromkeys(("L2/a.tif", "L2/b.tif", "b.tif"), (b"x", "image/tiff"))
     cached_map = cache.get_or_make("0" * 64, lambda: ConvertedMap(files, None, EMPTY))
     spread = recipe("0", spread=Spread("ground"))
-    assert file_of(spread, cached_map, "a.tif").name == "L2/a.tif"
-    assert file_of(spread, cached_map, "b.tif").name == "b.tif"
+    assert select_file(spread, cached_map, "a.tif").name == "L2/a.tif"
+    assert select_file(spread, cached_map, "b.tif").name == "b.tif"
     with pytest.raises(NotFound, match="its files are"):
-        file_of(spread, cached_map, "c.tif")
+        select_file(spread, cached_map, "c.tif")
     with pytest.raises(NotFound):
-        file_of(replace(spread, spread=None), cached_map, "a.tif")
+        select_file(replace(spread, spread=None), cached_map, "a.tif")
 
 
 def tower(*kinds: str) -> Layers:
@@ -163,5 +163,5 @@ def test_formats_with_parts_declare_their_own_options() -> None:
             assert getattr(options, fmt.parts.name) is None, fmt.name
             assert getattr(options, fmt.parts.level) is None, fmt.name
             assert fmt.parts.layer in fmt.carries
-            assert site.everything(fmt) == {fmt.parts.level: "*", fmt.parts.name: "*"}
-    assert site.everything(formats.get_format("tmap2")) == {}
+            assert site.whole_site_options(fmt) == {fmt.parts.level: "*", fmt.parts.name: "*"}
+    assert site.whole_site_options(formats.get_format("tmap2")) == {}

@@ -70,7 +70,7 @@ def test_fields_of_another_release_are_passed_over(tmp_path: Path) -> None:
 
 
 def test_memory_and_file_stay_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trials, "MOST", 5)
+    monkeypatch.setattr(trials, "MAX_TRIALS", 5)
     path = tmp_path / "trials"
     trial_record = Trials(path)
     for number in range(100):

@@ -135,7 +135,7 @@ def test_a_stored_plan_is_no_evidence_either() -> None:
     def version(information: Any, edited: bool = False) -> Version:
         steps = ({"step": "occupancy_to_imagery"},)
         source = Provenance(information, steps=steps, inputs=({},))
-        source = source.marked() if edited else source
+        source = source.with_edit_step() if edited else source
         part = PartEntry(PartKey("imagery", name="plan"), "00", 1, {}, source)
         return Version("e", 1, "", None, "", "", now, {}, (), (), None, (Level(),), (part,))
 

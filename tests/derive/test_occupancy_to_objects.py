@@ -415,7 +415,7 @@ def test_a_gazebo_world_of_the_objects_has_their_cylinders_and_boxes() -> None:
 def test_a_grid_alone_still_is_a_gazebo_world_of_its_cells() -> None:
     gazebo = formats.get_format("gazebo")
     key = PartKey("occupancy")
-    chain = recipe.chain(gazebo, recipe.AvailableLayers(frozenset({key}), datum=False), gazebo.write_options())
+    chain = recipe.plan_chain(gazebo, recipe.AvailableLayers(frozenset({key}), datum=False), gazebo.write_options())
     assert chain == recipe.DerivationChain((), (key,))
     # Objects that were made of it stand for it, unless it is named.
     both = [PartKey("objects", "ground", NAME), key]

@@ -161,14 +161,14 @@ def test_what_is_too_large_for_zenoh_is_not_even_read(
 ) -> None:
     api.post("environments", {"name": "large"})
     api.upload("large", samples.grid())
-    ready = api.app.state.services.maps.ready
+    ready = api.app.state.services.maps.get_cached
     api.get("/maps/large/occupancy_grid/map.pgm")
 
     def huge(recipe: Any) -> Any:
         cached_map = ready(recipe)
         return replace(cached_map, files=tuple(replace(f, size=2**40, path=Path("/nowhere")) for f in cached_map.files))
 
-    monkeypatch.setattr(api.app.state.services.maps, "ready", huge)
+    monkeypatch.setattr(api.app.state.services.maps, "get_cached", huge)
     reply = next(iter(session.get("fleetmap/large/latest/maps/occupancy_grid/map.pgm", timeout=20.0)))
     problem = json.loads(bytes(reply.err.payload))
     assert (problem["status"], problem["title"]) == (413, "Too large")

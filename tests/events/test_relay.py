@@ -204,7 +204,7 @@ def test_a_database_that_is_away_is_told_once(
     store = Store(f"sqlite:///{tmp_path / 'store.sqlite'}", tmp_path / "blobs")
     store.migrate()
     store.create_environment("farm")
-    relayed, reads = store.relayed, []
+    relayed, reads = store.relay_position, []
 
     def away() -> int:
         reads.append(1)
@@ -212,7 +212,7 @@ def test_a_database_that_is_away_is_told_once(
             raise Unavailable("the database is away")
         return relayed()
 
-    monkeypatch.setattr(store, "relayed", away)
+    monkeypatch.setattr(store, "relay_position", away)
     bus = Deaf()
     relay = Relay(store, bus, tmp_path)  # type: ignore[arg-type]
     relay.start()

@@ -123,13 +123,13 @@ def test_damaged_files_are_refused_with_file_and_reason_or_read(name: str, files
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_format_is_not_made_from_nothing(name: str) -> None:
-    from app.convert.recipe import AvailableLayers, chain
+    from app.convert.recipe import AvailableLayers, plan_chain
 
     fmt = formats.get_format(name)
     if fmt.write is None:
         pytest.fail(f"{name} is not served: say so in CHANGELOG.md first")
     with pytest.raises((MissingLayer, CannotConvert)) as caught:
-        chain(fmt, AvailableLayers(frozenset(), False), fmt.write_options())
+        plan_chain(fmt, AvailableLayers(frozenset(), False), fmt.write_options())
     assert "supply" in caught.value.detail or "needs" in caught.value.detail
 
 

@@ -16,7 +16,7 @@ import pytest
 import shapely
 
 from app import formats, generate
-from app.convert.files import written
+from app.convert.files import write_layers
 from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.formats import FileGroup, ReadContext
@@ -86,7 +86,7 @@ def agrees_with_itself(layers: Layers, radius: float, height: float = 0.2) -> No
 
 def world(layers: Layers, height: float) -> None:
     """The world as Gazebo gets it, cut above each level's floor, is the level's grid."""
-    files = written(layers, "gazebo", {}, CAME).files
+    files = write_layers(layers, "gazebo", {}, CAME).files
     read = formats.read(FileGroup(formats.get_format("gazebo"), "world.sdf", files), ReadContext())
     fence = {k: p for k, p in layers.parts.items() if k.layer == "location"}
     for key, grid in layers.grids().items():
@@ -105,7 +105,7 @@ def sound_sdf(layers: Layers, folder: Path) -> None:
     tool = shutil.which("ign")
     if tool is None:
         pytest.skip("ign is not installed")
-    for name, data in written(layers, "gazebo", {}, CAME).files.items():
+    for name, data in write_layers(layers, "gazebo", {}, CAME).files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
@@ -122,7 +122,7 @@ def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
     for name, fmt in formats.all_formats().items():
         if fmt.write is None:
             continue
-        written_map = written(layers, name, {}, CAME)
+        written_map = write_layers(layers, name, {}, CAME)
         assert written_map.files, name
         errors = [w for w in written_map.report["warnings"] if w.get("level") == "error"]
         assert not errors, (name, errors)

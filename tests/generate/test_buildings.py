@@ -9,7 +9,7 @@ import pytest
 import shapely
 import yaml
 
-from app.convert.files import written
+from app.convert.files import write_layers
 from app.errors import CannotGenerate, Invalid
 from app.formats import FileGroup, ReadContext, get_format, read
 from app.model.features import features
@@ -55,7 +55,7 @@ def test_wards_above_each_other(seed: int) -> None:
 
 
 def test_open_rmf_reads_walls_doors_and_the_lift(office: Layers) -> None:
-    files = written(office, "openrmf", {}, looks.CAME).files
+    files = write_layers(office, "openrmf", {}, looks.CAME).files
     building = yaml.safe_load(files["building.yaml"])
     assert list(building["levels"]) == ["ground", "L2"]
     assert building["levels"]["L2"]["elevation"] == 3.4
@@ -78,7 +78,7 @@ def test_open_rmf_reads_walls_doors_and_the_lift(office: Layers) -> None:
 
 
 def test_fleets_learn_which_lanes_lead_through_doors_and_into_the_lift(office: Layers) -> None:
-    graph = yaml.safe_load(written(office, "rmf_nav_graph", {}, looks.CAME).files["0.yaml"])
+    graph = yaml.safe_load(write_layers(office, "rmf_nav_graph", {}, looks.CAME).files["0.yaml"])
     assert set(graph["levels"]) == {"ground", "L2"}
     for name, level in graph["levels"].items():
         inside = {row[2]["name"] for row in level["vertices"] if row[2].get("lift") == "lift_1"}

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import shapely
 
-from app.convert.files import written
+from app.convert.files import write_layers
 from app.errors import CannotGenerate, Invalid
 from app.model.features import features
 from app.model.frame import GROUND, Datum
@@ -34,7 +34,7 @@ def test_each_species(species: str) -> None:
     looks.agrees_with_itself(layers, 0.3)
     objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
     assert len(objects) == 4
-    files = written(layers, "gazebo", {}, looks.CAME).files
+    files = write_layers(layers, "gazebo", {}, looks.CAME).files
     assert {f for f in files if f.endswith(".obj")} == set(layers.resources()), "the meshes go along"
 
 

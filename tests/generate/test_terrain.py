@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.cli import run
-from app.convert.files import written
+from app.convert.files import write_layers
 from app.errors import CannotGenerate, Invalid
 from app.generate import RandomSource, _kernels_noise, _noise
 from app.model import solids
@@ -179,7 +179,7 @@ def test_whole_ground(tmp_path: Path) -> None:
     assert looks.digest(site) == looks.digest(looks.make("terrain", **SMALL)[0])
     assert looks.digest(site) != looks.digest(looks.make("terrain", seed=8, **SMALL)[0])
     assert looks.digest(site)[:16] == GROUND
-    world = written(site, "gazebo", {}, looks.CAME).files
+    world = write_layers(site, "gazebo", {}, looks.CAME).files
     assert b"ground_plane" not in world["world.sdf"], "nothing lies over the hills"
     assert b"walls_" not in world["world.sdf"], "costs are no walls"
     assert any(name.endswith("heightmaps/terrain.png") for name in world)
@@ -237,7 +237,7 @@ def test_a_speed_mask_instead() -> None:
     mask = site.grids()[PartKey("occupancy", name="speed")]
     assert mask.cells.min() >= 10
     assert mask.cells.max() <= 100
-    files = written(site, "occupancy_grid", {"grid": "speed"}, looks.CAME).files
+    files = write_layers(site, "occupancy_grid", {"grid": "speed"}, looks.CAME).files
     assert any(name.endswith("_filter_info.yaml") for name in files)
     plain, _ = looks.make("terrain", rough="none", **SMALL)
     assert set(plain.grids()) == {GRID}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from app.convert.files import written
+from app.convert.files import write_layers
 from app.errors import CannotGenerate, Invalid
 from app.generate import RandomSource, _blocks, _streets
 from app.model.features import features
@@ -164,7 +164,7 @@ def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
         assert p["osm"]["tags"]["building:levels"] == str(p["levels"])
     lamps = objects.of_kind("pole")
     assert len(lamps) > 5
-    assert b'k="roof:shape"' in written(layers, "osm", {}, looks.CAME).files["map.osm"]
+    assert b'k="roof:shape"' in write_layers(layers, "osm", {}, looks.CAME).files["map.osm"]
 
 
 def test_the_boundary_is_given_or_the_fence() -> None:

@@ -19,7 +19,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app import formats, upload_reader
-from app.convert.recipe import AvailableLayers, chain
+from app.convert.recipe import AvailableLayers, plan_chain
 from app.convert.worker import write
 from app.errors import FleetMapError
 from app.formats import Limits
@@ -131,7 +131,7 @@ def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
     stock = AvailableLayers(frozenset(layers.parts), layers.datum is not None)
     for name, fmt in formats.all_formats().items():
         try:
-            written = write(fmt, layers, {}, chain(fmt, stock, fmt.write_options()))
+            written = write(fmt, layers, {}, plan_chain(fmt, stock, fmt.write_options()))
         except FleetMapError as error:
             assert error.detail
         except Exception as error:  # noqa: BLE001  all of them are what is looked for

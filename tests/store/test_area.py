@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from app.model.features import features
 from app.model.frame import Datum
 from app.model.geodesy import local_frame, surface
-from app.store.area import area_on_earth, fence_of
+from app.store.area import area_in_degrees, fence_polygon
 from app.store.encode import from_wkb
 from app.store.values import NO_AREA, Area
 
@@ -23,8 +23,8 @@ DATUMS = st.builds(Datum, st.floats(-85, 85), st.floats(-180, 180), st.just(0.0)
 
 def area_of(shape: Any, anchor: Any, datum: Datum | None = None) -> Area:
     frame = None if datum is None else local_frame(datum)
-    fence = fence_of([features([("f", shape, {"kind": "fence"})], anchor)], frame)
-    return NO_AREA if fence is None else area_on_earth("fence", fence)
+    fence = fence_polygon([features([("f", shape, {"kind": "fence"})], anchor)], frame)
+    return NO_AREA if fence is None else area_in_degrees("fence", fence)
 
 
 def check(area: Area) -> None:

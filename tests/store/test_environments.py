@@ -354,15 +354,15 @@ def test_channels_are_moved_planned_cancelled(store: Store):
     assert (planned.version, planned.planned.version) == (None, 2)  # type: ignore[union-attr]
     with pytest.raises(NotFound):
         store.version("farm", "staging")
-    assert store.apply_due(datetime.now(UTC)) == []
+    assert store.apply_due_moves(datetime.now(UTC)) == []
     assert store.cancel_planned("farm", "staging", "ann").planned is None
     with pytest.raises(NotFound, match="planned"):
         store.cancel_planned("farm", "staging", "ann")
     store.set_channel("farm", "production", 2, author="zoe", activate_at=soon)
     count = len(store.events("farm"))
-    ((name, done),) = store.apply_due(soon + timedelta(seconds=1))
+    ((name, done),) = store.apply_due_moves(soon + timedelta(seconds=1))
     assert (name, done.name, done.version, done.planned, done.author) == ("farm", "production", 2, None, "zoe")
-    assert store.apply_due(soon + timedelta(seconds=1)) == []
+    assert store.apply_due_moves(soon + timedelta(seconds=1)) == []
     assert len(store.events("farm")) == count + 1
     assert [c.name for c in store.channels("farm")] == ["latest", "production", "staging"]
     for bad in ("latest", "Production", "1x", "", "a" * 64):

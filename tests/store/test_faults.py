@@ -275,7 +275,7 @@ def test_a_failing_commit_stores_nothing(store: Store, monkeypatch: pytest.Monke
     def fail(*args: object, **more: object) -> None:
         raise RuntimeError("after everything but the event")
 
-    monkeypatch.setattr("app.store.outbox.append", fail)
+    monkeypatch.setattr("app.store.outbox.append_event", fail)
     with pytest.raises(RuntimeError):
         store.commit("farm", prepared, author="a", message="m")
     monkeypatch.undo()

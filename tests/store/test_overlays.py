@@ -65,15 +65,15 @@ def test_acceptance_is_in_force_until_the_end_with_an_event_each(farm: Store):
         farm.decide_overlay("farm", one.id, "pending", "rejected", "bob", NOW)
     in_force = farm.closures("farm")
     assert [c.id for c in in_force.items] == [one.id]
-    assert farm.standing("farm", "latest") == (replace(farm.version("farm"), closures=in_force), before + 1)
-    assert farm.standing("farm", 0) == (farm.version("farm", 0), 1), "a version's number is history"
-    assert farm.standing("farm", 0, "apply")[0].closures == in_force
+    assert farm.channel_target("farm", "latest") == (replace(farm.version("farm"), closures=in_force), before + 1)
+    assert farm.channel_target("farm", 0) == (farm.version("farm", 0), 1), "a version's number is history"
+    assert farm.channel_target("farm", 0, "apply")[0].closures == in_force
     end = NOW + timedelta(seconds=60)
     farm.end_due_overlays(NOW)
     assert farm.overlay("farm", one.id).state == "accepted"
     farm.end_due_overlays(end)
     assert (farm.overlay("farm", one.id).state, farm.closures("farm").items) == ("ended", ())
-    assert farm.standing("farm", "latest")[1] == before + 2
+    assert farm.channel_target("farm", "latest")[1] == before + 2
     events = [(e.body["type"], e.body.get("overlays_digest")) for e in farm.events("farm", before)]
     assert events == [("overlay.accepted", in_force.digest), ("overlay.ended", NO_CLOSURES.digest)]
     again, new = farm.add_overlay(blocked())

@@ -357,7 +357,7 @@ def test_several_servers_catch_up_together(store: Store, database_url: str, monk
         connection.execute(tables.area.delete())
         connection.execute(update(table).values(area_stale=True))
     moved = threading.Event()
-    compute = position.area_of
+    compute = position.compute_area
 
     def slow(*arguments: Any) -> Any:
         result = compute(*arguments)
@@ -368,7 +368,7 @@ def test_several_servers_catch_up_together(store: Store, database_url: str, monk
                 connection.execute(update(table).where(table.c.name == "farm-0").values(area_stale=True))
         return result
 
-    monkeypatch.setattr(position, "area_of", slow)
+    monkeypatch.setattr(position, "compute_area", slow)
     others = [Store(database_url, store.blob_dir) for _ in range(3)]
     try:
         with ThreadPoolExecutor(3) as threads:
@@ -392,7 +392,7 @@ def test_damaged_content_of_one_environment_keeps_no_other_away(
     with store._database.write() as connection:
         connection.execute(tables.area.delete())
         connection.execute(update(tables.environment).values(area_stale=True))
-    compute = position.area_of
+    compute = position.compute_area
 
     def fail(draft: Any, entries: Any, datum: Any) -> Any:
         if not calls:
@@ -401,7 +401,7 @@ def test_damaged_content_of_one_environment_keeps_no_other_away(
         return compute(draft, entries, datum)
 
     calls: list[int] = []
-    monkeypatch.setattr(position, "area_of", fail)
+    monkeypatch.setattr(position, "compute_area", fail)
     environment_names = names(store, HERE.latitude, HERE.longitude)
     assert len(environment_names) == 1
     assert len(stale(store)) == 1

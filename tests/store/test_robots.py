@@ -85,7 +85,7 @@ def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
     assert robot.report == RobotReport("production", 1, A, "active", "ok\ufffd", 4, reported_at)
     assert (robot.environment, robot.robot, robot.time, robot.since) == ("farm", "r1", NOW, NOW)
     assert robot.held == ActiveMap(1, A, 4, NOW)
-    assert (robot.there, robot.seen) == (None, None)
+    assert (robot.on_bus, robot.presence_at) == (None, None)
     farm.note_reports([heard("r1", 1, B, "downloading", version=2), heard("r1", 2, B, "failed", version=2)])
     (robot,) = farm.robots("farm", "r1")
     assert (robot.report.state, robot.report.version) == ("failed", 2)
@@ -164,11 +164,11 @@ def test_presence(farm: Store, monkeypatch: pytest.MonkeyPatch):
     farm.note_presence({"r1", "r2", "r9"}, set(), NOW)
     later = NOW + timedelta(minutes=9)
     farm.note_presence({"r1"}, {"r2"}, later)
-    assert [(r.robot, r.there, r.seen) for r in farm.robots()] == [("r1", True, later), ("r2", False, later)]
+    assert [(r.robot, r.on_bus, r.presence_at) for r in farm.robots()] == [("r1", True, later), ("r2", False, later)]
     monkeypatch.setattr(robots, "MAX_PRESENT", 3)
     farm.note_reports([heard("r3", 0)])
     farm.note_presence({"r2", "r3"}, {"r1"}, later)
-    assert [(r.robot, r.there) for r in farm.robots()] == [("r1", False), ("r2", True), ("r3", None)]
+    assert [(r.robot, r.on_bus) for r in farm.robots()] == [("r1", False), ("r2", True), ("r3", None)]
 
 
 def test_silent_robots_are_tidied_away(farm: Store):

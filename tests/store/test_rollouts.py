@@ -41,7 +41,7 @@ class Fleet:
 
     def tick(self, seconds: float) -> tuple[int | None, str]:
         """(version, state of the roll-out) after it."""
-        self.store.apply_due(self.at(seconds))
+        self.store.apply_due_moves(self.at(seconds))
         self.store.advance_rollouts(self.at(seconds), next_step)
         now = self.channel()
         return now.version, now.rollout.state if now.rollout else ""

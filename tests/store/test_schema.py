@@ -14,7 +14,7 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
 from app.errors import Unavailable
-from app.main import alone
+from app.main import startup_lock
 from app.store.database import Database
 from app.store.schema import comparison, config, newest
 from app.store.store import Store
@@ -114,7 +114,7 @@ def test_of_servers_that_start_together_one_makes_the_administrator(database_url
     def start(number: int) -> str | None:
         store = Store(database_url, tmp_path / "blobs")
         try:
-            with alone(tmp_path):
+            with startup_lock(tmp_path):
                 store.migrate()
             store.check()
             return store.create_administrator()

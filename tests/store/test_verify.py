@@ -16,7 +16,7 @@ import pytest
 from sqlalchemy import exc
 
 from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
-from app.store.blobs import _unreadable
+from app.store.blobs import _unreadable_error
 from app.store.changes import Changes
 from app.store.chunks import insert
 from app.store.encode import compress, digest
@@ -176,7 +176,7 @@ def test_a_scrub_passes_over_what_cannot_be_read(
 
     def problem(name: str, row: Any) -> str | None:
         if name == names[0]:
-            raise _unreadable(PermissionError(errno.EACCES, "refused", "/srv/data"))
+            raise _unreadable_error(PermissionError(errno.EACCES, "refused", "/srv/data"))
         return "damaged" if name == names[1] else real(name, row)
 
     monkeypatch.setattr(sqlite_store.blobs, "_problem", problem)

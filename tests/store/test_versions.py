@@ -737,5 +737,5 @@ def test_what_is_derived_anew_from_other_inputs_is_a_version_though_it_is_the_sa
 def test_an_edit_that_changes_nothing_renews_nothing(farm: Store):
     first = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("a")))
     assert save(farm, "farm", Put(TOPOLOGY, network(3).take([0]))).number == first.number
-    edited = derived("a").marked()
+    edited = derived("a").with_edit_step()
     assert save(farm, "farm", Replace(TOPOLOGY, network(3), edited)).number == first.number
