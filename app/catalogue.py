@@ -58,7 +58,7 @@ def _options(fmt: Format) -> list[dict[str, Any]]:
 
 
 def _information(fmt: Format, layer: Layer) -> str:
-    carried = fmt.carries - ({"occupancy"} if fmt.outlines else frozenset())  # where a grid lies is no grid
+    carried = fmt.layers - ({"occupancy"} if fmt.outlines else frozenset())  # where a grid lies is no grid
     if layer in carried:
         return "raw"
     return "derived" if derive.plan(carried, frozenset({layer})) is not None else "-"

@@ -21,7 +21,7 @@ from app.model.templates import DEFAULT_SET, FormatTemplate, Templates
 REQUEST, ENVIRONMENT, DEFAULT = "request", "environment", "default"
 """Where a value may come from, besides a set."""
 
-LONGEST_TEXT: Final = 2000
+MAX_TEXT_CHARACTERS: Final = 2000
 """Characters of a text among the values."""
 
 
@@ -92,7 +92,7 @@ class ResolvedTemplate:
     ignored: tuple[str, ...] = ()
 
 
-NOTHING: Final = ResolvedTemplate()
+NO_VALUES: Final = ResolvedTemplate()
 
 
 def check_set(name: str, location: str = "set") -> str:
@@ -121,9 +121,9 @@ def check_values(fmt: Format, values: Mapping[str, Any], location: str = "values
             error.detail, [dataclasses.replace(p, where=f"{location}.{p.where}") for p in error.problems]
         ) from None
     out = {name: _plain(getattr(chosen, name)) for name in sorted(values)}
-    reason = f"a text has at most {LONGEST_TEXT} printable characters"
+    reason = f"a text has at most {MAX_TEXT_CHARACTERS} printable characters"
     texts = {name: value for name, value in out.items() if isinstance(value, str)}
-    bad = [n for n, text in texts.items() if len(text) > LONGEST_TEXT or not text.isprintable()]
+    bad = [n for n, text in texts.items() if len(text) > MAX_TEXT_CHARACTERS or not text.isprintable()]
     if bad:
         raise Invalid(reason, [Problem(reason, where=f"{location}.{name}") for name in bad])
     return out
@@ -136,8 +136,8 @@ def resolve(templates: Templates, fmt: Format) -> ResolvedTemplate:
     gets its map all the same.
     """
     if templates.set == DEFAULT_SET and not templates.formats:
-        return NOTHING
-    format_template, chosen = templates.of(fmt.name), templates.chosen(fmt.name)
+        return NO_VALUES
+    format_template, chosen = templates.for_format(fmt.name), templates.set_of(fmt.name)
     ignored = [] if chosen in SETS else [f"the template set {chosen!r} is not known to this release"]
     values: dict[str, Any] = {}
     origin: dict[str, str] = {}

@@ -181,8 +181,8 @@ def read(
     if (content := _content.find(files)) is not None:
         if _read_exact_content(files, content, hints, limits, bundle):
             return bundle
-        files = {name: data for name, data in files.items() if name not in _content.owned(files, content)}
-    if hints.format is not None and formats.get_format(hints.format).holds:
+        files = {name: data for name, data in files.items() if name not in _content.content_files(files, content)}
+    if hints.format is not None and formats.get_format(hints.format).is_container:
         # A folder of other formats' maps is what any upload may be: each file is found out by its content.
         template_files = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
         if template_files:
@@ -196,7 +196,7 @@ def read(
     problems: list[Problem] = []
     details: list[str] = []
     errors: list[type[BadUpload]] = []
-    for group in sorted(taken, key=lambda g: (-g.format.rank, g.main)):
+    for group in sorted(taken, key=lambda g: (-g.format.priority, g.main)):
         try:
             parsed_parts += _read_group(group, hints, context, limits, bundle)
         except BadUpload as error:
@@ -250,10 +250,13 @@ def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Lim
         except BadUpload:
             raise
         except (*formats.BAD_INPUT, FleetMapError, shapely.errors.ShapelyError) as error:
-            reason = f"what is stored beside the maps is damaged: {formats.explain(error)[1]}; remove its folder"
+            reason = (
+                f"what is stored beside the maps is damaged: {formats.describe_parse_error(error)[1]}; remove its "
+                "folder"
+            )
             raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)]) from error
     if isinstance(content, str):
-        for name in _content.owned(files, main):
+        for name in _content.content_files(files, main):
             bundle.files[name] = FileUse("environment", used=False)
         bundle.warnings.append(Problem(f"not used, the maps of the package count: {content}", main))
         return False
@@ -280,7 +283,7 @@ def _unread_file_warnings(name: str, data: bytes, limits: Limits) -> Problem:
         problem = next(iter(error.problems), Problem(error.detail))
         return dataclasses.replace(problem, file=name)
     except formats.BAD_INPUT as error:
-        line, reason = formats.explain(error)
+        line, reason = formats.describe_parse_error(error)
         return Problem(f"it cannot be parsed: {reason}", name, line)
     return Problem("no known map format", name)
 
@@ -333,7 +336,7 @@ def _group(files: Files, hints: UploadHints) -> tuple[list[FileGroup], list[str]
         raise UnreadableFile("all files are empty", [Problem("the file is empty", name) for name in sorted(files)])
     groups, rest = formats.group(present, hints.format)
     for fmt in formats.all_formats().values():
-        if hints.format in (None, fmt.name) and fmt.completing & hints.options.keys():
+        if hints.format in (None, fmt.name) and fmt.completing_options & hints.options.keys():
             completed = _complete_group(fmt, groups, rest, present, hints.options.get("file"))
             if completed is not None:
                 groups = [*(g for g in groups if g.main not in completed.files), completed]
@@ -345,8 +348,8 @@ def _complete_group(
     fmt: Format, groups: list[FileGroup], rest: list[str], files: Files, main_name: str | None
 ) -> FileGroup | None:
     """The file that options of the upload make a map, where it says too little by itself: a picture and its place."""
-    lone = {g.main for g in groups if g.format is fmt and fmt.lacking(g.main, g.files[g.main])}
-    names = sorted(n for n in {*rest, *lone} if fmt.lacking(n, files[n]))
+    lone = {g.main for g in groups if g.format is fmt and fmt.missing_metadata(g.main, g.files[g.main])}
+    names = sorted(n for n in {*rest, *lone} if fmt.missing_metadata(n, files[n]))
     if main_name is not None:
         names = [n for n in names if n == main_name or n.rpartition("/")[2] == main_name]
         if not names:
@@ -365,7 +368,7 @@ def _complete_group(
 
 def _missing_metadata(name: str, data: bytes) -> str:
     """What a file would need to be a map, where a format knows it."""
-    return next((text for f in formats.all_formats().values() if data and (text := f.lacking(name, data))), "")
+    return next((text for f in formats.all_formats().values() if data and (text := f.missing_metadata(name, data))), "")
 
 
 def _read_variables(files: Files, bundle: Bundle) -> set[str]:
@@ -399,12 +402,16 @@ def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]
         sibling = name.replace("_autogen", "", 1) if "_autogen" in PurePosixPath(name).name else None
         if sibling in mains and mains[sibling].format is group.format:
             reason = f"{sibling} is used instead of what was generated"
-        elif (group.format.drawing or group.format.name == "prm") and folder == "topological" and not _is_regions(name):
+        elif (
+            (group.format.is_drawing or group.format.name == "prm")
+            and folder == "topological"
+            and not _is_regions(name)
+        ):
             richer = next((n for n in ("tmap2", "tmap") if (n, "topological") in kinds), None)
             if richer is not None:
                 reason = f"the network comes from the richer {richer} file"
         elif (
-            group.format.drawing
+            group.format.is_drawing
             and folder == "location"
             and PurePosixPath(name).name.startswith("fence_autogen.")
             and ("datum", "location") in kinds
@@ -457,9 +464,9 @@ def _read_group(
         grid=grid,
         layer=layer,
         options=formats.read_options(group.format, _applicable_options(group, hints)),
-        wanted=None if group.format.drawing else upload_context.wanted,
-        cells=upload_context.cells,
-        whole=upload_context.whole,
+        requested_layers=None if group.format.is_drawing else upload_context.wanted,
+        decode_cells=upload_context.cells,
+        keep_source_properties=upload_context.whole,
         folder=_folder_reader(hints, upload_context, limits, bundle),
     )
     layers = formats.read(group, context)
@@ -469,7 +476,7 @@ def _read_group(
     for site in layers.vector("location").values():
         bundle.fence = bundle.fence or (site.geometry[0] if len(site) else None)
     parts = dict(layers.parts)
-    if group.format.drawing and layer not in (None, "objects"):
+    if group.format.is_drawing and layer not in (None, "objects"):
         parts = _assign(parts, layer, hints.level, upload_context, layers.datum, group.main, bundle)
     if layers.datum is not None:
         if bundle.datum is None:
@@ -514,7 +521,7 @@ def _assign(
         areas = np.isin(kinds, [3, 6])
         if layer == "topology":
             frame = local_frame(datum or context.datum) if datum or context.datum else None
-            drawn = part if lines.any() else part.take(areas)
+            drawn = part if lines.any() else part.select(areas)
             if not lines.any() and not areas.any():
                 bundle.warnings.append(Problem("it has no lines or polygons to make a network of", file))
                 continue
@@ -534,11 +541,11 @@ def _move(
     """Take these features out of the objects and into another layer; the drawing's document goes along."""
     if not mask.any():
         return
-    moved = part.take(mask)
+    moved = part.select(mask)
     generic = ("region", "path", "poi", None)
     properties = tuple({**p, "kind": kind} if p.get("kind") in generic else p for p in moved.properties)
     parts[to] = Features(moved.ids, moved.geometry, properties, moved.local, part.document)
-    parts[key] = part.take(~mask)
+    parts[key] = part.select(~mask)
 
 
 def _is_own_fence(
@@ -618,7 +625,7 @@ def _merge_fence_style(winners: list[ParsedPart], loser: ParsedPart) -> bool:
 
 def _priority(one: ParsedPart) -> tuple[object, ...]:
     name = PurePosixPath(one.group.main).name
-    return (-one.group.format.rank, name.startswith("."), "_autogen" in name, len(name), one.group.main)
+    return (-one.group.format.priority, name.startswith("."), "_autogen" in name, len(name), one.group.main)
 
 
 def _join(candidates: list[ParsedPart], renamed: dict[str, dict[str, str]]) -> Part:

@@ -38,7 +38,7 @@ def test_no_name_stands_for_two_things() -> None:
 
 
 def test_what_holds() -> None:
-    assert templates.resolve(NO_TEMPLATES, TMAP2) is templates.NOTHING
+    assert templates.resolve(NO_TEMPLATES, TMAP2) is templates.NO_VALUES
     environment_templates = Templates(
         "outdoor",
         {"tmap2": FormatTemplate(None, {"xy_goal_tolerance": 0.4}), "lif": FormatTemplate(None, {"creator": "x"})},

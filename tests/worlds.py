@@ -21,7 +21,7 @@ WALLS = "walls.stl"
 def walls() -> bytes:
     """The closed walls of the house as binary STL."""
     ring = shapely.difference(shapely.box(-3, -2, 3, 2), shapely.box(-2.8, -1.8, 2.8, 1.8))
-    return stl(*(tuple(map(tuple, corners)) for corners in np.asarray(solids.extruded(ring, 0.0, 2.0)).tolist()))
+    return stl(*(tuple(map(tuple, corners)) for corners in np.asarray(solids.extrude(ring, 0.0, 2.0)).tolist()))
 
 
 def house(mesh: str | None, *models: bytes) -> dict[str, bytes]:

@@ -88,8 +88,8 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
             _select_features(services, old, changed.key, changed.put.ids),
         )
         old_ids = set(was.ids)
-        moved = changed.put.take([k for k, i in enumerate(changed.put.ids) if i in old_ids])
-        fresh = changed.put.take([k for k, i in enumerate(changed.put.ids) if i not in old_ids])
+        moved = changed.put.select([k for k, i in enumerate(changed.put.ids) if i in old_ids])
+        fresh = changed.put.select([k for k, i in enumerate(changed.put.ids) if i not in old_ids])
         groups += [(DELETED, deleted), (CHANGED, was), (CHANGED, moved), (ADDED, fresh)]
     grids = [(k, *_grids(services, old, new, k)) for k in sorted({g.key for g in delta.grids})]
     datum = new.datum or old.datum

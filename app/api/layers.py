@@ -30,7 +30,7 @@ from app.model.features import Features
 from app.model.frame import GROUND, MAX_METRES, Anchor
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import GeoImage, displayed
+from app.model.imagery import GeoImage, display_pixels
 from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, PartKey
 from app.model.voxels import DEPTH, Box3, VoxelMap
 from app.model.voxels import cut as cut_voxels
@@ -348,7 +348,7 @@ def _picture(key: PartKey, picture: GeoImage, accept: str) -> Response:
                 "attribution": list(picture.attribution),
             }
         )
-    return Response(png(displayed(picture)), media_type=kind)
+    return Response(png(display_pixels(picture)), media_type=kind)
 
 
 # --- choosing ---

@@ -252,7 +252,7 @@ def _recipe(services: Services, version: Version, entry: _Entry) -> Recipe:
     values = {**site.whole_site_options(formats.get_format(entry.format)), **entry.values}
     if entry.closures is not None:
         in_force = version.closures or services.store.closures(version.environment)
-        version = replace(version, closures=in_force.in_mode(entry.closures))
+        version = replace(version, closures=in_force.for_mode(entry.closures))
     return services.maps.recipe(version, entry.format, values, derive=entry.derive, listed=True)
 
 

@@ -194,7 +194,7 @@ def _commit_templates(
 
 def _line(stored_templates: Templates, fmt: Format) -> dict[str, Any]:
     """One format's templates as clients see them."""
-    format_template, ignored = stored_templates.of(fmt.name), templates.resolve(stored_templates, fmt).ignored
+    format_template, ignored = stored_templates.for_format(fmt.name), templates.resolve(stored_templates, fmt).ignored
     return {
         "format": fmt.name,
         "set": format_template.set,

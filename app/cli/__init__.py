@@ -22,16 +22,16 @@ def run(arguments: Sequence[str]) -> int:
     if list(arguments) == ["--version"]:  # without the imports of a command
         sys.stdout.write(f"fleetmap {__version__}\n")
         return 0
-    from app.cli.commands import build, needed
-    from app.cli.problems import RequestFailed, problem_of
+    from app.cli.commands import build, needed_command
+    from app.cli.problems import RequestFailed, describe_error
     from app.errors import FleetMapError
 
     try:
-        build(needed(arguments))(list(arguments), prog_name="fleetmap", standalone_mode=True)
+        build(needed_command(arguments))(list(arguments), prog_name="fleetmap", standalone_mode=True)
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     except (RequestFailed, FleetMapError, ModuleNotFoundError, OSError) as error:
-        problem, hint = problem_of(error)
+        problem, hint = describe_error(error)
         if problem is None:
             raise
         from app.cli import output

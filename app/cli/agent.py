@@ -23,7 +23,9 @@ def _copy_ros_package(workspace: Path | None) -> None:
     if workspace is not None:
         from app.agent import ros
 
-        output.say(f"wrote {ros.copy_package(workspace)}: build it with colcon build --packages-select fleetmap_ros")
+        output.print_status(
+            f"wrote {ros.copy_package(workspace)}: build it with colcon build --packages-select fleetmap_ros"
+        )
         raise typer.Exit
 
 
@@ -253,7 +255,7 @@ def _logger(*, as_json: bool) -> Callable[..., None]:
             sys.stdout.flush()
         else:
             style = "red" if event in ("failed", "refused", "damaged") else None
-            output.say(f"{event}: {_line(members)}".encode("utf-8", "replace").decode(), style=style)
+            output.print_status(f"{event}: {_line(members)}".encode("utf-8", "replace").decode(), style=style)
 
     return log
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import completion, options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.errors import Invalid
 
 
@@ -31,7 +31,7 @@ def align(
         ),
     ] = None,
     option: Annotated[
-        list[str] | None, options.named_values("A parameter of the slice of objects or voxels (height, …)")
+        list[str] | None, options.named_values_option("A parameter of the slice of objects or voxels (height, …)")
     ] = None,
     angle: Annotated[float, typer.Option("--angle", min=0, max=180, help="Maximum turn to try, in degrees.")] = 180.0,
     reach: Annotated[
@@ -74,7 +74,7 @@ def align(
         target: dict[str, Any] = {"layer": layer, "level": onto_level or level, "parameters": options.pairs(option)}
         body["onto"] = target if layer != "occupancy" else {**target, "name": onto}
     with Client(server, token) as client, output.progress_bar("aligning"):
-        result = client.post(path_of("environments", environment, "alignments"), body, repeat=True)
+        result = client.post(quote_path("environments", environment, "alignments"), body, repeat=True)
     if as_json:
         output.show_json(result)
         return
@@ -87,16 +87,18 @@ def _show(environment: str, result: Mapping[str, Any]) -> None:
         grid = fit.get("grid") or {}
         turn = math.degrees(float(fit["yaw"]))
         moved = f"turned by {turn:.3f}°, moved by {float(fit['x']):.3f}, {float(fit['y']):.3f} m"
-        output.show(f"{environment}: {grid.get('level')}/{grid.get('name')} {moved}")
+        output.print_result(f"{environment}: {grid.get('level')}/{grid.get('name')} {moved}")
         shares = [f"residual {float(fit['residual']):.3f} m", f"agreement {float(fit['agreement']):.1%}"]
         if fit.get("overlap") is not None:
             shares.append(f"overlap {float(fit['overlap']):.1%}")
-        output.show(f"  {', '.join(shares)}")
-        output.show(f"  origin {_place(fit['before'])} → {_place(fit['origin'])}")
+        output.print_result(f"  {', '.join(shares)}")
+        output.print_result(f"  origin {_place(fit['before'])} → {_place(fit['origin'])}")
         for other in fit.get("others") or ():
             turn = math.degrees(float(other["yaw"]))
-            output.show(f"  also possible: {turn:.3f}°, {other['x']:.3f}, {other['y']:.3f} m: {other['agreement']:.1%}")
-    output.show(f"  version {version['version']}" if version else "  nothing is stored")
+            output.print_result(
+                f"  also possible: {turn:.3f}°, {other['x']:.3f}, {other['y']:.3f} m: {other['agreement']:.1%}"
+            )
+    output.print_result(f"  version {version['version']}" if version else "  nothing is stored")
     output.show_warnings(result.get("warnings") or ())
 
 

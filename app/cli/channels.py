@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import completion, options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.groups import Commands
 from app.cli.problems import RequestFailed
 from app.model.names import did_you_mean
@@ -30,7 +30,7 @@ def list_channels(
     Example: `fleetmap channels list farm`
     """
     with Client(server, token) as client:
-        rows = client.get(path_of("environments", environment, "channels"))
+        rows = client.get(quote_path("environments", environment, "channels"))
     if as_json:
         output.show_json(rows)
         return
@@ -42,7 +42,7 @@ def list_channels(
                 "-" if row["version"] is None else row["version"],
                 output.minute(row.get("time")),
                 row.get("author"),
-                planned(row),
+                planned_move_text(row),
                 f"{row['robots']['holding']} of {row['robots']['total']}",
                 row["robots"]["failed"],
                 row["overlays"]["count"],
@@ -65,7 +65,7 @@ def show(
     Example: `fleetmap channels show farm production`
     """
     with Client(server, token) as client:
-        rows = client.get(path_of("environments", environment, "channels"))
+        rows = client.get(quote_path("environments", environment, "channels"))
     row = next((row for row in rows if row["channel"] == channel), None)
     if row is None:
         names = [row["channel"] for row in rows]
@@ -81,7 +81,7 @@ def show(
             "version": "none" if row["version"] is None else str(row["version"]),
             "since (UTC)": output.minute(row.get("time")),
             "author": row.get("author"),
-            "planned": planned(row),
+            "planned": planned_move_text(row),
             "roll-out": ", ".join(f"{name} {value}" for name, value in rollout.items() if value is not None),
             "robots": f"{robots['holding']} of {robots['total']} have it, {robots['lagging']} are behind, "
             f"{robots['failed']} failed, {robots['ready']} are ready for the plan",
@@ -104,14 +104,14 @@ def cancel(
     Example: `fleetmap channels cancel farm production`
     """
     with Client(server, token) as client:
-        client.delete(path_of("environments", environment, "channels", channel, "planned"))
+        client.delete(quote_path("environments", environment, "channels", channel, "planned"))
     if as_json:
         output.show_json({"environment": environment, "channel": channel, "planned": None})
     else:
-        output.show(f"{environment}: nothing is planned for {channel} any more")
+        output.print_result(f"{environment}: nothing is planned for {channel} any more")
 
 
-def planned(row: Mapping[str, Any]) -> str:
+def planned_move_text(row: Mapping[str, Any]) -> str:
     """Format what is planned for a channel: ``version 3 at 2026-05-01 08:30``."""
     plan = row.get("planned")
     if not plan:

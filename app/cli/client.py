@@ -19,7 +19,7 @@ from urllib.parse import quote, unquote, urljoin
 import httpx
 
 from app.cli import variables
-from app.cli.output import ProgressBar, progress_bar, say
+from app.cli.output import ProgressBar, print_status, progress_bar
 from app.cli.problems import RequestFailed
 from app.events.credentials import ca_ssl_context
 from app.model.names import did_you_mean
@@ -27,7 +27,7 @@ from app.model.names import did_you_mean
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 API = "/api/v1"
 
-TRIES = 4
+MAX_ATTEMPTS = 4
 """How often a request that may be repeated is sent before its failure is told."""
 
 RETRY_SECONDS = 0.5
@@ -115,7 +115,7 @@ class Client:
             self.server = f"http://{self.server}"
         self.token = token or os.environ.get("FLEETMAP_TOKEN") or None
         for warning in variables.mistyped(os.environ):
-            say(f"warning: {warning}", style="yellow")
+            print_status(f"warning: {warning}", style="yellow")
         headers = {"User-Agent": "fleetmap"}
         if self.token:
             headers["Authorization"] = f"Bearer {self.token}"
@@ -191,7 +191,7 @@ class Client:
         """Yield server-sent events as ``{id, type, data}`` until the server ends the stream."""
         timeout = httpx.Timeout(10.0, read=STREAM_SECONDS)
         with (
-            self._reach(),
+            self._connect(),
             self._http.stream("GET", self._address(path), params=_present(params), timeout=timeout) as answer,
         ):
             if answer.status_code != httpx.codes.OK:
@@ -234,7 +234,7 @@ class Client:
 
     def _download(self, path: str, params: Mapping[str, Any], target: Path) -> Download:
         while True:
-            with self._reach(), self._http.stream("GET", self._address(path), params=params or None) as answer:
+            with self._connect(), self._http.stream("GET", self._address(path), params=params or None) as answer:
                 if answer.status_code == httpx.codes.OK:
                     return _receive(answer, target)
                 answer.read()
@@ -258,8 +258,8 @@ class Client:
         repeat: bool = False,
         body: Callable[[], dict[str, Any]] | None = None,
     ) -> httpx.Response:
-        for left in range(TRIES - 1, -1, -1):
-            pause = RETRY_SECONDS * 2 ** (TRIES - 1 - left)
+        for left in range(MAX_ATTEMPTS - 1, -1, -1):
+            pause = RETRY_SECONDS * 2 ** (MAX_ATTEMPTS - 1 - left)
             try:
                 answer = self._http.request(
                     method,
@@ -315,7 +315,7 @@ class Client:
         return f"{question} `fleetmap environment list` lists all.".strip()
 
     @contextmanager
-    def _reach(self) -> Iterator[None]:
+    def _connect(self) -> Iterator[None]:
         try:
             yield
         except httpx.TransportError as error:
@@ -357,7 +357,7 @@ class Client:
                 pause = min(MAX_POLL_SECONDS, pause * 1.5)
 
 
-def path_of(*parts: Any) -> str:
+def quote_path(*parts: Any) -> str:
     """A path below the API from its parts, each quoted whole."""
     return "/" + "/".join(quote(str(part), safe="") for part in parts)
 

@@ -80,7 +80,7 @@ NEGATIVE_ARGUMENTS = frozenset({"where"})
 """Commands whose argument may start with a minus: a southern latitude is no option."""
 
 
-def needed(arguments: Sequence[str]) -> str | None:
+def needed_command(arguments: Sequence[str]) -> str | None:
     """Return the only command that a call needs: the fewer are imported, the sooner it starts. None: all of them."""
     if "_FLEETMAP_COMPLETE" not in os.environ:
         return groups.first_command(arguments)

@@ -46,7 +46,7 @@ def _companions(main: str, beside: _FilesBeside) -> list[str]:
         companion_names = fmt.sort(beside, [main]).get(main, ())
     else:
         names = list(beside)
-        companion_names = [*fmt.companions(main, beside[main], names), *fmt.looks_at(main, names)]
+        companion_names = [*fmt.companions(main, beside[main], names), *fmt.related_files(main, names)]
     return [name for name in companion_names if name in beside and name != main]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from app.cli.client import MAX_NAMES, Client, path_of
+from app.cli.client import MAX_NAMES, Client, quote_path
 from app.cli.problems import RequestFailed
 from app.errors import FleetMapError, Invalid
 from app.model.frame import Datum
@@ -39,7 +39,7 @@ def ensure_environment(
     """
     datum_values = datum.as_dict() if datum else None
     try:
-        environment = client.get(path_of("environments", name))
+        environment = client.get(quote_path("environments", name))
     except RequestFailed as refused:
         if refused.status != 404 or str(refused.problem.get("type")).endswith(":gone"):
             raise
@@ -58,7 +58,7 @@ def ensure_environment(
     if datum_values is None or (environment.get("datum") or {}) == datum_values or dry_run:
         yield False
         return
-    client.patch(path_of("environments", name), {"datum": datum_values})
+    client.patch(quote_path("environments", name), {"datum": datum_values})
     with _undo_on_error(lambda: _undo_datum(client, environment), f"The new datum of {name} could not be taken back"):
         yield False
 
@@ -89,7 +89,7 @@ def _undo_on_error(undo: Any, failure: str) -> Iterator[None]:
 
 def _remove(client: Client, environment: Mapping[str, Any]) -> None:
     """Remove an environment permanently, unless another client has changed it since."""
-    place = path_of("environments", environment["name"])
+    place = quote_path("environments", environment["name"])
     if client.get(place)["version"] == environment["version"]:
         client.delete(place)
         client.post(f"{place}/purge", {})
@@ -97,7 +97,7 @@ def _remove(client: Client, environment: Mapping[str, Any]) -> None:
 
 def _undo_datum(client: Client, environment: Mapping[str, Any]) -> None:
     """Return to the version before the datum was set, unless another client has made a version since."""
-    place = path_of("environments", environment["name"])
+    place = quote_path("environments", environment["name"])
     if client.get(place)["version"] == environment["version"] + 1:
         message = "take back the datum: the import it was for failed"
         client.post(f"{place}/versions", {"revert_to": environment["version"], "message": message}, repeat=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.problems import RequestFailed
 
 NAME = "orchard"
@@ -34,10 +34,10 @@ def install(client: Client) -> dict[str, Any]:
     except RequestFailed as refused:
         if refused.status != 409:
             raise
-    head = client.get(path_of("environments", NAME, "versions", "latest"))
+    head = client.get(quote_path("environments", NAME, "versions", "latest"))
     if any(kind != "missing" for kind in (head.get("information") or {}).values()):
         return {"environment": NAME, "version": head["version"], "created": False}
-    version = client.post(path_of("environments", NAME, "generations"), SITE)
+    version = client.post(quote_path("environments", NAME, "generations"), SITE)
     return {"environment": NAME, "version": version["version"], "created": True}
 
 

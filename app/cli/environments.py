@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import completion, options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.folder import check_name
 from app.cli.groups import Commands
 
@@ -59,8 +59,8 @@ def show(
     Example: `fleetmap environment show farm`
     """
     with Client(server, token) as client:
-        details = client.get(path_of("environments", environment))
-        channels = client.get(path_of("environments", environment, "channels"), {"robots": "false"})
+        details = client.get(quote_path("environments", environment))
+        channels = client.get(quote_path("environments", environment, "channels"), {"robots": "false"})
     if as_json:
         output.show_json(details)
         return
@@ -141,7 +141,7 @@ def rename(
     if name is not None:
         check_name(name)
     with Client(server, token) as client:
-        changed = client.patch(path_of("environments", environment), body)
+        changed = client.patch(quote_path("environments", environment), body)
     change = f"is now called {changed['name']}" if name not in (None, environment) else "changed"
     _show_result(changed, f"{environment}: {change}", as_json=as_json)
 
@@ -168,13 +168,13 @@ def set_datum(
     """
     new_datum = options.datum(datum)
     with Client(server, token) as client:
-        place = path_of("environments", environment)
+        place = quote_path("environments", environment)
         result = client.get(place) if new_datum is None else client.patch(place, {"datum": new_datum.as_dict()})
     if as_json:
         output.show_json(result["datum"] if new_datum is None else result)
         return
     version = "" if new_datum is None else f", version {result['version']}"
-    output.show(f"{environment}: datum {output.datum(result.get('datum'))}{version}")
+    output.print_result(f"{environment}: datum {output.datum(result.get('datum'))}{version}")
     output.show_warnings(result.get("warnings") or ())
 
 
@@ -190,11 +190,11 @@ def delete(
     Example: `fleetmap environment delete farm`
     """
     with Client(server, token) as client:
-        client.delete(path_of("environments", environment))
+        client.delete(quote_path("environments", environment))
     if as_json:
         output.show_json({"environment": environment, "deleted": True})
     else:
-        output.show(f"{environment}: deleted; `fleetmap environment restore {environment}` brings it back")
+        output.print_result(f"{environment}: deleted; `fleetmap environment restore {environment}` brings it back")
 
 
 @commands.command("restore")
@@ -209,7 +209,7 @@ def restore(
     Example: `fleetmap environment restore farm`
     """
     with Client(server, token) as client:
-        result = client.post(path_of("environments", environment, "restore"), {})
+        result = client.post(quote_path("environments", environment, "restore"), {})
     _show_result(result, f"{environment}: restored, version {result['version']}", as_json=as_json)
 
 
@@ -230,12 +230,12 @@ def purge(
     if not yes:
         typer.confirm(f"Remove {environment} and all its versions permanently?", abort=True, err=True)
     with Client(server, token) as client:
-        client.post(path_of("environments", environment, "purge"), {})
+        client.post(quote_path("environments", environment, "purge"), {})
     if as_json:
         output.show_json({"environment": environment, "purged": True})
     else:
-        output.show(f"{environment}: removed permanently")
+        output.print_result(f"{environment}: removed permanently")
 
 
 def _show_result(result: Any, line: str, *, as_json: bool) -> None:
-    output.show_json(result) if as_json else output.show(line)
+    output.show_json(result) if as_json else output.print_result(line)

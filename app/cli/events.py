@@ -69,7 +69,7 @@ def _follow(client: Client, environment: str | None, last: int | None, *, as_jso
         except RequestFailed as refused:
             if refused.status is not None and refused.status < 500:
                 raise
-            output.say(f"{refused}; trying again in {pause:g} s", style="yellow")
+            output.print_status(f"{refused}; trying again in {pause:g} s", style="yellow")
         time.sleep(pause)
         pause = min(MAX_PAUSE_SECONDS, pause * 2)
 
@@ -83,7 +83,9 @@ def _show(event: Mapping[str, Any], *, as_json: bool) -> None:
     standard_names = ("environment", "type", "time", "sequence", "epoch", "root")
     rest = [f"{name} {value}" for name, value in data.items() if name not in standard_names and _is_short(value)]
     moment = str(data.get("time") or "")[:19].replace("T", " ")
-    output.show(f"{event['id']}  {moment}  {data.get('environment', '')}  {event['type']}  {', '.join(rest)}".rstrip())
+    output.print_result(
+        f"{event['id']}  {moment}  {data.get('environment', '')}  {event['type']}  {', '.join(rest)}".rstrip()
+    )
 
 
 def _is_short(value: Any) -> bool:

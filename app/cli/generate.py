@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli import completion, local, options, output, output_files
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.created import ensure_environment
 from app.cli.folder import check_name, environment_name
 from app.cli.maps import show_parameters, show_report
-from app.cli.versions import show_made
+from app.cli.versions import show_commit
 from app.errors import Invalid, Problem
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def generate(
             autocompletion=completion.environments,
         ),
     ] = None,
-    option: Annotated[list[str] | None, options.named_values("A parameter of the generator")] = None,
+    option: Annotated[list[str] | None, options.named_values_option("A parameter of the generator")] = None,
     datum: options.DatumText = None,
     describe: Annotated[
         bool,
@@ -88,8 +88,8 @@ def generate(
             output.progress_bar(f"generating {site}"),
             ensure_environment(client, name, datum=place, create=create if environment else True),
         ):
-            result = client.post(path_of("environments", name, "generations"), body, repeat=True)
-        show_made(name, result, as_json=as_json)
+            result = client.post(quote_path("environments", name, "generations"), body, repeat=True)
+        show_commit(name, result, as_json=as_json)
         return
     if out is None:
         raise typer.BadParameter("--to needs -o: a file, a folder, or - for standard output")
@@ -150,7 +150,7 @@ def _check_names(site: str, ours: set[str], to: str, values: Mapping[str, str]) 
     from app import derive, formats, parameters
 
     theirs = {p["name"] for p in parameters.describe(formats.get_format(to).write_options)}
-    derived = {name for step in derive.all_derivations() for name in derive.takes(step)}
+    derived = {name for step in derive.all_derivations() for name in derive.parameter_names(step)}
     for name in values.keys() - ours - theirs - derived:
         of_format = f"; {to} accepts {', '.join(sorted(theirs))}" if theirs else ""
         reason = f"no such parameter of {site}; accepted: {', '.join(sorted(ours))}{of_format}"
@@ -169,9 +169,10 @@ def _write(
 
     generator = generate.get_generator(site)
     formats.get_format(to)
-    if generator.works_on:
+    if generator.editable_layers:
         raise Invalid(
-            f"{site} works on {', '.join(sorted(generator.works_on))} of an environment: name one with --environment"
+            f"{site} works on {', '.join(sorted(generator.editable_layers))} of an environment: name one with "
+            "--environment"
         )
     ours = {p["name"] for p in parameters.describe(generator.parameters)}
     _check_names(site, ours, to, values)
@@ -194,5 +195,5 @@ def _write(
         output.show_json({"files": names, "report": report})
         return
     for name in names if as_folder else [out] if out != "-" else []:
-        output.say(f"wrote {Path(out) / name if as_folder else name}")
+        output.print_status(f"wrote {Path(out) / name if as_folder else name}")
     show_report(report)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from app.cli import options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.groups import Commands
 
 commands = Commands("List, show and cancel the server's long-running work.")
@@ -63,7 +63,7 @@ def show(
     Example: `fleetmap jobs show 7f3a…`
     """
     with Client(server, token) as client:
-        details = client.get(path_of("jobs", job))
+        details = client.get(quote_path("jobs", job))
     if as_json:
         output.show_json(details)
         return
@@ -93,9 +93,9 @@ def cancel(
     Example: `fleetmap jobs cancel 7f3a…`
     """
     with Client(server, token) as client:
-        running = client.get(path_of("jobs", job))["state"] in ("queued", "running")
-        client.delete(path_of("jobs", job))
+        running = client.get(quote_path("jobs", job))["state"] in ("queued", "running")
+        client.delete(quote_path("jobs", job))
     if as_json:
         output.show_json({"id": job, "cancelled": running, "removed": not running})
     else:
-        output.show(f"job {job}: {'cancelled' if running else 'removed, since it had ended'}")
+        output.print_result(f"job {job}: {'cancelled' if running else 'removed, since it had ended'}")

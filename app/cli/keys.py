@@ -55,7 +55,7 @@ def show(
     if row is None:
         near = did_you_mean(key or "", [row["id"] for row in rows])
         raise RequestFailed({"title": "Not found", "detail": f"the server has no key {key!r}{near}"}, status=404)
-    output.show_json(row) if as_json else output.show(row["public_key"])
+    output.show_json(row) if as_json else output.print_result(row["public_key"])
 
 
 @commands.command("rotate")
@@ -78,4 +78,4 @@ def rotate(
     if as_json:
         output.show_json(result)
     else:
-        output.show(f"key {result['id']} signs from now on: {result['public_key']}")
+        output.print_result(f"key {result['id']} signs from now on: {result['public_key']}")

@@ -10,7 +10,7 @@ import typer
 
 from app.cli import completion, local, options, output, output_files
 from app.cli import folder as folders
-from app.cli.client import Client, Download, LocalFile, path_of
+from app.cli.client import Client, Download, LocalFile, quote_path
 from app.cli.companions import with_companions
 from app.cli.created import ensure_environment
 from app.cli.versions import change_line, channel_rows
@@ -77,12 +77,12 @@ def import_maps(
             create=create if environment else True,
             dry_run=dry_run,
         ) as is_new:
-            status, body = client.upload(path_of("environments", name, "versions"), files, fields)
+            status, body = client.upload(quote_path("environments", name, "versions"), files, fields)
     if as_json:
         output.show_json(body)
         return
     for note in notes:
-        output.say(f"left out: {note}", style="yellow")
+        output.print_status(f"left out: {note}", style="yellow")
     _show_import(name, status, body, dry_run=dry_run, is_new=is_new)
 
 
@@ -113,16 +113,16 @@ def export_map(
     params: dict[str, str] = options.pairs(option)
     params |= {} if derive else {"derive": "false"}
     with Client(server, token) as client:
-        chosen = version or _preferred(client, environment)
-        base = path_of("environments", environment, "versions", chosen)
-        with client.download(base + path_of("maps", format, *(file.split("/") if file else ())), params) as got:
+        chosen = version or _preferred_channel(client, environment)
+        base = quote_path("environments", environment, "versions", chosen)
+        with client.download(base + quote_path("maps", format, *(file.split("/") if file else ())), params) as got:
             written = _store(got, to)
-        report = client.get(base + path_of("reports", format), params)
+        report = client.get(base + quote_path("reports", format), params)
     if as_json:
         output.show_json({"files": written, "report": report})
         return
     for name in written:
-        output.show(name)
+        output.print_result(name)
     if verbose:
         show_report(report)
 
@@ -151,13 +151,13 @@ def link(
     parameters |= {} if derive else {"derive": "false"}
     body: dict[str, Any] = {"format": format, "file": file, "parameters": parameters, "seconds": seconds}
     with Client(server, token) as client:
-        chosen = version or _preferred(client, environment)
-        result = client.post_until_done(path_of("environments", environment, "versions", chosen, "links"), body)
+        chosen = version or _preferred_channel(client, environment)
+        result = client.post_until_done(quote_path("environments", environment, "versions", chosen, "links"), body)
     if as_json:
         output.show_json(result)
         return
-    output.say(f"{result['name']} of version {result['version']}, without a token until {result['expires']}:")
-    output.show(result["url"])
+    output.print_status(f"{result['name']} of version {result['version']}, without a token until {result['expires']}:")
+    output.print_result(result["url"])
 
 
 def convert(
@@ -188,14 +188,14 @@ def convert(
     local.require_server_python("convert")
     from app import formats, parameters
     from app.convert.files import offline
-    from app.derive import all_derivations, takes
+    from app.derive import all_derivations, parameter_names
     from app.upload_reader import UploadHints, parse_drawn_layer
 
     if out == "-" and as_json:
         raise typer.BadParameter("--json and -o - both want standard output")
     fmt = formats.get_format(to)
     ours = {p["name"] for p in parameters.describe(fmt.write_options)}
-    ours |= {name for step in all_derivations() for name in takes(step)}
+    ours |= {name for step in all_derivations() for name in parameter_names(step)}
     values = options.pairs(option)
     files, _, notes = _collect(paths)
     files = with_companions(files)
@@ -214,9 +214,9 @@ def convert(
         output.show_json({"files": names, "report": converted.report})
         return
     for note in notes:
-        output.say(f"left out: {note}", style="yellow")
+        output.print_status(f"left out: {note}", style="yellow")
     for name in names if as_folder else [out] if out != "-" else []:
-        output.say(f"wrote {Path(out) / name if as_folder else name}")
+        output.print_status(f"wrote {Path(out) / name if as_folder else name}")
     show_report(converted.report)
 
 
@@ -250,11 +250,11 @@ def check(
         output.show_json({"maps": results, "unknown": rest})
     else:
         for note in notes:
-            output.say(f"left out: {note}", style="yellow")
+            output.print_status(f"left out: {note}", style="yellow")
         for line in results:
             _show_check(line)
         for name in rest:
-            output.say(f"not checked: {name}: no format reads this file")
+            output.print_status(f"not checked: {name}: no format reads this file")
     if any(line["result"] == "error" for line in results):
         raise typer.Exit(1)
 
@@ -304,9 +304,9 @@ def list_formats(
 
 def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
     """Describe a format: files, the layers that it keeps and drops, what a map of it needs, and its parameters."""
-    carried_layers = [layer for layer in described["information"] if layer in fmt.carries]
-    dropped = [layer for layer in described["information"] if layer not in fmt.carries]
-    dropped += ["blocked edges"] if "topology" in fmt.carries and not fmt.marks_blocked else []
+    carried_layers = [layer for layer in described["information"] if layer in fmt.layers]
+    dropped = [layer for layer in described["information"] if layer not in fmt.layers]
+    dropped += ["blocked edges"] if "topology" in fmt.layers and not fmt.marks_blocked else []
     derived = [layer for layer, how in described["information"].items() if how == "derived"]
     output.show_members(
         {
@@ -314,7 +314,7 @@ def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
             "uploads": "yes, detected from the content" if fmt.read else "not read",
             "maps": ", ".join(fmt.files) if fmt.write else "not written",
             "media types": ", ".join(dict.fromkeys(fmt.media_types)) if fmt.write else "",
-            "a map needs": _needed(fmt.needs) if fmt.write else "",
+            "a map needs": _requirements_text(fmt.needs) if fmt.write else "",
             "keeps": ", ".join(carried_layers),
             "derived from it": ", ".join(derived) if fmt.read else "",
             "has no place for": ", ".join(dropped) if fmt.write else "",
@@ -324,7 +324,7 @@ def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
         show_parameters([p for p in described["options"] if p["for"] == use], title)
 
 
-def _needed(needs: LayerRequirements) -> str:
+def _requirements_text(needs: LayerRequirements) -> str:
     """Format what a map needs: ``objects, or occupancy; and a datum``."""
     layers = ", or ".join(" with ".join(sorted(layers)) for layers in needs.one_of)
     datum = "a datum" if needs.datum else "a datum, if any content is in metres" if needs.anchor == "wgs84" else ""
@@ -334,7 +334,7 @@ def _needed(needs: LayerRequirements) -> str:
 def show_parameters(described: Sequence[Mapping[str, Any]], title: str) -> None:
     """Show described parameters as a table, if there are any."""
     if described:
-        output.show("")
+        output.print_result("")
         columns = ("parameter", "value", "unit", "default", "meaning")
         output.show_table(columns, map(_parameter_row, described), title=f"{title} (-O NAME=VALUE)")
 
@@ -374,13 +374,13 @@ def coverage(
     """
     if picture is not None:
         with Client(server, token) as client:
-            address = path_of("environments", environment, "versions", version, "provenance")
+            address = quote_path("environments", environment, "versions", version, "provenance")
             with client.download(address, {}) as got:
                 written = _store(got, picture)
-        output.say(f"wrote {', '.join(written)}")
+        output.print_status(f"wrote {', '.join(written)}")
         return
     with Client(server, token) as client:
-        rows = client.get(path_of("environments", environment, "versions", version, "maps"))
+        rows = client.get(quote_path("environments", environment, "versions", version, "maps"))
     if as_json:
         output.show_json(rows)
         return
@@ -398,12 +398,12 @@ def show_report(report: Mapping[str, Any]) -> None:
     for line in report.get("layers") or ():
         steps = ", ".join(_step(step) for step in line.get("steps") or ())
         name = "/".join(str(line[k]) for k in ("layer", "level", "name") if line.get(k))
-        output.say(f"{name}: {line['information']}{f' ({steps})' if steps else ''}")
+        output.print_status(f"{name}: {line['information']}{f' ({steps})' if steps else ''}")
     for line in report.get("template") or ():
         source = f" ({line['from']})" if line.get("from", "default") != "default" else ""
-        output.say(f"filled in: {line['what']} = {line['value']}{source}: {line['why']}")
+        output.print_status(f"filled in: {line['what']} = {line['value']}{source}: {line['why']}")
     for line in report.get("dropped") or ():
-        output.say(f"dropped: {line['count']} × {line['what']}: {line['why']}", style="yellow")
+        output.print_status(f"dropped: {line['count']} × {line['what']}: {line['why']}", style="yellow")
     output.show_warnings(report.get("warnings") or ())
 
 
@@ -444,32 +444,36 @@ def _default_message(paths: Sequence[Path]) -> str:
 
 def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bool, is_new: bool) -> None:
     if dry_run:
-        output.show(f"{name}: this would make a version")
+        output.print_result(f"{name}: this would make a version")
     elif status == 201:
-        output.show(f"{name}: version {body['version']}{' of the new environment' if is_new else ''}")
+        output.print_result(f"{name}: version {body['version']}{' of the new environment' if is_new else ''}")
     else:
-        output.show(f"{name}: nothing changed, version {body['version']} stays")
+        output.print_result(f"{name}: nothing changed, version {body['version']} stays")
     if dry_run or status == 201:  # else they are those of the version that stays
         for subject, change in (body.get("changes") or {}).items():
-            output.show(f"  {change_line(subject, change)}")
+            output.print_result(f"  {change_line(subject, change)}")
     kinds = [f"{layer} {kind}" for layer, kind in (body.get("information") or {}).items() if kind != "missing"]
     if kinds:
-        output.show(f"  holds: {', '.join(kinds)}")
+        output.print_result(f"  holds: {', '.join(kinds)}")
     sources = body.get("sources") or []
     used = [s for s in sources if s.get("used")]
     idle = [s for s in sources if not s.get("used")]
     empty = sum(not s["size"] for s in idle)
     note = f" ({empty} of them empty)" if empty else ""
-    output.show(f"  files: {len(used)} used, {len(idle)} kept as sources only{note}")
+    output.print_result(f"  files: {len(used)} used, {len(idle)} kept as sources only{note}")
     for source in used:
-        output.show(f"    {source['name']} ({source.get('format') or 'part of a map'}, {output.size(source['size'])})")
+        output.print_result(
+            f"    {source['name']} ({source.get('format') or 'part of a map'}, {output.size(source['size'])})"
+        )
     names = [s["name"] for s in idle if s["size"]]
     if names:
-        output.show(f"  not used: {', '.join(names[:20])}{f' and {len(names) - 20} more' if len(names) > 20 else ''}")
+        output.print_result(
+            f"  not used: {', '.join(names[:20])}{f' and {len(names) - 20} more' if len(names) > 20 else ''}"
+        )
     output.show_warnings(body.get("warnings") or ())
 
 
-def _preferred(client: Client, environment: str) -> str:
+def _preferred_channel(client: Client, environment: str) -> str:
     """What the short address for robots gives: production where there is one, else latest."""
     names = {row["channel"] for row in channel_rows(client, environment)}
     return "production" if "production" in names else "latest"
@@ -500,9 +504,9 @@ _RESULTS: Mapping[str, str] = {
 
 
 def _show_check(line: Mapping[str, Any]) -> None:
-    output.show(f"{line['file']} ({line['format']}): {_RESULTS[line['result']]}")
+    output.print_result(f"{line['file']} ({line['format']}): {_RESULTS[line['result']]}")
     for finding in line["findings"]:
-        output.show(f"  {finding['level']}: {output.place(finding)}")
+        output.print_result(f"  {finding['level']}: {output.problem_place(finding)}")
 
 
 def _step(step: Any) -> str:

@@ -16,12 +16,14 @@ CONNECTION = "Server and output"
 """Panel of the help with the options that most commands share."""
 
 
-def named_values(help: str) -> Any:
+def named_values_option(help: str) -> Any:
     """Declare the option -O NAME=VALUE, which ``pairs`` reads."""
     return typer.Option("--option", "-O", metavar="NAME=VALUE", help=f"{help}; repeatable.")
 
 
-Options = Annotated[list[str] | None, named_values("A parameter of the format; `fleetmap formats FORMAT` lists them")]
+Options = Annotated[
+    list[str] | None, named_values_option("A parameter of the format; `fleetmap formats FORMAT` lists them")
+]
 Server = Annotated[
     str | None,
     typer.Option(

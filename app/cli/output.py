@@ -28,7 +28,7 @@ WORD = 13
 GAP = 2
 """Blanks between the columns of a table."""
 
-NAMED = 3
+MAX_FILES_NAMED = 3
 """Files that one line of warning names where many have the same."""
 
 
@@ -38,20 +38,20 @@ def _console(*, stderr: bool) -> Console:
     return Console(stderr=stderr, highlight=False, markup=False, emoji=False, width=width)
 
 
-def plain(value: Any) -> str:
+def single_line(value: Any) -> str:
     """A value as one line of text without control characters."""
     text = "" if value is None else str(value)
     return "".join(c if c.isprintable() else " " for c in text)
 
 
-def say(text: str, *, style: str | None = None) -> None:
+def print_status(text: str, *, style: str | None = None) -> None:
     """A line for people, on standard error."""
-    _console(stderr=True).print(Text(plain(text), style=style or ""), soft_wrap=True)
+    _console(stderr=True).print(Text(single_line(text), style=style or ""), soft_wrap=True)
 
 
-def show(text: str) -> None:
+def print_result(text: str) -> None:
     """A line of the result, on standard output."""
-    _console(stderr=False).print(Text(plain(text)), soft_wrap=True)
+    _console(stderr=False).print(Text(single_line(text)), soft_wrap=True)
 
 
 def show_json(value: Any) -> None:
@@ -62,8 +62,8 @@ def show_json(value: Any) -> None:
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, title: str | None = None) -> None:
     """A table on standard output. What identifies a row stays in one line where there is room; long texts wrap."""
     console = _console(stderr=False)
-    cells = [[plain(cell) for cell in row] for row in rows]
-    table = Table(title=Text(plain(title)) if title else None, box=None, pad_edge=False, title_justify="left")
+    cells = [[single_line(cell) for cell in row] for row in rows]
+    table = Table(title=Text(single_line(title)) if title else None, box=None, pad_edge=False, title_justify="left")
     texts = [list(column) for column in zip(columns, *cells, strict=True)]
     for number, width in enumerate(_widths(texts, console.width)):
         style = "bold" if number == 0 else None
@@ -78,7 +78,7 @@ def show_members(members: Mapping[str, Any]) -> None:
     width = max((len(name) for name in members), default=0)
     for name, value in members.items():
         if value not in (None, "", [], {}):
-            show(f"{name.ljust(width)}  {value}")
+            print_result(f"{name.ljust(width)}  {value}")
 
 
 def minute(time: Any) -> str:
@@ -121,7 +121,7 @@ def _widths(columns: Sequence[Sequence[str]], room: int) -> list[int]:
     return widths
 
 
-def place(problem: Mapping[str, Any]) -> str:
+def problem_place(problem: Mapping[str, Any]) -> str:
     """One problem as compilers print it: ``file:line: where: what``."""
     head = str(problem.get("file") or "")
     if problem.get("line") is not None:
@@ -138,13 +138,13 @@ def show_warnings(warnings: Sequence[Mapping[str, Any]], *, limit: int = 20) -> 
         lines.setdefault((warning.get("problem"),) if whole_file else (number,), []).append(warning)
     groups = list(lines.values())
     for alike in groups[:limit]:
-        names = ", ".join(str(w["file"]) for w in alike[:NAMED]) if len(alike) > 1 else ""
-        more = f" and {len(alike) - NAMED} more" if len(alike) > NAMED else ""
-        line = f"{len(alike)} files: {alike[0].get('problem')}: {names}{more}" if names else place(alike[0])
+        names = ", ".join(str(w["file"]) for w in alike[:MAX_FILES_NAMED]) if len(alike) > 1 else ""
+        more = f" and {len(alike) - MAX_FILES_NAMED} more" if len(alike) > MAX_FILES_NAMED else ""
+        line = f"{len(alike)} files: {alike[0].get('problem')}: {names}{more}" if names else problem_place(alike[0])
         severe = alike[0].get("level") == "error"
-        say(f"{'would be refused' if severe else 'warning'}: {line}", style="red" if severe else "yellow")
+        print_status(f"{'would be refused' if severe else 'warning'}: {line}", style="red" if severe else "yellow")
     if len(groups) > limit:
-        say(f"… and {sum(map(len, groups[limit:]))} more warnings (--json shows all)", style="yellow")
+        print_status(f"… and {sum(map(len, groups[limit:]))} more warnings (--json shows all)", style="yellow")
 
 
 def show_problem(problem: Mapping[str, Any], *, hint: str = "", as_json: bool = False, limit: int = 50) -> None:
@@ -153,16 +153,16 @@ def show_problem(problem: Mapping[str, Any], *, hint: str = "", as_json: bool = 
         sys.stderr.write(json.dumps(problem, ensure_ascii=False, indent=2) + "\n")
         return
     detail = str(problem.get("detail") or problem.get("title") or "it failed")
-    say(f"error: {detail}", style="bold red")
+    print_status(f"error: {detail}", style="bold red")
     errors = [e for e in problem.get("errors") or () if isinstance(e, Mapping)]
     for error in errors[:limit]:
-        line = place(error)
+        line = problem_place(error)
         if line != detail:
-            say(f"  {line}")
+            print_status(f"  {line}")
     if len(errors) > limit:
-        say(f"  … and {len(errors) - limit} more")
+        print_status(f"  … and {len(errors) - limit} more")
     if hint:
-        say(hint)
+        print_status(hint)
 
 
 def size(count: int) -> str:
@@ -191,7 +191,7 @@ class ProgressBar:
     ) -> None:
         """Set what is done, how much there is, or what is being done."""
         if self._progress is not None and self._task is not None:
-            text = None if description is None else plain(description)
+            text = None if description is None else single_line(description)
             self._progress.update(self._task, completed=completed, total=total, description=text)
 
 
@@ -204,4 +204,4 @@ def progress_bar(description: str, *, total: float | None = None, count_bytes: b
     columns = [SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn()]
     columns += [DownloadColumn()] if count_bytes else []
     with Progress(*columns, TimeElapsedColumn(), console=_console(stderr=True), transient=True) as progress:
-        yield ProgressBar(progress, progress.add_task(plain(description), total=total))
+        yield ProgressBar(progress, progress.add_task(single_line(description), total=total))

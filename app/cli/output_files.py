@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from app.errors import Invalid
-from app.model.names import bad_name
+from app.model.names import name_problem
 
 STDOUT = Path("-")
 
@@ -69,7 +69,7 @@ def unpack(archive: Path, folder: Path) -> list[str]:
 
 def inside(folder: Path, name: str) -> Path:
     """The place of a named file below a folder; Invalid for names that would leave it."""
-    reason = bad_name(name)
+    reason = name_problem(name)
     if reason:
         raise Invalid(f"the map has a file called {name!r}, which cannot be written here: its name {reason}")
     return folder.joinpath(*PurePosixPath(name).parts)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import completion, options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.groups import Commands
 from app.errors import Invalid
 from app.model.names import did_you_mean
@@ -43,7 +43,7 @@ def list_overlays(
     """
     options.check_choice("--state", state, STATES)
     with Client(server, token) as client:
-        rows = client.get(path_of("environments", environment, "overlays"), {"state": state})
+        rows = client.get(quote_path("environments", environment, "overlays"), {"state": state})
     if as_json:
         output.show_json(rows)
         return
@@ -77,7 +77,7 @@ def show(
     Example: `fleetmap overlays show farm 4f1c…`
     """
     with Client(server, token) as client:
-        rows = client.get(path_of("environments", environment, "overlays"))
+        rows = client.get(quote_path("environments", environment, "overlays"))
     row = next((row for row in rows if row["id"] == overlay), None)
     if row is None:
         near = did_you_mean(overlay, [row["id"] for row in rows])
@@ -145,8 +145,8 @@ def create(
     body |= {"detail": detail, "polygon": _polygon(polygon) if polygon else None}
     body["state"] = "accepted" if accept else None
     with Client(server, token) as client:
-        result = client.post(path_of("environments", environment, "overlays"), body)
-    _show_decided(environment, result, as_json=as_json)
+        result = client.post(quote_path("environments", environment, "overlays"), body)
+    _print_decision(environment, result, as_json=as_json)
 
 
 def _decision(name: str, help: str) -> Callable[..., None]:
@@ -160,8 +160,8 @@ def _decision(name: str, help: str) -> Callable[..., None]:
         as_json: options.Json = False,
     ) -> None:
         with Client(server, token) as client:
-            result = client.post(path_of("environments", environment, "overlays", overlay, name), {})
-        _show_decided(environment, result, as_json=as_json)
+            result = client.post(quote_path("environments", environment, "overlays", overlay, name), {})
+        _print_decision(environment, result, as_json=as_json)
 
     commands.command(name, help=f"{help}\n\nExample: `fleetmap overlays {name} farm 4f1c…`")(decide)
     return decide
@@ -178,7 +178,7 @@ def describe_obstruction(row: Mapping[str, Any]) -> str:
     return f"edge {row['edge']}" if row.get("edge") else "area"
 
 
-def _show_decided(environment: str, overlay: Mapping[str, Any], *, as_json: bool) -> None:
+def _print_decision(environment: str, overlay: Mapping[str, Any], *, as_json: bool) -> None:
     if as_json:
         output.show_json(overlay)
         return
@@ -186,7 +186,9 @@ def _show_decided(environment: str, overlay: Mapping[str, Any], *, as_json: bool
     until = f" until {output.minute(overlay['expires'])} UTC" if overlay["state"] in ("pending", "accepted") else ""
     state = {"pending": "waits for a decision", "accepted": "is in force", "ended": "has ended"}
     became = state.get(overlay["state"], f"is {overlay['state']}")
-    output.show(f"{environment}: overlay {overlay['id']} ({describe_obstruction(overlay)}) {became}{until}{permanence}")
+    output.print_result(
+        f"{environment}: overlay {overlay['id']} ({describe_obstruction(overlay)}) {became}{until}{permanence}"
+    )
 
 
 def _polygon(path: Path) -> Any:

@@ -44,6 +44,6 @@ def locate(
             ),
         )
     else:
-        output.say(f"no environment contains {position}")
+        output.print_status(f"no environment contains {position}")
     if not rows:
         raise typer.Exit(1)

@@ -34,7 +34,7 @@ def as_problem(error: FleetMapError) -> dict[str, Any]:
     return problem
 
 
-def problem_of(error: Exception) -> tuple[dict[str, Any] | None, str]:
+def describe_error(error: Exception) -> tuple[dict[str, Any] | None, str]:
     """Return the problem of an error and a hint; None for an error that is not the user's to mend."""
     if isinstance(error, RequestFailed):
         kind = str(error.problem.get("type", "")).rpartition(":")[2]

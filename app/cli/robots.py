@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import completion, options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.groups import Commands
 
 commands = Commands("List robots, what they run, and which are offline or behind their channel.")
@@ -74,7 +74,7 @@ def show(
     Example: `fleetmap robots show mower-3`
     """
     with Client(server, token) as client:
-        details = client.get(path_of("robots", robot), {"environment": environment, "limit": limit})
+        details = client.get(quote_path("robots", robot), {"environment": environment, "limit": limit})
     if as_json:
         output.show_json(details)
         return
@@ -119,11 +119,11 @@ def forget(
     Example: `fleetmap robots forget mower-3 --environment farm`
     """
     with Client(server, token) as client:
-        client.delete(path_of("robots", robot), {"environment": environment})
+        client.delete(quote_path("robots", robot), {"environment": environment})
     if as_json:
         output.show_json({"robot": robot, "environment": environment, "forgotten": True})
     else:
-        output.show(f"{robot}: forgotten in {environment}")
+        output.print_result(f"{robot}: forgotten in {environment}")
 
 
 def runs(row: Mapping[str, Any]) -> str:

@@ -79,13 +79,13 @@ def serve(*, demo: bool = False, **values: Any) -> None:
         preload_in_background()
     gc.disable()  # until the application is made: what is loaded by then stays
     try:
-        address = address_of(listener, secure=settings.tls_certificate is not None)
+        address = local_address(listener, secure=settings.tls_certificate is not None)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         check(settings)
         _main().check_bus(settings)
         os.environ.update(settings.as_environment())  # what worker processes read
         _compile(settings.data_dir / "native")
-        output.show(f"Fleet Map Server: {address} · documentation: {address}/docs")
+        output.print_result(f"Fleet Map Server: {address} · documentation: {address}/docs")
         sys.stdout.flush()
         if demo:
             token = settings.admin_token.get_secret_value() if settings.admin_token else None
@@ -135,7 +135,7 @@ def migrate(
     if as_json:
         output.show_json({"database": _without_password(settings.database), "migrated": True})
     else:
-        output.show(f"{_without_password(settings.database)}: the schema is current")
+        output.print_result(f"{_without_password(settings.database)}: the schema is current")
 
 
 def demo(server: options.Server = None, token: options.Token = None, as_json: options.Json = False) -> None:
@@ -152,18 +152,18 @@ def demo(server: options.Server = None, token: options.Token = None, as_json: op
     if as_json:
         output.show_json(result)
         return
-    output.show(
+    output.print_result(
         f"{result['environment']}: version {result['version']}{'' if result['created'] else ' was there already'}"
     )
     for line in lines:
-        output.show(f"  {line}")
+        output.print_result(f"  {line}")
 
 
 def application() -> Any:
     """The ASGI application, in a server process of its own: it ends with the process that started it."""
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+        threading.Thread(target=_stop_with_parent, args=(parent,), daemon=True).start()
     server_app = _main().create_app(load_settings({}, warn=False))  # the process that started it has warned
     gc.freeze()
     gc.unfreeze()  # all of it counts as old now, without a look at any of it
@@ -210,7 +210,7 @@ def _warn_unknown(settings: Iterable[str], file: Path) -> None:
         names |= dict.fromkeys(match[1].upper() for line in lines if (match := _ASSIGNED.match(line)))
     setting_names = {f"{variables.PREFIX}{name.upper()}" for name in settings} | {SECRETS_DIR}
     for warning in variables.unknown(names, setting_names):
-        output.say(f"warning: {warning}", style="yellow")
+        output.print_status(f"warning: {warning}", style="yellow")
 
 
 def with_flags(function: Callable[..., None]) -> Callable[..., None]:
@@ -274,7 +274,7 @@ def listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def address_of(listener: socket.socket, *, secure: bool = False) -> str:
+def local_address(listener: socket.socket, *, secure: bool = False) -> str:
     """Where a client on this machine reaches it."""
     scheme = "https" if secure else "http"
     host, port = listener.getsockname()[:2]
@@ -302,7 +302,7 @@ def check(settings: Settings) -> None:
         try:
             store.check_writable()
         except NoRoom as error:  # maps are served all the same
-            output.say(error.detail, style="yellow")
+            output.print_status(error.detail, style="yellow")
 
 
 def with_demo_token(settings: Settings) -> Settings:
@@ -370,7 +370,7 @@ def _run(settings: Settings, listener: socket.socket) -> None:
         raise typer.Exit(1) from error
 
 
-def _end_with(parent: Any) -> None:
+def _stop_with_parent(parent: Any) -> None:
     parent.join()
     os.kill(os.getpid(), signal.SIGTERM)
 
@@ -385,14 +385,14 @@ def _bring_demo(address: str, token: str | None) -> None:
         with Client(address, token) as client:
             result = orchard.install(client)
     except (FleetMapError, RequestFailed, OSError) as error:
-        output.say(f"the demo could not be installed: {error}", style="yellow")
+        output.print_status(f"the demo could not be installed: {error}", style="yellow")
         return
-    output.show(f"demo environment: {result['environment']}, version {result['version']}")
+    output.print_result(f"demo environment: {result['environment']}, version {result['version']}")
     if token:
-        output.show(f"administrator's token: {token}")
-    output.show("try:")
+        output.print_result(f"administrator's token: {token}")
+    output.print_result("try:")
     for line in orchard.curl_lines(address, token):
-        output.show(f"  {line}")
+        output.print_result(f"  {line}")
     sys.stdout.flush()
 
 

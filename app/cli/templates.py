@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import completion, local, options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.versions import change_line
 
 
@@ -27,7 +27,7 @@ def template(
         str | None,
         typer.Option("--set", metavar="NAME", help="Use this template set, for the environment or the format."),
     ] = None,
-    option: Annotated[list[str] | None, options.named_values("A value for a parameter of the format")] = None,
+    option: Annotated[list[str] | None, options.named_values_option("A value for a parameter of the format")] = None,
     unset: Annotated[
         bool, typer.Option("--unset", help="Return to the defaults; with -O NAME only for this parameter.")
     ] = False,
@@ -52,7 +52,7 @@ def template(
         raise typer.BadParameter("--option needs the format whose parameter it is")
     if unset and chosen is not None:
         raise typer.BadParameter("--unset and --set exclude each other")
-    place = path_of("environments", environment, "templates", *([format] if format else []))
+    place = quote_path("environments", environment, "templates", *([format] if format else []))
     with Client(server, token) as client:
         if not (chosen or option or unset):
             details = client.get(place, {"version": version})
@@ -66,15 +66,17 @@ def template(
         elif format is None:
             result = client.put(place, {"set": chosen, **common}, key)
         else:
-            body = _said(stored_template, chosen, option or [], unset=unset)
+            body = _merged_values(stored_template, chosen, option or [], unset=unset)
             result = client.put(place, {**body, **common}, {**key, "If-Match": f'"{stored_template["version"]}"'})
     if as_json:
         output.show_json(result)
     else:
-        _show_made(environment, result, before=stored_template["version"])
+        _print_commit(environment, result, before=stored_template["version"])
 
 
-def _said(stored_template: Mapping[str, Any], chosen: str | None, texts: list[str], *, unset: bool) -> dict[str, Any]:
+def _merged_values(
+    stored_template: Mapping[str, Any], chosen: str | None, texts: list[str], *, unset: bool
+) -> dict[str, Any]:
     """What is said of a format from now on: as before, with these options or without them."""
     values = dict(stored_template.get("values") or {})
     if unset:
@@ -85,17 +87,17 @@ def _said(stored_template: Mapping[str, Any], chosen: str | None, texts: list[st
     return {"set": chosen or stored_template.get("set"), "values": values}
 
 
-def _show_made(environment: str, result: Mapping[str, Any], *, before: int) -> None:
+def _print_commit(environment: str, result: Mapping[str, Any], *, before: int) -> None:
     changes = result.get("changes") or {}
     if result["version"] is None:
-        output.show(f"{environment}: {'this would make a version' if changes else 'nothing would change'}")
+        output.print_result(f"{environment}: {'this would make a version' if changes else 'nothing would change'}")
     elif result["version"] == before:
-        output.show(f"{environment}: nothing changed, version {before} stays")
+        output.print_result(f"{environment}: nothing changed, version {before} stays")
         return  # its changes are those that made it
     else:
-        output.show(f"{environment}: version {result['version']}")
+        output.print_result(f"{environment}: version {result['version']}")
     if "templates" in changes:
-        output.show(f"  {change_line('templates', changes['templates'])}")
+        output.print_result(f"  {change_line('templates', changes['templates'])}")
 
 
 def _sets(*, as_json: bool) -> None:
@@ -124,7 +126,7 @@ def _show(details: Mapping[str, Any]) -> None:
         for name, one in line["effective"].items()
         if one["from"] != "default"
     ]
-    output.show(f"{details['environment']}, version {details['version']}: the set {details['set']}")
+    output.print_result(f"{details['environment']}, version {details['version']}: the set {details['set']}")
     if rows:
         output.show_table(("format", "parameter", "value", "from"), rows)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from app.cli import options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.groups import Commands
 
 commands = Commands("Create, list and delete access tokens (as administrator).")
@@ -49,8 +49,8 @@ def create(
         output.show_json(result)
         return
     scope = f"{role}, sets the status of the robot {result['robot']}" if result.get("robot") else role
-    output.say(f"token {result['id']} for {name} ({scope}), shown only this once:")
-    output.show(result["token"])
+    output.print_status(f"token {result['id']} for {name} ({scope}), shown only this once:")
+    output.print_result(result["token"])
 
 
 @commands.command("list")
@@ -80,8 +80,8 @@ def delete(
     Example: `fleetmap token delete 3f9a…`
     """
     with Client(server, token) as client:
-        client.delete(path_of("tokens", identifier))
+        client.delete(quote_path("tokens", identifier))
     if as_json:
         output.show_json({"id": identifier, "deleted": True})
     else:
-        output.show(f"token {identifier} is deleted")
+        output.print_result(f"token {identifier} is deleted")

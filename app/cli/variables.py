@@ -27,7 +27,7 @@ HOOKS = ("NAV2_", "ROS_", "TOPOLOGICAL_", "HOOK_")
 COMPOSE = frozenset({"FLEETMAP_PUBLISH", "FLEETMAP_ZENOH_PUBLISH"})
 """Read by the Compose file."""
 
-SURE = 0.8
+MIN_SIMILARITY = 0.8
 """Similarity, 0 to 1, from which a variable is meant for a client: the names of a server's settings are not known."""
 
 
@@ -47,7 +47,7 @@ def mistyped(names: Iterable[str]) -> list[str]:
     out = []
     for name in sorted(names):
         ours = name.startswith(PREFIX) and name not in CLIENT | AGENT | COMPOSE
-        meant = nearest(name.removeprefix(PREFIX), [n.removeprefix(PREFIX) for n in CLIENT], similarity=SURE)
+        meant = nearest(name.removeprefix(PREFIX), [n.removeprefix(PREFIX) for n in CLIENT], similarity=MIN_SIMILARITY)
         if ours and meant is not None:
             out.append(f"unknown variable {name} (did you mean {PREFIX}{meant}?); it has no effect")
     return out

@@ -244,11 +244,11 @@ def _show(
     verification: VerifyResult, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, repaired: bool
 ) -> None:
     counts = ", ".join(f"{count} {kind}s" for kind, count in verification.checked.items() if kind != "database")
-    output.show(f"checked: {counts}, {cache[0]} cached maps")
+    output.print_result(f"checked: {counts}, {cache[0]} cached maps")
     if cache[1]:
-        output.show(f"{cache[1]} damaged cached maps were removed; they are made again when they are requested")
+        output.print_result(f"{cache[1]} damaged cached maps were removed; they are made again when they are requested")
     if not verification.findings:
-        output.show("nothing is damaged")
+        output.print_result("nothing is damaged")
         return
     rows = []
     for f in verification.findings:
@@ -260,8 +260,12 @@ def _show(
     output.show_table(("what", "problem", "versions", "repair"), rows)
     left = sum((f.kind, f.name) not in healed for f in verification.findings)
     if not left:
-        output.show("everything was repaired")
+        output.print_result("everything was repaired")
     elif repaired:
-        output.show(f"{left} still damaged: name another place by --from, upload the files again, or restore a backup")
+        output.print_result(
+            f"{left} still damaged: name another place by --from, upload the files again, or restore a backup"
+        )
     else:
-        output.show(f"{left} damaged: `fleetmap verify --repair` heals from uploads, and from places named by --from")
+        output.print_result(
+            f"{left} damaged: `fleetmap verify --repair` heals from uploads, and from places named by --from"
+        )

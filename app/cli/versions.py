@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import completion, local, options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, quote_path
 from app.cli.environments import list_environments
 from app.cli.problems import RequestFailed
 
@@ -37,7 +37,7 @@ def versions(
         return
     with Client(server, token) as client:
         page = {"limit": min(limit, 100)}
-        rows = list(client.pages(path_of("environments", environment, "versions"), page, limit=limit))
+        rows = list(client.pages(quote_path("environments", environment, "versions"), page, limit=limit))
         standing = channels_by_version(client, environment)
     if as_json:
         output.show_json(rows)
@@ -75,19 +75,19 @@ def diff(
     Example: `fleetmap diff farm production latest`
     """
     with Client(server, token) as client:
-        differences = client.get(path_of("environments", environment, "diff"), {"from": old, "to": new})
+        differences = client.get(quote_path("environments", environment, "diff"), {"from": old, "to": new})
     if as_json:
         output.show_json(differences)
         return
     old, new = str(differences.get("from", old)), str(differences.get("to", new))
     lines = [line for layer, change in (differences.get("layers") or {}).items() for line in _lines(layer, change)]
     if not lines:
-        output.show(f"versions {old} and {new} have the same content")
+        output.print_result(f"versions {old} and {new} have the same content")
         return
     parts = filter(None, (_summary(layer, change) for layer, change in differences["layers"].items()))
-    output.show(f"versions {old} → {new}: {'; '.join(parts)}")
+    output.print_result(f"versions {old} → {new}: {'; '.join(parts)}")
     for line in lines:
-        output.show(line)
+        output.print_result(line)
 
 
 def _summary(layer: str, change: Mapping[str, Any]) -> str:
@@ -150,12 +150,12 @@ def promote(
     stages = {"ready": ready, "failed": failed, "deadline": deadline, "window": window}
     rollout = {name: value for name, value in stages.items() if value is not None}
     with Client(server, token) as client:
-        path = path_of("environments", environment, "channels", channel)
+        path = quote_path("environments", environment, "channels", channel)
         if cancel:
             if at is not None or rollout:
                 raise typer.BadParameter("--cancel plans nothing: leave the other options out")
             client.delete(f"{path}/planned")
-            channels = client.get(path_of("environments", environment, "channels"), {"robots": "false"})
+            channels = client.get(quote_path("environments", environment, "channels"), {"robots": "false"})
             moved: Any = next((c for c in channels if c["channel"] == channel), {"channel": channel, "version": None})
         else:
             number = resolve(client, environment, version)
@@ -163,15 +163,15 @@ def promote(
     if as_json:
         output.show_json(moved)
     elif cancel:
-        output.show(f"{environment}: nothing is planned for {channel} any more")
+        output.print_result(f"{environment}: nothing is planned for {channel} any more")
     elif moved["planned"] is None:
         watched = (moved["rollout"] or {}).get("state") == "watching"
         more = ", and moves back where too many robots fail" if watched else ""
-        output.show(f"{environment}: {channel} points to version {number}{more}")
+        output.print_result(f"{environment}: {channel} points to version {number}{more}")
     else:
         when = [f"{ready:.4g} of its online robots have it"] if ready is not None else []
         when += [f"it is {at}"] if at else []
-        output.show(f"{environment}: {channel} will point to version {number} when {' and '.join(when)}")
+        output.print_result(f"{environment}: {channel} will point to version {number} when {' and '.join(when)}")
 
 
 def revert(
@@ -194,18 +194,18 @@ def revert(
     with Client(server, token) as client:
         number = resolve(client, environment, version)
         body = {"revert_to": number, "message": message or f"revert to version {number}"}
-        result = client.post(path_of("environments", environment, "versions"), body, repeat=True)
+        result = client.post(quote_path("environments", environment, "versions"), body, repeat=True)
     if as_json:
         output.show_json(result)
     else:
-        output.show(f"{environment}: version {result['version']} holds what version {number} holds")
+        output.print_result(f"{environment}: version {result['version']} holds what version {number} holds")
 
 
 def resolve(client: Client, environment: str, version: str) -> int:
     """The number that a channel's name stands for; Refused where there is none."""
     if version.isascii() and version.isdigit():
         return int(version)
-    number: int = client.get(path_of("environments", environment, "versions", version))["version"]
+    number: int = client.get(quote_path("environments", environment, "versions", version))["version"]
     return number
 
 
@@ -219,7 +219,7 @@ def channels_by_version(client: Client, environment: str) -> dict[int, list[str]
 
 def channel_rows(client: Client, environment: str) -> list[dict[str, Any]]:
     """All channels of an environment."""
-    rows: list[dict[str, Any]] = client.get(path_of("environments", environment, "channels"))
+    rows: list[dict[str, Any]] = client.get(quote_path("environments", environment, "channels"))
     return rows
 
 
@@ -303,7 +303,7 @@ def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
     local.require_server_python("derive")
     from app.catalogue import describe_derivations
 
-    output.say(f"{why}: a server with a provider of satellite pictures also has location_to_imagery")
+    output.print_status(f"{why}: a server with a provider of satellite pictures also has location_to_imagery")
     return describe_derivations()
 
 
@@ -318,7 +318,7 @@ def derive(
         str | None,
         typer.Argument(help="Derivation, such as occupancy_to_topology.", autocompletion=completion.derivations),
     ] = None,
-    option: Annotated[list[str] | None, options.named_values("A parameter of the derivation")] = None,
+    option: Annotated[list[str] | None, options.named_values_option("A parameter of the derivation")] = None,
     message: options.Message = "",
     replace: options.Replace = False,
     server: options.Server = None,
@@ -348,14 +348,16 @@ def derive(
         raise typer.BadParameter("name the derivation; `fleetmap derive` lists them")
     body = {"method": method, "parameters": options.pairs(option), "message": message, "replace": replace}
     with Client(server, token) as client, output.progress_bar(f"deriving by {method}"):
-        result = client.post(path_of("environments", environment, "derivations"), body, repeat=True)
-    show_made(environment, result, as_json=as_json)
+        result = client.post(quote_path("environments", environment, "derivations"), body, repeat=True)
+    show_commit(environment, result, as_json=as_json)
 
 
-def show_made(environment: str, result: Mapping[str, Any], *, as_json: bool) -> None:
+def show_commit(environment: str, result: Mapping[str, Any], *, as_json: bool) -> None:
     """A version that a derivation or a generator has made, or that is as it was."""
     if as_json:
         output.show_json(result)
         return
-    output.show(f"{environment}: version {result['version']}: {summary(result.get('changes') or {}) or 'nothing new'}")
+    output.print_result(
+        f"{environment}: version {result['version']}: {summary(result.get('changes') or {}) or 'nothing new'}"
+    )
     output.show_warnings(result.get("warnings") or ())

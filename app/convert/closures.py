@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from app.errors import FleetMapError
 from app.formats import Format
-from app.model.closures import Closure, ClosureMode, Closures, digest_of, zone_id
+from app.model.closures import Closure, ClosureMode, Closures, closures_digest, zone_id
 from app.model.features import Features, concatenate, features
 from app.model.frame import Anchor, Datum
 from app.model.geodesy import LocalFrame, local_frame
@@ -90,7 +90,7 @@ def _drop_timed_marks(part: Features) -> Features:
     timed = [UNTIL in p or ("overlay" in p and "expires" in p) for p in part.properties]
     if not any(timed):
         return part
-    remaining = part.take([k for k, p in enumerate(part.properties) if not ("overlay" in p and "expires" in p)])
+    remaining = part.select([k for k, p in enumerate(part.properties) if not ("overlay" in p and "expires" in p)])
     properties = tuple(
         {name: value for name, value in p.items() if name not in (BLOCKED, UNTIL)} if UNTIL in p else p
         for p in remaining.properties
@@ -103,8 +103,8 @@ def ingredients(version: Version, fmt: Format, keys: Collection[PartKey]) -> dic
     closures = version.closures
     if closures is None:
         return {}
-    network = fmt.holds or "topology" in fmt.carries
-    masked = fmt.holds or any(key.layer == "occupancy" and key.name == KEEPOUT for key in keys)
+    network = fmt.is_container or "topology" in fmt.layers
+    masked = fmt.is_container or any(key.layer == "occupancy" and key.name == KEEPOUT for key in keys)
     out: dict[str, Any] = {}
     if closures.items and (network or masked):
         out["closures"] = closures.digest
@@ -170,7 +170,7 @@ def _entry(key: PartKey, areas: Sequence[Closure]) -> PartEntry:
     zones = _zones(areas)
     bounds: Bounds = {"local": _box(zones, zones.local), "wgs84": _box(zones, ~zones.local)}
     steps = ({"step": "closures", "overlays": [closure.id for closure in areas]},)
-    digest = digest_of([closure.as_dict() for closure in areas])
+    digest = closures_digest([closure.as_dict() for closure in areas])
     return PartEntry(key, digest, len(areas), bounds, Provenance("raw", "closures", steps=steps))
 
 
@@ -329,7 +329,7 @@ def _close_edges(
         blocked = np.array([_is_blocked(p) for p in part.properties], bool)
         blocked[list(until)] = True
         report.omitted += int(blocked.sum())
-        left = part.take(~blocked) if blocked.any() else part
+        left = part.select(~blocked) if blocked.any() else part
         report.emptied |= bool(blocked.any()) and not any(p.get("kind") == "edge" for p in left.properties)
         return left
     if not until:
@@ -360,7 +360,7 @@ def _find_closed_edges(
             yield closure, [k]
     if areas and edges.any():
         places = np.flatnonzero(edges & part.local) if frame is None else np.flatnonzero(edges)
-        tree = shapely.STRtree(part.take(places).in_local(frame))
+        tree = shapely.STRtree(part.select(places).in_local(frame))
         for closure in areas:
             try:
                 area = _area_in_metres(closure, frame)

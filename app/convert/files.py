@@ -61,15 +61,15 @@ def _offline(
     fmt = formats.get_format(to)
     option_values = dict(options)
     recipes.writer_options(fmt, option_values)
-    needed: frozenset[Layer] = fmt.carries | fmt.needs.also.union(*fmt.needs.one_of)
-    if "topology" in fmt.carries:
+    needed: frozenset[Layer] = fmt.layers | fmt.needs.also.union(*fmt.needs.one_of)
+    if "topology" in fmt.layers:
         needed |= {"occupancy"}  # edges may lead through what it shows
     required_layers = None if "objects" in needed else needed  # whatever can be read can be an object
     if site.selects_all(fmt, option_values):
         required_layers = None  # further parts may be derived from any layer
     cells = bool(option_values) or not fmt.outlines  # an option may ask for the images, too
     complete = required_layers is None and cells
-    knowing = EnvironmentContext(datum, None, required_layers, cells, fmt.drawing or fmt.holds)
+    knowing = EnvironmentContext(datum, None, required_layers, cells, fmt.is_drawing or fmt.is_container)
     upload_bundle = upload_reader.read(upload_reader.unpack(load(), limits), hints, knowing, limits)
     try:
         written = _convert_layers(fmt, upload_bundle, datum, option_values, derived=derived and complete)

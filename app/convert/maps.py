@@ -101,7 +101,7 @@ class Maps:
         fmt = formats.get_format(name)
         values = values or {}
         filled = templates.resolve(version.templates, fmt)
-        hints = fmt.by_file(file.rpartition("/")[2]) if file is not None else {}
+        hints = fmt.options_from_filename(file.rpartition("/")[2]) if file is not None else {}
 
         def plan(without: frozenset[str]) -> Recipe:
             if fmt.parts is not None:
@@ -287,7 +287,7 @@ class Maps:
         """Warnings of edges that lead through obstacles which the map itself does not hold."""
         version, fmt, keys = recipe.version, recipe.format, recipe.chain.keys
         network = [k for k in keys if k.layer == "topology"]
-        if recipe.steps or fmt.holds or not network or "topology" not in fmt.carries:
+        if recipe.steps or fmt.is_container or not network or "topology" not in fmt.layers:
             return []
         beside = [(e.key, e.hash) for e in version.parts if e.key.layer in ("occupancy", "objects")]
         key = ("crossings", recipe.key, version.datum, tuple(beside))
@@ -307,7 +307,7 @@ class Maps:
 
     def _unused_templates(self, recipe: Recipe) -> list[str]:
         """What the environment's templates say and this release cannot use."""
-        used = formats.all_formats().values() if recipe.format.holds else [recipe.format]
+        used = formats.all_formats().values() if recipe.format.is_container else [recipe.format]
         reasons = [reason for fmt in used for reason in templates.resolve(recipe.version.templates, fmt).ignored]
         return list(dict.fromkeys(reasons))
 
@@ -317,7 +317,7 @@ class Maps:
         out: dict[str, str] = {}
         for part in self._store.load(version, keys).vector("objects").values() if keys else ():
             stored = part.document.get(environment.NAME)
-            out |= _shell.handed_on(stored.get("variables") if isinstance(stored, Mapping) else None)[0]
+            out |= _shell.exported_variables(stored.get("variables") if isinstance(stored, Mapping) else None)[0]
         return dict(sorted(out.items()))
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:
@@ -381,7 +381,7 @@ class Maps:
 
     def _check_content(self, version: Version, fmt: formats.Format, chain: recipes.DerivationChain) -> None:
         """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
-        if fmt.lacks is None:
+        if fmt.missing_content is None:
             return
         failure = self._find_failure(
             _trial_key(version, chain, fmt), chain, making.find_missing_content, version, fmt.name, chain

@@ -47,7 +47,7 @@ class AvailableLayers:
         file is
     a map of its own format, and of no other. pinned: by layer, the derivations and parameters that a version was
     given its content by; where that content is stale, it is left out of ``keys`` and made anew by them. drawn: parts
-    that a step made for maps alone (see ``Derivation.last``), which are no evidence for other derivations.
+    that a step made for maps alone (see ``Derivation.is_terminal``), which are no evidence for other derivations.
     """
 
     keys: frozenset[PartKey]
@@ -59,10 +59,10 @@ class AvailableLayers:
 
     def for_format(self, fmt: Format) -> AvailableLayers:
         """The same with the blank parts that came from this format; a folder of maps holds all of them."""
-        if fmt.holds:
+        if fmt.is_container:
             return replace(self, keys=self.keys | self.empty_parts, empty_parts=frozenset())
         format_keys = {
-            k for k in self.empty_parts if k.name == fmt.family or (k.layer == "voxels" and k.layer in fmt.carries)
+            k for k in self.empty_parts if k.name == fmt.family or (k.layer == "voxels" and k.layer in fmt.layers)
         }
         return replace(self, keys=self.keys | format_keys, empty_parts=frozenset()) if format_keys else self
 
@@ -156,7 +156,9 @@ def available_layers(version: Version) -> AvailableLayers:
     entries = [e for e in entries if e.key.layer not in pinned]
     anchors = {e.key: frozenset(name for name, box in (e.bounds or {}).items() if box) for e in entries}
     blank = frozenset(e.key for e in version.parts if not e.count)
-    drawn = frozenset(e.key for e in entries if not e.provenance.is_edited and derive.is_drawn(e.provenance.steps))
+    drawn = frozenset(
+        e.key for e in entries if not e.provenance.is_edited and derive.ends_in_display_step(e.provenance.steps)
+    )
     return AvailableLayers(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned, drawn)
 
 
@@ -227,18 +229,18 @@ def plan_chain(
         available, best = _plan_with_parameters(fmt, available, without, frozenset(rest), derived=derived)
     if best is None:
         raise MissingLayer(f"{fmt.name} cannot be made: supply {' or '.join(missing_layers(fmt, available))}")
-    carried = fmt.carries | {layer for step in best.steps for layer in step.reads}
+    carried = fmt.layers | {layer for step in best.steps for layer in step.reads}
     keys = sorted(k for k in available.keys if k.layer in carried)
-    chosen: Sequence[PartKey] = [k for k in keys if k.layer in fmt.carries]
-    if not any(step.gives in fmt.carries for step in best.steps):  # else it is chosen once all parts are there
-        chosen = fmt.choose(chosen, options)
+    chosen: Sequence[PartKey] = [k for k in keys if k.layer in fmt.layers]
+    if not any(step.gives in fmt.layers for step in best.steps):  # else it is chosen once all parts are there
+        chosen = fmt.select_parts(chosen, options)
     needed = {layer for step in best.steps for layer in step.needs}
     if not _has_complete_map(fmt, available):
         _check_anchor(fmt, available, sorted({*chosen, *(k for k in keys if k.layer in needed)}))
     read = {layer for step in best.steps for layer in step.reads}
     keys = sorted({*chosen, *(k for k in keys if k.layer in read and k not in available.drawn)})
     remembered = {name: value for steps in available.pinned.values() for name, value in steps.items()}
-    steps = [derive.with_values([s], {**remembered.get(s.name, {}), **option_values})[0] for s in best.steps]
+    steps = [derive.with_parameters([s], {**remembered.get(s.name, {}), **option_values})[0] for s in best.steps]
     return DerivationChain(tuple(steps), tuple(keys))
 
 
@@ -256,17 +258,17 @@ def _chain_to_named_part(
     for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name)):
         if (
             d.gives != layer
-            or name not in d.makes
+            or name not in d.part_names
             or not d.needs <= available.layers - available.dead
             or d.name in without
         ):
             continue
         if level is not None and not any(k.level == level and k.layer in d.needs for k in available.keys):
             continue
-        if further <= derive.takes(d.name):
+        if further <= derive.parameter_names(d.name):
             keys = sorted(k for k in available.keys if k.layer in d.needs or (k.layer, k.name) == (layer, MAP))
             before = available.pinned.get(layer, {}).get(d.name, {})
-            return DerivationChain(derive.with_values([d.step()], {**before, **option_values}), tuple(keys))
+            return DerivationChain(derive.with_parameters([d.step()], {**before, **option_values}), tuple(keys))
     return None
 
 
@@ -288,7 +290,7 @@ def _has_complete_map(fmt: Format, available: AvailableLayers) -> bool:
 
 def _parameters_of(plan: derive.Plan) -> frozenset[str]:
     """The names of all parameters on a way."""
-    return frozenset().union(*(derive.takes(step.name) for step in plan.steps))
+    return frozenset().union(*(derive.parameter_names(step.name) for step in plan.steps))
 
 
 def _plan_with_parameters(
@@ -299,7 +301,7 @@ def _plan_with_parameters(
     everything = derive.all_derivations()
     candidates: list[tuple[float, str, AvailableLayers, derive.Plan]] = []
     for name, step in everything.items() if derived else ():
-        if not names <= derive.takes(name) or step.gives not in useful or name in without:
+        if not names <= derive.parameter_names(name) or step.gives not in useful or name in without:
             continue
         remaining_keys = frozenset(k for k in available.keys if k.layer != step.gives)
         less = replace(available, keys=remaining_keys, drawn=available.drawn & remaining_keys)
@@ -318,11 +320,11 @@ def _plan_with_parameters(
     if candidates:
         _, _, less, plan = min(candidates, key=lambda f: f[:2])
         return less, plan
-    if any(names <= derive.takes(name) for name in without):
+    if any(names <= derive.parameter_names(name) for name in without):
         lacking = " or ".join(missing_layers(fmt, available)) or "other layers"
         raise MissingLayer(f"{fmt.name} cannot be made with {', '.join(sorted(names))}: supply {lacking}")
     derivation_parameters = sorted(
-        {n for d, step in everything.items() if step.gives in useful for n in derive.takes(d)}
+        {n for d, step in everything.items() if step.gives in useful for n in derive.parameter_names(d)}
     )
     format_parameters = [p["name"] for p in parameters.describe(fmt.write_options)]
     accepted = ", ".join(format_parameters) or "none"
@@ -405,7 +407,7 @@ def recipe_of_chain(
 def writer_options(fmt: Format, values: Mapping[str, str]) -> Any:
     """The format's own options among what was asked for; Invalid for a name that nothing on any way could mean."""
     option_names = {f.name for f in dataclasses.fields(fmt.write_options)}
-    steps = frozenset().union(*(derive.takes(name) for name in derive.all_derivations()))
+    steps = frozenset().union(*(derive.parameter_names(name) for name in derive.all_derivations()))
     return formats.write_options(fmt, {n: v for n, v in values.items() if n in option_names or n not in steps})
 
 
@@ -433,11 +435,11 @@ def _key(
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
     ingredients |= applied_closures.ingredients(version, fmt, chain.keys)
-    if fmt.titled or fmt.holds:
+    if fmt.has_title or fmt.is_container:
         ingredients["title"] = version.environment
     if spread is not None:
         ingredients["spread"] = dataclasses.asdict(spread)
-    if fmt.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations
+    if fmt.is_container:  # its bytes are those of other writers and, where they lack a layer, of derivations
         ingredients["formats"] = [[f.name, f.version] for f in formats.all_formats().values()]
         ingredients["derivations"] = [[d.name, d.version] for d in derive.all_derivations().values()]
         format_defaults = {

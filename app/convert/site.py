@@ -118,7 +118,9 @@ class _Site:
         if any((key.level, key.name) == (level, name) for key in self.stored):
             return None
         for maker in self.makers:
-            if name in maker.makes and any(k.level == level and k.layer in maker.needs for k in self.available.keys):
+            if name in maker.part_names and any(
+                k.level == level and k.layer in maker.needs for k in self.available.keys
+            ):
                 return maker
         return None
 
@@ -131,10 +133,10 @@ def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: 
     makers = tuple(
         d
         for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name))
-        if derived and d.makes and d.gives == fmt.parts.layer and d.needs <= available.layers
+        if derived and d.part_names and d.gives == fmt.parts.layer and d.needs <= available.layers
     )
     option_names = {f.name for f in dataclasses.fields(fmt.write_options)}
-    only_makers = frozenset().union(*(derive.takes(d.name) for d in makers)) - option_names
+    only_makers = frozenset().union(*(derive.parameter_names(d.name) for d in makers)) - option_names
     own_values = {name: value for name, value in values.items() if name not in only_makers}
     main, lacking = None, None
     if not stored or own_values.keys() - option_names:  # not stored, or to be derived with these parameters
@@ -184,16 +186,16 @@ def recipe(
     site = _site(version, fmt, rest, derived=derived, without=without)
     levels = None if level == ALL else frozenset({site.default if level is None else level})
     names = None if name in (ALL, None) else frozenset({name})
-    if site.lacking is not None and not (names and any(names <= maker.makes for maker in site.makers)):
+    if site.lacking is not None and not (names and any(names <= maker.part_names for maker in site.makers)):
         raise site.lacking
     members: list[Member] = []
     if site.main is None:
         members += _stored_members(site, levels, name, derived=derived)
-    elif names is None or not any(names <= maker.makes for maker in site.makers):
+    elif names is None or not any(names <= maker.part_names for maker in site.makers):
         members.append(_spread(site, site.main, levels, names, only_default=name is None))
     if name is not None:
         for maker in site.makers:
-            if (names is None or names & maker.makes) and _can_add_part(site, maker, levels):
+            if (names is None or names & maker.part_names) and _can_add_part(site, maker, levels):
                 members.append(_derived_member(site, maker, levels, names))
     if not members:
         _raise_missing(site, level, name, derived=derived)
@@ -238,7 +240,7 @@ def _spread(
     maker: Derivation | None = None,
 ) -> Member:
     """All that the last step of a chain gives, as one map; a member may select some of its files."""
-    makes = () if maker is None else tuple(sorted(maker.makes))
+    makes = () if maker is None else tuple(sorted(maker.part_names))
     stored_parts = tuple(sorted((k.level, k.name) for k in site.stored if k.name in makes))
     spread = Spread(site.default, makes, stored_parts, optional=maker is not None)
     values = site.own_values if maker is None else site.values
@@ -260,7 +262,7 @@ def _chain_of_derivation(site: _Site, maker: Derivation) -> DerivationChain:
     """The chain of a derivation that makes named parts: it may take the frame of the layer's usual part."""
     keys = (k for k in site.available.keys if k.layer in maker.needs or (k.layer, k.name) == (maker.gives, MAP))
     before = site.available.pinned.get(maker.gives, {}).get(maker.name, {})
-    return DerivationChain(derive.with_values([maker.step()], {**before, **site.values}), tuple(sorted(keys)))
+    return DerivationChain(derive.with_parameters([maker.step()], {**before, **site.values}), tuple(sorted(keys)))
 
 
 def _derived_member(
@@ -274,7 +276,7 @@ def _can_add_part(site: _Site, maker: Derivation, levels: frozenset[str] | None)
     stored_parts = {(key.level, key.name) for key in site.stored}
     able = {key.level for key in site.available.keys if key.layer in maker.needs}
     return any(
-        (levels is None or level in levels) and any((level, n) not in stored_parts for n in maker.makes)
+        (levels is None or level in levels) and any((level, n) not in stored_parts for n in maker.part_names)
         for level in able
     )
 
@@ -332,7 +334,7 @@ def file_recipe(
     if of_file is None or (level is not None and level != of_file):
         levels = ", ".join(sorted(site.levels))
         raise NotFound(f"{fmt.name} has no file {file!r}: no level has this folder; there are the levels {levels}")
-    hints = dict(fmt.by_file(base))
+    hints = dict(fmt.options_from_filename(base))
     if name is None and parts.name in hints:
         name = _part_with_stem(site, of_file, hints[parts.name])
     kinds = {o: v for o, v in hints.items() if o != parts.name and _default_kinds(fmt).get(o) != v}
@@ -353,7 +355,7 @@ def file_recipe(
 
 def _default_kinds(fmt: Format) -> dict[str, str]:
     """Collect the options that the names of the format's default files imply, where they agree: PGM is the default."""
-    hints = [dict(fmt.by_file(name)) for name in fmt.files]
+    hints = [dict(fmt.options_from_filename(name)) for name in fmt.files]
     values = {option: {one[option] for one in hints if option in one} for one in hints for option in one}
     return {option: next(iter(choices)) for option, choices in values.items() if len(choices) == 1}
 

@@ -76,7 +76,7 @@ def find_chain_failure(
     """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
     layers = applied_closures.load(open_store(database_url, blob_dir), version, chain.keys)
     try:
-        derive.attempt(chain.steps, layers)
+        derive.try_steps(chain.steps, layers)
     except CannotDerive as error:
         return ChainFailure(error.step, error.detail, error.choose)
     except FleetMapError as error:
@@ -91,7 +91,7 @@ def stored_crossings(
     fmt = formats.get_format(name)
     seen = [e.key for e in version.parts if e.key.layer in ("occupancy", "objects") and e.key not in keys]
     layers = applied_closures.load(open_store(database_url, blob_dir), version, [*keys, *seen])
-    chosen = fmt.choose(sorted(k for k in keys if k.layer in fmt.carries), formats.write_options(fmt, {}))
+    chosen = fmt.select_parts(sorted(k for k in keys if k.layer in fmt.layers), formats.write_options(fmt, {}))
     used = replace(layers, parts={k: layers.parts[k] for k in chosen})
     return crossing_edges(fmt, applied_closures.close(fmt, used, version.closures)[0], layers)
 
@@ -106,7 +106,7 @@ def find_missing_content(
         derived_layers = derive.run(chain.steps, layers)
     except FleetMapError as error:
         return ChainFailure("", error.detail)
-    reason = fmt.lacks(derived_layers) if fmt.lacks is not None else None
+    reason = fmt.missing_content(derived_layers) if fmt.missing_content is not None else None
     return None if reason is None else ChainFailure("", f"{name}: {reason}")
 
 
@@ -171,7 +171,7 @@ def _write_each(
         raise AssertionError(f"{fmt.name} declares no parts")
     keys = [
         k
-        for k in derived_layers.of(parts.layer)
+        for k in derived_layers.parts_of(parts.layer)
         if k not in source.layers.parts and (k.level, k.name) not in spread.stored
     ]
     keys = [k for k in keys if not spread.names or k.name in spread.names]
@@ -208,12 +208,12 @@ def _write_one(
     context = WriteContext(source.title, options, stored=None if closures is not None and closures.items else noted)
     inner: list[dict[str, Any]] = []
     inner_closures: list[list[dict[str, Any]]] = []
-    if fmt.holds:
+    if fmt.is_container:
         context.make = partial(_inner, source, inner, inner_closures)
-    chosen = fmt.choose(sorted(k for k in derived_layers.parts if k.layer in fmt.carries), context.options)
+    chosen = fmt.select_parts(sorted(k for k in derived_layers.parts if k.layer in fmt.layers), context.options)
     used = Layers({k: derived_layers.parts[k] for k in chosen}, derived_layers.datum, derived_layers.levels)
     closed = applied_closures.ClosureReport()
-    if not fmt.holds:  # a folder's inner maps apply closures themselves
+    if not fmt.is_container:  # a folder's inner maps apply closures themselves
         drawn = derived_layers.parts.keys() - layers.parts.keys()
         applied, closed = applied_closures.close(fmt, used, closures, drawn)
         if closed.emptied and _has_no_edges(fmt, applied):
@@ -223,7 +223,7 @@ def _write_one(
     context.attribution = tuple(sorted(report_credits(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(fmt, used, context)
     _report_blocked_edges(fmt, closed, context)
-    if not fmt.holds:  # as above
+    if not fmt.is_container:  # as above
         context.warnings += crossing_edges(
             fmt, used, replace(derived_layers, parts={**source.around.parts, **derived_layers.parts})
         )
@@ -244,12 +244,12 @@ def _write_one(
 
 def crossing_edges(fmt: Format, written: Layers, around: Layers) -> list[Problem]:
     """Warn of edges that lead through obstacles in a map of these layers. around: layers with grids and objects."""
-    return crossings(written, around, shape_of=fmt.name if fmt.bends == "foreign" else None)
+    return crossings(written, around, shape_of=fmt.name if fmt.keeps_bends == "foreign" else None)
 
 
 def _has_no_edges(fmt: Format, layers: Layers) -> bool:
     """Whether the format cannot be written without an edge."""
-    return fmt.lacks is not None and fmt.lacks(layers) is not None
+    return fmt.missing_content is not None and fmt.missing_content(layers) is not None
 
 
 def _report_blocked_edges(fmt: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
@@ -504,12 +504,12 @@ def unsupported_layers(
     counts: dict[str, int] = {}
     if entries is not None:
         for key, entry in entries.items():
-            if key.layer not in fmt.carries and entry.count:
+            if key.layer not in fmt.layers and entry.count:
                 items = entry.count if key.layer in VECTOR_LAYERS else 1  # grids and pictures, not their cells
                 counts[key.layer] = counts.get(key.layer, 0) + items
     else:
         for key, part in layers.parts.items():
-            if key.layer not in fmt.carries:
+            if key.layer not in fmt.layers:
                 counts[key.layer] = counts.get(key.layer, 0) + (len(part) if isinstance(part, Features) else 1)
     why = f"{fmt.name} has no place for it"
     return [{"what": layer, "count": counts[layer], "why": why} for layer in LAYERS if counts.get(layer)]

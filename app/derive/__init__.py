@@ -60,10 +60,10 @@ class Derivation:
     """One step. gives: the layer it makes. needs: the layers it reads. also: stored layers that it uses a part of where
     they are there, and does without where they are not. cost: relative effort and loss, above 0.
 
-    makes: names of the parts that it makes, where these are others than the usual one. Such a step is no way to the
-    layer; it is taken where a part of such a name is asked for and not stored, and is given the layer's usual part,
-    whose frame it may take. last: what it makes is good for a map and not for deriving more (a grid that knows of no
-    obstacle). trial: says whether it works, where that is cheaper to tell than to do.
+    part_names: names of the parts that it makes, where these are others than the usual one. Such a step is no way to
+    the layer; it is taken where a part of such a name is asked for and not stored, and is given the layer's usual part,
+    whose frame it may take. is_terminal: what it makes is good for a map and not for deriving more (a grid that knows
+    of no obstacle). trial: says whether it works, where that is cheaper to tell than to do.
     """
 
     name: str
@@ -75,8 +75,8 @@ class Derivation:
     parameters: type[Any]
     function: Function
     also: frozenset[Layer] = frozenset()
-    makes: frozenset[str] = frozenset()
-    last: bool = False
+    part_names: frozenset[str] = frozenset()
+    is_terminal: bool = False
     trial: Trial | None = None
 
     def step(self) -> Step:
@@ -158,10 +158,12 @@ def all_derivations() -> Mapping[str, Derivation]:
     return dict(sorted(_registry.items()))
 
 
-def is_drawn(steps: Iterable[Mapping[str, Any]]) -> bool:
+def ends_in_display_step(steps: Iterable[Mapping[str, Any]]) -> bool:
     """Whether one of these steps, as provenance tells them, is the last one that a map may take (see ``last``)."""
     derivations = all_derivations()
-    return any(name in derivations and derivations[name].last for name in (str(step.get("step")) for step in steps))
+    return any(
+        name in derivations and derivations[name].is_terminal for name in (str(step.get("step")) for step in steps)
+    )
 
 
 def plan(
@@ -184,32 +186,32 @@ def plan(
         if have in done:
             continue
         done.add(have)
-        blocked = dead | {step.gives for step in steps if all_derivations()[step.name].last}
+        blocked = dead | {step.gives for step in steps if all_derivations()[step.name].is_terminal}
         for d in all_derivations().values():
             if d.needs & blocked:
                 continue
-            if d.needs <= have and d.gives not in have and d.name not in without and not d.makes:
+            if d.needs <= have and d.gives not in have and d.name not in without and not d.part_names:
                 pushed += 1
                 heapq.heappush(queue, (cost + d.cost, pushed, have | {d.gives}, (*steps, d.step())))
     return None
 
 
-def takes(name: str) -> frozenset[str]:
+def parameter_names(name: str) -> frozenset[str]:
     """The names of a derivation's parameters."""
     return frozenset(f.name for f in dataclasses.fields(all_derivations()[name].parameters))
 
 
-def with_values(steps: Iterable[Step], values: Mapping[str, Any]) -> tuple[Step, ...]:
+def with_parameters(steps: Iterable[Step], values: Mapping[str, Any]) -> tuple[Step, ...]:
     """The steps, each with those of the values that it knows. Invalid names what is wrong with one."""
     out = []
     for step in steps:
-        step_values = {name: value for name, value in values.items() if name in takes(step.name)}
+        step_values = {name: value for name, value in values.items() if name in parameter_names(step.name)}
         chosen = parameters.parse(all_derivations()[step.name].parameters, step_values, f"parameter of {step.name}")
         out.append(replace(step, given=tuple(parameters.canonical(chosen).items())))
     return tuple(out)
 
 
-def _says_nothing(part: Part) -> bool:
+def _is_empty_result(part: Part) -> bool:
     """Whether a derived part is no information: no items, no voxels, or all cells unknown or free alike."""
     if isinstance(part, OccupancyGrid):
         first = part.cells[0, 0]
@@ -222,12 +224,12 @@ def run(steps: Iterable[Step], layers: Layers, notes: DerivationNotes | None = N
     notes = notes or DerivationNotes()
     for step in steps:
         derivation = all_derivations()[step.name]
-        with _blaming(step):
+        with _as_derivation_error(step):
             derived_layers = derivation.function(layers, derivation.parameters(**dict(step.given)), notes)
         if (
-            not derivation.makes
-            and not derivation.last
-            and all(map(_says_nothing, derived_layers.of(step.gives).values()))
+            not derivation.part_names
+            and not derivation.is_terminal
+            and all(map(_is_empty_result, derived_layers.parts_of(step.gives).values()))
         ):
             needs = " and ".join(step.needs)
             reason = f"{step.name} finds nothing in the stored {needs} to make {step.gives} of: supply {step.gives}"
@@ -236,19 +238,19 @@ def run(steps: Iterable[Step], layers: Layers, notes: DerivationNotes | None = N
     return layers
 
 
-def attempt(steps: Sequence[Step], layers: Layers) -> None:
+def try_steps(steps: Sequence[Step], layers: Layers) -> None:
     """Raise what ``run`` would raise; cheaper where the last step has a trial."""
     last = all_derivations()[steps[-1].name]
     if last.trial is None:
         run(steps, layers)
         return
     layers = run(steps[:-1], layers)
-    with _blaming(steps[-1]):
+    with _as_derivation_error(steps[-1]):
         last.trial(layers, last.parameters(**dict(steps[-1].given)))
 
 
 @contextlib.contextmanager
-def _blaming(step: Step) -> Iterator[None]:
+def _as_derivation_error(step: Step) -> Iterator[None]:
     """CannotDerive instead of CannotConvert: the step is to blame."""
     try:
         yield

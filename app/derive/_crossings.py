@@ -13,9 +13,9 @@ from app.errors import FleetMapError, Invalid, MissingDatum, Problem
 from app.model import masks
 from app.model.bends import is_identified
 from app.model.features import Features, Properties
-from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid, as_seen
+from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey_as_unknown
 from app.model.layers import MAP, Layers, PartKey
-from app.model.obstacles import footprint_of
+from app.model.obstacles import object_footprint
 from app.model.solids import Solids
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ MAX_EDGES, MAX_BODIES = 500_000, 50_000
 SAMPLES, MAX_SAMPLES = 2**20, 2**25
 """Places along edges that are looked up at once, and in all: of a longer network they are farther apart."""
 
-LISTED = 5
+MAX_LISTED = 5
 
 
 def crossings(networks: Layers, around: Layers, *, shape_of: str | None = None) -> list[Problem]:
@@ -68,10 +68,10 @@ def crossings(networks: Layers, around: Layers, *, shape_of: str | None = None) 
         blocked = np.zeros(len(edges), bool)
         if grid is not None and grid_key is not None:
             segments, owner = _segments(lines)
-            blocked[owner[_in_grid(segments, grid)[0]]] = True
+            blocked[owner[_crossed_cells(segments, grid)[0]]] = True
             name = f"occupied cells of the occupancy grid {grid_key.name!r}"
             out += _problems([part.ids[edges[n]] for n in np.flatnonzero(blocked).tolist()], name, key)
-        hit = _in_bodies(lines, bodies, grid) & ~blocked
+        hit = _crosses_bodies(lines, bodies, grid) & ~blocked
         out += _problems([part.ids[edges[n]] for n in np.flatnonzero(hit).tolist()], "buildings or walls", key)
     return out
 
@@ -80,7 +80,7 @@ def _problems(ids: Sequence[str], obstacles: str, key: PartKey) -> list[Problem]
     if not ids:
         return []
     count = "1 edge crosses" if len(ids) == 1 else f"{len(ids)} edges cross"
-    named = ", ".join(ids[:LISTED]) + (" …" if len(ids) > LISTED else "")
+    named = ", ".join(ids[:MAX_LISTED]) + (" …" if len(ids) > MAX_LISTED else "")
     reason = f"{count} {obstacles}: {named}; a robot that follows the network meets an obstacle there"
     return [Problem(reason, where=f"topology {key.level}/{key.name}")]
 
@@ -116,12 +116,12 @@ def _obstacle_grid(grids: Mapping[PartKey, OccupancyGrid]) -> PartKey | None:
     return next((k for k in keys if k.name == MAP), keys[0] if len(keys) == 1 else None)
 
 
-def _in_grid(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _crossed_cells(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which pieces lead through an occupied cell, and which through an unknown one or beyond the grid.
 
     They are looked up twice a cell.
     """
-    grid = as_seen(grid)
+    grid = unknown_grey_as_unknown(grid)
     x, y, yaw = grid.origin
     cosine, sine = np.cos(yaw), np.sin(yaw)
     turned = (segments - np.array([x, y])) @ np.array([[cosine, -sine], [sine, cosine]])
@@ -153,14 +153,14 @@ def _bodies(around: Layers, level: str) -> list[Any]:
     solids = Solids({})
     for key, part in around.vector("objects").items():
         rows = [k for k, p in enumerate(part.properties) if _is_body(p)] if key.level == level else []
-        chosen = part.take(rows[: MAX_BODIES - len(bodies)])
+        chosen = part.select(rows[: MAX_BODIES - len(bodies)])
         try:
             shapes = chosen.in_local(around.frame)
         except (MissingDatum, Invalid):
             continue
         for p, geometry in zip(chosen.properties, shapes, strict=True):
             try:
-                body = footprint_of({**p, "shapes": None}, geometry, solids)
+                body = object_footprint({**p, "shapes": None}, geometry, solids)
             except FleetMapError:  # what it is made of cannot be used: its derivations report it
                 continue
             if body is not None and not body.is_empty:
@@ -168,7 +168,7 @@ def _bodies(around: Layers, level: str) -> list[Any]:
     return bodies
 
 
-def _in_bodies(lines: NDArray[np.object_], bodies: Sequence[Any], grid: OccupancyGrid | None) -> NDArray[np.bool_]:
+def _crosses_bodies(lines: NDArray[np.object_], bodies: Sequence[Any], grid: OccupancyGrid | None) -> NDArray[np.bool_]:
     """Which lines lead through a ground plan, but for the way from an end inside to the outside.
 
     grid: of the obstacles: a way that it knows all along is not in a body's way.
@@ -190,7 +190,7 @@ def _in_bodies(lines: NDArray[np.object_], bodies: Sequence[Any], grid: Occupanc
     if grid is not None:
         segments, number = _segments(parts)
         unknown = np.zeros(len(parts), bool)
-        unknown[number[_in_grid(segments, grid)[1]]] = True
+        unknown[number[_crossed_cells(segments, grid)[1]]] = True
         owner = owner[unknown]
     hit[owner] = True
     return hit

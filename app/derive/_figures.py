@@ -21,25 +21,25 @@ ROUND = 0.8
 PARTLY, HOLLOW = 0.7, 0.88
 """The same for a rim of which a part was not seen, and of its rectangle it then fills less than this (a disc 0.79)."""
 
-STRETCH = 0.7
+MIN_ASPECT = 0.7
 """How wide a round figure is against its length at least."""
 
-FULL = 0.85
+MIN_FILL = 0.85
 """Share of its enclosing rectangle that a rectangle fills: more than a disc (0.79) or a triangle (0.5)."""
 
-MOST = 200_000
+MAX_FIGURES = 200_000
 """Figures, and edges of middle lines: more are noise."""
 
-PIECES = 2_000_000
+MAX_PIECES = 2_000_000
 """Pieces and holes of a mask, specks too."""
 
-ROWS = 1024
+ROWS_PER_BLOCK = 1024
 """Rows that are looked at together."""
 
 STEP = 0.25
 """Cells between the places at which a wall's width is looked up."""
 
-PLACES = 64
+MAX_SAMPLES = 64
 """Places along a wall at which its width is looked up, at most."""
 
 
@@ -92,12 +92,12 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
     """All figures of a mask, in order of their rows and columns.
 
     free: bool [height, width], which cells are known to be free; what closes around such a cell is no solid figure but
-    walls around a room. CannotConvert where there are more figures than ``MOST``.
+    walls around a room. CannotConvert where there are more figures than ``MAX_FIGURES``.
     """
     import cv2
 
-    if pieces(mask) > PIECES:
-        raise CannotConvert(f"this is noise: it has more than {PIECES} pieces and holes")
+    if pieces(mask) > MAX_PIECES:
+        raise CannotConvert(f"this is noise: it has more than {MAX_PIECES} pieces and holes")
     contours, tree = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     shapes = MaskShapes([], [], [], [], 0)
     specks = 0
@@ -119,22 +119,22 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
             child = int(links[child, 0])
         # What is larger than a disc or a box, and wider than a wall, is none of these anyway.
         small = box.length <= max(sizes.disc, sizes.box) or box.width <= sizes.wall
-        room = small and any(_holds(contours[c], free) for c in inner)
+        room = small and any(_has_free_cell(contours[c], free) for c in inner)
         disc = None if room else _disc(points, sides, sizes)
         if disc is not None:
             shapes.discs.append(disc)
-        elif not room and share >= FULL and box.width <= sizes.wall and box.length >= 2 * box.width:
+        elif not room and share >= MIN_FILL and box.width <= sizes.wall and box.length >= 2 * box.width:
             shapes.walls.append(box)
-        elif not room and share >= FULL and box.length <= sizes.box:
+        elif not room and share >= MIN_FILL and box.length <= sizes.box:
             shapes.boxes.append(box)
         else:
             cv2.drawContours(rest, [contours[k], *(contours[c] for c in inner)], -1, 1, cv2.FILLED)
     if rest.any():
-        _others(rest & mask, sizes, shapes)
+        _split_others(rest & mask, sizes, shapes)
     return MaskShapes(shapes.discs, shapes.boxes, shapes.walls, shapes.areas, specks)
 
 
-def _holds(contour: Any, free: NDArray[np.bool_]) -> bool:
+def _has_free_cell(contour: Any, free: NDArray[np.bool_]) -> bool:
     """Whether a hole has a free cell."""
     import cv2
 
@@ -149,10 +149,10 @@ def pieces(mask: NDArray[np.uint8]) -> int:
     """How many pieces and holes a mask has at most: cells that begin one, with none of the same before and above."""
     height, width = mask.shape
     count = 0
-    for start in range(0, height, ROWS):
-        band = np.zeros((min(ROWS, height - start) + 1, width + 2), bool)
+    for start in range(0, height, ROWS_PER_BLOCK):
+        band = np.zeros((min(ROWS_PER_BLOCK, height - start) + 1, width + 2), bool)
         low = max(0, start - 1)
-        rows = mask[low : start + ROWS]
+        rows = mask[low : start + ROWS_PER_BLOCK]
         band[-len(rows) :, 1:-1] = rows == 1
         before = band[1:, :-2]
         count += int((band[1:, 1:-1] & ~(before | band[:-1, :-2] | band[:-1, 1:-1] | band[:-1, 2:])).sum())
@@ -201,13 +201,13 @@ def _disc(points: NDArray[Any], sides: tuple[float, float], sizes: ShapeLimits) 
     length, width = sides[0] + 1, sides[1] + 1
     share = area / (math.pi * radius**2)
     corners = (area + 1 - math.pi / 4) / (length * width)
-    round_ = width >= STRETCH * length and (share >= ROUND or (share >= PARTLY and corners < HOLLOW))
+    round_ = width >= MIN_ASPECT * length and (share >= ROUND or (share >= PARTLY and corners < HOLLOW))
     if not round_ and length > sizes.small:
         return None
     return Disc(x + 0.5, y + 0.5, math.sqrt(area / math.pi) if round_ else radius)
 
 
-def _others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShapes) -> None:
+def _split_others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShapes) -> None:
     """Figures that are neither: their thin parts are walls, the others rectangles or areas."""
     from app.derive import _skeleton
 
@@ -215,7 +215,7 @@ def _others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShapes) -> 
     top, left = int(rows[0]), int(columns[0])
     mask = np.pad(rest[top : int(rows[-1]) + 1, left : int(columns[-1]) + 1], 1)
     at = np.array([left - 1.0, top - 1.0])
-    thick = _opened(mask, sizes.wall / 2)
+    thick = _open_mask(mask, sizes.wall / 2)
     if thick.any():
         shapes.areas.extend(_areas(thick, sizes, shapes, at))
     thin = mask & (1 - thick)
@@ -224,16 +224,16 @@ def _others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShapes) -> 
     free_space = _skeleton.space(thin.copy(), 0, 0, 0.0)
     # Ends that reach less than their width out of a wall are its roughness.
     graph, _ = _skeleton.skeleton(free_space, merge=2.0, spur=sizes.speck, tolerance=sizes.tolerance, island=0.0)
-    if len(graph.edges) > MOST:
-        raise CannotConvert(f"this is no place with walls: thin pieces have more than {MOST} edges")
-    ends = straightened(graph.nodes[:, ::-1].astype(np.float64), graph.edges, sizes.tolerance)
+    if len(graph.edges) > MAX_FIGURES:
+        raise CannotConvert(f"this is no place with walls: thin pieces have more than {MAX_FIGURES} edges")
+    ends = straighten_lines(graph.nodes[:, ::-1].astype(np.float64), graph.edges, sizes.tolerance)
     for a, b in ends:
         wall = _wall(thin, a + 0.5, b + 0.5, sizes.wall)
         if wall.length >= sizes.speck:
             shapes.walls.append(Box(wall.x + at[0], wall.y + at[1], wall.length, wall.width, wall.yaw))
 
 
-def _opened(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
+def _open_mask(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
     """What is wider than two radii, with its corners. The mask has a border of zeros."""
     from app.derive import _skeleton
 
@@ -265,7 +265,7 @@ def _areas(thick: NDArray[np.uint8], sizes: ShapeLimits, mask_shapes: MaskShapes
     for _, area in sorted(shapes.items()):
         around = shapely.minimum_rotated_rectangle(area)
         corners = shapely.get_coordinates(around)
-        if len(corners) == 5 and area.area >= FULL * around.area:
+        if len(corners) == 5 and area.area >= MIN_FILL * around.area:
             sides = np.hypot(*np.diff(corners[:3], axis=0).T)
             long = int(np.argmax(sides))
             step = corners[long + 1] - corners[long]
@@ -279,7 +279,7 @@ def _areas(thick: NDArray[np.uint8], sizes: ShapeLimits, mask_shapes: MaskShapes
     return out
 
 
-def straightened(
+def straighten_lines(
     nodes: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """The ends of straight lines, each of edges that go on where another ends and that it passes within ``tolerance``.
@@ -297,8 +297,8 @@ def straightened(
             neighbours = sorted(at[node])
             for i, one in enumerate(neighbours):
                 for other in neighbours[i + 1 :]:
-                    joined = _joined(lines[one], lines[other], node)
-                    away = _away(nodes[joined], tolerance)
+                    joined = _join_lines(lines[one], lines[other], node)
+                    away = _distance_from_line(nodes[joined], tolerance)
                     if away is not None and (best is None or away < best[0]):
                         best = (away, one, other, joined)
             if best is None:
@@ -314,14 +314,14 @@ def straightened(
     return [(nodes[line[0]], nodes[line[-1]]) for _, line in sorted(lines.items())]
 
 
-def _joined(one: list[int], other: list[int], node: int) -> list[int]:
+def _join_lines(one: list[int], other: list[int], node: int) -> list[int]:
     """Two lines as one that runs through a common end."""
     first = one if one[-1] == node else one[::-1]
     second = other if other[0] == node else other[::-1]
     return [*first, *second[1:]]
 
 
-def _away(line: NDArray[np.float64], tolerance: float) -> float | None:
+def _distance_from_line(line: NDArray[np.float64], tolerance: float) -> float | None:
     """How far the straight line between the ends is from the corners; None if too far, or if the line turns back."""
     chord = line[-1] - line[0]
     length = float(np.hypot(*chord))
@@ -340,7 +340,7 @@ def _wall(thin: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.float64
     length = float(np.hypot(*(b - a)))
     along = (b - a) / length
     across = np.array([-along[1], along[0]])
-    n = min(PLACES, max(3, round(length)))
+    n = min(MAX_SAMPLES, max(3, round(length)))
     share = (np.arange(n) + 0.5) / n
     middle = a + (b - a) * share[:, None]
     left, right = _reach(thin, middle, across, widest), _reach(thin, middle, -across, widest)

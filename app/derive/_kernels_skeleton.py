@@ -148,9 +148,9 @@ def thin(mask: U8) -> int:
         count -= deleted
         need = max(n2, 0) + 8 * deleted
         if need > len(second):
-            second = _grown(second, n2, need)
+            second = _grow(second, n2, need)
         if 8 * deleted > len(first):
-            first = _grown(first, 0, 8 * deleted)
+            first = _grow(first, 0, 8 * deleted)
         for i in range(deleted):
             cell = removed[i]
             for k in range(8):
@@ -181,14 +181,14 @@ def thin(mask: U8) -> int:
 
 
 @native
-def _grown(array: I32, used: int, need: int) -> I32:
+def _grow(array: I32, used: int, need: int) -> I32:
     out = np.empty(max(need, 2 * len(array)), np.int32)
     out[:used] = array[:used]
     return out
 
 
 @native
-def listed(mask: U8, cells: I32, rows: I64) -> None:
+def list_cells(mask: U8, cells: I32, rows: I64) -> None:
     """The set cells as [n, 2] row and column, and where each row begins in that list ([height + 1])."""
     height, width = mask.shape
     n = 0
@@ -566,7 +566,7 @@ def compile_all() -> None:
     gaps(mask, gap)
     thinned = mask.copy()
     cells, rows = np.empty((thin(thinned), 2), np.int32), np.empty(len(mask) + 1, np.int64)
-    listed(thinned, cells, rows)
+    list_cells(thinned, cells, rows)
     graph = contract(trace(thinned, cells, rows), gap, cells, 1.0)
     _, begin, path = chains(graph, prune(graph, gap, cells, 1.0))
     simplify(mask, cells, begin, path, 1.0, np.zeros(len(path), np.uint8))

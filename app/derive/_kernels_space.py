@@ -22,7 +22,7 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
-FAR = 65535
+MAX_GAP = 65535
 """The largest gap that is told apart."""
 
 

@@ -135,7 +135,7 @@ def anchors(mask: U8, gap: U16, scale: float, rank: U16) -> int:
 
 
 @native
-def counted(mask: U8, rank: U16, out: I64) -> None:
+def count_ranks(mask: U8, rank: U16, out: I64) -> None:
     """How many cells of the mask there are of each rank ([65536])."""
     height, width = mask.shape
     for y in range(height):
@@ -145,7 +145,7 @@ def counted(mask: U8, rank: U16, out: I64) -> None:
 
 
 @native
-def sorted_band(mask: U8, rank: U16, low: int, high: int, place: I64, out: I32) -> None:
+def sort_band(mask: U8, rank: U16, low: int, high: int, place: I64, out: I32) -> None:
     """The cells of the mask with ranks from ``low`` to before ``high``, by rank, then row and column, as places in the
     flat mask. place: where the cells of each rank begin in ``out``, [high - low]; it is counted up."""
     height, width = mask.shape
@@ -214,8 +214,8 @@ def compile_all() -> None:
     farthest(free, gap)
     anchors(free, gap, 1.0, rank)
     counts = np.zeros(65536, np.int64)
-    counted(free, rank, counts)
+    count_ranks(free, rank, counts)
     order = np.empty(int(counts.sum()), np.int32)
-    sorted_band(free, rank, 0, 65536, np.cumsum(counts) - counts, order)
+    sort_band(free, rank, 0, 65536, np.cumsum(counts) - counts, order)
     thin(free, order, rank)
     finish(free, np.flatnonzero(free).astype(np.int32))

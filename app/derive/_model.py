@@ -15,12 +15,12 @@ def segments(ground: GroundImage, how: Segmentation, notes: DerivationNotes, nam
     gives [1, classes, h, w] tells pixels. Raises CannotConvert, NotFound or TooLarge, which say what to supply, and
     Invalid for parameters that belong to another family.
     """
-    supplied = _onnx.supplied(how.model or "")
+    supplied = _onnx.find_model(how.model or "")
     min_area = 1.0 if how.minimum_area is None else how.minimum_area
     if len(supplied.files) == 2:
-        model = _sam.model_of(supplied)
-        sure = _sam.SURE if how.confidence is None else how.confidence
-        stable = _sam.STABLE if how.stability is None else how.stability
+        model = _sam.check_model(supplied)
+        sure = _sam.MIN_SCORE if how.confidence is None else how.confidence
+        stable = _sam.MIN_STABILITY if how.stability is None else how.stability
         return _sam.segments(ground, model, sure, stable, how.points or _sam.POINTS, min_area, notes, name)
     problems = [
         Problem(f"belongs to models of the Segment-Anything family, and {how.model} is none", where=word)
@@ -29,16 +29,16 @@ def segments(ground: GroundImage, how: Segmentation, notes: DerivationNotes, nam
     ]
     if problems:
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
-    file = _onnx.loaded(supplied.files[0], supplied.name)
+    file = _onnx.load_session(supplied.files[0], supplied.name)
     ranks = [len(shape) for _, shape in file.outputs.values()]
     if ranks and ranks[0] == 4 and 3 not in ranks:
-        sure = _pixels.SURE if how.confidence is None else how.confidence
-        return _pixels.segments(ground, _pixels.model_of(supplied, file), sure, min_area, notes, name)
+        sure = _pixels.MIN_CONFIDENCE if how.confidence is None else how.confidence
+        return _pixels.segments(ground, _pixels.check_model(supplied, file), sure, min_area, notes, name)
     if 3 not in ranks:
         raise CannotConvert(
             f"the model {supplied.name} is of no family that is known: of one file [1, 3, h, w] -> boxes [1, values, "
             "n] (YOLO) or [1, classes, h, w] is expected, of Segment-Anything two files, "
             f"{supplied.name}.encoder.onnx and {supplied.name}.decoder.onnx; it is {file.signature()}"
         )
-    sure = _yolo.SURE if how.confidence is None else how.confidence
-    return _yolo.segments(ground, _yolo.model_of(supplied, file), sure, min_area, notes, name)
+    sure = _yolo.MIN_CONFIDENCE if how.confidence is None else how.confidence
+    return _yolo.segments(ground, _yolo.check_model(supplied, file), sure, min_area, notes, name)

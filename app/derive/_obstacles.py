@@ -18,11 +18,11 @@ from app.model.features import NO_GEOMETRY, Features, Properties
 from app.model.grid import OCCUPIED, UNKNOWN
 from app.model.layers import Layers
 from app.model.obstacles import UNKNOWN_RADIUS_METRES
-from app.model.osm_areas import areas_of, ground_around, incomplete_areas
+from app.model.osm_areas import ground_around, incomplete_areas, multipolygon_areas
 
 Array = NDArray[np.float64]
 
-SURROUNDINGS = 5.0
+DEFAULT_SURROUNDINGS_METRES = 5.0
 """Metres around the origin of a solid that cannot be read: ground of which nothing is known."""
 
 NO_AREA = "they have neither an area nor a size"
@@ -30,10 +30,10 @@ WITHOUT_FILES = "they say neither shapes nor a size: upload the files of their m
 POINTS = "they are points: say their size, or draw their outlines"
 INCOMPLETE = "their ways or nodes are missing, or their rings do not close: upload the whole area"
 
-MOST_TRIANGLES = 10_000_000
+MAX_TRIANGLES = 10_000_000
 """Of all solids of a site together: a mesh of some megabytes can stand in a world many thousand times."""
 
-IN_NO_WAY = "nothing in a robot's way"
+NOT_AN_OBSTACLE = "nothing in a robot's way"
 
 
 @dataclass(slots=True)
@@ -121,7 +121,7 @@ def sites(
     doors_closed: bool = False,
     visuals: bool = False,
     world: str | None = None,
-    surroundings: float = SURROUNDINGS,
+    surroundings: float = DEFAULT_SURROUNDINGS_METRES,
     unknown_radius: float = UNKNOWN_RADIUS_METRES,
 ) -> dict[str, LevelObstacles]:
     """The sites of all levels that have objects; of several worlds one (``app.model.worlds``).
@@ -137,7 +137,7 @@ def sites(
         raise Invalid("no world is stored", [Problem("no world is stored", where="world")])
     for key, part in parts.items():
         try:
-            one, others = worlds.chosen(part, world)
+            one, others = worlds.select_world(part, world)
         except NotFound as error:
             raise Invalid(error.detail, [Problem(error.detail, where="world")]) from error
         if others:
@@ -145,7 +145,7 @@ def sites(
         if len(one):
             reader.read(one, out.setdefault(key.level, LevelObstacles()), key.level)
     reader.report()
-    return {level: reader.finished(site, level) for level, site in out.items()}
+    return {level: reader.finish(site, level) for level, site in out.items()}
 
 
 def fences(layers: Layers, notes: DerivationNotes) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def fences(layers: Layers, notes: DerivationNotes) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for key, part in layers.vector("location").items():
         flat = np.isin(shapely.get_type_id(part.geometry), (3, 6)) & ~shapely.is_empty(part.geometry)
-        chosen = part.take(flat)
+        chosen = part.select(flat)
         if not len(chosen):
             continue
         try:
@@ -175,7 +175,7 @@ def unreadable_error(reasons: Iterable[str], summary: str) -> MissingLayer:
     return MissingLayer(detail, [Problem(reason) for reason in named[:100]])
 
 
-def fence_of(fences: Mapping[str, Any], level: str, ground: str) -> Any:
+def level_fence(fences: Mapping[str, Any], level: str, ground: str) -> Any:
     """A level's fence, else that of the ground; None where there is none."""
     return fences.get(level, fences.get(ground))
 
@@ -210,7 +210,7 @@ class _Reader:
         rows: list[int] = []
         for k, p in enumerate(part.properties):
             kind = str(p.get("kind") or "") or "without a kind"
-            role = obstacles.role_of(p, doors_closed=self.doors_closed)
+            role = obstacles.object_role(p, doors_closed=self.doors_closed)
             if role == "mark":
                 self.left[kind] += 1
             elif role == "solids":
@@ -221,10 +221,10 @@ class _Reader:
         if not rows:
             return
         try:
-            metres = part.take(rows).in_local(self.layers.frame)
+            metres = part.select(rows).in_local(self.layers.frame)
         except Invalid as error:  # too far from the datum
             raise CannotConvert(error.detail, error.problems) from error
-        old = areas_of(part, [k for k, geometry in zip(rows, metres, strict=True) if geometry.is_empty])
+        old = multipolygon_areas(part, [k for k, geometry in zip(rows, metres, strict=True) if geometry.is_empty])
         incomplete = incomplete_areas(part, rows)
         for k, stored in zip(rows, metres, strict=True):
             geometry = self._local(part, old[k]) if old.get(k) is not None else stored
@@ -243,13 +243,13 @@ class _Reader:
     def _outline(self, part: Features, k: int, geometry: Any, site: LevelObstacles, level: str) -> None:
         """An object by its geometry in metres: a body, or ground that is free."""
         p = part.properties[k]
-        role = obstacles.role_of(p, doors_closed=self.doors_closed)
+        role = obstacles.object_role(p, doors_closed=self.doors_closed)
         if role == "bodiless":
             self._around(part, k, geometry, WITHOUT_FILES, site)
             return
         is_ground = role == "ground"
         if is_ground:
-            ground = obstacles.ground_of(p, geometry)
+            ground = obstacles.object_ground(p, geometry)
             if ground is not None:
                 site.free.append(ground)
             if p.get("kind") != "lift":
@@ -257,7 +257,7 @@ class _Reader:
             if p.get("shapes"):
                 self._solids(part, k, site, level)
                 return
-        body = obstacles.body_of(p, geometry)
+        body = obstacles.object_body(p, geometry)
         if body is not None:
             site.footprints.append(body.area)
             site.base.append(body.base)
@@ -272,7 +272,7 @@ class _Reader:
         """The ground of an object of unknown extent. geometry: what there is of it, in metres."""
         p = part.properties[k]
         if p.get("kind") != "floor":  # a floor is free only where it is known
-            self._unknown(part, k, obstacles.surroundings_of(p, geometry, self.unknown_radius), reason, site)
+            self._unknown(part, k, obstacles.object_surroundings(p, geometry, self.unknown_radius), reason, site)
 
     def _unknown(self, part: Features, k: int, ground: Any, reason: str, site: LevelObstacles) -> None:
         if ground is None or ground.is_empty:
@@ -292,15 +292,15 @@ class _Reader:
         try:
             triangles, unreadable = self.known.read(p)
         except (Invalid, TooLarge) as error:
-            self._surround(_name(part, k), p, self._all_of(part, k), [error.detail], site)
+            self._mark_unknown_ground(_name(part, k), p, self._ground_around(part, k), [error.detail], site)
             return
         if unreadable:
             origins = shapely.MultiPoint([one.at for one in unreadable])
-            ground = obstacles.surroundings_of({**p, "pose": None}, origins, self.surroundings)
-            self._surround(_name(part, k), p, ground, [one.error.detail for one in unreadable], site)
+            ground = obstacles.object_surroundings({**p, "pose": None}, origins, self.surroundings)
+            self._mark_unknown_ground(_name(part, k), p, ground, [one.error.detail for one in unreadable], site)
         self.triangles += len(triangles)
-        if self.triangles > MOST_TRIANGLES:
-            raise CannotConvert(f"the solids of the objects have more than {MOST_TRIANGLES} triangles")
+        if self.triangles > MAX_TRIANGLES:
+            raise CannotConvert(f"the solids of the objects have more than {MAX_TRIANGLES} triangles")
         if unreadable and not len(triangles):
             return
         if len(triangles):
@@ -308,16 +308,18 @@ class _Reader:
         else:
             self.left["with planes or pictures only"] += 1
 
-    def _all_of(self, part: Features, k: int) -> Any:
+    def _ground_around(self, part: Features, k: int) -> Any:
         """The ground around an object whose solids cannot be placed."""
         try:
-            geometry = part.take([k]).in_local(self.layers.frame)[0]
+            geometry = part.select([k]).in_local(self.layers.frame)[0]
         except (Invalid, MissingDatum):
             geometry = NO_GEOMETRY
-        ground = obstacles.surroundings_of(part.properties[k], geometry, self.surroundings)
+        ground = obstacles.object_surroundings(part.properties[k], geometry, self.surroundings)
         return shapely.Point(0, 0).buffer(self.surroundings) if ground is None else ground
 
-    def _surround(self, name: str, p: Properties, ground: Any, reasons: Iterable[str], site: LevelObstacles) -> None:
+    def _mark_unknown_ground(
+        self, name: str, p: Properties, ground: Any, reasons: Iterable[str], site: LevelObstacles
+    ) -> None:
         """The ground around solids of unknown extent, and what of the object is seen or said to be there."""
         around = [ground]
         shapes = p.get("shapes")
@@ -332,7 +334,7 @@ class _Reader:
             if reason not in site.unreadable:
                 site.unreadable.append(reason)
 
-    def finished(self, site: LevelObstacles, level: str) -> LevelObstacles:  # noqa: ARG002
+    def finish(self, site: LevelObstacles, level: str) -> LevelObstacles:  # noqa: ARG002
         """The site with its solids' triangles."""
         pieces = self.found.get(id(site), [])
         if pieces:
@@ -343,7 +345,7 @@ class _Reader:
     def report(self) -> None:
         """What was left out, and why."""
         for kind, count in sorted(self.left.items()):
-            self.notes.drop(f"objects {kind}", count, IN_NO_WAY)
+            self.notes.drop(f"objects {kind}", count, NOT_AN_OBSTACLE)
         for kind, count in sorted(self.shapeless.items()):
             self.notes.drop(f"objects {kind}", count, WITHOUT_FILES)
         self.notes.drop("objects", self.bodiless, NO_AREA)

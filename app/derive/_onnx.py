@@ -26,7 +26,7 @@ from app.errors import CannotConvert, NotFound, TooLarge
 from app.model.names import did_you_mean
 
 FOLDER, LARGEST = "FLEETMAP_MODELS_DIR", "FLEETMAP_MODELS_MAX_BYTES"
-MOST_BYTES = 2 * 2**30
+MAX_MODEL_BYTES = 2 * 2**30
 INSTALL = 'models need onnxruntime, which is not installed: pip install "fleet-map-server[models]"'
 
 OVERLAP = 0.2
@@ -56,7 +56,7 @@ class ModelFiles:
     files: tuple[Path, ...]
 
     @property
-    def words(self) -> Path:
+    def classes_file(self) -> Path:
         """The file with its classes."""
         return self.files[0].with_name(f"{self.name}.json")
 
@@ -89,7 +89,7 @@ class LoadedModel:
         return f"({describe(self.inputs)}) → ({describe(self.outputs)})"[:600]
 
 
-def supplied(name: str) -> ModelFiles:
+def find_model(name: str) -> ModelFiles:
     """The operator's model of that name. CannotConvert or NotFound say what to supply, TooLarge what is too much."""
     folder = os.environ.get(FOLDER, "")
     if not folder:
@@ -97,12 +97,12 @@ def supplied(name: str) -> ModelFiles:
             f"there are no models: the operator sets {FOLDER} to a folder with {name[:100]}.onnx, or "
             f"{name[:100]}.encoder.onnx and {name[:100]}.decoder.onnx"
         )
-    models = _known(Path(folder))
+    models = _list_models(Path(folder))
     if not _NAME.fullmatch(name) or name not in models:
         near = did_you_mean(name, models)
         raise NotFound(f"there is no model {name[:100]!r}{near}; there are: {', '.join(models) or 'none'}")
     files = models[name]
-    max_bytes = int(os.environ.get(LARGEST) or MOST_BYTES)
+    max_bytes = int(os.environ.get(LARGEST) or MAX_MODEL_BYTES)
     stems = {file.stem for file in files}
     beside = (f for f in Path(folder).iterdir() if f.is_file() and any(f.name.startswith(stem) for stem in stems))
     if sum(f.stat().st_size for f in beside) > max_bytes:
@@ -112,7 +112,7 @@ def supplied(name: str) -> ModelFiles:
     return ModelFiles(name, files)
 
 
-def _known(folder: Path) -> dict[str, tuple[Path, ...]]:
+def _list_models(folder: Path) -> dict[str, tuple[Path, ...]]:
     """The models of a folder by name, sorted."""
     files = {f.stem: f for f in sorted(folder.glob("*.onnx"))}
     halves: dict[str, dict[str, Path]] = {}
@@ -124,7 +124,7 @@ def _known(folder: Path) -> dict[str, tuple[Path, ...]]:
     return dict(sorted({**{stem: (f,) for stem, f in files.items() if f not in taken}, **pairs}.items()))
 
 
-def loaded(file: Path, name: str) -> LoadedModel:
+def load_session(file: Path, name: str) -> LoadedModel:
     """A file's session on one thread, so that sums are made in one order: the same picture, the same map."""
     try:
         runtime = importlib.import_module("onnxruntime")
@@ -149,7 +149,7 @@ def classes(model: ModelFiles, session: Any) -> tuple[tuple[str | None, ...], Ma
     The file is a list of kinds, or a mapping with the list as ``classes``; without a file the names in the model's own
     metadata (as Ultralytics writes them) count.
     """
-    file, name = model.words, model.name
+    file, name = model.classes_file, model.name
     metadata: Any
     more: Mapping[str, Any] = {}
     try:
@@ -174,7 +174,7 @@ def classes(model: ModelFiles, session: Any) -> tuple[tuple[str | None, ...], Ma
     return kinds, more
 
 
-def one_picture(model: ModelFiles, file: LoadedModel, reason: str, usual: int) -> int:
+def input_side(model: ModelFiles, file: LoadedModel, reason: str, usual: int) -> int:
     """The side of the one picture [1, 3, h, w] that a model takes. told: of a model that takes something else, for the
     error. CannotConvert says what it should take."""
     (kind, shape), *more = file.inputs.values()

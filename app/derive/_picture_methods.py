@@ -5,39 +5,41 @@ from __future__ import annotations
 from dataclasses import fields
 
 from app.derive import DerivationNotes, _model, _plans
-from app.derive._pictures import GroundImage, infrared
-from app.derive._segments import OWN, Segmentation, Segments, segments
+from app.derive._pictures import GroundImage, infrared_band
+from app.derive._segments import METHOD_PARAMETERS, Segmentation, Segments, segments
 from app.errors import Invalid, Problem
 from app.model.geodesy import LocalFrame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import LOCAL, GeoImage, displayed
-from app.model.resampling import resampled
+from app.model.imagery import LOCAL, GeoImage, display_pixels
+from app.model.resampling import resample
 
 THUMB = 2**20
 """Pixels by which it is told whether a picture is a plan."""
 
 
-def method_of(picture: GeoImage, how: Segmentation) -> str:
+def choose_method(picture: GeoImage, how: Segmentation) -> str:
     """The method, found out where it is ``auto``. Invalid for parameters that belong to another one."""
     method: str = how.segmentation
     if method == "auto":
         step = max(1, round((picture.pixels.shape[0] * picture.pixels.shape[1] / THUMB) ** 0.5))
         few = GeoImage(picture.pixels[::step, ::step].copy(), picture.transform, picture.crs, picture.properties)
-        shown = displayed(few)
+        shown = display_pixels(few)
         bands = shown.shape[2]
         valid = shown[..., -1] >= 128 if bands in (2, 4) else shown[..., 0] >= 0
-        method = "plan" if _plans.looks_like(shown[..., : 1 if bands < 3 else 3], valid) else "colour"
+        method = "plan" if _plans.looks_like_plan(shown[..., : 1 if bands < 3 else 3], valid) else "colour"
         if how.near_infrared is not None:
             method = "index"
     changed = [f.name for f in fields(how) if getattr(how, f.name) != f.default]
-    wrong = [n for n in changed if method not in OWN.get(n, (method,))]
+    wrong = [n for n in changed if method not in METHOD_PARAMETERS.get(n, (method,))]
     if wrong:
-        problems = [Problem(f"belongs to segmentation={OWN[n][0]}, not to {method}", where=n) for n in wrong]
+        problems = [
+            Problem(f"belongs to segmentation={METHOD_PARAMETERS[n][0]}, not to {method}", where=n) for n in wrong
+        ]
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
     return method
 
 
-def seen(
+def segment_picture(
     on: GroundImage, picture: GeoImage, how: Segmentation, method: str, notes: DerivationNotes, name: str
 ) -> Segments:
     """A picture told apart."""
@@ -45,16 +47,16 @@ def seen(
         if not how.model:
             raise Invalid("model: name one", [Problem("segmentation=model needs the name of a model", where="model")])
         return _model.segments(on, how, notes, name)
-    nir = infrared(picture, how.near_infrared, name) if method == "index" else None
+    nir = infrared_band(picture, how.near_infrared, name) if method == "index" else None
     return segments(on, how, method, nir, notes, name)
 
 
-def plan_of(
+def plan_to_grid(
     picture: GeoImage, frame: LocalFrame | None, how: Segmentation, notes: DerivationNotes, name: str
 ) -> OccupancyGrid:
     """A plan as a grid."""
-    upright = picture if picture.crs == LOCAL else resampled(picture, frame, crs=LOCAL)
+    upright = picture if picture.crs == LOCAL else resample(picture, frame, crs=LOCAL)
     speck = 0.05 if how.minimum_area is None else how.minimum_area
-    return _plans.grid_of(
+    return _plans.plan_to_grid(
         upright, _plans.FloorPlanOptions(how.gap, speck, how.resolution, how.outside_free), notes, name
     )

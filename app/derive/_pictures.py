@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._select import named, one_each
+from app.derive._select import parts_with_name, select_per_level
 from app.errors import CannotConvert, Invalid
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
-from app.model.imagery import CLEAR, LOCAL, GeoImage, displayed
+from app.model.imagery import CLEAR, LOCAL, GeoImage, display_pixels
 from app.model.layers import Layers, PartKey
-from app.model.resampling import resampled
+from app.model.resampling import resample
 
 SATELLITE = "satellite"
 """The usual name of a picture."""
@@ -24,10 +24,10 @@ SATELLITE = "satellite"
 STEPS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """Metres a pixel that are taken unless asked otherwise: the first that is no finer than the picture."""
 
-EASY = 2**21
+DEFAULT_MAX_PIXELS = 2**21
 """Pixels up to which that is kept."""
 
-MOST = 2**25
+MAX_PIXELS = 2**25
 """Pixels that are looked at whatever was asked for."""
 
 OPAQUE = 128
@@ -40,13 +40,13 @@ INFRARED = ("nir", "near infrared", "near-infrared", "near_infrared", "infrared"
 class GroundImage:
     """A picture on a grid of the local frame, row 0 on top, north up.
 
-    rgb: uint8 [h, w, 3]. known: bool [h, w], where there is a picture. resolution: metres a pixel. left, top: metres of
+    rgb: uint8 [h, w, 3]. valid: bool [h, w], where there is a picture. resolution: metres a pixel. left, top: metres of
     the upper left corner. raw: the resampled bands. frame: the local frame (a passing one, where the environment has no
     datum). grey: whether the picture has no colours. on_earth: whether the picture is anchored there.
     """
 
     rgb: NDArray[np.uint8]
-    known: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     resolution: float
     left: float
     top: float
@@ -61,15 +61,15 @@ class GroundImage:
         return (self.resolution, 0.0, self.left, 0.0, -self.resolution, self.top)
 
 
-def chosen(layers: Layers, name: str | None) -> dict[PartKey, GeoImage]:
+def select_pictures(layers: Layers, name: str | None) -> dict[PartKey, GeoImage]:
     """One picture for each level: the named one, else ``satellite``, else the only one. NotFound, or Ambiguous."""
-    pictures = {key: part for key, part in layers.of("imagery").items() if isinstance(part, GeoImage)}
+    pictures = {key: part for key, part in layers.parts_of("imagery").items() if isinstance(part, GeoImage)}
     if name is not None:
-        return named(pictures, name, "picture")
-    return one_each(pictures, SATELLITE, "picture", "picture")
+        return parts_with_name(pictures, name, "picture")
+    return select_per_level(pictures, SATELLITE, "picture", "picture")
 
 
-def called(key: PartKey) -> str:
+def picture_label(key: PartKey) -> str:
     """What messages call a picture."""
     return f"the picture {key.name!r} of level {key.level!r}"
 
@@ -88,20 +88,22 @@ def ground(
     if resolution is None:
         resolution = next((step for step in STEPS if step >= size * 0.999), size)
         for step in STEPS:
-            if step >= resolution and _count(picture, size, step) <= EASY:
+            if step >= resolution and _count(picture, size, step) <= DEFAULT_MAX_PIXELS:
                 resolution = step
                 break
         if resolution > size * 2:
             notes.fill(
                 "resolution", resolution, f"{name} is looked at in pixels of this size; a finer one can be given"
             )
-    if _count(picture, size, resolution) > MOST:
-        raise CannotConvert(f"{name} would have more than {MOST} pixels of {resolution:g} m: give a coarser resolution")
+    if _count(picture, size, resolution) > MAX_PIXELS:
+        raise CannotConvert(
+            f"{name} would have more than {MAX_PIXELS} pixels of {resolution:g} m: give a coarser resolution"
+        )
     try:
-        seen = resampled(picture, frame, crs=LOCAL, resolution=resolution, most_pixels=2 * MOST)
+        seen = resample(picture, frame, crs=LOCAL, resolution=resolution, most_pixels=2 * MAX_PIXELS)
     except Invalid as error:
         raise CannotConvert(f"{name}: {error.detail}", error.problems) from error
-    shown = displayed(seen)
+    shown = display_pixels(seen)
     bands = shown.shape[2]
     valid = shown[..., -1] >= OPAQUE if bands in (2, 4) else np.ones(shown.shape[:2], bool)
     grey = bands < 3
@@ -112,7 +114,7 @@ def ground(
     return GroundImage(rgb, valid, seen.transform[0], left, top, seen.pixels, frame, grey, on_earth)
 
 
-def infrared(picture: GeoImage, number: int | None, name: str) -> int | None:
+def infrared_band(picture: GeoImage, number: int | None, name: str) -> int | None:
     """The place of the near-infrared band: the told one (counted from 1), else the one that says so."""
     count = picture.pixels.shape[2]
     if number is not None:

@@ -16,20 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._onnx import Array, LoadedModel, ModelFiles, classes, one_picture, starts
+from app.derive._onnx import Array, LoadedModel, ModelFiles, classes, input_side, starts
 from app.derive._pictures import GroundImage
-from app.derive._segments import Region, Segments, way
+from app.derive._segments import Region, Segments, way_attributes
 from app.errors import CannotConvert
 
 SIDE = 512
 """Pixels of a tile where a model takes any size."""
 
-SURE = 0.5
+MIN_CONFIDENCE = 0.5
 """Probability from which on a pixel is told, unless asked otherwise."""
 
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
-MOST = 100_000
+MAX_SEGMENTS = 100_000
 """Things in one picture: more is noise."""
 
 
@@ -45,13 +45,13 @@ class Model:
     deviation: Array
 
 
-def model_of(supplied: ModelFiles, file: LoadedModel) -> Model:
+def check_model(supplied: ModelFiles, file: LoadedModel) -> Model:
     """A loaded file as a model that tells pixels. CannotConvert says what it should take."""
-    side = one_picture(supplied, file, "tells no pixels", SIDE)
+    side = input_side(supplied, file, "tells no pixels", SIDE)
     kinds, metadata = classes(supplied, file.session)
     mean, deviation = (_three(metadata, word, usual, supplied) for word, usual in (("mean", MEAN), ("std", DEVIATION)))
     if (deviation <= 0).any():
-        raise CannotConvert(f"{supplied.words.name}: std must be above 0")
+        raise CannotConvert(f"{supplied.classes_file.name}: std must be above 0")
     return Model(file, supplied.name, kinds, side, mean, deviation)
 
 
@@ -61,7 +61,9 @@ def _three(metadata: Mapping[str, Any], word: str, usual: tuple[float, ...], sup
     except (TypeError, ValueError):
         values = np.empty(0, np.float32)
     if values.shape != (3,) or not np.isfinite(values).all():
-        raise CannotConvert(f"{supplied.words.name}: {word} must be three numbers, of red, green and blue from 0 to 1")
+        raise CannotConvert(
+            f"{supplied.classes_file.name}: {word} must be three numbers, of red, green and blue from 0 to 1"
+        )
     return values
 
 
@@ -71,7 +73,7 @@ def segments(
     """What a model tells of each pixel. least: square metres."""
     import cv2
 
-    height, width = ground.known.shape
+    height, width = ground.valid.shape
     labels = np.zeros(
         (height, width), np.uint8 if len(model.classes) < 255 else np.uint16
     )  # 0: nothing, k: class k - 1
@@ -84,7 +86,7 @@ def segments(
         inner = (slice(top, None), slice(left, None))
         at = (slice(row + top, row + best.shape[0]), slice(column + left, column + best.shape[1]))
         labels[at], chance[at] = best[inner] + 1, score[inner]
-    labels[(chance < sure) | ~ground.known] = 0
+    labels[(chance < sure) | ~ground.valid] = 0
     label = np.zeros((height, width), np.int32)
     regions: list[Region] = []
     other = small = 0
@@ -96,14 +98,16 @@ def segments(
         count, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
         large = stats[:, cv2.CC_STAT_AREA] * ground.resolution**2 >= max(min_area, ground.resolution**2)
         small += int(count - 1 - large[1:].sum())
-        if len(regions) + int(large[1:].sum()) > MOST:
-            raise CannotConvert(f"{name}: the model {model.name} tells more than {MOST} things: give minimum_area")
+        if len(regions) + int(large[1:].sum()) > MAX_SEGMENTS:
+            raise CannotConvert(
+                f"{name}: the model {model.name} tells more than {MAX_SEGMENTS} things: give minimum_area"
+            )
         for piece in (np.flatnonzero(large[1:]) + 1).tolist():
             x, y, w, h, area = (int(v) for v in stats[piece])
             at = (slice(y, y + h), slice(x, x + w))
             inside = pieces[at] == piece
             attributes = {"area": round(area * ground.resolution**2, 2), "model": model.name}
-            attributes |= way(kind, inside, ground.resolution)
+            attributes |= way_attributes(kind, inside, ground.resolution)
             mean = round(float(chance[at][inside].mean(dtype=np.float64)), 3)
             regions.append(Region(kind, min(mean, 1.0), attributes))  # type: ignore[arg-type]
             label[at][inside] = len(regions)

@@ -15,25 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._raster import RasterFrame, limited
+from app.derive._raster import RasterFrame, check_frame
 from app.errors import CannotConvert
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.imagery import GeoImage, displayed, placed
+from app.model.imagery import GeoImage, display_pixels, pixel_positions
 
 RESOLUTION = 0.05
 """Metres a cell unless asked otherwise or the picture is coarser."""
 
-MOST = 2**28
-LONGEST = 32767
+MAX_CELLS = 2**28
+MAX_SIDE_CELLS = 32767
 
-SAME = 24
+MIN_CONTRAST = 24
 """Levels of grey by which ink and paper must differ."""
 
 SHADE = 0.02
 """Share of the picture from which on an even shade between ink and paper is no room."""
 
-REACH = 1.0
+MAX_ROOM_DISTANCE_METRES = 1.0
 """Metres from a room beyond which ink is no wall but a title, a scale or a measure."""
 
 ROOM = 1.0
@@ -53,7 +53,7 @@ class FloorPlanOptions:
     outside_free: bool
 
 
-def looks_like(rgb: NDArray[np.uint8], valid: NDArray[np.bool_]) -> bool:
+def looks_like_plan(rgb: NDArray[np.uint8], valid: NDArray[np.bool_]) -> bool:
     """Whether a picture is ink on paper: hardly any colour, and one bright shade on much of it."""
     if not valid.any():
         return False
@@ -68,9 +68,9 @@ def looks_like(rgb: NDArray[np.uint8], valid: NDArray[np.bool_]) -> bool:
     return bool(around[180:].max() >= PAPER * len(grey)) and bool((grey < 128).any())
 
 
-def grey_of(picture: GeoImage) -> NDArray[np.uint8]:
+def to_grey(picture: GeoImage) -> NDArray[np.uint8]:
     """The picture in grey on white paper: uint8 [h, w]."""
-    shown = displayed(picture)
+    shown = display_pixels(picture)
     rgb = shown[..., :3] if shown.shape[2] >= 3 else shown[..., :1]
     grey = rgb[..., 0] if rgb.shape[2] == 1 else _luma(rgb)
     if shown.shape[2] in (2, 4):
@@ -85,18 +85,18 @@ def _luma(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def grid_of(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNotes, name: str) -> OccupancyGrid:
+def plan_to_grid(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNotes, name: str) -> OccupancyGrid:
     """A plan in the local frame as a grid: ink occupied, rooms free, else unknown. Its origin is a multiple of a cell.
 
     Raises CannotConvert for a picture without ink or without a closed room.
     """
     import cv2
 
-    grey = grey_of(picture)
+    grey = to_grey(picture)
     threshold, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     level = int(threshold)
     ink = grey <= level
-    if ink.all() or not ink.any() or int(grey[~ink].mean()) - int(grey[ink].mean()) < SAME:
+    if ink.all() or not ink.any() or int(grey[~ink].mean()) - int(grey[ink].mean()) < MIN_CONTRAST:
         raise CannotConvert(f"{name} is of one shade: there is no ink on paper in it. Ask with another segmentation")
     if ink.mean() > 0.5:
         raise CannotConvert(f"{name} is dark all over, and no plan on bright paper. Ask with another segmentation")
@@ -108,12 +108,14 @@ def grid_of(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNotes, na
     if not np.abs(corners).max() <= MAX_METRES:
         raise CannotConvert(f"{name} reaches beyond the local frame")
     low, high = corners.min(axis=0), corners.max(axis=0)
-    frame = limited(
-        RasterFrame.around((float(low[0]), float(low[1]), float(high[0]), float(high[1])), resolution), MOST, LONGEST
+    frame = check_frame(
+        RasterFrame.from_box((float(low[0]), float(low[1]), float(high[0]), float(high[1])), resolution),
+        MAX_CELLS,
+        MAX_SIDE_CELLS,
     )
     walls = _walls(ink, picture, frame, size)
-    paper, shaded = _looked_up(~unknown, picture, frame)
-    walls, specks = _without_specks(walls, how.speck / resolution**2)
+    paper, shaded = _sample_picture(~unknown, picture, frame)
+    walls, specks = _drop_specks(walls, how.speck / resolution**2)
     notes.drop("marks", specks, f"{name}: ink of less than {how.speck:g} m² is dirt or writing")
     has_unknown = bool(unknown.any())
     if has_unknown:
@@ -133,8 +135,8 @@ def grid_of(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNotes, na
     near = walls == 1
     if inside.any() and not has_unknown and not how.outside_free:
         away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-        far = near & (away > REACH / resolution)
-        notes.drop("cells of ink", int(far.sum()), f"{name}: more than {REACH:g} m from any room")
+        far = near & (away > MAX_ROOM_DISTANCE_METRES / resolution)
+        notes.drop("cells of ink", int(far.sum()), f"{name}: more than {MAX_ROOM_DISTANCE_METRES:g} m from any room")
         near &= ~far
     cells[near] = OCCUPIED
     return OccupancyGrid(cells, resolution, (*frame.origin, 0.0))
@@ -145,7 +147,7 @@ def _shades(grey: NDArray[np.uint8], level: int, notes: DerivationNotes, name: s
     counts = np.bincount(grey.ravel(), minlength=256)
     paper = int(np.argmax(counts[level + 1 :])) + level + 1
     brightest = int(np.flatnonzero(counts > 0.05 * grey.size)[-1]) if (counts > 0.05 * grey.size).any() else paper
-    shades = [k for k in range(level + 1, max(paper, brightest) - SAME) if counts[k] >= SHADE * grey.size]
+    shades = [k for k in range(level + 1, max(paper, brightest) - MIN_CONTRAST) if counts[k] >= SHADE * grey.size]
     if not shades:
         return np.zeros(grey.shape, bool)
     listing = ", ".join(map(str, shades))
@@ -164,15 +166,15 @@ def _walls(ink: NDArray[np.bool_], picture: GeoImage, frame: RasterFrame, size: 
         rows, columns = np.nonzero(ink)
         for k in range(0, len(rows), 2**20):
             u, v = (np.asarray(n[k : k + 2**20], np.float64) + 0.5 for n in (columns, rows))
-            at = placed(picture.transform, u, v)
-            x, y = np.floor(frame.of(at)).astype(np.int64).T
+            at = pixel_positions(picture.transform, u, v)
+            x, y = np.floor(frame.to_cells(at)).astype(np.int64).T
             walls[np.clip(y, 0, frame.height - 1), np.clip(x, 0, frame.width - 1)] = 1
-    _, mask = _looked_up(~ink, picture, frame)
+    _, mask = _sample_picture(~ink, picture, frame)
     walls[mask] = 1
     return walls
 
 
-def _looked_up(
+def _sample_picture(
     bright: NDArray[np.bool_], picture: GeoImage, frame: RasterFrame
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(cells whose middle is in the picture, those of them where it is not bright)."""
@@ -194,7 +196,7 @@ def _looked_up(
     return inside, dark
 
 
-def _without_specks(walls: NDArray[np.uint8], min_area: float) -> tuple[NDArray[np.uint8], int]:
+def _drop_specks(walls: NDArray[np.uint8], min_area: float) -> tuple[NDArray[np.uint8], int]:
     """Without pieces of ink that cover fewer cells than that, and how many they were."""
     import cv2
 

@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 Spans = NDArray[np.int64]
 """int64 [n, 4]: layer, row, first column, end column (exclusive)."""
 
-INWARDS = 1e-6
+INSET_METRES = 1e-6
 """Metres that surfaces are moved inwards; half of it, their ends."""
 
-AT_ONCE = 2**18
+BLOCK_SIZE = 2**18
 """Triangles, or edges times the rows that they cross, that are worked on at a time."""
 
 NONE: Spans = np.empty((0, 4), np.int64)
@@ -46,7 +46,7 @@ class RasterFrame:
     height: int
 
     @classmethod
-    def around(cls, box: tuple[float, float, float, float], resolution: float) -> RasterFrame:
+    def from_box(cls, box: tuple[float, float, float, float], resolution: float) -> RasterFrame:
         """The grid of whole cells around a box (min x, min y, max x, max y), its origin a multiple of a cell."""
         first = [math.floor(v / resolution + 1e-6) for v in box[:2]]
         end = [math.ceil(v / resolution - 1e-6) for v in box[2:]]
@@ -58,7 +58,7 @@ class RasterFrame:
         """How many cells it has."""
         return self.width * self.height
 
-    def of(self, xy: Array) -> Array:
+    def to_cells(self, xy: Array) -> Array:
         """Metres [..., 2] as cells."""
         return np.asarray((xy - np.array(self.origin)) / self.resolution, np.float64)
 
@@ -77,9 +77,9 @@ def surfaces(triangles: Array, frame: RasterFrame, slabs: Array) -> Iterator[Spa
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normal, axis=1)
     inner = np.divide(normal, length[:, None], out=np.zeros_like(normal), where=length[:, None] > 0)
-    moved = triangles - INWARDS * inner[:, None, :]
-    low, high = _shorter(moved[:, :, 2].min(axis=1), moved[:, :, 2].max(axis=1), INWARDS / 2)
-    xy = frame.of(moved[:, :, :2])
+    moved = triangles - INSET_METRES * inner[:, None, :]
+    low, high = _shorten(moved[:, :, 2].min(axis=1), moved[:, :, 2].max(axis=1), INSET_METRES / 2)
+    xy = frame.to_cells(moved[:, :, :2])
     aside = (xy.max(axis=1) < 0).any(axis=1) | (xy.min(axis=1) > [frame.width, frame.height]).any(axis=1)
     first = np.searchsorted(slabs[:, 1], low, side="left")
     end = np.searchsorted(slabs[:, 0], high, side="right")
@@ -89,10 +89,10 @@ def surfaces(triangles: Array, frame: RasterFrame, slabs: Array) -> Iterator[Spa
         owner = np.repeat(chosen, times)
         layer = np.repeat(first[chosen], times) + _within(times)
         corners = np.concatenate([xy[owner], moved[owner][:, :, 2:]], axis=2)
-        yield from _touched(*_clipped(corners, slabs[layer, 0], slabs[layer, 1]), layer, frame)
+        yield from _touched_cells(*_clip(corners, slabs[layer, 0], slabs[layer, 1]), layer, frame)
 
 
-def _clipped(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np.int64]]:
+def _clip(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np.int64]]:
     """Convex pieces of triangles [n, 3, 3] between two heights each: edges float64 [m, 2, 2] and whose they are.
 
     A piece is what its edges' projections enclose; where a triangle only touches, an edge may be a point.
@@ -126,7 +126,9 @@ def _clipped(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np
     return np.concatenate(parts), np.concatenate(owners)
 
 
-def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], frame: RasterFrame) -> Iterator[Spans]:
+def _touched_cells(
+    edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], frame: RasterFrame
+) -> Iterator[Spans]:
     """The cells that convex pieces touch, a span for each row: between the leftmost and the rightmost of what their
     edges (float64 [m, 2, 2], in cells) have in that row. layer: of each piece."""
     order = np.argsort(owner, kind="stable")
@@ -134,9 +136,9 @@ def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], f
     starts = np.flatnonzero(np.diff(owner, prepend=-1)) if len(owner) else np.empty(0, np.int64)
     if not len(starts):
         return
-    end = INWARDS / 2 / frame.resolution
+    end = INSET_METRES / 2 / frame.resolution
     y = edges[..., 1]
-    bottom, top = _shorter(np.minimum.reduceat(y.min(axis=1), starts), np.maximum.reduceat(y.max(axis=1), starts), end)
+    bottom, top = _shorten(np.minimum.reduceat(y.min(axis=1), starts), np.maximum.reduceat(y.max(axis=1), starts), end)
     size = np.diff(np.append(starts, len(owner)))
     low = np.maximum(np.floor(y.min(axis=1)), np.repeat(np.floor(bottom), size))
     high = np.minimum(np.floor(y.max(axis=1)), np.repeat(np.floor(top), size))
@@ -165,7 +167,7 @@ def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], f
         begin = np.flatnonzero(np.diff(key[order], prepend=-1))
         leftmost = np.minimum.reduceat(np.minimum(left, right)[order], begin)
         rightmost = np.maximum.reduceat(np.maximum(left, right)[order], begin)
-        leftmost, rightmost = _shorter(leftmost, rightmost, end)
+        leftmost, rightmost = _shorten(leftmost, rightmost, end)
         c0 = np.clip(np.floor(leftmost), 0, frame.width).astype(np.int64)
         c1 = np.clip(np.floor(rightmost) + 1, 0, frame.width).astype(np.int64)
         first = order[begin]
@@ -173,7 +175,7 @@ def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], f
         yield spans[c1 > c0]
 
 
-def _shorter(low: Array, high: Array, end: float) -> tuple[Array, Array]:
+def _shorten(low: Array, high: Array, end: float) -> tuple[Array, Array]:
     """Ranges without their ends; of short ones the middle is left."""
     less = np.minimum(end, (high - low) / 2)
     return low + less, high - less
@@ -205,7 +207,7 @@ def insides(triangles: Array, owner: NDArray[np.int64], frame: RasterFrame, heig
             a = triangles[index]
             ends, through = _crossings(a, heights[layer])
             group = of_solid[index] * len(heights) + layer
-            yield from _enclosed(frame.of(ends[through]), group[through], len(heights), frame)
+            yield from _enclosed_cells(frame.to_cells(ends[through]), group[through], len(heights), frame)
 
 
 def _crossings(corners: Array, height: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -223,7 +225,7 @@ def _crossings(corners: Array, height: Array) -> tuple[Array, NDArray[np.bool_]]
     return np.stack([at[n, up.argmax(axis=1)], at[n, down.argmax(axis=1)]], axis=1), through
 
 
-def _enclosed(edges: Array, group: NDArray[np.int64], layers: int, frame: RasterFrame) -> Iterator[Spans]:
+def _enclosed_cells(edges: Array, group: NDArray[np.int64], layers: int, frame: RasterFrame) -> Iterator[Spans]:
     """The cells whose middle lies inside closed directed edges (float64 [m, 2, 2], in cells), each group on its own;
     the layer is the group modulo ``layers``."""
     y0, y1 = edges[:, 0, 1], edges[:, 1, 1]
@@ -273,21 +275,21 @@ def areas(polygons: Iterable[object], frame: RasterFrame, *, touched: bool) -> I
     rings, owner = shapely.get_rings(shapely.orient_polygons(parts[flat]), return_index=True)
     edges, of_ring = _edges(rings)
     if len(edges):
-        yield from _enclosed(frame.of(edges), owner[of_ring], 1, frame)
+        yield from _enclosed_cells(frame.to_cells(edges), owner[of_ring], 1, frame)
     if touched and len(edges):
         step = edges[:, 1] - edges[:, 0]
         length = np.linalg.norm(step, axis=1)
         left = np.column_stack([-step[:, 1], step[:, 0]])
         left = np.divide(left, length[:, None], out=np.zeros_like(left), where=length[:, None] > 0)
-        yield from _in_one(lines(edges + INWARDS * left[:, None, :], frame))
+        yield from _merge_spans(lines(edges + INSET_METRES * left[:, None, :], frame))
     others = parts[~flat]
     straight, _ = _edges(others[np.isin(shapely.get_type_id(others), (1, 2))])
-    yield from _in_one(lines(straight, frame))
+    yield from _merge_spans(lines(straight, frame))
     at = shapely.get_coordinates(others[shapely.get_type_id(others) == 0])
-    yield from _in_one(lines(np.stack([at, at], axis=1), frame))
+    yield from _merge_spans(lines(np.stack([at, at], axis=1), frame))
 
 
-def _in_one(parts: Iterable[Spans]) -> Iterator[Spans]:
+def _merge_spans(parts: Iterable[Spans]) -> Iterator[Spans]:
     """The spans, all in the layer 0."""
     for spans in parts:
         spans[:, 0] = 0
@@ -297,10 +299,10 @@ def _in_one(parts: Iterable[Spans]) -> Iterator[Spans]:
 def lines(edges: Array, frame: RasterFrame) -> Iterator[Spans]:
     """The cells that straight lines (float64 [n, 2, 2], metres) touch; a line's number is the spans' layer."""
     if len(edges):
-        xy = frame.of(edges)
+        xy = frame.to_cells(edges)
         aside = (xy.max(axis=1) < 0).any(axis=1) | (xy.min(axis=1) > [frame.width, frame.height]).any(axis=1)
         indices = np.flatnonzero(~aside)
-        yield from _touched(xy[indices], np.arange(len(indices)), indices, frame)
+        yield from _touched_cells(xy[indices], np.arange(len(indices)), indices, frame)
 
 
 def _edges(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
@@ -335,14 +337,14 @@ def paint(cells: NDArray[np.uint8], spans: Iterable[Spans], value: int) -> None:
             cells[low_row:high_row, left:right][depth[:, :-1] > 0] = value
 
 
-def expanded(spans: Spans) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def expand_spans(spans: Spans) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """(layer, row, column) of every cell of the spans, with repeats."""
     times = spans[:, 3] - spans[:, 2]
     layer, row = np.repeat(spans[:, 0], times), np.repeat(spans[:, 1], times)
     return layer, row, np.repeat(spans[:, 2], times) + _within(times)
 
 
-def flooded(cells: NDArray[np.uint8], value: int, new: int) -> None:
+def flood(cells: NDArray[np.uint8], value: int, new: int) -> None:
     """Give a new value to all cells of a value that are joined to the border by their sides through such cells."""
     import cv2
 
@@ -355,7 +357,7 @@ def flooded(cells: NDArray[np.uint8], value: int, new: int) -> None:
                 cv2.floodFill(cells, None, (int(x), int(y)), new, flags=4)
 
 
-def grown(cells: NDArray[np.uint8], value: int, distance: float) -> None:
+def grow(cells: NDArray[np.uint8], value: int, distance: float) -> None:
     """Give a value to all cells whose middle is at most ``distance`` (in cells) from the middle of one that has it."""
     import cv2
 
@@ -374,7 +376,7 @@ def grown(cells: NDArray[np.uint8], value: int, distance: float) -> None:
             cells[low : low + rows][near] = value
 
 
-def limited(frame: RasterFrame, cap: int, longest: int) -> RasterFrame:
+def check_frame(frame: RasterFrame, cap: int, longest: int) -> RasterFrame:
     """The frame; CannotConvert where it has more cells than ``cap`` or a side longer than ``longest`` cells."""
     if frame.cells > cap or max(frame.width, frame.height) > longest:
         side = max(frame.width, frame.height) * frame.resolution
@@ -395,7 +397,7 @@ def _portions(load: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
     """Consecutive indexes whose loads together are about AT_ONCE; none that has no load at the ends of the list."""
     if not len(load) or not int(load.sum()):
         return
-    bucket = (np.cumsum(load) - load) // AT_ONCE
+    bucket = (np.cumsum(load) - load) // BLOCK_SIZE
     cuts = np.flatnonzero(np.diff(bucket)) + 1
     for part in np.split(np.arange(len(load)), cuts):
         if int(load[part].sum()):

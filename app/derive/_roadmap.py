@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive._skeleton import FreeSpace, Graph, clear_only, lengths, only, pieces, tidy
+from app.derive._skeleton import FreeSpace, Graph, drop_blocked, lengths, pieces, subgraph, tidy
 
-NEAR = 16
+MAX_LINKS = 16
 """To how many nodes of the skeleton a sample may be joined."""
 
 
@@ -24,18 +24,18 @@ def roadmap(
     from scipy.spatial import cKDTree
 
     random = np.random.default_rng(seed)
-    middle = _along(skeleton, free_space, samples // 2, random)
-    cells = np.unique(np.concatenate([middle, _anywhere(free_space, samples - len(middle), random)]), axis=0)
+    middle = _sample_along(skeleton, free_space, samples // 2, random)
+    cells = np.unique(np.concatenate([middle, _sample_cells(free_space, samples - len(middle), random)]), axis=0)
     n = len(cells)
     _, near = cKDTree(cells).query(cells, k=min(neighbours + 1, n), distance_upper_bound=max_edge)
     near = near.reshape(n, -1)
     a, b = np.repeat(np.arange(n), near.shape[1]), near.ravel()
     pairs = np.stack([a, b], axis=1)[(b < n) & (a != b)]
-    edges = clear_only(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64), cells, free_space)
-    return _joined(Graph(cells, edges), skeleton, free_space)
+    edges = drop_blocked(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64), cells, free_space)
+    return _join_pieces(Graph(cells, edges), skeleton, free_space)
 
 
-def _along(skeleton: Graph, free_space: FreeSpace, count: int, random: np.random.Generator) -> NDArray[np.int64]:
+def _sample_along(skeleton: Graph, free_space: FreeSpace, count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Cells on the skeleton's edges, evenly by length."""
     if not len(skeleton.edges):
         return np.empty((0, 2), np.int64)
@@ -46,7 +46,7 @@ def _along(skeleton: Graph, free_space: FreeSpace, count: int, random: np.random
     return np.asarray(cells[free_space.mask[cells[:, 0], cells[:, 1]] == 1])
 
 
-def _anywhere(free_space: FreeSpace, count: int, random: np.random.Generator) -> NDArray[np.int64]:
+def _sample_cells(free_space: FreeSpace, count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Different cells of the space, evenly."""
     before = np.concatenate([[0], np.cumsum(free_space.mask.sum(axis=1, dtype=np.int64))])
     chosen = np.sort(random.choice(int(before[-1]), size=min(count, int(before[-1])), replace=False))
@@ -59,7 +59,7 @@ def _anywhere(free_space: FreeSpace, count: int, random: np.random.Generator) ->
     return out
 
 
-def _joined(graph: Graph, skeleton: Graph, free_space: FreeSpace) -> tuple[Graph, int]:
+def _join_pieces(graph: Graph, skeleton: Graph, free_space: FreeSpace) -> tuple[Graph, int]:
     """The roadmap with what of the skeleton is needed to join its pieces, without what nothing can join."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
@@ -67,10 +67,10 @@ def _joined(graph: Graph, skeleton: Graph, free_space: FreeSpace) -> tuple[Graph
 
     n, more = len(graph.nodes), len(skeleton.nodes)
     nodes = np.concatenate([graph.nodes, skeleton.nodes])
-    k = min(NEAR, more)
+    k = min(MAX_LINKS, more)
     _, near = cKDTree(skeleton.nodes).query(graph.nodes, k=k)
     pairs = np.stack([np.repeat(np.arange(n), k), near.reshape(-1) + n], axis=1).astype(np.int64)
-    fallback_edges = np.concatenate([clear_only(pairs, nodes, free_space), skeleton.edges + n])
+    fallback_edges = np.concatenate([drop_blocked(pairs, nodes, free_space), skeleton.edges + n])
     links = np.concatenate([graph.edges, fallback_edges])
     # A tree that prefers the roadmap's own edges, then short ways; a weight of 0 would mean no edge to scipy.
     weight = np.concatenate([np.full(len(graph.edges), 1e-6), np.maximum(lengths(nodes, fallback_edges), 0.0) + 1e-3])
@@ -93,5 +93,5 @@ def _joined(graph: Graph, skeleton: Graph, free_space: FreeSpace) -> tuple[Graph
     connected = np.zeros(count, bool)
     connected[piece[n:]] = True
     remaining &= connected[piece]
-    full = only(full, remaining)
+    full = subgraph(full, remaining)
     return tidy(full.nodes, full.edges), n - int(remaining[:n].sum())

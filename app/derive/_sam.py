@@ -31,37 +31,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._onnx import Array, LoadedModel, ModelFiles, loaded, square, starts
+from app.derive._onnx import Array, LoadedModel, ModelFiles, load_session, square, starts
 from app.derive._pictures import GroundImage
 from app.derive._segments import ColourRules, Region, Segments
 from app.errors import CannotConvert
 
-USUAL = 1024
+DEFAULT_SIDE = 1024
 """Pixels of a tile where the files do not say."""
 
-SURE, STABLE, POINTS = 0.88, 0.95, 16
+MIN_SCORE, MIN_STABILITY, POINTS = 0.88, 0.95, 16
 """Defaults: least predicted IoU and least stability of segment_anything, and points along a tile (there 32)."""
 
 OFFSET = 1.0
 """By which the threshold is moved either way to see whether a mask is stable."""
 
-SAME = 0.7
+MIN_DUPLICATE_OVERLAP = 0.7
 """Intersection over union of boxes from which on two masks are one thing."""
 
 EDGE = 20 / 1024
 """Share of a tile's side: a mask that comes as near to an edge goes on beyond it."""
 
-AT_ONCE = 16
+PROMPTS_PER_CALL = 16
 """Prompts that are asked together where the decoder takes several."""
 
-MOST_TILES, MOST_PROMPTS = 256, 2**15
+MAX_TILES, MAX_PROMPTS = 256, 2**15
 
 MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 DEVIATION = np.array([58.395, 57.12, 57.375], np.float32)
 """ImageNet's, of values 0 to 255."""
 
 PROMPT = ("point_coords", "point_labels", "mask_input", "has_mask_input")
-EXPECTED = (
+EXPECTED_MODEL = (
     "an encoder with one picture [1, 3, side, side] or [height, width, 3] as its input, and a decoder with the inputs "
     "image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size and the outputs masks, "
     "iou_predictions, low_res_masks (segment-anything's scripts/export_onnx_model.py), or SAM 2's with image_embed and "
@@ -103,14 +103,14 @@ class Mask:
         return np.unpackbits(self.bits, count=(y1 - y0) * (x1 - x0)).astype(bool).reshape(y1 - y0, x1 - x0)
 
 
-def model_of(supplied: ModelFiles) -> Model:
+def check_model(supplied: ModelFiles) -> Model:
     """The two files as a model. CannotConvert says which inputs and outputs are expected."""
     name = supplied.name
-    encoder, decoder = (loaded(file, f"{name} ({file.name})") for file in supplied.files)
+    encoder, decoder = (load_session(file, f"{name} ({file.name})") for file in supplied.files)
 
     def wrong(file: LoadedModel) -> CannotConvert:
         return CannotConvert(
-            f"the model {name} is not of the Segment-Anything family: expected are {EXPECTED}; {file.name} is "
+            f"the model {name} is not of the Segment-Anything family: expected are {EXPECTED_MODEL}; {file.name} is "
             f"{file.signature()}"
         )
 
@@ -130,7 +130,7 @@ def model_of(supplied: ModelFiles) -> Model:
     else:
         raise wrong(encoder)
     low = [4 * n if isinstance(n, int) else n for n in decoder.inputs["mask_input"][1][2:]]
-    side = square(low if upright else shape[2:], name, square(low, name, USUAL))
+    side = square(low if upright else shape[2:], name, square(low, name, DEFAULT_SIDE))
     together = not isinstance((decoder.inputs["point_coords"][1] or [1])[0], int)
     return Model(encoder, decoder, name, passed, side, upright, len(wants) > 1, together)
 
@@ -154,26 +154,26 @@ def segments(
     Raises CannotConvert before work starts where the model would have to be asked too often, and where it finds
     nothing.
     """
-    height, width = ground.known.shape
+    height, width = ground.valid.shape
     tiles = list(_tiles(height, width, model.side))
-    prompts = [_grid(tile, points, ground.known) for tile in tiles]
+    prompts = [_grid(tile, points, ground.valid) for tile in tiles]
     prompt_count = sum(len(p) for p in prompts)
-    if len(tiles) > MOST_TILES or prompt_count > MOST_PROMPTS:
+    if len(tiles) > MAX_TILES or prompt_count > MAX_PROMPTS:
         raise CannotConvert(
             f"{name}: the model {model.name} would be asked {prompt_count} times in {len(tiles)} tiles of {model.side} "
-            f"pixels, at most {MOST_PROMPTS} in {MOST_TILES} are done: give a coarser resolution than "
+            f"pixels, at most {MAX_PROMPTS} in {MAX_TILES} are done: give a coarser resolution than "
             f"{ground.resolution:g} m, or fewer points than {points}"
         )
     masks: list[Mask] = []
     for tile, places in zip(tiles, prompts, strict=True):
         if len(places):
-            masks += _without_twice(_seen(ground, tile, places, model, sure, stable))
-    best_masks = _without_twice(masks)
+            masks += _drop_duplicates(_tile_masks(ground, tile, places, model, sure, stable))
+    best_masks = _drop_duplicates(masks)
     if not best_masks:
         raise CannotConvert(
             f"{name}: the model {model.name} finds nothing of a confidence of {sure:g} and a stability of {stable:g}"
         )
-    return _told(ground, best_masks, model, min_area, notes, name)
+    return _masks_to_segments(ground, best_masks, model, min_area, notes, name)
 
 
 def _tiles(height: int, width: int, side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -196,7 +196,7 @@ def _grid(tile: tuple[int, int, int, int], points: int, valid: NDArray[np.bool_]
     return at[mask].astype(np.float32)
 
 
-def _seen(
+def _tile_masks(
     ground: GroundImage, tile: tuple[int, int, int, int], places: Array, model: Model, sure: float, stable: float
 ) -> list[Mask]:
     """The good masks of one tile."""
@@ -209,25 +209,25 @@ def _seen(
     high, wide = max(1, high), max(1, wide)
     shrinks = high < rows or wide < columns
     image = cv2.resize(part, (wide, high), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    feed = _encoded(image.astype(np.float32), model)
+    feed = _encode_image(image.astype(np.float32), model)
     at = places * np.array([wide / columns, high / rows], np.float32)
     out: list[Mask] = []
-    count = AT_ONCE if model.together else 1
+    count = PROMPTS_PER_CALL if model.together else 1
     for k in range(0, len(at), count):
-        logits, scores = _asked(at[k : k + count], feed, (rows, columns), (high, wide), model)
+        logits, scores = _prompt_masks(at[k : k + count], feed, (rows, columns), (high, wide), model)
         for one, score in zip(logits[scores >= sure], scores[scores >= sure].tolist(), strict=True):
             steady = _stability(one)
             if steady < stable:
                 continue
             full = cv2.resize(one, (columns, rows), interpolation=cv2.INTER_LINEAR) > 0.0
-            full &= ground.known[row : row + rows, column : column + columns]
-            mask = _mask(full, tile, ground.known.shape, score, steady)
+            full &= ground.valid[row : row + rows, column : column + columns]
+            mask = _mask(full, tile, ground.valid.shape, score, steady)
             if mask is not None:
                 out.append(mask)
     return out
 
 
-def _encoded(image: Array, model: Model) -> dict[str, Array]:
+def _encode_image(image: Array, model: Model) -> dict[str, Array]:
     """What the encoder says of a picture [h, w, 3] of values 0 to 255, by the decoder's names."""
     if not model.upright:
         padded = np.zeros((model.side, model.side, 3), np.float32)
@@ -237,7 +237,7 @@ def _encoded(image: Array, model: Model) -> dict[str, Array]:
     return {theirs: answer[ours] for ours, theirs in model.passed.items()}
 
 
-def _asked(
+def _prompt_masks(
     at: Array, feed: Mapping[str, Array], size: tuple[int, int], inner: tuple[int, int], model: Model
 ) -> tuple[Array, Array]:
     """(logits [m, h, w] of the tile alone, predicted IoU [m]) at each of the points, one mask after the other."""
@@ -299,7 +299,7 @@ def _mask(
     return Mask(box, np.packbits(inside), int(inside.sum()), float(score), stability, rows * columns)
 
 
-def _without_twice(masks: list[Mask]) -> list[Mask]:
+def _drop_duplicates(masks: list[Mask]) -> list[Mask]:
     """Non-maximum suppression by boxes: what is seen in a finer tile goes first, then the surest."""
     import cv2
 
@@ -308,21 +308,21 @@ def _without_twice(masks: list[Mask]) -> list[Mask]:
     masks = sorted(masks, key=lambda m: (m.tile, -m.score, -m.stability, m.box))
     boxes = [(m.box[0], m.box[1], m.box[2] - m.box[0], m.box[3] - m.box[1]) for m in masks]
     rank = np.linspace(1.0, 0.5, len(masks)).tolist()
-    indices = cv2.dnn.NMSBoxes(boxes, rank, 0.0, SAME)
+    indices = cv2.dnn.NMSBoxes(boxes, rank, 0.0, MIN_DUPLICATE_OVERLAP)
     return [masks[k] for k in sorted(int(i) for i in np.asarray(indices).ravel())]
 
 
-def _told(
+def _masks_to_segments(
     ground: GroundImage, masks: list[Mask], model: Model, min_area: float, notes: DerivationNotes, name: str
 ) -> Segments:
     """The masks as regions, by their colours and shapes."""
-    label = np.zeros(ground.known.shape, np.int32)
+    label = np.zeros(ground.valid.shape, np.int32)
     pixels = max(min_area / ground.resolution**2, 1.0)
     masks.sort(key=lambda m: (-m.size, m.score, m.box))
-    clean = [(mask, cleaned) for mask in masks if (cleaned := _cleaned(mask.pixels(), pixels)) is not None]
+    clean = [(mask, cleaned) for mask in masks if (cleaned := _clean_mask(mask.pixels(), pixels)) is not None]
     for k, (mask, cleaned) in enumerate(clean, 1):
         x0, y0, x1, y1 = mask.box
-        label[y0:y1, x0:x1][cleaned & ground.known[y0:y1, x0:x1]] = k
+        label[y0:y1, x0:x1][cleaned & ground.valid[y0:y1, x0:x1]] = k
     seen = np.bincount(label.ravel(), minlength=len(clean) + 1)
     colours = ColourRules(ground, min_area)
     regions: list[Region] = []
@@ -334,14 +334,14 @@ def _told(
         x0, y0, x1, y1 = mask.box
         at = (slice(y0, y1), slice(x0, x1))
         region_mask = label[at] == k
-        rest = _without_small(region_mask, pixels)  # what others leave of it
+        rest = _drop_small(region_mask, pixels)  # what others leave of it
         label[at][region_mask & ~rest] = 0
         if not rest.any():
             continue
         region = colours.kind(rest, at)
         unsure += region.kind == "area"
         region.confidence = round(min(1.0, max(0.05, region.confidence * min(mask.score, 1.0))), 3)
-        region.said |= {"model": model.name, "stability": round(mask.stability, 3)}
+        region.attributes |= {"model": model.name, "stability": round(mask.stability, 3)}
         regions.append(region)
         numbers[k] = len(regions)
     if not regions:
@@ -358,14 +358,14 @@ def _told(
     return Segments(numbers[label], regions, np.zeros(label.shape, bool))
 
 
-def _cleaned(mask: NDArray[np.bool_], min_pixels: float) -> NDArray[np.bool_] | None:
+def _clean_mask(mask: NDArray[np.bool_], min_pixels: float) -> NDArray[np.bool_] | None:
     """A mask without pieces and holes that are too small; None where nothing is left."""
-    filled = ~_without_small(np.pad(~mask, 1, constant_values=True), min_pixels)[1:-1, 1:-1]
-    inside = _without_small(filled, min_pixels)
+    filled = ~_drop_small(np.pad(~mask, 1, constant_values=True), min_pixels)[1:-1, 1:-1]
+    inside = _drop_small(filled, min_pixels)
     return inside if inside.any() else None
 
 
-def _without_small(mask: NDArray[np.bool_], min_pixels: float) -> NDArray[np.bool_]:
+def _drop_small(mask: NDArray[np.bool_], min_pixels: float) -> NDArray[np.bool_]:
     """A mask without its connected pieces of fewer pixels."""
     import cv2
 

@@ -124,7 +124,7 @@ class Segmentation:
     outside_free: bool = parameter(False, "plan: whether what no wall encloses is free, too, and not unknown")
 
 
-OWN = {
+METHOD_PARAMETERS = {
     "model": ("model",),
     "confidence": ("model",),
     "points": ("model",),
@@ -140,11 +140,12 @@ OWN = {
 
 @dataclass(slots=True)
 class Region:
-    """One thing. confidence: 0 to 1, how well its shape and shade fit its kind. said: what else is known of it."""
+    """One thing. confidence: 0 to 1, how well its shape and shade fit its kind. attributes: what else is known of
+    it."""
 
     kind: Kind
     confidence: float
-    said: dict[str, Any] = field(default_factory=dict)
+    attributes: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -179,35 +180,35 @@ def segments(
     min_area = 1.0 if how.minimum_area is None else how.minimum_area
     work = _RegionBuilder(ground, min_area)
     if method == "index":
-        grows = _by_index(ground, nir, notes, name)
+        grows = _vegetation_by_index(ground, nir, notes, name)
         work.vegetation(grows)
-        rest = ground.known & ~grows
+        rest = ground.valid & ~grows
         work.small(notes, name)
         return Segments(work.label, work.regions, rest | work.open_)
     smooth = cv2.bilateralFilter(ground.rgb, 5, 25.0, 2.0)
     lab = cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
-    group, centres = _groups(np.asarray(lab, np.float32), ground.known, how.clusters, how.cluster_seed)
+    group, centres = _groups(np.asarray(lab, np.float32), ground.valid, how.clusters, how.cluster_seed)
     if len(centres) < 2:
         raise CannotConvert(f"{name} is of one colour: there is nothing to be told apart")
-    of = group[ground.known]
-    sums = np.stack([np.bincount(of, smooth[..., k][ground.known], len(centres)) for k in range(3)], axis=1)
+    of = group[ground.valid]
+    sums = np.stack([np.bincount(of, smooth[..., k][ground.valid], len(centres)) for k in range(3)], axis=1)
     means = sums / np.maximum(np.bincount(of, minlength=len(centres)), 1)[:, None]
     green = (2 * means[:, 1] - means[:, 0] - means[:, 2]) / np.maximum(means.sum(axis=1), 1.0) > GREEN
     dark = ~green & (centres[:, 0] < SHADOW)
-    grows = ground.known & green[group]
+    grows = ground.valid & green[group]
     work.vegetation(grows)
     for k in np.flatnonzero(~green & ~dark).tolist():
-        work.sealed(ground.known & (group == k))
-    shadow = ground.known & dark[group]
+        work.add_sealed(ground.valid & (group == k))
+    shadow = ground.valid & dark[group]
     area = ground.resolution**2
     notes.drop("m² of shadow", round(float(shadow.sum()) * area), f"{name}: too dark to tell what it is")
     work.small(notes, name)
-    left = (work.label == 0) & ground.known & ~shadow & ~work.open_
+    left = (work.label == 0) & ground.valid & ~shadow & ~work.open_
     notes.drop("m² of ground", round(float(left.sum()) * area), f"{name}: of no shape or colour that is known")
     return Segments(work.label, work.regions, work.open_)
 
 
-def _by_index(ground: GroundImage, nir: int | None, notes: DerivationNotes, name: str) -> NDArray[np.bool_]:
+def _vegetation_by_index(ground: GroundImage, nir: int | None, notes: DerivationNotes, name: str) -> NDArray[np.bool_]:
     """Where vegetation is."""
     import cv2
 
@@ -222,8 +223,8 @@ def _by_index(ground: GroundImage, nir: int | None, notes: DerivationNotes, name
             index = np.divide(infrared - red, total, out=np.zeros(total.shape), where=total > 0)
         index = np.clip(np.nan_to_num(index, nan=0.0), -1.0, 1.0).astype(np.float32)
         minimum = NDVI
-    index = cv2.GaussianBlur(np.where(ground.known, index, np.float32(0)).astype(np.float32), (3, 3), 0)
-    values = index[ground.known]
+    index = cv2.GaussianBlur(np.where(ground.valid, index, np.float32(0)).astype(np.float32), (3, 3), 0)
+    values = index[ground.valid]
     low, high = float(values.min()), float(values.max())
     if high < minimum:
         raise CannotConvert(f"{name}: nothing in it grows, by its vegetation index of at most {high:.2f}")
@@ -234,7 +235,7 @@ def _by_index(ground: GroundImage, nir: int | None, notes: DerivationNotes, name
         threshold = max(minimum, low + (cut + 0.5) / 255 * (high - low))
     word = "excess green" if nir is None else "NDVI"
     notes.fill("threshold", round(threshold, 4), f"{name}: what has a higher {word} is vegetation")
-    return np.asarray(ground.known & (index > threshold))
+    return np.asarray(ground.valid & (index > threshold))
 
 
 def _red(ground: GroundImage) -> NDArray[np.float64]:
@@ -272,14 +273,14 @@ class _RegionBuilder:
         import cv2
 
         self.size = ground.resolution
-        self.least = max(min_area / self.size**2, 1.0)
-        self.height, self.width = (int(n) for n in ground.known.shape)
-        self.label = np.zeros(ground.known.shape, np.int32)
+        self.minimum_area = max(min_area / self.size**2, 1.0)
+        self.height, self.width = (int(n) for n in ground.valid.shape)
+        self.label = np.zeros(ground.valid.shape, np.int32)
         self.regions: list[Region] = []
         self.lightness = cv2.cvtColor(ground.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[..., 0]
         self.few = 0
-        self.known = ground.known
-        self.open_ = np.zeros(ground.known.shape, bool)
+        self.known = ground.valid
+        self.open_ = np.zeros(ground.valid.shape, bool)
 
     def pixels(self, metres: float) -> int:
         """A length as an odd number of pixels, at least 3."""
@@ -287,7 +288,7 @@ class _RegionBuilder:
 
     def small(self, notes: DerivationNotes, name: str) -> None:
         """Say what was left out for its size."""
-        min_area = self.least * self.size**2
+        min_area = self.minimum_area * self.size**2
         notes.drop("spots", self.few, f"{name}: smaller than minimum_area={min_area:g} m²")
 
     def add(self, mask: NDArray[np.bool_], at: tuple[slice, slice], region: Region) -> None:
@@ -304,7 +305,7 @@ class _RegionBuilder:
         out = []
         for k in range(1, count):
             x, y, w, h, area = (int(v) for v in stats[k])
-            if area < self.least:
+            if area < self.minimum_area:
                 self.few += 1
                 continue
             at = (slice(y, y + h), slice(x, x + w))
@@ -365,7 +366,7 @@ class _RegionBuilder:
             size = int(crown.sum())
             round_ = _roundness(crown)
             across = 2 * math.sqrt(size / math.pi) * self.size
-            if size >= self.least and round_ >= ROUND and CROWNS[0] <= across <= CROWNS[1]:
+            if size >= self.minimum_area and round_ >= ROUND and CROWNS[0] <= across <= CROWNS[1]:
                 attributes = {"area": self.metres(size), "width": round(across, 2)}
                 self.add(crown, _inner(at, inner), Region("tree", _fit(round_), attributes))
             else:
@@ -375,7 +376,7 @@ class _RegionBuilder:
             self.add(part, _inner(at, inner), Region("vegetation", 0.6, {"area": self.metres(size)}))
 
     # --- what does not ------------------------------------------------------------------------------------------------
-    def sealed(self, mask: NDArray[np.bool_]) -> None:
+    def add_sealed(self, mask: NDArray[np.bool_]) -> None:
         """Ground and roofs of one group of colours."""
         import cv2
 
@@ -384,11 +385,11 @@ class _RegionBuilder:
         clean = cv2.morphologyEx(clean, cv2.MORPH_CLOSE, kernel, iterations=2)
         clean[(self.label > 0) | ~self.known] = 0
         for piece, at, area in self.pieces(clean):
-            self._by_shape(piece, at, area)
+            self._add_by_shape(piece, at, area)
 
-    def _by_shape(self, piece: NDArray[np.bool_], at: tuple[slice, slice], area: int) -> None:
+    def _add_by_shape(self, piece: NDArray[np.bool_], at: tuple[slice, slice], area: int) -> None:
         ends = at[0].start == 0 or at[1].start == 0 or at[0].stop == self.height or at[1].stop == self.width
-        region = _shaped(piece, self.lightness[at], area, self.least, self.size, ends)
+        region = _classify_shape(piece, self.lightness[at], area, self.minimum_area, self.size, ends)
         if region is not None:
             self.add(piece, at, region)
 
@@ -402,7 +403,7 @@ class ColourRules:
 
         self.size, self.grey = ground.resolution, ground.grey
         self.least = max(min_area / self.size**2, 1.0)
-        self.shape = ground.known.shape
+        self.shape = ground.valid.shape
         smooth = cv2.bilateralFilter(ground.rgb, 5, 25.0, 2.0).astype(np.float32)
         self.green = (2 * smooth[..., 1] - smooth[..., 0] - smooth[..., 2]) > GREEN * np.maximum(
             smooth.sum(axis=2), 1.0
@@ -427,7 +428,7 @@ class ColourRules:
         if grows <= MIXED:
             ends = any(s.start == 0 or s.stop == n for s, n in zip(at, self.shape, strict=True))
             return (
-                None if light < SHADOW else _shaped(mask, self.light[at], size, self.least, self.size, ends)
+                None if light < SHADOW else _classify_shape(mask, self.light[at], size, self.least, self.size, ends)
             ) or unsure
         inner = cv2.erode(np.pad(mask, 1).astype(np.uint8), np.ones((self.box, self.box), np.uint8))[1:-1, 1:-1] == 1
         if light >= DARK and not (inner.any() and self.rough[at][inner].mean() > 0.5):
@@ -439,7 +440,7 @@ class ColourRules:
         return Region("vegetation", _fit(0.6 * grows), {"area": area})
 
 
-def way(kind: str, mask: NDArray[np.bool_], size: float) -> dict[str, Any]:
+def way_attributes(kind: str, mask: NDArray[np.bool_], size: float) -> dict[str, Any]:
     """What a path or road of this shape says more than other kinds: its mean width. size: metres a pixel."""
     if kind not in ("path", "road"):
         return {}
@@ -461,7 +462,7 @@ def _band(piece: NDArray[np.bool_], area: int, min_pixels: float) -> tuple[float
     return length, area / length, max(outlines, key=cv2.contourArea)
 
 
-def _shaped(
+def _classify_shape(
     piece: NDArray[np.bool_], light: NDArray[Any], area: int, min_pixels: float, size: float, ends: bool
 ) -> Region | None:
     """What a piece of ground or roof is by its shape. light: lightness of its window; area and least: pixels; size:

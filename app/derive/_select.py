@@ -12,7 +12,7 @@ from app.model.names import did_you_mean
 P = TypeVar("P")
 
 
-def named(parts: Mapping[PartKey, P], name: str, label: str) -> dict[PartKey, P]:
+def parts_with_name(parts: Mapping[PartKey, P], name: str, label: str) -> dict[PartKey, P]:
     """The parts of this name. what: what errors call one. Raises NotFound with the names that there are."""
     matches = {key: part for key, part in parts.items() if key.name == name}
     if not matches:
@@ -22,7 +22,7 @@ def named(parts: Mapping[PartKey, P], name: str, label: str) -> dict[PartKey, P]
     return matches
 
 
-def one_each(parts: Mapping[PartKey, P], usual: str, label: str, option: str) -> dict[PartKey, P]:
+def select_per_level(parts: Mapping[PartKey, P], usual: str, label: str, option: str) -> dict[PartKey, P]:
     """For each level the part of the usual name, else the only one. Ambiguous says which option names one."""
     out: dict[PartKey, P] = {}
     for level in dict.fromkeys(key.level for key in parts):

@@ -6,33 +6,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._select import named, one_each
+from app.derive._select import parts_with_name, select_per_level
 from app.errors import MissingLayer
 from app.model import masks
-from app.model.grid import OccupancyGrid, as_seen, unknown_grey
+from app.model.grid import OccupancyGrid, unknown_grey, unknown_grey_as_unknown
 from app.model.layers import MAP, Layers, PartKey
 
 
-def chosen(layers: Layers, name: str | None, label: str) -> dict[PartKey, OccupancyGrid]:
+def select_grids(layers: Layers, name: str | None, label: str) -> dict[PartKey, OccupancyGrid]:
     """One grid for each level: the named one, else ``map``, else the only one that is no costmap filter mask.
 
     label: what masks do not tell, for the error. Raises NotFound, MissingLayer where there are masks alone, Ambiguous.
     """
     grids = layers.grids()
     if name is not None:
-        return named(grids, name, "occupancy grid")
+        return parts_with_name(grids, name, "occupancy grid")
     maps = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
     if not maps:
         raise MissingLayer(f"costmap filter masks alone tell no {label}: upload an occupancy grid of what stands there")
-    return one_each(maps, MAP, "occupancy grid", "grid")
+    return select_per_level(maps, MAP, "occupancy grid", "grid")
 
 
-def seen(grid: OccupancyGrid, name: str, notes: DerivationNotes) -> OccupancyGrid:
+def as_planned(grid: OccupancyGrid, name: str, notes: DerivationNotes) -> OccupancyGrid:
     """The grid with free cells of unknown's grey as unknown, and a warning where there are such cells."""
     grey = unknown_grey(grid)
     if grey is not None:
         notes.warn(grey_warning(grid, grey, name, "they are taken as unknown"))
-    return as_seen(grid)
+    return unknown_grey_as_unknown(grid)
 
 
 def grey_warning(grid: OccupancyGrid, grey: NDArray[np.bool_], name: str, effect: str) -> str:
@@ -44,6 +44,6 @@ def grey_warning(grid: OccupancyGrid, grey: NDArray[np.bool_], name: str, effect
     )
 
 
-def called(key: PartKey) -> str:
+def grid_label(key: PartKey) -> str:
     """What errors call a grid."""
     return f"the occupancy grid {key.name!r} of level {key.level!r}"

@@ -91,7 +91,7 @@ def skeleton(
     thinned = free_space.mask.copy()
     cells = np.empty((ridges(thinned, free_space.gap) if voronoi else kernels.thin(thinned), 2), np.int32)
     rows = np.empty(len(thinned) + 1, np.int64)
-    kernels.listed(thinned, cells, rows)
+    kernels.list_cells(thinned, cells, rows)
     raw = kernels.trace(thinned, cells, rows)
     del thinned
     merged = kernels.contract(raw, free_space.gap, cells, merge)
@@ -106,7 +106,7 @@ def skeleton(
     edges = np.sort(np.searchsorted(used, pairs), axis=1)
     edges = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0)
     graph = Graph(cells[used].astype(np.int64), edges.astype(np.int64))
-    return without_islands(graph, free_space, island)
+    return drop_islands(graph, free_space, island)
 
 
 BAND = 2**25
@@ -124,13 +124,13 @@ def ridges(mask: NDArray[np.uint8], gap: NDArray[np.uint16]) -> int:
     # In 16 bits a distance is exact to 1/65535 of the largest; below 181 cells no two different ones are the same.
     largest = np.sqrt(np.float32(kernels.farthest(mask, gap)))
     kernels.anchors(mask, gap, 65535.0 / max(float(largest), 1.0), rank)
-    for order in _by_rank(mask, rank, BAND):
+    for order in _cells_by_rank(mask, rank, BAND):
         kernels.thin(mask, order, rank)
-    left = np.concatenate([*_by_rank(mask, rank, BAND), np.empty(0, np.int32)])
+    left = np.concatenate([*_cells_by_rank(mask, rank, BAND), np.empty(0, np.int32)])
     return int(kernels.finish(mask, left))
 
 
-def _by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], limit: int) -> Iterator[NDArray[np.int32]]:
+def _cells_by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], limit: int) -> Iterator[NDArray[np.int32]]:
     """The set cells as places in the flat mask, sorted by rank, then place; about ``limit`` at a time.
 
     Those of higher ranks may not change meanwhile.
@@ -138,7 +138,7 @@ def _by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], limit: int) -> I
     from app.derive import _kernels_voronoi as kernels
 
     counts = np.zeros(2**16, np.int64)
-    kernels.counted(mask, rank, counts)
+    kernels.count_ranks(mask, rank, counts)
     low = 0
     while low < len(counts):
         fit = int(np.searchsorted(np.cumsum(counts[low:]), limit, side="right"))
@@ -146,12 +146,12 @@ def _by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], limit: int) -> I
         band_counts = counts[low:high]
         if band_counts.any():
             order = np.empty(int(band_counts.sum()), np.int32)
-            kernels.sorted_band(mask, rank, low, high, np.cumsum(band_counts) - band_counts, order)
+            kernels.sort_band(mask, rank, low, high, np.cumsum(band_counts) - band_counts, order)
             yield order
         low = high
 
 
-def without_islands(graph: Graph, free_space: FreeSpace, island: float) -> tuple[Graph, int]:
+def drop_islands(graph: Graph, free_space: FreeSpace, island: float) -> tuple[Graph, int]:
     """The graph without pieces that are less than ``island`` cells across, but always with the largest one.
 
     And how many such pieces there were.
@@ -171,7 +171,7 @@ def without_islands(graph: Graph, free_space: FreeSpace, island: float) -> tuple
     across = np.hypot(*(high - low).T) + 2.0 * widest
     stays = across >= island
     stays[int(np.argmax(across))] = True
-    return only(graph, stays[piece]), int(count - stays.sum())
+    return subgraph(graph, stays[piece]), int(count - stays.sum())
 
 
 def pieces(graph: Graph) -> tuple[int, NDArray[np.int64]]:
@@ -188,13 +188,13 @@ def pieces(graph: Graph) -> tuple[int, NDArray[np.int64]]:
     return int(count), piece.astype(np.int64)
 
 
-def only(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
+def subgraph(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
     """Some nodes (whole pieces) with their edges."""
     place = np.cumsum(mask) - 1
     return Graph(graph.nodes[mask], place[graph.edges[mask[graph.edges[:, 0]]]])
 
 
-def filled(
+def add_open_edges(
     graph: Graph, free_space: FreeSpace, *, spacing: float, detour: float, phase: tuple[float, float] = (0.0, 0.0)
 ) -> Graph:
     """The graph with nodes ``spacing`` cells apart also in the open, and the straight ways that save a detour.
@@ -205,12 +205,12 @@ def filled(
     """
     from app.derive import _kernels_roadmap as kernels
 
-    graph = divided(graph, free_space, spacing)
+    graph = divide_edges(graph, free_space, spacing)
     node_count = len(graph.nodes)
     nodes = np.concatenate([graph.nodes, _lattice(graph, free_space, spacing, phase)])
-    pairs = _triangulated(nodes)
+    pairs = _triangulate(nodes)
     pairs = pairs[lengths(nodes, pairs) <= 4.0 * spacing]
-    pairs = clear_only(pairs, nodes, free_space)
+    pairs = drop_blocked(pairs, nodes, free_space)
     straight = lengths(nodes, pairs)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], straight))
     pairs, straight = pairs[order], straight[order]
@@ -221,11 +221,11 @@ def filled(
     count, piece = pieces(full)
     connected = np.zeros(count, bool)
     connected[piece[:node_count]] = True
-    full = only(full, connected[piece])
+    full = subgraph(full, connected[piece])
     return tidy(full.nodes, full.edges)
 
 
-def clear_only(pairs: NDArray[np.int64], nodes: NDArray[np.int64], free_space: FreeSpace) -> NDArray[np.int64]:
+def drop_blocked(pairs: NDArray[np.int64], nodes: NDArray[np.int64], free_space: FreeSpace) -> NDArray[np.int64]:
     """The pairs whose straight line is collision-free."""
     from app.derive import _kernels_space as kernels
 
@@ -247,7 +247,7 @@ def lengths(nodes: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.fl
     return np.asarray(np.hypot(*(nodes[pairs[:, 0]] - nodes[pairs[:, 1]]).T))
 
 
-def divided(graph: Graph, free_space: FreeSpace, spacing: float) -> Graph:
+def divide_edges(graph: Graph, free_space: FreeSpace, spacing: float) -> Graph:
     """Nodes also along the edges, at most ``spacing`` apart where the cells allow."""
     if not len(graph.edges):
         return graph
@@ -286,7 +286,7 @@ def _lattice(graph: Graph, free_space: FreeSpace, spacing: float, phase: tuple[f
     return np.asarray(cells[np.isinf(away)])
 
 
-def _triangulated(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+def _triangulate(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     """The edges of a Delaunay triangulation; none where all nodes are on one line."""
     from scipy.spatial import Delaunay, QhullError
 

@@ -14,22 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._onnx import Array, LoadedModel, ModelFiles, classes, one_picture, starts
+from app.derive._onnx import Array, LoadedModel, ModelFiles, classes, input_side, starts
 from app.derive._pictures import GroundImage
-from app.derive._segments import Region, Segments, way
+from app.derive._segments import Region, Segments, way_attributes
 from app.errors import CannotConvert
 
 SIDE = 640
 """Pixels of a tile where a model takes any size."""
 
-SAME = 0.5
+MIN_DUPLICATE_OVERLAP = 0.5
 """Intersection over union from which on two boxes of one class are one thing."""
 
-SURE = 0.25
+MIN_CONFIDENCE = 0.25
 """Confidence from which on a box counts, unless asked otherwise."""
 
 PAD = 114 / 255
-MOST = 20_000
+MAX_DETECTIONS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +52,9 @@ class Model:
     side: int
 
 
-def model_of(supplied: ModelFiles, file: LoadedModel) -> Model:
+def check_model(supplied: ModelFiles, file: LoadedModel) -> Model:
     """A loaded file as a model of the family. CannotConvert says what it should take."""
-    side = one_picture(supplied, file, "is not of the YOLO family", SIDE)
+    side = input_side(supplied, file, "is not of the YOLO family", SIDE)
     return Model(file, supplied.name, classes(supplied, file.session)[0], side)
 
 
@@ -66,10 +66,10 @@ def segments(
     for column in starts(ground.rgb.shape[1], model.side):
         for row in starts(ground.rgb.shape[0], model.side):
             detections += _tile(ground.rgb, row, column, model, confidence)
-    remaining = _without_twice(detections)
+    remaining = _drop_duplicates(detections)
     if not remaining:
         raise CannotConvert(f"{name}: the model {model.name} finds nothing of a confidence of {confidence:g}")
-    label = np.zeros(ground.known.shape, np.int32)
+    label = np.zeros(ground.valid.shape, np.int32)
     regions: list[Region] = []
     other = small = 0
     height, width = len(label), len(label[0])
@@ -82,12 +82,12 @@ def segments(
         x1, y1 = min(width, int(np.ceil(one.box[2]))), min(height, int(np.ceil(one.box[3])))
         window = label[y0:y1, x0:x1]
         mask = np.ones(window.shape, bool) if one.mask is None else one.mask[: window.shape[0], : window.shape[1]]
-        mask = mask & (window == 0) & ground.known[y0:y1, x0:x1]
+        mask = mask & (window == 0) & ground.valid[y0:y1, x0:x1]
         area = int(mask.sum()) * ground.resolution**2
         if area <= 0 or area < min_area:
             small += 1
             continue
-        attributes = {"area": round(area, 2), "model": model.name, **way(kind, mask, ground.resolution)}
+        attributes = {"area": round(area, 2), "model": model.name, **way_attributes(kind, mask, ground.resolution)}
         regions.append(Region(kind, round(one.score, 3), attributes))  # type: ignore[arg-type]
         window[mask] = len(regions)
     notes.drop("things", other, f"{name}: of classes that the model's operator gave no kind")
@@ -105,10 +105,10 @@ def _tile(rgb: NDArray[np.uint8], row: int, column: int, model: Model, confidenc
     answer = list(model.file.run(feed).values())
     rows = next((a[0] for a in answer if a.ndim == 3 and a.shape[0] == 1), None)
     masks = next((a[0] for a in answer if a.ndim == 4 and a.shape[0] == 1), None)
-    boxes, scores, kinds, weights = _decoded(rows, 0 if masks is None else len(masks), model)
+    boxes, scores, kinds, weights = _decode_rows(rows, 0 if masks is None else len(masks), model)
     sure = np.flatnonzero(scores >= confidence)
     out = []
-    for k in sure[np.argsort(-scores[sure], kind="stable")][:MOST].tolist():
+    for k in sure[np.argsort(-scores[sure], kind="stable")][:MAX_DETECTIONS].tolist():
         x, y, w, h = (float(v) for v in boxes[k])
         x0, y0, x1, y1 = (min(max(v, 0.0), float(side)) for v in (x - w / 2, y - h / 2, x + w / 2, y + h / 2))
         x1, y1 = min(x1, float(part.shape[1])), min(y1, float(part.shape[0]))
@@ -120,7 +120,7 @@ def _tile(rgb: NDArray[np.uint8], row: int, column: int, model: Model, confidenc
     return out
 
 
-def _decoded(rows: Array | None, coefficients: int, model: Model) -> tuple[Array, Array, NDArray[np.int64], Array]:
+def _decode_rows(rows: Array | None, coefficients: int, model: Model) -> tuple[Array, Array, NDArray[np.int64], Array]:
     """(boxes [n, 4], scores [n], classes [n], mask coefficients [n, m]) of a model's first output."""
     count = len(model.classes)
     plain, older = 4 + count + coefficients, 5 + count + coefficients
@@ -151,14 +151,14 @@ def _mask(weights: Array, prototypes: Array, side: int, box: tuple[float, float,
     return np.asarray(full[y0:y1, x0:x1] > 0.0)  # the sigmoid is above a half where its argument is above 0
 
 
-def _without_twice(detections: list[Detection]) -> list[Detection]:
+def _drop_duplicates(detections: list[Detection]) -> list[Detection]:
     """Non-maximum suppression over all tiles, class by class; the surest first."""
     import cv2
 
     if not detections:
         return []
-    detections = sorted(detections, key=lambda f: (-f.score, f.box))[:MOST]
+    detections = sorted(detections, key=lambda f: (-f.score, f.box))[:MAX_DETECTIONS]
     boxes = [(f.box[0], f.box[1], f.box[2] - f.box[0], f.box[3] - f.box[1]) for f in detections]
     kinds = [f.kind for f in detections]
-    indices = cv2.dnn.NMSBoxesBatched(boxes, [f.score for f in detections], kinds, 0.0, SAME)
+    indices = cv2.dnn.NMSBoxesBatched(boxes, [f.score for f in detections], kinds, 0.0, MIN_DUPLICATE_OVERLAP)
     return [detections[k] for k in sorted(int(i) for i in np.asarray(indices).ravel())]

@@ -10,8 +10,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._picture_methods import method_of, plan_of, seen
-from app.derive._pictures import GroundImage, called, chosen, ground
+from app.derive._picture_methods import choose_method, plan_to_grid, segment_picture
+from app.derive._pictures import GroundImage, ground, picture_label, select_pictures
 from app.derive._segments import Segmentation, Segments
 from app.errors import CannotConvert
 from app.model.features import features
@@ -43,15 +43,15 @@ def imagery_to_objects(layers: Layers, parameters: Parameters, notes: Derivation
     CannotConvert where nothing can be told.
     """
     parts: dict[PartKey, Part] = {}
-    for key, picture in chosen(layers, parameters.picture).items():
-        name = called(key)
-        method = method_of(picture, parameters)
+    for key, picture in select_pictures(layers, parameters.picture).items():
+        name = picture_label(key)
+        method = choose_method(picture, parameters)
         if method == "plan":
-            grid = plan_of(picture, layers.frame, parameters, notes, name)
+            grid = plan_to_grid(picture, layers.frame, parameters, notes, name)
             on, rows = None, _plan(grid, parameters)
         else:
             on = ground(picture, layers.frame, parameters.resolution, notes, name)
-            rows = _regions(seen(on, picture, parameters, method, notes, name), on, parameters)
+            rows = _regions(segment_picture(on, picture, parameters, method, notes, name), on, parameters)
         if not rows:
             raise CannotConvert(f"{name} shows nothing that can be told: try other clusters, or another segmentation")
         if on is not None and on.on_earth and on.frame is not None:
@@ -71,7 +71,7 @@ def _regions(segments: Segments, on: GroundImage, parameters: Parameters) -> lis
     rows: list[Row] = []
     for k, region in enumerate(segments.regions, 1):
         if k in shapes:
-            properties = {"kind": region.kind, "confidence": region.confidence, **region.said}
+            properties = {"kind": region.kind, "confidence": region.confidence, **region.attributes}
             rows.append((f"{region.kind}/{k}", shapes[k], properties))
     rows += _middles(segments, on)
     return rows
@@ -106,7 +106,7 @@ def _middles(segments: Segments, on: GroundImage) -> list[Row]:
         return []
     mask = np.pad(np.isin(segments.label, path_labels), 1).astype(np.uint8)
     free_space = _skeleton.space(mask, -1, -1, 0.0)
-    widths = [float(segments.regions[k - 1].said["width"]) for k in path_labels]
+    widths = [float(segments.regions[k - 1].attributes["width"]) for k in path_labels]
     usual = float(np.median(widths)) / on.resolution
     graph, _ = _skeleton.skeleton(free_space, merge=max(2.0, usual / 2), spur=usual, tolerance=1.0, island=0.0)
     if not len(graph.edges):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.derive import DerivationNotes, derives
-from app.derive._picture_methods import method_of, plan_of, seen
-from app.derive._pictures import called, chosen, ground
+from app.derive._picture_methods import choose_method, plan_to_grid, segment_picture
+from app.derive._pictures import ground, picture_label, select_pictures
 from app.derive._segments import Segmentation
 from app.errors import CannotConvert, MissingDatum
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -32,16 +32,16 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
     MissingDatum where it lies on earth and there is no datum.
     """
     parts: dict[PartKey, Part] = {}
-    for key, picture in chosen(layers, parameters.picture).items():
-        name = called(key)
+    for key, picture in select_pictures(layers, parameters.picture).items():
+        name = picture_label(key)
         if picture.crs != LOCAL and layers.frame is None:
             raise MissingDatum('a grid lies in local metres: PATCH the environment with {"datum": {…}}')
-        method = method_of(picture, parameters)
+        method = choose_method(picture, parameters)
         if method == "plan":
-            grid = plan_of(picture, layers.frame, parameters, notes, name)
+            grid = plan_to_grid(picture, layers.frame, parameters, notes, name)
         else:
             on = ground(picture, layers.frame, parameters.resolution, notes, name)
-            segments = seen(on, picture, parameters, method, notes, name)
+            segments = segment_picture(on, picture, parameters, method, notes, name)
             cells = np.full(segments.label.shape, UNKNOWN, np.uint8)
             cells[segments.open_] = FREE
             values = np.array([UNKNOWN, *(_value(r.kind) for r in segments.regions)], np.uint8)

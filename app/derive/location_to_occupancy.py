@@ -8,7 +8,7 @@ import shapely
 
 from app.derive import DerivationNotes, derives
 from app.derive._obstacles import fences, sites, unreadable_error
-from app.derive.objects_to_occupancy import blank, cell_size, framed
+from app.derive.objects_to_occupancy import cell_size, empty_cells, grid_frame
 from app.errors import MissingLayer
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
@@ -44,8 +44,8 @@ def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivat
         raise unreadable_error(unreadable, "a blank grid would call ground free that is not known")
     parts: dict[PartKey, Part] = {}
     for level, fence in fences(layers, notes).items():
-        frame = framed(shapely.bounds(fence).tolist(), parameters.resolution, notes)
-        cells = blank(frame, fence, [])
+        frame = grid_frame(shapely.bounds(fence).tolist(), parameters.resolution, notes)
+        cells = empty_cells(frame, fence, [])
         if level in obstacles:
             obstacles[level].draw_unknown(cells, frame)
         parts[PartKey("occupancy", level, MAP)] = OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))

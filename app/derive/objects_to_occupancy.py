@@ -10,7 +10,15 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, _raster, derives
-from app.derive._obstacles import IN_NO_WAY, SURROUNDINGS, LevelObstacles, fence_of, fences, sites, unreadable_error
+from app.derive._obstacles import (
+    DEFAULT_SURROUNDINGS_METRES,
+    NOT_AN_OBSTACLE,
+    LevelObstacles,
+    fences,
+    level_fence,
+    sites,
+    unreadable_error,
+)
 from app.derive._raster import RasterFrame
 from app.errors import Invalid, MissingLayer, Problem
 from app.model.frame import GROUND
@@ -25,7 +33,7 @@ ENCLOSE = (
 )
 """What to do where no ground is known to be free."""
 
-COVERED = (
+ALL_COVERED = (
     "all of it is occupied or near objects of unknown extent; upload the files of their models, or ask with a smaller "
     "unknown_radius"
 )
@@ -37,16 +45,16 @@ HEIGHT = 0.2
 RESOLUTION = 0.05
 """Metres a cell unless asked otherwise."""
 
-COARSER = (RESOLUTION, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+RESOLUTIONS = (RESOLUTION, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 """What is taken where a finer one would give a grid that no robot loads."""
 
-EASY = 2**25
+DEFAULT_MAX_CELLS = 2**25
 """Cells up to which the usual resolution is kept."""
 
-MOST = 2**29
+MAX_CELLS = 2**29
 """Cells of a grid whatever was asked for: a byte each, and twice that while it is made."""
 
-LONGEST = 32767
+MAX_SIDE_CELLS = 32767
 """Cells along a side: beyond it Nav2's map_server refuses the map."""
 
 
@@ -83,7 +91,7 @@ class Parameters:
         False, "whether ground that neither floor, fence nor closed walls surround is free, too, and not unknown"
     )
     surroundings: float = parameter(
-        SURROUNDINGS,
+        DEFAULT_SURROUNDINGS_METRES,
         "radius of unknown ground around a solid that cannot be read (a mesh that was not uploaded)",
         minimum=0.0,
         maximum=1000.0,
@@ -139,7 +147,7 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
     parts: dict[PartKey, Part] = {}
     reach: list[tuple[float, float]] = []
     for level, site in obstacles.items():
-        fence = fence_of(around, level, GROUND)
+        fence = level_fence(around, level, GROUND)
         grid = _grid(site, fence, (low, high), parameters, level, notes)
         if grid is not None:
             parts[PartKey("occupancy", level, MAP)] = grid
@@ -153,7 +161,9 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
         unreadable = [reason for site in obstacles.values() for reason in site.unreadable]
         if unreadable:
             raise unreadable_error(unreadable, f"nothing that can be read stands in a robot's way {band}{extra}")
-        extra += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped if d["why"] != IN_NO_WAY)
+        extra += "".join(
+            f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped if d["why"] != NOT_AN_OBSTACLE
+        )
         raise MissingLayer(
             f"no stored object stands in a robot's way {band}{extra}: ask for another height or band, or upload walls, "
             "buildings, barriers, trees or a world with solids"
@@ -185,41 +195,43 @@ def _grid(
         box = (box[0] - pad, box[1] - pad, box[2] + pad, box[3] + pad)
     elif section.count and not shapely.box(*(section.bounds() or box)).intersects(fence):
         notes.warn(f"all obstacles of the level {level} lie outside the fence", where=level)
-    frame = framed(box, parameters.resolution, notes)
-    cells = blank(frame, fence, site.free)
+    frame = grid_frame(box, parameters.resolution, notes)
+    cells = empty_cells(frame, fence, site.free)
     section.draw(cells, frame, low, high)
     if fence is None and not site.free and not parameters.outside_free:
-        _raster.flooded(cells, FREE, UNKNOWN)
+        _raster.flood(cells, FREE, UNKNOWN)
         why = "neither floors nor a fence say how far the site reaches"
         notes.fill("ground that no walls enclose", "unknown", why, "outside_free")
     enclosed = bool((cells == FREE).any())
     section.draw_unknown(cells, frame)
-    _raster.grown(cells, OCCUPIED, parameters.inflate / frame.resolution)
+    _raster.grow(cells, OCCUPIED, parameters.inflate / frame.resolution)
     if not (cells == FREE).any():
         if site.unreadable:
             raise unreadable_error(site.unreadable, f"no free ground of the level {level} is known")
-        todo = COVERED if enclosed and section.unknown else ENCLOSE
+        todo = ALL_COVERED if enclosed and section.unknown else ENCLOSE
         notes.warn(f"no cell of the level {level} is free: {todo}", where=level)
     return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
 
 
-def framed(box: tuple[float, ...], resolution: float | None, notes: DerivationNotes) -> RasterFrame:
+def grid_frame(box: tuple[float, ...], resolution: float | None, notes: DerivationNotes) -> RasterFrame:
     """The grid around a box (min x, min y, max x, max y in metres). CannotConvert where it would be too large."""
     low_x, low_y, high_x, high_y = box[:4]
     if resolution is not None:
-        return _raster.limited(RasterFrame.around((low_x, low_y, high_x, high_y), resolution), MOST, LONGEST)
-    frame = RasterFrame.around((low_x, low_y, high_x, high_y), COARSER[0])
-    for coarser in COARSER:
-        frame = RasterFrame.around((low_x, low_y, high_x, high_y), coarser)
-        if frame.cells <= EASY and max(frame.width, frame.height) <= LONGEST:
+        return _raster.check_frame(
+            RasterFrame.from_box((low_x, low_y, high_x, high_y), resolution), MAX_CELLS, MAX_SIDE_CELLS
+        )
+    frame = RasterFrame.from_box((low_x, low_y, high_x, high_y), RESOLUTIONS[0])
+    for coarser in RESOLUTIONS:
+        frame = RasterFrame.from_box((low_x, low_y, high_x, high_y), coarser)
+        if frame.cells <= DEFAULT_MAX_CELLS and max(frame.width, frame.height) <= MAX_SIDE_CELLS:
             break
     if frame.resolution != RESOLUTION:
         side = f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m"
         notes.fill("resolution", frame.resolution, f"{RESOLUTION} m would be too many cells for {side}")
-    return _raster.limited(frame, MOST, LONGEST)
+    return _raster.check_frame(frame, MAX_CELLS, MAX_SIDE_CELLS)
 
 
-def blank(frame: RasterFrame, fence: Any, free: list[Any]) -> NDArray[np.uint8]:
+def empty_cells(frame: RasterFrame, fence: Any, free: list[Any]) -> NDArray[np.uint8]:
     """Cells, uint8 [height, width], that are free on the floors, within the fence, or all where there is neither."""
     cells = np.full((frame.height, frame.width), FREE if fence is None and not free else UNKNOWN, np.uint8)
     inside = free

@@ -41,7 +41,7 @@ def objects_to_topology(layers: Layers, parameters: Parameters, notes: Derivatio
     for key, part in layers.vector("objects").items():
         if key.name in RAW:
             continue
-        chosen = part if key.name in DRAWINGS else part.of_kind("path", "poi")
+        chosen = part if key.name in DRAWINGS else part.select_kinds("path", "poi")
         if len(chosen):
             by_level.setdefault(key.level, []).append((key.name, chosen))
     parts: dict[PartKey, Part] = {}

@@ -21,19 +21,19 @@ from app.model.layers import MAP, Layers, PartKey
 from app.model.voxels import HALF, VoxelMap
 from app.parameters import parameter
 
-MOST = 2**25
+MAX_VOXELS = 2**25
 """Occupied voxels (``Limits.voxels``)."""
 
-EASY = 2**23
+DEFAULT_MAX_VOXELS = 2**23
 """Voxels up to which the usual resolution is kept."""
 
 RESOLUTION = 0.1
 """Metres unless asked otherwise."""
 
-COARSER = (RESOLUTION, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+RESOLUTIONS = (RESOLUTION, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 """What is taken where a finer one would give too many voxels."""
 
-AT_ONCE = 2**22
+CELLS_PER_BLOCK = 2**22
 """Cells of spans that are told apart at a time."""
 
 OCCUPIED = math.log(0.971 / (1.0 - 0.971))
@@ -82,7 +82,7 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationN
         up = np.array([0.0, 0.0, layers.elevation(level)])
         if len(site.triangles):
             triangles += [one + up for one in np.split(site.triangles, np.flatnonzero(np.diff(site.owner)) + 1)]
-        pieces, without = _extruded(site, parameters.extrude)
+        pieces, without = _extrude_footprints(site, parameters.extrude)
         triangles += [one + up for one in pieces]
         guessed += without
     if not triangles:
@@ -100,7 +100,7 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationN
     return Layers({PartKey("voxels", GROUND, MAP): made_of}, layers.datum, layers.levels)
 
 
-def _extruded(site: LevelObstacles, otherwise: float) -> tuple[list[Array], int]:
+def _extrude_footprints(site: LevelObstacles, otherwise: float) -> tuple[list[Array], int]:
     """The footprints as closed solids, and how many of them took the height from the parameter."""
     out, without = [], 0
     for footprint, base, top in zip(site.footprints, site.base, site.top, strict=True):
@@ -109,13 +109,13 @@ def _extruded(site: LevelObstacles, otherwise: float) -> tuple[list[Array], int]
         without += not math.isfinite(top)
         high = top if math.isfinite(top) else base + otherwise
         if high > base:
-            triangles = solids.extruded(shapely.make_valid(footprint), base, high)
+            triangles = solids.extrude(shapely.make_valid(footprint), base, high)
             if len(triangles):
                 out.append(triangles)
     return out, without
 
 
-def _expected(corners: Array, owner: NDArray[np.int64], resolution: float, *, filled: bool) -> float:
+def _estimate_voxels(corners: Array, owner: NDArray[np.int64], resolution: float, *, filled: bool) -> float:
     """About how many voxels: what lies in the solids, and one for each square of their surface."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     normal = np.cross(b - a, c - a)
@@ -129,8 +129,13 @@ def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, no
     flat = corners.reshape(-1, 3)
     low, high = flat.min(axis=0).tolist(), flat.max(axis=0).tolist()
     edge = parameters.resolution or next(
-        (r for r in COARSER if _fits(low, high, r) and _expected(corners, owner, r, filled=parameters.filled) <= EASY),
-        COARSER[-1],
+        (
+            r
+            for r in RESOLUTIONS
+            if _fits(low, high, r)
+            and _estimate_voxels(corners, owner, r, filled=parameters.filled) <= DEFAULT_MAX_VOXELS
+        ),
+        RESOLUTIONS[-1],
     )
     if parameters.resolution is None and edge != RESOLUTION:
         notes.fill("resolution", edge, f"{RESOLUTION} m would be too many voxels")
@@ -140,9 +145,9 @@ def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, no
             f"an octree reaches {HALF * edge:g} m to each side at {edge:g} m, and the objects lie further from the "
             f"origin: ask for a resolution of at least {needed:.3g} m, or set a datum nearer to them"
         )
-    if _expected(corners, owner, edge, filled=parameters.filled) > 4 * MOST:
-        _too_many(edge)
-    frame = RasterFrame.around((low[0], low[1], high[0], high[1]), edge)
+    if _estimate_voxels(corners, owner, edge, filled=parameters.filled) > 4 * MAX_VOXELS:
+        _raise_too_many(edge)
+    frame = RasterFrame.from_box((low[0], low[1], high[0], high[1]), edge)
     first = math.floor(low[2] / edge + 1e-6)
     end = max(math.ceil(high[2] / edge - 1e-6), first + 1)
     levels = np.round(np.arange(first, end + 1) * edge, 9)
@@ -153,7 +158,7 @@ def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, no
     if not len(codes):
         raise MissingLayer("no stored object has a body of any extent")
     depth = np.full(len(codes), voxels.DEPTH, np.uint8)
-    return voxels.pruned(VoxelMap(edge, depth, codes, np.full(len(codes), OCCUPIED, np.float32)))
+    return voxels.prune(VoxelMap(edge, depth, codes, np.full(len(codes), OCCUPIED, np.float32)))
 
 
 def _fits(low: Sequence[float], high: Sequence[float], edge: float) -> bool:
@@ -167,18 +172,18 @@ def _codes(spans: Iterable[Spans], frame: RasterFrame, first: int) -> voxels.Cod
     waiting: list[voxels.Codes] = []
     size = 0
     for part in spans:
-        portion = np.cumsum(part[:, 3] - part[:, 2]) // AT_ONCE
+        portion = np.cumsum(part[:, 3] - part[:, 2]) // CELLS_PER_BLOCK
         for some in np.split(part, np.flatnonzero(np.diff(portion)) + 1):
-            layer, row, column = _raster.expanded(some)
+            layer, row, column = _raster.expand_spans(some)
             waiting.append(_distinct(voxels.morton(column + x0, row + y0, layer + first)))
             size += len(waiting[-1])
-            if size > MOST:
+            if size > MAX_VOXELS:
                 out, waiting, size = _distinct(np.concatenate([out, *waiting])), [], 0
-                if len(out) > MOST:
-                    _too_many(frame.resolution)
+                if len(out) > MAX_VOXELS:
+                    _raise_too_many(frame.resolution)
     out = _distinct(np.concatenate([out, *waiting]))
-    if len(out) > MOST:
-        _too_many(frame.resolution)
+    if len(out) > MAX_VOXELS:
+        _raise_too_many(frame.resolution)
     return out
 
 
@@ -190,7 +195,7 @@ def _distinct(codes: voxels.Codes) -> voxels.Codes:
     return ordered[new]
 
 
-def _too_many(resolution: float) -> None:
+def _raise_too_many(resolution: float) -> None:
     raise CannotConvert(
-        f"voxels of {resolution:g} m would be more than {MOST}: ask for a coarser resolution, or filled=false"
+        f"voxels of {resolution:g} m would be more than {MAX_VOXELS}: ask for a coarser resolution, or filled=false"
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, _raster, derives
 from app.derive._raster import RasterFrame
-from app.derive._select_grids import called, chosen, seen
+from app.derive._select_grids import as_planned, grid_label, select_grids
 from app.errors import CannotConvert, MissingDatum
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage
@@ -21,8 +21,8 @@ from app.model.layers import Layers, Part, PartKey
 from app.parameters import parameter
 
 NAME = "plan"
-MOST_PIXELS = 2**26
-WANTED = "what is where"
+MAX_PIXELS = 2**26
+GRID_PURPOSE = "what is where"
 
 PAPER, INK, NOTHING = (246, 246, 242), (44, 46, 52), (205, 205, 205)
 """Red, green, blue of free, occupied and unknown cells; costs between lie between paper and ink."""
@@ -58,8 +58,8 @@ class Parameters:
 
 
 def _try(layers: Layers, parameters: Parameters) -> None:
-    for key, grid in chosen(layers, parameters.grid, WANTED).items():
-        _step(grid, parameters.pixel, called(key))
+    for key, grid in select_grids(layers, parameters.grid, GRID_PURPOSE).items():
+        _step(grid, parameters.pixel, grid_label(key))
 
 
 @derives(
@@ -80,14 +80,14 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Derivati
     a grid raises, CannotConvert where the plan would have too many pixels.
     """
     parts: dict[PartKey, Part] = {}
-    for key, stored in chosen(layers, parameters.grid, WANTED).items():
-        grid = seen(stored, called(key), notes)
-        step = _step(grid, parameters.pixel, called(key))
+    for key, stored in select_grids(layers, parameters.grid, GRID_PURPOSE).items():
+        grid = as_planned(stored, grid_label(key), notes)
+        step = _step(grid, parameters.pixel, grid_label(key))
         cells = _coarser(grid.cells, step)
         size = grid.resolution * step
         if step > 1 and parameters.pixel is None:
             notes.warn(f"a pixel is {step} cells wide, {size:g} m: drawn finer, the plan would be too large")
-        pixels = _coloured(cells)
+        pixels = _colour_cells(cells)
         frame = RasterFrame((0.0, 0.0), size, cells.shape[1], cells.shape[0])
         if parameters.draw_objects:
             _draw_objects(pixels, layers, key.level, grid, frame, notes)
@@ -106,10 +106,10 @@ def _step(grid: OccupancyGrid, pixel: float | None, label: str) -> int:
     """Cells along the side of a pixel."""
     if pixel is not None:
         step = max(1, round(pixel / grid.resolution))
-        if grid.width * grid.height / step**2 > MOST_PIXELS:
-            raise CannotConvert(f"a plan of {label} with {pixel:g} m a pixel would have more than {MOST_PIXELS} pixels")
+        if grid.width * grid.height / step**2 > MAX_PIXELS:
+            raise CannotConvert(f"a plan of {label} with {pixel:g} m a pixel would have more than {MAX_PIXELS} pixels")
         return step
-    return max(1, math.ceil(math.sqrt(grid.width * grid.height / MOST_PIXELS)))
+    return max(1, math.ceil(math.sqrt(grid.width * grid.height / MAX_PIXELS)))
 
 
 def _coarser(cells: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
@@ -126,7 +126,7 @@ def _coarser(cells: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
     return out
 
 
-def _coloured(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _colour_cells(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
     table = np.zeros((256, 4), np.uint8)
     share = np.linspace(0.0, 1.0, OCCUPIED + 1 - FREE)[:, None]
     table[FREE : OCCUPIED + 1, :3] = np.round((1 - share) * np.array(PAPER) + share * np.array(INK))
@@ -150,7 +150,7 @@ def _draw_objects(
         if not rows:
             continue
         try:
-            geometries = part.take(rows).in_local(layers.frame)
+            geometries = part.select(rows).in_local(layers.frame)
         except MissingDatum:
             notes.drop("objects", len(rows), "they are places on earth, and there is no datum: not drawn on the plan")
             continue
@@ -172,7 +172,7 @@ def _draw_network(
     notes: DerivationNotes,
 ) -> None:
     for part in layers.vector("topology", level).values():
-        edges = part.of_kind("edge")
+        edges = part.select_kinds("edge")
         try:
             geometries = edges.in_local(layers.frame)
         except MissingDatum:

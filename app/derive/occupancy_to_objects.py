@@ -27,8 +27,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._figures import MOST, Box, Disc, MaskShapes, ShapeLimits, figures
-from app.derive._select_grids import called, chosen, seen
+from app.derive._figures import MAX_FIGURES, Box, Disc, MaskShapes, ShapeLimits, figures
+from app.derive._select_grids import as_planned, grid_label, select_grids
 from app.errors import CannotConvert, TooLarge
 from app.model.features import features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -101,8 +101,10 @@ def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Derivati
     """
     parts: dict[PartKey, Part] = {}
     used: set[str] = set()
-    for key, grid in chosen(layers, parameters.grid, "obstacles").items():
-        rows = _objects(seen(grid, called(key), notes), parameters, layers.elevation(key.level), notes, called(key))
+    for key, grid in select_grids(layers, parameters.grid, "obstacles").items():
+        rows = _objects(
+            as_planned(grid, grid_label(key), notes), parameters, layers.elevation(key.level), notes, grid_label(key)
+        )
         used.update(row[2]["kind"] for row in rows)
         parts[PartKey("objects", key.level, NAME)] = features(rows, "local")
     for kind in sorted(used):
@@ -120,7 +122,7 @@ def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Derivati
 def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: DerivationNotes, name: str) -> list[Row]:
     context = CONTEXTS[parameters.context]
     cell = grid.resolution
-    mask = _occupied(grid, name)
+    mask = _occupied_mask(grid, name)
     sizes = ShapeLimits(
         speck=2.0 if parameters.minimum_size is None else parameters.minimum_size / cell,
         disc=context.widest / cell,
@@ -140,14 +142,14 @@ def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: D
         raise CannotConvert(
             f"{name} has nothing but {shapes.specks} specks less than {limit:g} m across: give a smaller minimum_size"
         )
-    if count > MOST:
+    if count > MAX_FIGURES:
         raise CannotConvert(
-            f"{name} would be {count} objects, the limit is {MOST}: give a larger minimum_size than {limit:g} m"
+            f"{name} would be {count} objects, the limit is {MAX_FIGURES}: give a larger minimum_size than {limit:g} m"
         )
     return _rows(shapes, grid, context, parameters.height, floor)
 
 
-def _occupied(grid: OccupancyGrid, name: str) -> NDArray[np.uint8]:
+def _occupied_mask(grid: OccupancyGrid, name: str) -> NDArray[np.uint8]:
     """1 where something stands; CannotConvert where that is nowhere, or everywhere that is known."""
     if grid.cells.size > CELLS:
         raise TooLarge(f"{name} has {grid.cells.size} cells; objects can be made of at most {CELLS}")

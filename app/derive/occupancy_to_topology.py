@@ -19,10 +19,10 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._select_grids import called, chosen, grey_warning
+from app.derive._select_grids import grey_warning, grid_label, select_grids
 from app.errors import CannotConvert, Invalid, Problem, TooLarge
 from app.model.features import Features, Properties, SharedKeyDicts, from_columns, points
-from app.model.grid import OccupancyGrid, as_seen, unknown_grey
+from app.model.grid import OccupancyGrid, unknown_grey, unknown_grey_as_unknown
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 RASTERS = (0.5, 0.1, 0.01)
 """Metres: a node is named after its place on the first of these on which no other node has the same."""
 
-BELONGS: Mapping[str, tuple[str, ...]] = {
+METHOD_PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "spacing": ("skeleton", "voronoi"),
     "detour": ("skeleton",),
     "samples": ("roadmap",),
@@ -108,8 +108,8 @@ def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: Derivat
     """
     _check(parameters)
     parts: dict[PartKey, Part] = {}
-    for key, grid in chosen(layers, parameters.grid, "ways").items():
-        parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, notes, called(key))
+    for key, grid in select_grids(layers, parameters.grid, "ways").items():
+        parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, notes, grid_label(key))
     return Layers(parts, layers.datum, layers.levels)
 
 
@@ -117,7 +117,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
     """One grid's network. called: what errors call the grid."""
     from app.derive import _roadmap, _skeleton
 
-    grid = _without_unseen(grid, parameters, notes, called)
+    grid = _drop_unseen(grid, parameters, notes, called)
     space = _space(grid, parameters, called)
     cell = grid.resolution
     graph, islands = _skeleton.skeleton(
@@ -143,10 +143,12 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
         )
         notes.drop("samples", alone, f"{called}: they see nothing to be joined to, or lie in places left out")
     elif parameters.method == "voronoi":
-        graph = _skeleton.divided(graph, space, max(parameters.spacing / cell, 2.0)) if parameters.spacing else graph
+        graph = (
+            _skeleton.divide_edges(graph, space, max(parameters.spacing / cell, 2.0)) if parameters.spacing else graph
+        )
     elif parameters.spacing > 0.0:
         spacing = max(parameters.spacing / cell, 2.0)
-        graph = _skeleton.filled(
+        graph = _skeleton.add_open_edges(
             graph, space, spacing=spacing, detour=parameters.detour, phase=_phase(grid, space, spacing)
         )
     if not len(graph.edges):
@@ -162,7 +164,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
     return _features(grid, row, column, graph, width)
 
 
-def _without_unseen(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str) -> OccupancyGrid:
+def _drop_unseen(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str) -> OccupancyGrid:
     """The grid with its free cells of unknown's grey as unknown, unless they are to be free."""
     grey = unknown_grey(grid)
     if grey is None:
@@ -171,15 +173,15 @@ def _without_unseen(grid: OccupancyGrid, parameters: Parameters, notes: Derivati
         notes.warn(grey_warning(grid, grey, called, "ways may lead where nobody has been"))
         return grid
     notes.warn(grey_warning(grid, grey, called, "no edges lead there; unknown_grey=free takes them as free"))
-    return as_seen(grid)
+    return unknown_grey_as_unknown(grid)
 
 
 def _check(parameters: Parameters) -> None:
     """Refuse what the chosen method would ignore."""
     changed = [f.name for f in fields(parameters) if getattr(parameters, f.name) != f.default]
-    wrong = [n for n in changed if parameters.method not in BELONGS.get(n, (parameters.method,))]
+    wrong = [n for n in changed if parameters.method not in METHOD_PARAMETERS.get(n, (parameters.method,))]
     if wrong:
-        methods = {n: " or ".join(BELONGS[n]) for n in wrong}
+        methods = {n: " or ".join(METHOD_PARAMETERS[n]) for n in wrong}
         problems = [Problem(f"belongs to method={methods[n]}, not to {parameters.method}", where=n) for n in wrong]
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
 

@@ -9,24 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._select_grids import called, seen
+from app.derive._select_grids import as_planned, grid_label
 from app.errors import CannotConvert, MissingLayer
 from app.model import masks
-from app.model.grid import UNKNOWN, OccupancyGrid, as_seen
+from app.model.grid import UNKNOWN, OccupancyGrid, unknown_grey_as_unknown
 from app.model.layers import MAP, Layers, Part, PartKey
 from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, morton
 from app.parameters import parameter
 
-MOST = 2**25
+MAX_LEAVES = 2**25
 """Leaves (``Limits.voxels``)."""
 
 COLUMNS = 2**28
 """Columns that are looked at (``Limits.pixels``)."""
 
-ROWS = 2**9
+ROWS_PER_BLOCK = 2**9
 """Rows that are sampled at once."""
 
-NOTHING_KNOWN = (
+NO_KNOWN_CELLS = (
     "voxels are made of a grid's occupied and free cells, and the stored grids have none: upload an occupancy grid, an "
     "octree or a point cloud"
 )
@@ -50,15 +50,17 @@ class Parameters:
 
 def _try(layers: Layers, parameters: Parameters) -> None:
     blocks = [
-        _placed(as_seen(grid), parameters, layers.elevation(key.level), key.name)
-        for key, grid in _mains(layers).items()
+        _grid_columns(unknown_grey_as_unknown(grid), parameters, layers.elevation(key.level), key.name)
+        for key, grid in _default_grids(layers).items()
     ]
     filled_blocks = [block for block in blocks if block is not None]
     if not filled_blocks:
-        raise MissingLayer(NOTHING_KNOWN)
+        raise MissingLayer(NO_KNOWN_CELLS)
     for block in filled_blocks:
-        if np.count_nonzero(block.state) * (block.top - block.bottom) > MOST:  # so many, were all leaves the smallest
-            _cut(block)
+        if (
+            np.count_nonzero(block.state) * (block.top - block.bottom) > MAX_LEAVES
+        ):  # so many, were all leaves the smallest
+            _cut_into_leaves(block)
 
 
 @derives(gives="voxels", needs={"occupancy"}, parameters=Parameters, cost=8.0, version=2, trial=_try)
@@ -70,15 +72,17 @@ def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Derivatio
     MissingLayer where nothing is known, CannotConvert where the octree would be too large.
     """
     parts: dict[PartKey, Part] = {}
-    for key, grid in _mains(layers).items():
-        block = _placed(seen(grid, called(key), notes), parameters, layers.elevation(key.level), key.name)
+    for key, grid in _default_grids(layers).items():
+        block = _grid_columns(
+            as_planned(grid, grid_label(key), notes), parameters, layers.elevation(key.level), key.name
+        )
         if block is not None:
             voxels = VoxelMap(block.edge, *_leaves(block))
             parts[PartKey("voxels", key.level, key.name)] = voxels
             if not voxels.leaf_counts()["occupied"]:
                 notes.warn(f"{key.name}: the grid has no occupied cell, so the voxels hold free space only")
     if not parts:
-        raise MissingLayer(NOTHING_KNOWN)
+        raise MissingLayer(NO_KNOWN_CELLS)
     notes.fill("height", parameters.height, "a grid does not say how high what it shows is", "height")
     return Layers(parts, layers.datum, layers.levels)
 
@@ -99,7 +103,7 @@ class _Block:
     top: int
 
 
-def _mains(layers: Layers) -> dict[PartKey, OccupancyGrid]:
+def _default_grids(layers: Layers) -> dict[PartKey, OccupancyGrid]:
     """The grids to extrude."""
     grids = layers.grids()
     candidates = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
@@ -107,7 +111,7 @@ def _mains(layers: Layers) -> dict[PartKey, OccupancyGrid]:
     return {key: grid for key, grid in candidates.items() if key.name == MAP or key.level not in mains}
 
 
-def _placed(grid: OccupancyGrid, parameters: Parameters, floor: float, name: str) -> _Block | None:
+def _grid_columns(grid: OccupancyGrid, parameters: Parameters, floor: float, name: str) -> _Block | None:
     """A grid's columns; None where nothing is known. CannotConvert where they reach beyond an octree."""
     edge = parameters.resolution or grid.resolution
     state, corner = _columns(grid, edge, parameters.free, name)
@@ -156,12 +160,12 @@ def _columns(grid: OccupancyGrid, edge: float, free: bool, name: str) -> tuple[S
     out = np.zeros((height, width), np.uint8)
     c, s = math.cos(yaw), math.sin(yaw)
     across = (np.arange(width) + left + 0.5) * edge - x
-    for start in range(0, height, ROWS):
-        along = ((np.arange(start, min(height, start + ROWS)) + bottom + 0.5) * edge - y)[:, None]
+    for start in range(0, height, ROWS_PER_BLOCK):
+        along = ((np.arange(start, min(height, start + ROWS_PER_BLOCK)) + bottom + 0.5) * edge - y)[:, None]
         u = np.floor((across * c + along * s) / grid.resolution).astype(np.int64)
         v = np.floor((along * c - across * s) / grid.resolution).astype(np.int64)
         inside = (u >= 0) & (u < grid.width) & (v >= 0) & (v < grid.height)
-        out[start : start + ROWS][inside] = state[v[inside], u[inside]]
+        out[start : start + ROWS_PER_BLOCK][inside] = state[v[inside], u[inside]]
     _splat(out, state, grid, edge, (left, bottom))
     return out, (left, bottom)
 
@@ -182,7 +186,7 @@ def _splat(out: States, state: States, grid: OccupancyGrid, edge: float, corner:
             out[np.clip(row, 0, out.shape[0] - 1), np.clip(column, 0, out.shape[1] - 1)] = 2
 
 
-def _cut(block: _Block) -> list[tuple[int, NDArray[np.int64], Square]]:
+def _cut_into_leaves(block: _Block) -> list[tuple[int, NDArray[np.int64], Square]]:
     """The fewest leaves: squares of equal columns, cut into cubes between the two heights. CannotConvert if too many.
 
     For each size 2^j of cubes: j, where they begin above each of the squares (in units of their size), the squares.
@@ -198,10 +202,10 @@ def _cut(block: _Block) -> list[tuple[int, NDArray[np.int64], Square]]:
             square = every if j == k else largest
             stack = 1 << (k - j)
             total += len(square[0]) * stack
-            if total > MOST:
+            if total > MAX_LEAVES:
                 raise CannotConvert(
-                    f"the grid {block.name} would become more than {MOST} voxels: ask for a coarser resolution or a "
-                    "smaller height"
+                    f"the grid {block.name} would become more than {MAX_LEAVES} voxels: ask for a coarser resolution "
+                    "or a smaller height"
                 )
             out.append((j, (start >> j) + np.arange(stack, dtype=np.int64), square))
     return out
@@ -210,7 +214,7 @@ def _cut(block: _Block) -> list[tuple[int, NDArray[np.int64], Square]]:
 def _leaves(block: _Block) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
     """Depth, code and log-odds of a block's leaves, in order."""
     depths, codes, odds = [], [], []
-    for j, z, (x, y, values) in _cut(block):
+    for j, z, (x, y, values) in _cut_into_leaves(block):
         n, stack = len(x), len(z)
         # Of the squares as smallest voxels from the middle, so that their codes can be cut to the depth.
         coordinates = [np.repeat(x << j, stack) - HALF, np.repeat(y << j, stack) - HALF, np.tile(z << j, n) - HALF]
@@ -245,7 +249,7 @@ def _squares(state: States, corner: tuple[int, int], max_level: int) -> list[tup
     """
     levels = [(state, corner)]
     for _ in range(max_level):
-        levels.append(_halved(*levels[-1]))
+        levels.append(_halve(*levels[-1]))
     out = []
     for j, (level_states, (x0, y0)) in enumerate(levels):
         row, column = np.nonzero(level_states)
@@ -259,7 +263,7 @@ def _squares(state: States, corner: tuple[int, int], max_level: int) -> list[tup
     return out
 
 
-def _halved(state: States, corner: tuple[int, int]) -> tuple[States, tuple[int, int]]:
+def _halve(state: States, corner: tuple[int, int]) -> tuple[States, tuple[int, int]]:
     """Squares of twice the size: their state where all four quarters have it, else 0."""
     x0, y0 = corner
     height, width = state.shape

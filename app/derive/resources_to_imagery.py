@@ -16,7 +16,7 @@ from app.errors import MissingLayer
 from app.model.imagery import GeoImage
 from app.model.layers import Layers, Part, PartKey
 
-MOST_PIXELS = 2**26
+MAX_PIXELS = 2**26
 KINDS = ("PNG", "JPEG", "BMP")
 
 
@@ -68,10 +68,10 @@ def _drawings(layers: Layers) -> Iterator[tuple[str, str, tuple[float, float, fl
         if isinstance(name, str) and name and isinstance(turn, list | tuple) and len(turn) == 4:
             scale, rotation, x, y = (float(v) for v in turn)
             if scale > 0 and all(map(math.isfinite, (scale, rotation, x, y))):
-                yield key.level, _found(name, layers.resources()), (scale, rotation, x, y)
+                yield key.level, _find_file(name, layers.resources()), (scale, rotation, x, y)
 
 
-def _found(path: str, files: Mapping[str, bytes]) -> str:
+def _find_file(path: str, files: Mapping[str, bytes]) -> str:
     """The stored file that a drawing's name means: itself, else the first of that base name."""
     base = path.replace("\\", "/").rpartition("/")[2]
     return path if path in files else next((f for f in sorted(files) if f.rpartition("/")[2] == base), path)
@@ -84,8 +84,8 @@ def _pixels(data: bytes, name: str, level: str, notes: DerivationNotes) -> NDArr
     reason: Any = None
     try:
         with Image.open(io.BytesIO(data), formats=KINDS) as image:
-            if image.width * image.height > MOST_PIXELS:
-                reason = f"{image.width} × {image.height} pixels are too many: at most {MOST_PIXELS}"
+            if image.width * image.height > MAX_PIXELS:
+                reason = f"{image.width} × {image.height} pixels are too many: at most {MAX_PIXELS}"
             else:
                 clear = "transparency" in image.info or "A" in image.getbands()
                 grey = image.mode in ("1", "L", "LA")

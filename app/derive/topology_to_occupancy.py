@@ -11,8 +11,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, _raster, derives
-from app.derive._obstacles import LevelObstacles, fence_of, fences, sites
-from app.derive.objects_to_occupancy import HEIGHT, blank, cell_size, framed
+from app.derive._obstacles import LevelObstacles, fences, level_fence, sites
+from app.derive.objects_to_occupancy import HEIGHT, cell_size, empty_cells, grid_frame
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
 from app.model.features import Features, Properties
 from app.model.frame import GROUND
@@ -34,7 +34,7 @@ OF_HIGHWAY: Mapping[str, float] = {
 """OpenStreetMap: metres of a way by its class, where neither a width nor lanes are said. They are on the narrow side,
 so that what is called free is road."""
 
-WIDEST = 1000.0
+MAX_WIDTH_METRES = 1000.0
 """Metres of an edge's width: beyond it is a mistake."""
 
 MARGIN = 1.0
@@ -49,7 +49,7 @@ class Parameters:
         None,
         f"width of edges that do not say theirs; default: {WIDTH}, of an OpenStreetMap way that of its class",
         minimum=0.01,
-        maximum=WIDEST,
+        maximum=MAX_WIDTH_METRES,
         unit="m",
     )
     resolution: float | None = cell_size()
@@ -79,12 +79,12 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivat
         open_, through = _free(layers, level, parameters, notes)
         if not len(open_) and not len(through):
             continue
-        fence = fence_of(around, level, GROUND)
+        fence = level_fence(around, level, GROUND)
         box = shapely.total_bounds(np.concatenate([open_, through])).tolist()
-        frame = framed(
+        frame = grid_frame(
             (box[0] - MARGIN, box[1] - MARGIN, box[2] + MARGIN, box[3] + MARGIN), parameters.resolution, notes
         )
-        cells = blank(frame, None, [shapely.Point(box[0], box[1])])  # a floor without an area: all is unknown
+        cells = empty_cells(frame, None, [shapely.Point(box[0], box[1])])  # a floor without an area: all is unknown
         ground = open_ if fence is None else shapely.intersection(open_, fence)
         _raster.paint(cells, _raster.areas(ground, frame, touched=False), FREE)
         if level in obstacles:
@@ -124,7 +124,7 @@ def _free(
             rows.append(k)
             widths.append(width or parameters.edge_width or OF_HIGHWAY.get(_tag(p, "highway"), WIDTH))
             inner.append(_tag(p, "tunnel") == "building_passage" or _tag(p, "covered") == "yes")
-        lines = _metres(part.take(rows), layers)
+        lines = _metres(part.select(rows), layers)
         buffers = shapely.buffer(lines, np.array(widths) / 2, quad_segs=4)
         good = ~shapely.is_empty(buffers)
         flat += int(np.count_nonzero(~good))
@@ -151,7 +151,7 @@ def _metres(part: Features, layers: Layers) -> NDArray[np.object_]:
 
 def _width(p: Properties) -> float | None:
     value = p.get("width")
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= WIDEST
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= MAX_WIDTH_METRES
     return float(value) if good and value is not None else None
 
 

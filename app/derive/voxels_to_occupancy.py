@@ -15,13 +15,13 @@ from app.model.layers import Layers, Part, PartKey
 from app.model.voxels import DEPTH, HALF, VoxelMap, gather
 from app.parameters import parameter
 
-MOST = 2**28
+MAX_CELLS = 2**28
 """Cells of a grid whatever was asked for (``Limits.pixels``)."""
 
-LONGEST = 32767
+MAX_SIDE_CELLS = 32767
 """Cells along a side: beyond it Nav2's map_server refuses the map."""
 
-FULL = 0.95
+MAX_OCCUPIED_SHARE = 0.95
 """From this share of occupied cells on the floor has probably been taken for an obstacle."""
 
 RANK = np.array([1, 0, 2], np.uint8)
@@ -67,28 +67,28 @@ def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivatio
         raise CannotConvert(f"a band goes from its lower to its higher end, got {low:g},{high:g}")
     parts: dict[PartKey, Part] = {}
     seen: list[str] = []
-    for key, part in layers.of("voxels").items():
+    for key, part in layers.parts_of("voxels").items():
         if not isinstance(part, VoxelMap) or not len(part):
             continue
-        grid = _projected(part, parameters, layers.elevation(key.level))
+        grid = _project(part, parameters, layers.elevation(key.level))
         if grid is None:
             z = part.bounds()
             seen.append(f"{key.name} from {z[2]:g} to {z[5]:g} m above the local origin" if z else key.name)
             continue
         parts[PartKey("occupancy", key.level, key.name)] = grid
-        _doubts(key, part, grid, parameters, notes)
+        _report_doubts(key, part, grid, parameters, notes)
     if not parts:
         why = f"no voxel lies in the band; there are: {'; '.join(seen)}" if seen else "the voxel maps hold no voxels"
         raise MissingLayer(f"{why}. Ask with another band=low,high, or upload an octree or a point cloud")
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _doubts(
+def _report_doubts(
     key: PartKey, voxels: VoxelMap, grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes
 ) -> None:
     counts = grid.counts()
     known_cells = counts["occupied"] + counts["free"]
-    if parameters.band is None and counts["occupied"] >= FULL * known_cells:
+    if parameters.band is None and counts["occupied"] >= MAX_OCCUPIED_SHARE * known_cells:
         notes.warn(
             f"{key.name}: nearly every column has something in it, the floor too: ask with band=low,high for the "
             "heights at which a robot meets it"
@@ -97,7 +97,7 @@ def _doubts(
         notes.warn(f"{key.name}: the voxels tell of no free space, so whatever is not occupied is unknown")
 
 
-def _projected(voxels: VoxelMap, parameters: Parameters, floor: float) -> OccupancyGrid | None:
+def _project(voxels: VoxelMap, parameters: Parameters, floor: float) -> OccupancyGrid | None:
     """The grid of a voxel map; None where nothing lies in the band. floor: metres above the local origin."""
     edge = voxels.resolution
     bounds = [(int(low.min()), int(high.max())) for low, high in (voxels.axis(0), voxels.axis(1))]
@@ -106,7 +106,7 @@ def _projected(voxels: VoxelMap, parameters: Parameters, floor: float) -> Occupa
     if parameters.band is not None:
         low, high = voxels.axis(2)
         bottom, top = ((floor + v) / edge for v in parameters.band)
-        inside = (high > _near(bottom)) & (low < _near(top))
+        inside = (high > _snap_to_integer(bottom)) & (low < _snap_to_integer(top))
         if not inside.any():
             return None
     state = _columns(voxels, inside, bounds)
@@ -117,10 +117,13 @@ def _projected(voxels: VoxelMap, parameters: Parameters, floor: float) -> Occupa
         size = edge
     else:
         ranks = RANK[state]
-        spans = [(math.floor(_near(a * edge / size)), math.ceil(_near(b * edge / size))) for a, b in bounds]
+        spans = [
+            (math.floor(_snap_to_integer(a * edge / size)), math.ceil(_snap_to_integer(b * edge / size)))
+            for a, b in bounds
+        ]
         _check_size([last - begin for begin, last in spans], size, "ask with a coarser resolution")
         for axis, source, span in ((1, bounds[0], spans[0]), (0, bounds[1], spans[1])):
-            ranks = _resampled(ranks, axis, source, span, size / edge)
+            ranks = _resample(ranks, axis, source, span, size / edge)
         first = [begin for begin, _ in spans]
         cells = VALUE[ranks]
     x, y = (round(v * size, 9) for v in first)
@@ -128,10 +131,10 @@ def _projected(voxels: VoxelMap, parameters: Parameters, floor: float) -> Occupa
 
 
 def _check_size(sides: list[int], edge: float, instead: str) -> None:
-    if max(sides) > LONGEST or sides[0] * sides[1] > MOST:
+    if max(sides) > MAX_SIDE_CELLS or sides[0] * sides[1] > MAX_CELLS:
         raise CannotConvert(
-            f"{sides[0]} × {sides[1]} cells of {edge:g} m are more than a grid may have (a side of {LONGEST}, {MOST} "
-            f"in all): {instead}"
+            f"{sides[0]} × {sides[1]} cells of {edge:g} m are more than a grid may have (a side of {MAX_SIDE_CELLS}, "
+            f"{MAX_CELLS} in all): {instead}"
         )
 
 
@@ -163,7 +166,7 @@ def _columns(voxels: VoxelMap, inside: NDArray[np.bool_], bounds: list[tuple[int
     return picture
 
 
-def _resampled(ranks: States, axis: int, source: tuple[int, int], span: tuple[int, int], ratio: float) -> States:
+def _resample(ranks: States, axis: int, source: tuple[int, int], span: tuple[int, int], ratio: float) -> States:
     """Cells of another size along one axis.
 
     source: first and end of the cells that are there, counted from the origin; span: of the wanted ones, each ``ratio``
@@ -190,7 +193,7 @@ def _resampled(ranks: States, axis: int, source: tuple[int, int], span: tuple[in
     return out
 
 
-def _near(value: float) -> float:
+def _snap_to_integer(value: float) -> float:
     """A whole number where it is one but for the rounding of a division."""
     integer = round(value)
     return float(integer) if abs(value - integer) < 1e-6 else value

@@ -34,7 +34,7 @@ SPEEDS = frozenset({"speed", "speed_limit", "speed_zone"})
 RESOLUTION = 0.05
 """Metres a cell where there is no map to take it from: what Nav2's maps usually have."""
 
-COARSEST = 1.0
+MAX_RESOLUTION_METRES = 1.0
 """Maximum size of a cell in metres that is chosen for large zones without a map."""
 
 MARGIN = 1.0
@@ -43,8 +43,8 @@ MARGIN = 1.0
 STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Metres per second that one step of a cell may stand for: the finest one is taken that reaches the highest limit."""
 
-MOST_CELLS = 2**28
-_SAID = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|percent|m/s)?\s*\Z", re.ASCII)
+MAX_CELLS = 2**28
+_LIMIT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|percent|m/s)?\s*\Z", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +192,7 @@ def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | No
     first = [math.floor(v / cell + 1e-6) for v in low_high[:2]]
     end = [math.ceil(v / cell - 1e-6) for v in low_high[2:]]
     width, height = (max(1, b - a) for a, b in zip(first, end, strict=True))
-    if width * height > MOST_CELLS:
+    if width * height > MAX_CELLS:
         raise CannotConvert(f"a mask of {width} × {height} cells is too large: ask for a coarser resolution")
     return _Frame(round(first[0] * cell, 9), round(first[1] * cell, 9), cell, width, height)
 
@@ -200,7 +200,7 @@ def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | No
 def _coarse_enough(cell: float, low_high: Any) -> float:
     """Double the size of a cell, up to COARSEST, until a mask of this extent has a bearable number of cells."""
     width, height = float(low_high[2] - low_high[0]), float(low_high[3] - low_high[1])
-    while (width / cell) * (height / cell) > MOST_CELLS / 4 and cell * 2.0 <= COARSEST:
+    while (width / cell) * (height / cell) > MAX_CELLS / 4 and cell * 2.0 <= MAX_RESOLUTION_METRES:
         cell *= 2.0
     return cell
 
@@ -231,7 +231,7 @@ def _limits(zones: list[_Zone], parameters: Parameters, notes: DerivationNotes) 
 
     Limits are rounded down to what a cell can say, and never to 0, which would be none.
     """
-    limits = [_said(z) for z in zones]
+    limits = [_parse_limit(z) for z in zones]
     notes.drop("speed zones without a limit", limits.count(None), "their value is no speed in m/s and no percentage")
     valid_limits = [s for s in limits if s is not None]
     if not valid_limits:
@@ -272,10 +272,10 @@ def _limits(zones: list[_Zone], parameters: Parameters, notes: DerivationNotes) 
     return values, FilterInfo(kind, 0.0, step) if any(values) else None
 
 
-def _said(zone: _Zone) -> tuple[float, bool] | None:
+def _parse_limit(zone: _Zone) -> tuple[float, bool] | None:
     """A zone's limit and whether it is a percentage: a number is m/s, a text may name its unit."""
     value = zone.value
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return (float(value), False) if value >= 0 and math.isfinite(value) else None
-    match = _SAID.match(value) if isinstance(value, str) else None
+    match = _LIMIT.match(value) if isinstance(value, str) else None
     return None if match is None else (float(match[1]), match[2] in ("%", "percent"))

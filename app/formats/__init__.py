@@ -82,8 +82,10 @@ class ReadContext:
 
     frame: the environment's, where it has a datum. level: where the map belongs. grid: the name for a grid, else None.
     layer: what the lines and polygons of a drawing are meant for, else None. options: the format's own read options.
-    wanted: the layers that will be used (None: all); a reader may leave others out. cells: whether anybody will look at
-    the cells of grids; if not, a reader checks an image's header only. whole: whether anybody will ask for this format
+    requested_layers: the layers that will be used (None: all); a reader may leave others out. decode_cells: whether
+        anybody will look at
+    the cells of grids; if not, a reader checks an image's header only. keep_source_properties: whether anybody will ask
+    for this format
     (or its family) back; if not, a reader may leave out what only it knows (``properties.<format>``, the document).
     main: the file that was detected. folder: reads files that hold other formats' maps, as a folder of an upload is
     read, for the formats that are such folders in one file; None inside one.
@@ -95,9 +97,9 @@ class ReadContext:
     grid: str | None = None
     layer: Layer | None = None
     options: Any = None
-    wanted: frozenset[Layer] | None = None
-    cells: bool = True
-    whole: bool = True
+    requested_layers: frozenset[Layer] | None = None
+    decode_cells: bool = True
+    keep_source_properties: bool = True
     main: str = ""
     folder: Callable[[Files], Layers] | None = None
     warnings: list[Problem] = field(default_factory=list)
@@ -109,7 +111,7 @@ class ReadContext:
 
     def wants(self, layer: Layer) -> bool:
         """Whether anybody will use this layer."""
-        return self.wanted is None or layer in self.wanted
+        return self.requested_layers is None or layer in self.requested_layers
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,71 +216,75 @@ class Format:
     """A file format. Only what is declared here is known of it elsewhere.
 
     name: its id. files: the names it is served as. media_types: of the served files, in that order.
-    carries: layers it can hold. needs: what writing takes. detect: is this file (name, content) the main file of such
-    a map; sure formats first (``rank``). companions: further files of the upload that belong to a main file.
-    family: format family of its objects (``osm``, ``kml`` …). drawing: its lines and polygons may be meant for any
-    layer (the upload's ``layer`` says which). rank: of two files that tell the same network, the higher one wins.
-    version: raise it when the same layers give other bytes (it is part of every ETag). choose: of the parts that it
-    carries, those that these options ask for. by_file: the options that a wanted file's name says. outlines: it writes
-    where grids lie, not their cells. joined: its main files of one folder are one map (graphs 0.yaml, 1.yaml …).
+    layers: layers it can hold. needs: what writing takes. detect: is this file (name, content) the main file of such
+    a map; sure formats first (``priority``). companions: further files of the upload that belong to a main file.
+    family: format family of its objects (``osm``, ``kml`` …). is_drawing: its lines and polygons may be meant for any
+    layer (the upload's ``layer`` says which). priority: of two files that tell the same network, the higher one wins.
+    version: raise it when the same layers give other bytes (it is part of every ETag). select_parts: of the parts that
+    it carries, those that these options ask for. options_from_filename: the options that a wanted file's name says.
+    outlines: it writes
+    where grids lie, not their cells. one_map_per_folder: its main files of one folder are one map (graphs 0.yaml,
+    1.yaml …).
     check: the loader rules of the map's consumers, looked at in a map's files (main file first) without our reader
-    or writer; ``app.formats.check`` says what it gives and what it may cost. lacks: what such layers must hold besides
-    being there (an edge), and do not: what to supply, or None.
-    yields: a main file of this name only speaks for others (a world file for its picture), so it is none where one of
-    those is a main file itself. lacking: what a file needs that may be such a map but does not say enough by itself (a
-    picture without a place); empty for other files. completing: the read options that say it.
-    looks_at: files of other maps of the upload that it looks into. parts: the options that select a stored part, for
-    formats whose files hold one part each. holds: it is a folder of other formats' maps. marks_blocked: it can
-    express a blocked edge, so that such an edge stays in it; other formats leave it out. bends: see ``Bends``. titled:
-    it names the environment (``WriteContext.title``), so its bytes depend on that name.
+    or writer; ``app.formats.check`` says what it gives and what it may cost. missing_content: what such layers must
+    hold besides being there (an edge), and do not: what to supply, or None.
+    is_sidecar: a main file of this name only speaks for others (a world file for its picture), so it is none where one
+        of
+    those is a main file itself. missing_metadata: what a file needs that may be such a map but does not say enough by
+    itself (a picture without a place); empty for other files. completing_options: the read options that say it.
+    related_files: files of other maps of the upload that it looks into. parts: the options that select a stored part,
+        for
+    formats whose files hold one part each. is_container: it is a folder of other formats' maps. marks_blocked: it can
+    express a blocked edge, so that such an edge stays in it; other formats leave it out. keeps_bends: see ``Bends``.
+    titled: it names the environment (``WriteContext.title``), so its bytes depend on that name.
     """
 
     name: str
     title: str
     files: tuple[str, ...]
     media_types: tuple[str, ...]
-    carries: frozenset[Layer]
+    layers: frozenset[Layer]
     detect: Callable[[str, bytes], bool]
     read: Callable[[Files, ReadContext], Layers] | None = None
     write: Callable[[Layers, WriteContext], dict[str, bytes]] | None = None
     needs: LayerRequirements = field(default_factory=lambda: LayerRequirements(()))
     companions: Callable[[str, bytes, Sequence[str]], Iterable[str]] = lambda main, data, names: ()
-    looks_at: Callable[[str, Sequence[str]], Iterable[str]] = lambda main, names: ()
+    related_files: Callable[[str, Sequence[str]], Iterable[str]] = lambda main, names: ()
     read_options: type[Any] = NoOptions
     write_options: type[Any] = NoOptions
     family: str = ""
-    drawing: bool = False
-    rank: int = 0
+    is_drawing: bool = False
+    priority: int = 0
     version: int = 1
     extensions: tuple[str, ...] = ()
-    choose: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
-    by_file: Callable[[str], Mapping[str, str]] = lambda name: {}
+    select_parts: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
+    options_from_filename: Callable[[str], Mapping[str, str]] = lambda name: {}
     parts: Parts | None = None
     outlines: bool = False
-    joined: bool = False
+    one_map_per_folder: bool = False
     sort: Callable[[Files, Sequence[str]], Mapping[str, Iterable[str]]] | None = None
-    holds: bool = False
+    is_container: bool = False
     check: Callable[[Files], Iterable[Problem]] | None = None
-    lacks: Callable[[Layers], str | None] | None = None
-    yields: Callable[[str], bool] = lambda name: False
-    lacking: Callable[[str, bytes], str] = lambda name, data: ""
-    completing: frozenset[str] = frozenset()
+    missing_content: Callable[[Layers], str | None] | None = None
+    is_sidecar: Callable[[str], bool] = lambda name: False
+    missing_metadata: Callable[[str, bytes], str] = lambda name, data: ""
+    completing_options: frozenset[str] = frozenset()
     marks_blocked: bool = False
-    bends: Bends = "shape"
-    titled: bool = False
+    keeps_bends: Bends = "shape"
+    has_title: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class FileGroup:
     """The files of an upload that are one map: a main file and what belongs to it.
 
-    borrowed: what belongs to other maps, and is looked into.
+    shared_files: what belongs to other maps, and is looked into.
     """
 
     format: Format
     main: str
     files: Files
-    borrowed: Files = field(default_factory=dict)
+    shared_files: Files = field(default_factory=dict)
 
 
 _registry: dict[str, Format] = {}
@@ -315,7 +321,7 @@ def get_format(name: str) -> Format:
 
 def detect(name: str, data: bytes) -> Format | None:
     """The format whose main file this is, judged by content; the highest rank wins."""
-    readable = sorted((f for f in all_formats().values() if f.read), key=lambda f: (-f.rank, f.name))
+    readable = sorted((f for f in all_formats().values() if f.read), key=lambda f: (-f.priority, f.name))
     return next((f for f in readable if f.detect(name, data)), None)
 
 
@@ -343,41 +349,41 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[FileGroup]
             raise Invalid(f"{forced_format.name} can be served but not read")
         main = next((n for n in sorted(files) if n.lower().endswith(forced_format.extensions)), None)
         groups = [(forced_format, main or next(iter(sorted(files))))]
-    groups, belong = _sorted(files, groups)
+    groups, belong = _sort_files(files, groups)
     out = []
     mains = {main for _, main in groups}
     names = tuple(sorted(files))
-    speaking = tuple(sorted(main for fmt, main in groups if fmt.yields(main)))
-    speakers = {fmt.name for fmt, main in groups if fmt.yields(main)}
+    speaking = tuple(sorted(main for fmt, main in groups if fmt.is_sidecar(main)))
+    speakers = {fmt.name for fmt, main in groups if fmt.is_sidecar(main)}
     yielding = {
         other
         for fmt, main in groups
-        if fmt.name in speakers and not fmt.yields(main)
+        if fmt.name in speakers and not fmt.is_sidecar(main)
         for other in fmt.companions(main, files[main], speaking)
-        if fmt.yields(other)
+        if fmt.is_sidecar(other)
     }
     groups = [(fmt, main) for fmt, main in groups if main not in yielding]
     mains -= yielding
     joined: dict[tuple[str, str], list[str]] = {}
     for fmt, main in groups:
-        if fmt.joined:
+        if fmt.one_map_per_folder:
             joined.setdefault((fmt.name, main.rpartition("/")[0]), []).append(main)
     for fmt, main in groups:
         more = belong[main] if main in belong else fmt.companions(main, files[main], names)
         companions = [n for n in more if n in files and n not in mains]
-        if fmt.joined:
+        if fmt.one_map_per_folder:
             first, *further = joined[fmt.name, main.rpartition("/")[0]]
             if main != first:
                 continue
             companions += further
         used.update([main, *companions])
         own_files = {n: files[n] for n in [main, *companions]}
-        seen = {n: files[n] for n in fmt.looks_at(main, names) if n in files and n not in own_files}
+        seen = {n: files[n] for n in fmt.related_files(main, names) if n in files and n not in own_files}
         out.append(FileGroup(fmt, main, own_files, seen))
     return out, sorted(set(files) - used)
 
 
-def _sorted(
+def _sort_files(
     files: Files, groups: Sequence[tuple[Format, str]]
 ) -> tuple[list[tuple[Format, str]], dict[str, Iterable[str]]]:
     """The main files that stay ones, and what belongs to those of formats that look into the files."""
@@ -424,47 +430,49 @@ def read(item: FileGroup, context: ReadContext) -> Layers:
         context.options = fmt.read_options()
     earlier = len(context.warnings)
     try:
-        with _without_collector():
-            layers = fmt.read({**item.files, **item.borrowed} if item.borrowed else item.files, context)
+        with _gc_paused():
+            layers = fmt.read({**item.files, **item.shared_files} if item.shared_files else item.files, context)
     except BadUpload as error:
         raise type(error)(
-            error.detail, [_in_file(p, item.main) for p in error.problems] or [_said(error, item)]
+            error.detail, [_with_file(p, item.main) for p in error.problems] or [_problem_of(error, item)]
         ) from error
     except FleetMapError as error:
         raise UnreadableFile(
-            f"{item.main}: {error.detail}", [_in_file(p, item.main) for p in error.problems] or [_said(error, item)]
+            f"{item.main}: {error.detail}",
+            [_with_file(p, item.main) for p in error.problems] or [_problem_of(error, item)],
         ) from error
     except MemoryError as error:
         raise TooLarge(
             f"{item.main} needs more memory than an upload may use", [Problem("out of memory", item.main)]
         ) from error
     except BAD_INPUT as error:
-        line, reason = explain(error)
+        line, reason = describe_parse_error(error)
         detail = f"{item.main} cannot be read as {fmt.title}: {reason}"
         raise UnreadableFile(detail, [Problem(reason, item.main, line)]) from error
-    if fmt.bends == "nodes":
+    if fmt.keeps_bends == "nodes":
         layers = bends.join(layers)
     count = sum(len(p) for p in layers.parts.values() if isinstance(p, Features))
     if count > context.limits.features:
         raise TooLarge(f"{item.main} has {count} features; the limit is {context.limits.features}")
-    context.warnings[earlier:] = grouped(context.warnings[earlier:], context.limits.warnings)
+    context.warnings[earlier:] = group_warnings(context.warnings[earlier:], context.limits.warnings)
     return layers
 
 
-def grouped(warnings: Sequence[Problem], limit: int) -> list[Problem]:
+def group_warnings(warnings: Sequence[Problem], limit: int) -> list[Problem]:
     """Warnings of one file with those that repeat as one: the first of its kind, how many more, and where.
 
-    Two are of one kind if they differ only in names and numbers. Of kinds with at most ``ALIKE`` warnings all stay.
+    Two are of one kind if they differ only in names and numbers. Of kinds with at most ``MAX_ALIKE_WARNINGS`` warnings
+    all stay.
     """
     kinds: dict[tuple[str | None, str], list[Problem]] = {}
     for one in dict.fromkeys(warnings):
         kinds.setdefault((one.file, _VARIABLE.sub("…", one.problem)), []).append(one)
     out: list[Problem] = []
     for same in kinds.values():
-        if len(same) <= ALIKE:
+        if len(same) <= MAX_ALIKE_WARNINGS:
             out += same
             continue
-        examples = "; ".join(dict.fromkeys(one.where or one.problem for one in same[1:ALIKE]))[:240]
+        examples = "; ".join(dict.fromkeys(one.where or one.problem for one in same[1:MAX_ALIKE_WARNINGS]))[:240]
         reason = f"{same[0].problem} (and {len(same) - 1} more like it: {examples})"
         out.append(replace(same[0], problem=reason))
     if len(out) > limit:
@@ -473,7 +481,7 @@ def grouped(warnings: Sequence[Problem], limit: int) -> list[Problem]:
     return out
 
 
-ALIKE = 3
+MAX_ALIKE_WARNINGS = 3
 """Warnings of one kind that a file reports one by one."""
 
 MAX_RAW_WARNINGS = 100_000
@@ -488,37 +496,37 @@ def write(fmt: Format, layers: Layers, context: WriteContext) -> dict[str, bytes
         raise Invalid(f"{fmt.name} can be read but not served")
     if context.options is None:
         context.options = fmt.write_options()
-    layers = _straightened(fmt, layers, context)
-    with _without_collector():
+    layers = _straighten(fmt, layers, context)
+    with _gc_paused():
         files = fmt.write(layers, context)
-    token = SERVED.set(True)
+    token = JUST_WRITTEN.set(True)
     try:
-        context.warnings = _joined(context.warnings, check(fmt, files))
+        context.warnings = _merge_findings(context.warnings, check(fmt, files))
     finally:
-        SERVED.reset(token)
+        JUST_WRITTEN.reset(token)
     return files
 
 
-def _straightened(fmt: Format, layers: Layers, context: WriteContext) -> Layers:
+def _straighten(fmt: Format, layers: Layers, context: WriteContext) -> Layers:
     """The layers with straight edges only, for formats whose consumers drive straight from node to node."""
-    straight, split = straightened(fmt, layers)
+    straight, split = straighten(fmt, layers)
     if split.nodes:
         edges = "1 edge bends" if split.edges == 1 else f"{split.edges} edges bend"
         context.fill("nodes at bends", split.nodes, f"{edges}, and in {fmt.name} edges are straight")
     return straight
 
 
-def straightened(fmt: Format, layers: Layers) -> tuple[Layers, bends.Split]:
+def straighten(fmt: Format, layers: Layers) -> tuple[Layers, bends.Split]:
     """The layers as a format's consumers drive them: networks with straight edges only where shapes do not count."""
-    if fmt.bends == "shape":
+    if fmt.keeps_bends == "shape":
         return layers, bends.Split()
-    return bends.split(layers, fmt.name if fmt.bends == "foreign" else None)
+    return bends.split(layers, fmt.name if fmt.keeps_bends == "foreign" else None)
 
 
-LISTED = 50
+MAX_FINDINGS = 50
 """Findings of each level that a check tells one by one; of further ones it tells the number."""
 
-SERVED: ContextVar[bool] = ContextVar("SERVED", default=False)
+JUST_WRITTEN: ContextVar[bool] = ContextVar("SERVED", default=False)
 """Whether what is checked was just written here, so that of a large text a look at its head must do."""
 
 
@@ -526,7 +534,7 @@ def check(fmt: Format, files: Files) -> list[Problem]:
     """What the consumers of a map would refuse (level ``error``) or may not like (``warning``), errors first.
 
     files: the map's, main file first. This runs on each map that is served, where it may cost a few milliseconds
-    (``_rules.brief``). A format's ``check`` yields problems from its loader's rules and raises what is natural where
+    (``_rules.is_brief``). A format's ``check`` yields problems from its loader's rules and raises what is natural where
     the files do not parse at all, which is an error too.
     """
     if fmt.check is None or not files:
@@ -535,14 +543,14 @@ def check(fmt: Format, files: Files) -> list[Problem]:
     findings: dict[str, list[Problem]] = {"error": [], "warning": []}
     more = {"error": 0, "warning": 0}
     seen: set[tuple[str | None, str | None, str]] = set()
-    with _without_collector():
+    with _gc_paused():
         every = list(_findings(fmt, files, main))
     for one in every:
         problem = replace(one, file=one.file or main, level=one.level or "error")
         finding_key = (problem.file, problem.where, problem.problem)
         if finding_key in seen:
             continue
-        if len(findings[str(problem.level)]) < LISTED:
+        if len(findings[str(problem.level)]) < MAX_FINDINGS:
             seen.add(finding_key)
             findings[str(problem.level)].append(problem)
         else:
@@ -561,11 +569,11 @@ def _findings(fmt: Format, files: Files, main: str) -> Iterator[Problem]:
     except FleetMapError as error:
         yield from [replace(p, level="error") for p in error.problems] or [Problem(error.detail, main, level="error")]
     except BAD_INPUT as error:
-        line, reason = explain(error)
+        line, reason = describe_parse_error(error)
         yield Problem(f"it cannot be read as {fmt.title}: {reason}", main, line, level="error")
 
 
-def _joined(warnings: Sequence[Problem], findings: Iterable[Problem]) -> list[Problem]:
+def _merge_findings(warnings: Sequence[Problem], findings: Iterable[Problem]) -> list[Problem]:
     """A writer's warnings and a check's findings; of two about one place the writer's own words stay, at its level."""
     places: dict[tuple[str | None, str | None], int] = {(p.file, p.where): k for k, p in enumerate(warnings) if p.where}
     texts = {p.problem for p in warnings}
@@ -580,7 +588,7 @@ def _joined(warnings: Sequence[Problem], findings: Iterable[Problem]) -> list[Pr
 
 
 @contextlib.contextmanager
-def _without_collector() -> Iterator[None]:
+def _gc_paused() -> Iterator[None]:
     """No search for reference cycles meanwhile: readers build many values that stay, which it walks again and again
     (a quarter of the time of a large file)."""
     enabled = gc.isenabled()
@@ -602,15 +610,15 @@ def read_options(fmt: Format, values: Mapping[str, str]) -> Any:
     return parameters.parse(fmt.read_options, values, f"option of {fmt.name}")
 
 
-def _in_file(problem: Problem, file: str) -> Problem:
+def _with_file(problem: Problem, file: str) -> Problem:
     return problem if problem.file else Problem(problem.problem, file, problem.line, problem.where)
 
 
-def _said(error: FleetMapError, item: FileGroup) -> Problem:
+def _problem_of(error: FleetMapError, item: FileGroup) -> Problem:
     return Problem(error.detail, item.main)
 
 
-def explain(error: BaseException) -> tuple[int | None, str]:
+def describe_parse_error(error: BaseException) -> tuple[int | None, str]:
     """Line (from 1, where the parser told one) and a reason that a user understands."""
     if isinstance(error, yaml.MarkedYAMLError):
         mark = error.problem_mark or error.context_mark

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from app.errors import Problem, TooLarge, UnreadableFile, UnsafeArchive
 from app.formats import UNPACKED_FREE_BYTES, Limits
-from app.model.names import bad_name
+from app.model.names import name_problem
 
 _END = struct.Struct("<4s4H2LH")
 _END64 = struct.Struct("<4sQ2H2L4Q")
@@ -96,7 +96,7 @@ def unpack(data: bytes, limits: Limits) -> dict[str, bytes]:
     spans.sort(key=lambda s: s[0])
     for (_, end, _, before), (begin, _, _, entry) in itertools.pairwise(spans):
         if begin < end:
-            raise _unsafe("shares its bytes with another member", f"{before.name} and {entry.name}")
+            raise _unsafe_error("shares its bytes with another member", f"{before.name} and {entry.name}")
     places = {entry.name: start for _, _, start, entry in spans}
     return {e.name: _inflate(data, e, places[e.name]) for e in entries if not e.is_folder}
 
@@ -104,32 +104,32 @@ def unpack(data: bytes, limits: Limits) -> dict[str, bytes]:
 def _check_sizes(entries: list[_Entry], packed: int, limits: Limits) -> None:
     """Refuse what unfolds to too much for what it is: a text to be parsed, an image, or anything else.
 
-    ``_deflated`` counts what really comes out and stops at the declared size.
+    ``_inflate_pieces`` counts what really comes out and stops at the declared size.
     """
     images = [e for e in entries if _is_image(e.name)]
     for e in entries:
         if e.name.lower().endswith(_TEXTS):
             bound = min(limits.text_bytes, limits.max_unpacked(e.packed // _TEXT_COST))
             if e.size > bound:
-                raise _too_large(e.size, bound, f"the limit for a text of {e.packed} compressed bytes", e.name)
+                raise _too_large_error(e.size, bound, f"the limit for a text of {e.packed} compressed bytes", e.name)
     size_of_images = sum(e.size for e in images)
     size = sum(e.size for e in entries)
     if size > limits.unpacked_bytes:
-        raise _too_large(size, limits.unpacked_bytes, "the limit")
+        raise _too_large_error(size, limits.unpacked_bytes, "the limit")
     ratio = f"the limit for an archive of {packed} bytes"
     for noun, declared, bound in (
         ("images", size_of_images, limits.max_unpacked(packed, limits.pixels)),
         ("files", size - size_of_images, limits.max_unpacked(packed)),
     ):
         if declared > bound:
-            raise _too_large(declared, bound, ratio, noun=f" of {noun}")
+            raise _too_large_error(declared, bound, ratio, noun=f" of {noun}")
 
 
 def _is_image(name: str) -> bool:
     return name.lower().endswith(_IMAGES) or _ARRAY.fullmatch(name) is not None
 
 
-def _too_large(size: int, bound: int, limit: str, location: str | None = None, noun: str = "") -> TooLarge:
+def _too_large_error(size: int, bound: int, limit: str, location: str | None = None, noun: str = "") -> TooLarge:
     prefix = f"{location}: " if location else ""
     reason = f"declares {size} bytes{noun}; {limit} is {bound}"
     return TooLarge(f"the archive unfolds to too much: {prefix}{reason}", [Problem(reason, where=location)])
@@ -145,7 +145,7 @@ def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
     free = {True: _LIMITS.pixels // 2, False: UNPACKED_FREE_BYTES // 2}
     with zipfile.ZipFile(out, "w") as archive:
         for name in sorted(files, key=lambda n: (n != first, n)):
-            reason = bad_name(name)
+            reason = name_problem(name)
             if reason or name.endswith("/"):
                 raise ValueError(f"{name!r} cannot be a name in an archive: it {reason or 'names a folder'}")
             info = zipfile.ZipInfo(name, _EPOCH)
@@ -162,18 +162,18 @@ def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
     return out.getvalue()
 
 
-def _unsafe(reason: str, location: str | None = None) -> UnsafeArchive:
+def _unsafe_error(reason: str, location: str | None = None) -> UnsafeArchive:
     prefix = f"{location}: " if location else ""
     detail = f"unsafe archive: {prefix}{reason}; pack it anew with plain files"
     return UnsafeArchive(detail, [Problem(reason, where=location)])
 
 
-def _damaged(reason: str, location: str | None = None) -> UnreadableFile:
+def _damaged_error(reason: str, location: str | None = None) -> UnreadableFile:
     prefix = f"{location}: " if location else ""
     return UnreadableFile(f"damaged or not a ZIP archive: {prefix}{reason}", [Problem(reason, where=location)])
 
 
-def _end(data: bytes) -> tuple[int, int, int]:
+def _read_end_record(data: bytes) -> tuple[int, int, int]:
     """Number of entries, start of the central directory, and its end."""
     offset = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16))
     while offset >= 0:
@@ -181,17 +181,17 @@ def _end(data: bytes) -> tuple[int, int, int]:
             break
         offset = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16), offset + 3) if offset else -1
     if offset < 0:
-        raise _damaged("it has no end of central directory (is it cut off?)")
+        raise _damaged_error("it has no end of central directory (is it cut off?)")
     _, disk, first_disk, disk_count, count, size, start, _ = _END.unpack_from(data, offset)
     stop = offset
     at64 = offset - _LOCATOR64.size
     if at64 >= 0 and data[at64 : at64 + 4] == b"PK\x06\x07":
         _, end_disk, end_at, disks = _LOCATOR64.unpack_from(data, at64)
         if end_disk or disks > 1 or end_at + _END64.size > at64 or data[end_at : end_at + 4] != b"PK\x06\x06":
-            raise _damaged("its ZIP64 end of central directory is not where it says")
+            raise _damaged_error("its ZIP64 end of central directory is not where it says")
         _, length, _, _, disk64, first64, here64, count64, size64, start64 = _END64.unpack_from(data, end_at)
         if end_at + 12 + length != at64:
-            raise _damaged("its ZIP64 end of central directory has another length than it says")
+            raise _damaged_error("its ZIP64 end of central directory has another length than it says")
         for small, large, mask in (
             (disk, disk64, _MASK16),
             (first_disk, first64, _MASK16),
@@ -201,7 +201,7 @@ def _end(data: bytes) -> tuple[int, int, int]:
             (start, start64, _MASK32),
         ):
             if small not in (mask, large):
-                raise _unsafe("its two ends of central directory disagree")
+                raise _unsafe_error("its two ends of central directory disagree")
         disk, first_disk, disk_count, count, size, start, stop = (
             disk64,
             first64,
@@ -212,17 +212,17 @@ def _end(data: bytes) -> tuple[int, int, int]:
             end_at,
         )
     if disk or first_disk or disk_count != count:
-        raise _damaged("it is one part of a split archive: join the parts first")
+        raise _damaged_error("it is one part of a split archive: join the parts first")
     if start + size != stop:
-        raise _damaged("its central directory is not where it says")
+        raise _damaged_error("its central directory is not where it says")
     return count, start, stop
 
 
 def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
     """The members in the directory's order, and where the directory starts."""
     if not is_archive(data):
-        raise _damaged("it does not start like one")
-    count, start, stop = _end(data)
+        raise _damaged_error("it does not start like one")
+    count, start, stop = _read_end_record(data)
     if count > limits.files:
         raise TooLarge(
             f"the archive has {count} members; the limit is {limits.files}",
@@ -231,7 +231,7 @@ def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
     out, offset = [], start
     for _ in range(count):
         if offset + _CENTRAL.size > stop:
-            raise _damaged("its central directory is shorter than it says")
+            raise _damaged_error("its central directory is shorter than it says")
         head = _CENTRAL.unpack_from(data, offset)
         (
             mark,
@@ -255,7 +255,7 @@ def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
         begin = offset + _CENTRAL.size
         offset = begin + n_name + n_extra + n_comment
         if mark != b"PK\x01\x02" or offset > stop:
-            raise _damaged("its central directory is broken")
+            raise _damaged_error("its central directory is broken")
         raw = data[begin : begin + n_name]
         extra = _extra(data[begin + n_name : begin + n_name + n_extra])
         name = _decode(raw, flags, made_by >> 8, extra)
@@ -265,12 +265,12 @@ def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
             packed = next(wide) if packed == _MASK32 else packed
             header_offset = next(wide) if header_offset == _MASK32 else header_offset
         except StopIteration:
-            raise _damaged("its ZIP64 sizes are missing", name) from None
+            raise _damaged_error("its ZIP64 sizes are missing", name) from None
         if disk not in (0, _MASK16):
-            raise _damaged("it is one part of a split archive: join the parts first", name)
+            raise _damaged_error("it is one part of a split archive: join the parts first", name)
         out.append(_Entry(name, raw, flags, method, crc, packed, size, header_offset, attr >> 16))
     if offset != stop:
-        raise _damaged("its central directory is longer than its members")
+        raise _damaged_error("its central directory is longer than its members")
     return out, start
 
 
@@ -308,23 +308,23 @@ def _decode(raw: bytes, flags: int, system: int, extra: Mapping[int, bytes]) -> 
                 pass
         return raw.decode("cp437")
     except UnicodeDecodeError:
-        raise _unsafe("has a name that is not the UTF-8 it says", repr(raw[:80])) from None
+        raise _unsafe_error("has a name that is not the UTF-8 it says", repr(raw[:80])) from None
 
 
 def _check_names(entries: list[_Entry]) -> None:
     """Refuse whatever could escape, collide on some file system, or not be a plain file."""
     seen: dict[str, _Entry] = {}
     for e in entries:
-        reason = bad_name(e.name)
+        reason = name_problem(e.name)
         if reason:
-            raise _unsafe(reason, e.name.encode("unicode_escape").decode()[:200])
+            raise _unsafe_error(reason, e.name.encode("unicode_escape").decode()[:200])
         if e.flags & _ENCRYPTED:
-            raise _unsafe("is encrypted", e.name)
+            raise _unsafe_error("is encrypted", e.name)
         kind = stat.S_IFMT(e.mode)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR) or (kind and (kind == stat.S_IFDIR) != e.is_folder):
-            raise _unsafe("is a link, a device or a folder in disguise", e.name)
+            raise _unsafe_error("is a link, a device or a folder in disguise", e.name)
         if e.is_folder and e.size:
-            raise _unsafe("is a folder with content", e.name)
+            raise _unsafe_error("is a folder with content", e.name)
         if e.method not in (_STORED, _DEFLATED):
             raise UnreadableFile(
                 f"{e.name} is packed by method {e.method}; only stored and deflated members are read: pack it anew",
@@ -332,14 +332,14 @@ def _check_names(entries: list[_Entry]) -> None:
             )
         key = _fold(e.name)
         if key in seen:
-            raise _unsafe("has a name that another member has too (on some computers)", e.name)
+            raise _unsafe_error("has a name that another member has too (on some computers)", e.name)
         seen[key] = e
     files = {key for key, e in seen.items() if not e.is_folder}
     for key, e in seen.items():
         cut = key.find("/")
         while cut >= 0:
             if key[:cut] in files:
-                raise _unsafe("lies in a folder that is also a file", e.name)
+                raise _unsafe_error("lies in a folder that is also a file", e.name)
             cut = key.find("/", cut + 1)
 
 
@@ -351,16 +351,16 @@ def _fold(name: str) -> str:
 def _locate(data: bytes, e: _Entry, directory: int) -> tuple[int, int]:
     """Start of a member's data, and the end of all that is its own; its local header must agree."""
     if e.start + _LOCAL.size > directory:
-        raise _damaged("it is not where the directory says", e.name)
+        raise _damaged_error("it is not where the directory says", e.name)
     mark, _, flags, method, _, _, crc, packed, size, n_name, n_extra = _LOCAL.unpack_from(data, e.start)
     if mark != b"PK\x03\x04":
-        raise _damaged("it is not where the directory says", e.name)
+        raise _damaged_error("it is not where the directory says", e.name)
     begin = e.start + _LOCAL.size
     extra = _extra(data[begin + n_name : begin + n_name + n_extra])
     start = begin + n_name + n_extra
     end = start + e.packed
     if end > directory:
-        raise _damaged("it ends beyond the archive's data", e.name)
+        raise _damaged_error("it ends beyond the archive's data", e.name)
     later = bool(e.flags & _DESCRIPTOR)
     wide = _wide(extra)
     if size == _MASK32 and packed == _MASK32 and len(wide) >= 2:
@@ -374,7 +374,7 @@ def _locate(data: bytes, e: _Entry, directory: int) -> tuple[int, int]:
         and (packed == e.packed or (later and packed == 0))
     )
     if not agree or (e.method == _STORED and e.packed != e.size):
-        raise _unsafe("its local header and the directory disagree", e.name)
+        raise _unsafe_error("its local header and the directory disagree", e.name)
     if later:
         tail = data[end : min(end + 24, directory)]
         forms = ("<LLL", "<LQQ") if max(e.packed, e.size) <= _MASK32 else ("<LQQ",)
@@ -383,20 +383,20 @@ def _locate(data: bytes, e: _Entry, directory: int) -> tuple[int, int]:
             for descriptor in (b"PK\x07\x08" + body, body):
                 if tail.startswith(descriptor):
                     return start, end + len(descriptor)
-        raise _unsafe("its data descriptor and the directory disagree", e.name)
+        raise _unsafe_error("its data descriptor and the directory disagree", e.name)
     return start, end
 
 
 def _inflate(data: bytes, e: _Entry, start: int) -> bytes:
     """A member's content, never more than it declares."""
     packed = memoryview(data)[start : start + e.packed]
-    body = bytes(packed) if e.method == _STORED else _deflated(packed, e)
+    body = bytes(packed) if e.method == _STORED else _inflate_pieces(packed, e)
     if zlib.crc32(body) != e.crc:
-        raise _damaged("its checksum is wrong", e.name)
+        raise _damaged_error("its checksum is wrong", e.name)
     return body
 
 
-def _deflated(packed: memoryview, e: _Entry) -> bytes:
+def _inflate_pieces(packed: memoryview, e: _Entry) -> bytes:
     """Unpack in pieces, so that neither the input is copied again and again nor the output grows beyond its size."""
     unpacker = zlib.decompressobj(-zlib.MAX_WBITS)
     parts, total = [], 0
@@ -407,17 +407,17 @@ def _deflated(packed: memoryview, e: _Entry) -> bytes:
             try:
                 part = unpacker.decompress(piece, limit)
             except zlib.error as error:
-                raise _damaged(str(error), e.name) from None
+                raise _damaged_error(str(error), e.name) from None
             piece = unpacker.unconsumed_tail
             total += len(part)
             parts.append(part)
             if total > e.size:
-                raise _unsafe(f"unfolds to more than the {e.size} bytes it declares", e.name)
+                raise _unsafe_error(f"unfolds to more than the {e.size} bytes it declares", e.name)
             if not piece and len(part) < limit:
                 break
         if unpacker.eof:
             spare = len(unpacker.unused_data) + max(0, len(packed) - offset - _CHUNK)
             if total != e.size or spare:
-                raise _unsafe("has another size than it declares", e.name)
+                raise _unsafe_error("has another size than it declares", e.name)
             return b"".join(parts)
-    raise _damaged("its data is cut off", e.name)
+    raise _damaged_error("its data is cut off", e.name)

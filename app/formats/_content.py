@@ -59,7 +59,7 @@ def pack(layers: Layers, maps: Files, credits: Mapping[PartKey, Sequence[str]]) 
     parts = [
         {
             **{"layer": key.layer, "level": key.level, "name": key.name, "attribution": list(credits.get(key, ()))},
-            **_encoded(part, blobs),
+            **_encode_part(part, blobs),
         }
         for key, part in sorted(layers.parts.items(), key=lambda item: item[0])
     ]
@@ -88,7 +88,7 @@ class _Blobs:
         return self.paths[digest]
 
 
-def _encoded(part: Part, blobs: _Blobs) -> dict[str, Any]:
+def _encode_part(part: Part, blobs: _Blobs) -> dict[str, Any]:
     if isinstance(part, Features):
         columns = {"ids": list(part.ids), "local": part.local.tolist(), "properties": list(part.properties)}
         return {**columns, "geometry": shapely.to_wkb(part.geometry, hex=True).tolist(), "document": part.document}
@@ -111,7 +111,7 @@ def find(files: Files) -> str | None:
     return next((name for name in sorted(files) if f"/{name}".endswith(f"/config/{MAIN}")), None)
 
 
-def owned(files: Files, main: str) -> set[str]:
+def content_files(files: Files, main: str) -> set[str]:
     """The names of the content's own files."""
     return {name for name in files if name.startswith(main.removesuffix(MAIN) + FOLDER)}
 
@@ -127,7 +127,7 @@ def read(files: Files, main: str, limits: Limits, unread: Callable[[], Collectio
         return f"its version is not {VERSION}"
     folder = main.removesuffix(MAIN)
     maps = {f"{folder}{path}": digest for path, digest in top["maps"].items()}
-    other_names = files.keys() - owned(files, main)
+    other_names = files.keys() - content_files(files, main)
     added = frozenset(other_names - maps.keys())
     new_maps = added.difference(unread()) if added else added
     for name in sorted(maps.keys() | new_maps):
@@ -142,13 +142,13 @@ def read(files: Files, main: str, limits: Limits, unread: Callable[[], Collectio
     for row in top["parts"]:
         key = PartKey(row.pop("layer"), row.pop("level"), row.pop("name"))
         stated[key] = tuple(map(str, row.pop("attribution")))
-        parts[key] = _decoded(key, row, {n.removeprefix(folder): data for n, data in files.items()}, limits)
+        parts[key] = _decode_part(key, row, {n.removeprefix(folder): data for n, data in files.items()}, limits)
     datum = None if top["datum"] is None else Datum(**top["datum"])
     levels = tuple(Level(str(name), float(elevation)) for name, elevation in top["levels"])
     return Content(Layers(parts, datum, levels), stated, added)
 
 
-def _decoded(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes], limits: Limits) -> Part:
+def _decode_part(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes], limits: Limits) -> Part:
     kind = PART_TYPES[key.layer]
     if kind is Features:
         ids = tuple(map(str, row["ids"]))
@@ -177,7 +177,7 @@ def _check_place(picture: GeoImage) -> None:
     """Refuse a picture that lies nowhere, or whose CRS PROJ would look for in files."""
     if picture.crs != LOCAL and not _raster.CRS_NAME.fullmatch(picture.crs):
         _raster.crs_from_wkt(picture.crs)
-    if (reason := _raster.lies_nowhere(picture)) is not None:
+    if (reason := _raster.position_problem(picture)) is not None:
         raise UnreadableFile(f"a picture: {reason}", [Problem(reason)])
 
 

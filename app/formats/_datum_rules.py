@@ -12,7 +12,7 @@ from typing import Any
 
 from app.errors import Problem
 from app.formats import Files, _yaml
-from app.formats._rules import LIMITS, doubted, is_number, numbers, refused, shown
+from app.formats._rules import LIMITS, error_finding, is_number, numbers, shown, warning_finding
 from app.model.frame import MAX_DATUM_LATITUDE
 
 SIZES = ("xmin", "xmax", "ymin", "ymax")
@@ -24,31 +24,31 @@ def check(files: Files) -> Iterator[Problem]:
     main = next(iter(files))
     top = _yaml.load(files[main], LIMITS)
     if not isinstance(top, dict):
-        yield refused("a datum is a mapping", main)
+        yield error_finding("a datum is a mapping", main)
         return
     position: dict[str, Any] = {}
     for key, bound in (("datum_latitude", 90.0), ("datum_longitude", 180.0)):
         value = top.get(key)
         if not is_number(value) or abs(value) > bound:
-            yield refused(f"must be degrees within ±{bound:g}, is {shown(value)}", main, where=key)
+            yield error_finding(f"must be degrees within ±{bound:g}, is {shown(value)}", main, where=key)
         else:
             position[key] = value
     if abs(position.get("datum_latitude", 0.0)) > MAX_DATUM_LATITUDE:
         reason = f"beyond ±{MAX_DATUM_LATITUDE:g} degrees no local frame is exact: this server refuses such a datum"
-        yield refused(reason, main, where="datum_latitude")
+        yield error_finding(reason, main, where="datum_latitude")
     fence = top.get("gnss_fence")
     corners = fence.get("gnss_fence_coords") if isinstance(fence, dict) else None
     if corners is None or corners == []:  # as the writer leaves it where there is no fence
-        yield doubted("the environment_template's tools draw the map from the fence", main, where="gnss_fence")
+        yield warning_finding("the environment_template's tools draw the map from the fence", main, where="gnss_fence")
     elif not isinstance(corners, list) or len(corners) < 3 or not all(numbers(c, 2, 3) for c in corners):
         reason = "must be a list of three corners [latitude, longitude] or more"
-        yield refused(reason, main, where="gnss_fence.gnss_fence_coords")
+        yield error_finding(reason, main, where="gnss_fence.gnss_fence_coords")
     elif any(abs(c[0]) > 90.0 or abs(c[1]) > 180.0 for c in corners):
         reason = "a corner is no [latitude, longitude] in degrees"
-        yield refused(reason, main, where="gnss_fence.gnss_fence_coords")
+        yield error_finding(reason, main, where="gnss_fence.gnss_fence_coords")
     size = top.get("gmapping")
     if size is not None and not (isinstance(size, dict) and all(is_number(size.get(w)) for w in SIZES)):
-        yield refused(f"needs the numbers {', '.join(SIZES)}", main, where="gmapping")
+        yield error_finding(f"needs the numbers {', '.join(SIZES)}", main, where="gmapping")
     yield from _navsat(top.get("navsat_transform_node"), position, main)
 
 
@@ -59,16 +59,16 @@ def _navsat(parameters: Any, position: dict[str, Any], main: str) -> Iterator[Pr
     datum = parameters.get("datum") if isinstance(parameters, dict) else None
     if datum is None:
         if isinstance(parameters, dict) and parameters.get("wait_for_datum"):
-            yield doubted("robot_localization waits for a datum that is not there", main, where=location)
+            yield warning_finding("robot_localization waits for a datum that is not there", main, where=location)
         return
     if not numbers(datum, 3, 3):
-        yield refused(f"must be [latitude, longitude, yaw], is {shown(datum)}", main, where=location)
+        yield error_finding(f"must be [latitude, longitude, yaw], is {shown(datum)}", main, where=location)
         return
     if len({type(v) for v in datum}) > 1:
-        yield doubted(
+        yield warning_finding(
             f"ROS 2 wants values of one type in a list: write 0.0 for 0 in {shown(datum)}", main, where=location
         )
     for value, key in zip(datum, ("datum_latitude", "datum_longitude"), strict=False):
         if key in position and abs(value - position[key]) > SAME_DEGREES:
-            yield doubted(f"differs from {key} {position[key]!r}", main, where=location)
+            yield warning_finding(f"differs from {key} {position[key]!r}", main, where=location)
             break

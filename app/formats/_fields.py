@@ -18,7 +18,7 @@ from app.formats import ReadContext, _yaml
 from app.model.frame import MAX_METRES
 
 MAX_FINDINGS = 1000
-SHOWN = 6
+MAX_NAMES_SHOWN = 6
 """Names that one warning lists."""
 
 ANY: Final = None
@@ -54,12 +54,12 @@ class Number:
         if number is None and self.or_other:
             return "", ""
         if number is None:
-            return f"must be a number{unit and ' of' + unit}, is {_shown(value)}", ""
+            return f"must be a number{unit and ' of' + unit}, is {_shorten(value)}", ""
         if not self.low <= number <= self.high or (self.above and number == self.low):
             bounds = f"above {self.low:g} and at most" if self.above else f"from {self.low:g} to"
-            return f"must be {bounds} {self.high:g}{unit}, is {_shown(value)}", ""
+            return f"must be {bounds} {self.high:g}{unit}, is {_shorten(value)}", ""
         if self.usual and not self.usual[0] <= number <= self.usual[1]:
-            return "", f"{_shown(value)}{unit} is unusual: {self.hint}"
+            return "", f"{_shorten(value)}{unit} is unusual: {self.hint}"
         return "", ""
 
 
@@ -73,7 +73,7 @@ class OneOf:
         """Return why the value is doubtful."""
         if any(value == literal and type(value) is type(literal) for literal in self.allowed):
             return "", ""
-        return "", f"unknown value {_shown(value)}: it is one of {', '.join(map(str, self.allowed))}"
+        return "", f"unknown value {_shorten(value)}: it is one of {', '.join(map(str, self.allowed))}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class Text:
         """Return why the value is doubtful."""
         if not isinstance(value, str) or (_CONDITION.fullmatch(value) and not _CALL.search(value)):
             return "", ""
-        return "", f"{_shown(value)} is no condition of words: a planner that evaluates it runs it as code"
+        return "", f"{_shorten(value)} is no condition of words: a planner that evaluates it runs it as code"
 
 
 _CONDITION = re.compile(r"[\w\s&|~!()=<>'\",.:/+*-]*")
@@ -100,7 +100,7 @@ class Quaternion:
         parts = [_number(value.get(axis, 0.0)) for axis in "xyzw"] if isinstance(value, dict) else [None]
         numbers = [part for part in parts if part is not None]
         if len(numbers) < 4:
-            return f"must be a mapping of numbers x, y, z, w, is {_shown(value)}", ""
+            return f"must be a mapping of numbers x, y, z, w, is {_shorten(value)}", ""
         length = math.hypot(*numbers)
         return "", "" if abs(length - 1.0) < 0.01 else f"a quaternion of length {length:g}: it must be 1"
 
@@ -143,10 +143,10 @@ LENGTH = Number(0.0, MAX_METRES, above=True, unit="metres")
 WIDTH = Number(0.0, MAX_METRES, usual=(1e-6, MAX_METRES), hint="there is no room in it", unit="metres")
 NOT_NEGATIVE = Number(0.0, MAX_METRES)
 SPEED = Number(0.0, 1000.0, usual=(0.0, 50.0), hint="is it in metres per second?", unit="m/s")
-ANGLE_USUAL = 6.3
+MAX_USUAL_ANGLE = 6.3
 """Radians: a full turn. What is beyond it may be degrees."""
 
-ANGLE = Number(-1e4, 1e4, usual=(-ANGLE_USUAL, ANGLE_USUAL), hint="is it in radians?", unit="rad")
+ANGLE = Number(-1e4, 1e4, usual=(-MAX_USUAL_ANGLE, MAX_USUAL_ANGLE), hint="is it in radians?", unit="rad")
 POINT = record(x=COORDINATE, y=COORDINATE, z=COORDINATE)
 
 Path = tuple[Any, ...]
@@ -182,12 +182,14 @@ class _Findings:
         if key in self.doubts:
             self.doubts[key][0] += 1
         elif len(self.doubts) < MAX_FINDINGS:
-            self.doubts[key] = [1, _where(path), reason]
+            self.doubts[key] = [1, _path_text(path), reason]
 
     def report(self, context: ReadContext) -> None:
         if self.unknown:
-            names = [name if n == 1 else f"{name} ({n} times)" for name, n in list(self.unknown.items())[:SHOWN]]
-            more = len(self.unknown) - SHOWN
+            names = [
+                name if n == 1 else f"{name} ({n} times)" for name, n in list(self.unknown.items())[:MAX_NAMES_SHOWN]
+            ]
+            more = len(self.unknown) - MAX_NAMES_SHOWN
             names += [f"and {more} more"] if more > 0 else []
             context.warn(f"unknown keys, kept without effect: {', '.join(names)}", file=self.file)
         for count, location, reason in self.doubts.values():
@@ -204,7 +206,7 @@ def _walk(value: Any, shape: Any, path: Path, findings: _Findings) -> None:
         if not isinstance(value, dict):
             if shape.loose:
                 return
-            findings.add_doubt(path, f"{_shown(value)} is no mapping")
+            findings.add_doubt(path, f"{_shorten(value)} is no mapping")
             return
         if not (shape.open or shape.each is not ANY) and not value.keys() <= shape.known:
             findings.add_unknown(path, frozenset(value.keys() - shape.known))
@@ -216,7 +218,7 @@ def _walk(value: Any, shape: Any, path: Path, findings: _Findings) -> None:
                 _walk(value[key], shape.each, (key, path), findings)
     elif kind is list:
         if not isinstance(value, list):
-            findings.add_doubt(path, f"{_shown(value)} is no list")
+            findings.add_doubt(path, f"{_shorten(value)} is no list")
             return
         for k, item in enumerate(value):
             _walk(item, shape[0], (k, path), findings)
@@ -228,7 +230,7 @@ def _walk(value: Any, shape: Any, path: Path, findings: _Findings) -> None:
     else:
         refusal, doubt = shape.check(value)
         if refusal:
-            location = _where(path)
+            location = _path_text(path)
             raise UnreadableFile(f"{location}: {refusal}", [Problem(refusal, findings.file, where=location)])
         if doubt:
             findings.add_doubt(path, doubt)
@@ -246,7 +248,7 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = (
         repr(value) if not isinstance(value, (dict, list)) else f"a {'mapping' if isinstance(value, dict) else 'list'}"
     )
@@ -259,7 +261,7 @@ def _steps(path: Path) -> Iterator[Any]:
         yield key
 
 
-def _where(path: Path) -> str:
+def _path_text(path: Path) -> str:
     steps = [f"[{s}]" if isinstance(s, int) else f".{s[:80]}" for s in reversed(list(_steps(path)))]
     return "".join(steps).removeprefix(".") or "top"
 

@@ -67,7 +67,7 @@ class Grey:
         return grey, opaque
 
 
-def kind_of(data: bytes) -> str | None:
+def detect_kind(data: bytes) -> str | None:
     """``pgm`` (all of PBM, PGM, PPM), ``png``, ``bmp`` or ``jpeg`` by the first bytes; None for anything else."""
     if data[:8] == PNG_MAGIC:
         return "png"
@@ -82,7 +82,7 @@ def kind_of(data: bytes) -> str | None:
 
 def read_grey(data: bytes, limits: Limits) -> Grey:
     """A picture as grey, as GraphicsMagick and so Nav2 sees it. Raises UnreadableFile or TooLarge."""
-    if kind_of(data) == "pgm" and data[:2] in (b"P2", b"P5"):
+    if detect_kind(data) == "pgm" and data[:2] in (b"P2", b"P5"):
         return _read_pgm(data, limits)
     image = read_image(data, limits)
     return Grey(image.width, image.height, lambda: _image_strips(image))
@@ -93,7 +93,7 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
 
     16-bit greys have mode ``I;16``; transparency is in the alpha band or in ``info["transparency"]``.
     """
-    kind = kind_of(data)
+    kind = detect_kind(data)
     if kind is None:
         raise UnreadableFile("its first bytes are not those of a PGM, PNG, BMP or JPEG picture")
     if kind == "pgm" and data[:2] in (b"P1", b"P3"):
@@ -102,7 +102,7 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
         pixels, _ = _read_pgm(data, limits).pixels()
         return Image.fromarray(pixels)
     if kind == "png":
-        data = b"".join(_checked_png(data, limits))
+        data = b"".join(_check_png(data, limits))
     elif kind == "jpeg":
         _check_jpeg(data)
     names = {"png": "PNG", "jpeg": "JPEG", "bmp": "BMP", "pgm": "PPM"}
@@ -140,14 +140,14 @@ def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = Non
     # keeps to filter 0.
     packer = zlib.compressobj(1, zlib.DEFLATED, 15, 9, zlib.Z_RLE if bands == 1 else zlib.Z_DEFAULT_STRATEGY)
     rows = max(1, STRIP // (width * bands))
-    packed = _Packed(out)
+    packed = _IdatWriter(out)
     for y in range(0, height, rows):
         end = min(height, y + rows)
         block = pixels[height - end : height - y][::-1] if flip else pixels[y:end]
         lines = np.zeros((end - y, 1 + width * bands), np.uint8)
         lines[:, 1:] = block.reshape(end - y, width * bands)
         if table is not None:
-            lines[:, 1:] = look_up(lines[:, 1:], table)
+            lines[:, 1:] = apply_table(lines[:, 1:], table)
         packed.write(packer.compress(lines.data))
     packed.write(packer.flush())
     packed.close()
@@ -155,7 +155,7 @@ def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = Non
     return out.getvalue()
 
 
-class _Packed:
+class _IdatWriter:
     """The IDAT chunks of a PNG, of up to 2^30 bytes each, written as they come: the packed pixels may be as large as
     the picture, and are in memory once."""
 
@@ -163,9 +163,9 @@ class _Packed:
 
     def __init__(self, out: io.BytesIO) -> None:
         self.out = out
-        self.begin()
+        self.reserve_length()
 
-    def begin(self) -> None:
+    def reserve_length(self) -> None:
         """Leave room for the length of a chunk."""
         self.size, self.sum = 0, zlib.crc32(b"IDAT")
         self.out.write(bytes(4) + b"IDAT")
@@ -176,7 +176,7 @@ class _Packed:
         while remainder:
             if self.size == self.MOST:
                 self.close()
-                self.begin()
+                self.reserve_length()
             part = remainder[: self.MOST - self.size]
             self.out.write(part)
             self.size += len(part)
@@ -191,7 +191,7 @@ class _Packed:
         self.out.seek(0, io.SEEK_END)
 
 
-def png_of_cells(cells: Bytes) -> bytes:
+def cells_to_png(cells: Bytes) -> bytes:
     """A grey PNG of canonical cells (bottom row first): the value 0…100, 255 unknown; the top row of the map on top."""
     return encode_png(cells, flip=True)
 
@@ -208,9 +208,9 @@ def overlay_png(grid: OccupancyGrid) -> bytes:
     return encode_png(grid.cells, flip=True, palette=palette)
 
 
-def size_of(data: bytes, limits: Limits) -> tuple[int, int]:
+def read_size(data: bytes, limits: Limits) -> tuple[int, int]:
     """(width, height) by the header alone. Raises UnreadableFile or TooLarge."""
-    kind = kind_of(data)
+    kind = detect_kind(data)
     if kind == "pgm" and data[:2] in (b"P2", b"P5"):
         grey = _read_pgm(data, limits)
         return grey.width, grey.height
@@ -225,7 +225,7 @@ def size_of(data: bytes, limits: Limits) -> tuple[int, int]:
         raise UnreadableFile(f"the {names[kind]} picture is damaged: {error}") from error
 
 
-def look_up(pixels: Bytes, table: bytes) -> Bytes:
+def apply_table(pixels: Bytes, table: bytes) -> Bytes:
     """table[pixels]: bytes.translate takes a third of the time of numpy's indexing. The result is read-only."""
     return np.frombuffer(pixels.tobytes().translate(table), np.uint8).reshape(pixels.shape)
 
@@ -245,7 +245,7 @@ def _read_pgm(data: bytes, limits: Limits) -> Grey:
     """P2 and P5 by netpbm's rules: white space and comments between the numbers, one white space before the pixels."""
     offset, numbers = 2, []
     for noun in ("width", "height", "highest value"):
-        offset = _skip_blank(data, offset)
+        offset = _skip_white_space(data, offset)
         end = offset
         while end < offset + 10 and data[end : end + 1].isdigit():
             end += 1
@@ -265,7 +265,7 @@ def _read_pgm(data: bytes, limits: Limits) -> Grey:
     if data[:2] == b"P2":
         if len(data) > limits.text_bytes:
             raise TooLarge(f"the plain PGM has {len(data)} bytes; the limit is {limits.text_bytes}: save it as P5")
-        values = _plain_numbers(data[offset:], count)
+        values = _parse_plain_numbers(data[offset:], count)
     else:
         size = count * (1 if maximum < 256 else 2)
         if len(data) - offset < size:
@@ -288,7 +288,7 @@ def _read_pgm(data: bytes, limits: Limits) -> Grey:
     return Grey(width, height, strips)
 
 
-def _skip_blank(data: bytes, offset: int) -> int:
+def _skip_white_space(data: bytes, offset: int) -> int:
     """The next byte that is neither white space nor in a comment."""
     while offset < len(data):
         if data[offset] == 0x23:
@@ -303,7 +303,7 @@ def _skip_blank(data: bytes, offset: int) -> int:
     return offset
 
 
-def _plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
+def _parse_plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
     """The first ``count`` numbers of a P2's pixels; comments may stand between them."""
     if len(text) < 2 * count - 1:
         raise UnreadableFile(f"the PGM is cut short: {count} pixels need more than {len(text)} characters")
@@ -363,9 +363,9 @@ def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
     picture of its own that begins with the row before it, so that no more than the result takes memory.
     Raises UnreadableFile or TooLarge, as ``read_image``.
     """
-    if kind_of(data) != "png":
+    if detect_kind(data) != "png":
         return None
-    chunks = _checked_png(data, limits)
+    chunks = _check_png(data, limits)
     width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", chunks[1][8:21])
     mode = {2: "RGB", 4: "LA", 6: "RGBA"}.get(colour)
     if mode is None or depth != 8 or interlaced or any(bytes(chunk[4:8]) == b"tRNS" for chunk in chunks[1:]):
@@ -373,7 +373,7 @@ def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
     bands = len(mode)
     pixels = np.empty((height, width, bands), np.uint8)
     line, rows = 1 + width * bands, max(1, STRIP // width)
-    packed = _inflated(chunk[8:-4] for chunk in chunks[1:] if bytes(chunk[4:8]) == b"IDAT")
+    packed = _inflate(chunk[8:-4] for chunk in chunks[1:] if bytes(chunk[4:8]) == b"IDAT")
     next(packed)
     before = bytes(line)
     try:
@@ -393,7 +393,7 @@ def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
     return pixels
 
 
-def _inflated(chunks: Iterator[memoryview]) -> Generator[bytes, int, None]:
+def _inflate(chunks: Iterator[memoryview]) -> Generator[bytes, int, None]:
     """The unfolded content of a zlib stream: send how many bytes are wanted next (fewer come at its end)."""
     unfold = zlib.decompressobj()
     pieces = (chunk[k : k + 2**14] for chunk in chunks for k in range(0, len(chunk), 2**14))
@@ -414,7 +414,7 @@ def _inflated(chunks: Iterator[memoryview]) -> Generator[bytes, int, None]:
         budget = yield b"".join(out)
 
 
-def _checked_png(data: bytes, limits: Limits) -> list[memoryview]:
+def _check_png(data: bytes, limits: Limits) -> list[memoryview]:
     """The PNG's signature and the chunks that make its pixels, each one's checksum verified (Pillow skips IDAT's)."""
     view = memoryview(data)
     offset, chunks, packed = 8, [view[:8]], 0

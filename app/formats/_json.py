@@ -46,17 +46,17 @@ def _check_depth(data: bytes) -> None:
         raise UnreadableFile(reason, [Problem(reason)])
 
 
-def ranks(keys: str) -> dict[str, int]:
-    """The words of a text with their places, for ``ordered``."""
+def rank_keys(keys: str) -> dict[str, int]:
+    """The words of a text with their places, for ``sort_keys``."""
     return {key: rank for rank, key in enumerate(keys.split())}
 
 
-def ordered(value: Any, key_ranks: Mapping[str, int]) -> Any:
+def sort_keys(value: Any, key_ranks: Mapping[str, int]) -> Any:
     """The value with the keys of all its objects in order: these words by their rank, then others by alphabet.
 
     So that equal values give equal bytes, however they were put together.
     """
     if isinstance(value, dict):
         last = len(key_ranks)
-        return {k: ordered(value[k], key_ranks) for k in sorted(value, key=lambda k: (key_ranks.get(k, last), k))}
-    return [ordered(v, key_ranks) for v in value] if isinstance(value, list) else value
+        return {k: sort_keys(value[k], key_ranks) for k in sorted(value, key=lambda k: (key_ranks.get(k, last), k))}
+    return [sort_keys(v, key_ranks) for v in value] if isinstance(value, list) else value

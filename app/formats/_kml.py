@@ -60,18 +60,18 @@ ITEMS = frozenset({"Placemark", "NetworkLink"}) | OVERLAYS
 SIMPLE = frozenset({"Point", "LineString", "LinearRing", "Polygon"})
 GEOMETRIES = SIMPLE | {"MultiGeometry", "Model", "Track", "MultiTrack"}
 
-MARK = "fleetmap"
+OWN_ELEMENT = "fleetmap"
 STYLE = "fleetmap-"
-USUAL_PART: Mapping[str, str] = {
+DEFAULT_PART: Mapping[str, str] = {
     **{"topology": NETWORK, "location": SITE, "zones": ZONES, "occupancy": MAP, "objects": "", "imagery": "satellite"}
 }
-OWN_WORDS = frozenset({"layer", "level", "part", "id", "local", "geometry", "more", MARK})
+OWN_KEYS = frozenset({"layer", "level", "part", "id", "local", "geometry", "more", OWN_ELEMENT})
 """Names in ExtendedData that place an item; a property of such a name travels in ``more``."""
 
-PLACE_WORDS = frozenset({"layer", "level", "part", "id"})
+PLACE_KEYS = frozenset({"layer", "level", "part", "id"})
 """Those whose values are names."""
 
-RESERVED = OWN_WORDS | {
+RESERVED = OWN_KEYS | {
     *("kind", "name", "source", "target", "orientation", "action", "speed_limit", "width", "value", "expires"),
     *("pose", "size", "datum", "drawn_from", "data", "documents", "tags", "properties", "style", "kml", "kmz", "osm"),
     *("geojson", "tmap", "tmap2", "openrmf", "rmf_nav_graph", "gazebo", "navgraph", "nav2_route", "lif", "lanelet2"),
@@ -145,7 +145,7 @@ def parse_coordinates(texts: Sequence[str]) -> Sequences:
     kind = np.frombuffer(classes, np.uint8)
     cuts = np.flatnonzero(kind == _CUT)
     if len(cuts) != len(texts):
-        return _one_by_one(texts)
+        return _parse_each(texts)
     odd = np.zeros(len(texts), bool)
     inside = kind >= _COMMA
     begins = np.flatnonzero(inside[1:] > inside[:-1]) + 1
@@ -168,7 +168,7 @@ def parse_coordinates(texts: Sequence[str]) -> Sequences:
     try:
         values = np.array(list(map(float, joined.translate(_SPACES).split())), np.float64)
     except ValueError:
-        return _one_by_one(texts)
+        return _parse_each(texts)
     if len(values) == 3 * len(begins) and (size == 3).all():
         points = values.reshape(-1, 3)
     else:
@@ -181,7 +181,7 @@ def parse_coordinates(texts: Sequence[str]) -> Sequences:
     return Sequences(points, start, odd)
 
 
-def _there_and_back(parsed: Sequences, rings: Sequence[int]) -> Sequences:
+def _parse_two_way_rings(parsed: Sequences, rings: Sequence[int]) -> Sequences:
     """The same with these rings of three points (an edge drawn as an area: there and back) made ones of four, as few as
     a ring can have, by giving their second point twice.
     """
@@ -191,7 +191,7 @@ def _there_and_back(parsed: Sequences, rings: Sequence[int]) -> Sequences:
     return Sequences(np.repeat(parsed.points, times, axis=0), before[parsed.start], parsed.odd)
 
 
-def _one_by_one(texts: Sequence[str]) -> Sequences:
+def _parse_each(texts: Sequence[str]) -> Sequences:
     """The same where one text spoils the others."""
     if len(texts) == 1:
         return Sequences(np.empty((0, 3)), np.zeros(2, np.int64), np.ones(1, bool))
@@ -204,7 +204,7 @@ _SPACED_COMMA = re.compile(r"[ \t\r\n]*,[ \t\r\n]*")
 _PLAIN_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?\Z")
 
 
-def lenient_tuples(text: str, line: int | None) -> list[tuple[float, float, float]]:
+def parse_lenient_tuples(text: str, line: int | None) -> list[tuple[float, float, float]]:
     """Coordinates as Google Earth reads them: blanks around commas, a stray comma, and a,b,c,d,e,f without blanks.
 
     Tuples of one number are left out. Raises UnreadableFile for what is no number.
@@ -214,7 +214,9 @@ def lenient_tuples(text: str, line: int | None) -> list[tuple[float, float, floa
         parts = [p for p in token.split(",") if p]
         for p in parts:
             if not _PLAIN_NUMBER.match(p):
-                raise UnreadableFile(f"{p[:40]!r} is not a coordinate", [_at(f"{p[:40]!r} is not a number", line)])
+                raise UnreadableFile(
+                    f"{p[:40]!r} is not a coordinate", [_with_line(f"{p[:40]!r} is not a number", line)]
+                )
         values = [float(p) for p in parts]
         step = 3 if len(values) % 3 == 0 else len(values) if len(values) == 2 else 0
         if step:
@@ -225,15 +227,15 @@ def lenient_tuples(text: str, line: int | None) -> list[tuple[float, float, floa
 def _point(values: Sequence[float], line: int | None) -> tuple[float, float, float]:
     x, y, z = (*values, 0.0, 0.0)[:3]
     if not (abs(x) <= 180.0 and abs(y) <= 90.0 and math.isfinite(z)):
-        raise UnreadableFile(f"the coordinates {x:g},{y:g} are not on earth", [_off_earth(x, y, line)])
+        raise UnreadableFile(f"the coordinates {x:g},{y:g} are not on earth", [_is_off_earth(x, y, line)])
     return x, y, z
 
 
-def _off_earth(x: float, y: float, line: int | None) -> Problem:
-    return _at(f"longitude {x:g}, latitude {y:g}: must be finite, within ±180 and ±90 degrees", line)
+def _is_off_earth(x: float, y: float, line: int | None) -> Problem:
+    return _with_line(f"longitude {x:g}, latitude {y:g}: must be finite, within ±180 and ±90 degrees", line)
 
 
-def _at(problem: str, line: int | None) -> Problem:
+def _with_line(problem: str, line: int | None) -> Problem:
     return Problem(problem, line=line)
 
 
@@ -263,7 +265,7 @@ def _area(rings: Sequence[Sequence[tuple[float, float, float]]]) -> Any:
     return shapely.polygons(make[0], holes=make[1:] or None)
 
 
-def _joined(parts: Sequence[Any]) -> Any:
+def _join_geometries(parts: Sequence[Any]) -> Any:
     """Several geometries as one: Multi… where they are of one type."""
     flat = list(parts)
     while any(p.geom_type.startswith(("Multi", "Geometry")) for p in flat):
@@ -284,11 +286,13 @@ def read_geometry(g: etree._Element) -> Any:
     """One geometry element, whatever oddity it has; empty ones give NO_GEOMETRY. Raises UnreadableFile."""
     name = local_name(g)
     if name in ("Point", "LineString", "LinearRing"):
-        points = _own_tuples(g)
+        points = _coordinate_tuples(g)
         return _line(points[:1] if name == "Point" else points)
     if name == "Polygon":
         rings = [
-            _own_tuples(r) for side in ("outer", "inner") for r in g.iterfind(f"{{*}}{side}BoundaryIs/{{*}}LinearRing")
+            _coordinate_tuples(r)
+            for side in ("outer", "inner")
+            for r in g.iterfind(f"{{*}}{side}BoundaryIs/{{*}}LinearRing")
         ]
         return _area(rings)
     if name == "Track":
@@ -301,17 +305,17 @@ def read_geometry(g: etree._Element) -> Any:
             return NO_GEOMETRY
         return _line([_point(_floats([t or "0" for t in texts3], g.sourceline), g.sourceline)])
     inner = [read_geometry(c) for c in g if isinstance(c.tag, str) and local_name(c) in GEOMETRIES]
-    return _joined(inner)
+    return _join_geometries(inner)
 
 
-def _own_tuples(g: etree._Element) -> list[tuple[float, float, float]]:
-    return [t for c in g.iterchildren("{*}coordinates") for t in lenient_tuples(c.text or "", c.sourceline)]
+def _coordinate_tuples(g: etree._Element) -> list[tuple[float, float, float]]:
+    return [t for c in g.iterchildren("{*}coordinates") for t in parse_lenient_tuples(c.text or "", c.sourceline)]
 
 
 def _floats(texts: Sequence[str], line: int | None) -> list[float]:
     for t in texts:
         if not _PLAIN_NUMBER.match(t.strip()):
-            raise UnreadableFile(f"{t[:40]!r} is not a number", [_at(f"{t[:40]!r} is not a number", line)])
+            raise UnreadableFile(f"{t[:40]!r} is not a number", [_with_line(f"{t[:40]!r} is not a number", line)])
     return [float(t) for t in texts]
 
 
@@ -323,14 +327,14 @@ def item_geometry(element: etree._Element) -> Any:
     if len(geometries) == 1:
         return read_geometry(geometries[0])
     shapes = [s for s in map(read_geometry, geometries) if not s.is_empty]
-    return shapes[0] if len(shapes) == 1 else _joined(shapes)
+    return shapes[0] if len(shapes) == 1 else _join_geometries(shapes)
 
 
 def overlay_footprint(element: etree._Element) -> Any:
     """Where a GroundOverlay lies: its gx:LatLonQuad, else its LatLonBox turned about its middle (counter-clockwise)."""
     quad, box = child(element, "LatLonQuad"), child(element, "LatLonBox")
     if quad is not None:
-        corners = _own_tuples(quad)
+        corners = _coordinate_tuples(quad)
         return shapely.polygons([p[:2] for p in corners]) if len(corners) == 4 else NO_GEOMETRY
     if box is None:
         return NO_GEOMETRY
@@ -340,9 +344,13 @@ def overlay_footprint(element: etree._Element) -> Any:
     west, south, east, north, turn = _floats([*texts[:4], texts[4] or "0"], box.sourceline)
     for x, y in ((west, south), (east, north)):
         if not (abs(x) <= 360.0 and abs(y) <= 90.0):
-            raise UnreadableFile(f"an overlay's corner {x:g},{y:g} is not on earth", [_off_earth(x, y, box.sourceline)])
+            raise UnreadableFile(
+                f"an overlay's corner {x:g},{y:g} is not on earth", [_is_off_earth(x, y, box.sourceline)]
+            )
     if not math.isfinite(turn):
-        raise UnreadableFile("an overlay's rotation is not finite", [_at("rotation is not finite", box.sourceline)])
+        raise UnreadableFile(
+            "an overlay's rotation is not finite", [_with_line("rotation is not finite", box.sourceline)]
+        )
     if east < west:
         east += 360.0
     corners2 = np.array([[west, south], [east, south], [east, north], [west, north]])
@@ -353,10 +361,10 @@ def overlay_footprint(element: etree._Element) -> Any:
         u, v = (corners2 - middle).T * np.array([[shrink], [1.0]])
         c, s = math.cos(angle), math.sin(angle)
         corners2 = middle + np.stack([(c * u - s * v) / shrink, s * u + c * v], axis=1)
-    return _within_earth(shapely.polygons(corners2))
+    return _is_within_earth(shapely.polygons(corners2))
 
 
-def _within_earth(shape: Any) -> Any:
+def _is_within_earth(shape: Any) -> Any:
     """A footprint that crosses the antimeridian as two, one on either side."""
     west, _, east, _ = shape.bounds
     if west >= -180.0 and east <= 180.0:
@@ -367,7 +375,7 @@ def _within_earth(shape: Any) -> Any:
         piece = shapely.intersection(moved, shapely.box(-180.0, -90.0, 180.0, 90.0))
         if piece.area > 0.0:
             pieces.append(piece)
-    return pieces[0] if len(pieces) == 1 else _joined(pieces)
+    return pieces[0] if len(pieces) == 1 else _join_geometries(pieces)
 
 
 # --- values -----------------------------------------------------------------------------------------------------------
@@ -381,11 +389,11 @@ _ESCAPES = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "\r": "&#13;"}
 
 
 def escape(text: str) -> str:
-    """A text for XML content and (with ``quoted``) attributes; what XML cannot hold becomes U+FFFD."""
+    """A text for XML content and (with ``quote_attribute``) attributes; what XML cannot hold becomes U+FFFD."""
     return ILLEGAL.sub("\ufffd", text).translate(_ESCAPES)
 
 
-def quoted(text: str) -> str:
+def quote_attribute(text: str) -> str:
     """A text for an attribute in double quotes."""
     return escape(text).replace('"', "&quot;").replace("\n", "&#10;").replace("\t", "&#9;")
 
@@ -455,9 +463,9 @@ def read_kml(
             f"the root element is <{local_name(root)}>: KML starts with <kml>",
             [Problem(f"<{local_name(root)}> is not KML", line=root.sourceline)],
         )
-    _xml.warn_of_active_content(data, context)
+    _xml.report_active_content(data, context)
     defined = {schema.get("name", "") for schema in root.iter("{*}Schema")}
-    _xml.warn_of_unknown(data, root, ELEMENTS | defined, context, free={*FREE, *defined}, namespace="kml")
+    _xml.report_unknown_elements(data, root, ELEMENTS | defined, context, free={*FREE, *defined}, namespace="kml")
     _check_values(root, context)
     reader = _Reader(context, pictures)
     reader.read(root, entry)
@@ -532,7 +540,7 @@ def _check_values(root: etree._Element, context: ReadContext) -> None:
         if _PLAIN_NUMBER.match(north) and _PLAIN_NUMBER.match(south) and float(north) < float(south):
             reason = f"north {north} is south of south {south}"
             if local_name(box) == "LatLonBox":
-                raise UnreadableFile(f"<LatLonBox>: {reason}", [_at(reason, box.sourceline)])
+                raise UnreadableFile(f"<LatLonBox>: {reason}", [_with_line(reason, box.sourceline)])
             doubts.setdefault("LatLonAltBox", [reason, box.sourceline, 0])[2] += 1
     for name, (doubt, line, count) in doubts.items():
         more = "" if count == 1 else f" ({count} times)"
@@ -558,12 +566,12 @@ class _Reader:
         """A document, and those that we have put inside it."""
         marks = self._marks(root)
         for element, values in marks:
-            if values.get(MARK) == "document" and element is not root and element.getparent() is not None:
+            if values.get(OWN_ELEMENT) == "document" and element is not root and element.getparent() is not None:
                 level = values.get("level") or self.context.level
                 self._detach(element)
-                self._read_one(element, values.get("document"), values.get("entry"), level, [])
-        ours = [(e, w) for e, w in marks if w.get(MARK) != "document"]
-        self._read_one(root, None, entry, self.context.level, ours)
+                self._read_document(element, values.get("document"), values.get("entry"), level, [])
+        ours = [(e, w) for e, w in marks if w.get(OWN_ELEMENT) != "document"]
+        self._read_document(root, None, entry, self.context.level, ours)
 
     def _marks(self, root: etree._Element) -> list[tuple[etree._Element, dict[str, str]]]:
         """Containers that carry our mark, innermost last, with their words."""
@@ -571,8 +579,8 @@ class _Reader:
         for extended in root.iter("{*}ExtendedData"):
             parent = extended.getparent()
             if parent is not None and local_name(parent) in CONTAINERS:
-                values = _words(_values(extended), PLACE_WORDS | {"document", "entry"})
-                if MARK in values:
+                values = _words(_values(extended), PLACE_KEYS | {"document", "entry"})
+                if OWN_ELEMENT in values:
                     out.append((parent, values))
         return out
 
@@ -585,7 +593,7 @@ class _Reader:
         element.getparent().remove(element)
         element.tag = f"{namespace}}}kml" if namespace else "kml"
 
-    def _read_one(
+    def _read_document(
         self,
         root: etree._Element,
         name: str | None,
@@ -602,23 +610,23 @@ class _Reader:
         _check_places(items, parsed)
         own_items, other_items = [], []
         for item in items:
-            values = _words(item.data, PLACE_WORDS)
-            if values.get("layer") in USUAL_PART:
+            values = _words(item.data, PLACE_KEYS)
+            if values.get("layer") in DEFAULT_PART:
                 own_items.append((item, values))
             else:
                 other_items.append(item)
-        self._take(own_items, parsed)
+        self._take_own_items(own_items, parsed)
         all_own = self._remove_ours(root, ours)
         if (other_items or not all_own) and self.context.wants("objects"):
-            self._keep(root, other_items, parsed, name, entry, level)
+            self._take_drawing(root, other_items, parsed, name, entry, level)
 
     # --- our own words ---
 
     def _key(self, values: Mapping[str, str], layer: str) -> PartKey:
-        part = values.get("part") or USUAL_PART[layer] or FAMILY
+        part = values.get("part") or DEFAULT_PART[layer] or FAMILY
         return PartKey(layer, values.get("level") or self.context.level, part)  # type: ignore[arg-type]
 
-    def _take(self, own_items: Sequence[tuple[_Item, dict[str, str]]], parsed: Sequences) -> None:
+    def _take_own_items(self, own_items: Sequence[tuple[_Item, dict[str, str]]], parsed: Sequences) -> None:
         """Items of ours go back to their parts."""
         geometry = _geometries([item for item, _ in own_items], parsed)
         metres = _metres([values.get("local") for _, values in own_items], [item.element for item, _ in own_items])
@@ -634,7 +642,7 @@ class _Reader:
                 continue
             properties: dict[str, Any] = {"name": title} if title else {}
             for label, text in values.items():
-                if label not in OWN_WORDS:
+                if label not in OWN_KEYS:
                     properties[label] = unspell(text)
             if "more" in values and isinstance(more := unspell(values["more"]), dict):
                 properties |= more
@@ -663,7 +671,7 @@ class _Reader:
         icon = child(element, "Icon")
         href = "" if icon is None else child_text(icon, "href")
         layer = values["layer"]
-        label = values.get("part") or title or USUAL_PART[layer]
+        label = values.get("part") or title or DEFAULT_PART[layer]
         noun = "grid" if layer == "occupancy" else "picture"
         data = self.pictures.get(href)
         if data is None:
@@ -718,7 +726,7 @@ class _Reader:
             for style in element.findall("{*}Style"):
                 if style.get("id", "").startswith(STYLE):
                     element.remove(style)
-            if values[MARK] == "part" and values.get("layer") in VECTOR_LAYERS:
+            if values[OWN_ELEMENT] == "part" and values.get("layer") in VECTOR_LAYERS:
                 level = values.get("level") or self.context.level
                 elevation = unspell(values.get("elevation", "0"))
                 if isinstance(elevation, int | float):
@@ -727,7 +735,7 @@ class _Reader:
                 part_items = self.own.setdefault(self._key(values, values["layer"]), _OwnItems())
                 part_items.document |= document if isinstance(document, dict) else {}
             described = child(element, "description")
-            if values[MARK] == "map" and described is not None:
+            if values[OWN_ELEMENT] == "map" and described is not None:
                 self.credit += [line for line in (described.text or "").splitlines() if line]
             left = [c for c in element if local_name(c) not in ("name", "description", "visibility", "open")]
             parent = element.getparent()
@@ -746,7 +754,7 @@ class _Reader:
         for item in items:
             if len(item.geometries) != 1 or local_name(item.element) == "GroundOverlay":
                 continue
-            sequences = _plain_sequences(item.geometries[0])
+            sequences = _parse_plain_sequences(item.geometries[0])
             if sequences is None:
                 continue
             item.shape = sequences[0]
@@ -783,9 +791,9 @@ class _Reader:
                 where=child_text(strange[0], "name")[:200] or None,
             )
         rings = [k for item in items for role, k, _ in item.sequences if role == "R" and counts[k] == 3]
-        return _there_and_back(parsed, rings) if rings else parsed
+        return _parse_two_way_rings(parsed, rings) if rings else parsed
 
-    def _keep(
+    def _take_drawing(
         self,
         root: etree._Element,
         items: list[_Item],
@@ -801,7 +809,7 @@ class _Reader:
         types = shapely.get_type_id(geometry).tolist()
         for k, item in enumerate(items):
             title = titles[k]
-            kind = "overlay" if local_name(item.element) in OVERLAYS else _KINDS[types[k]] or _mixed(geometry[k])
+            kind = "overlay" if local_name(item.element) in OVERLAYS else _KINDS[types[k]] or _mixed_type(geometry[k])
             item_properties: dict[str, Any] = {"kind": kind}
             source_element: dict[str, Any] = {"place": k}
             if title is not None and title[1]:
@@ -813,8 +821,8 @@ class _Reader:
             properties.append(item_properties)
         self.columns.setdefault(level, []).append((ids, list(geometry), properties))
         documents = self.documents.setdefault(level, {})
-        if self.context.whole:
-            xml = _keep_text(root, items, [t[0] if t else None for t in titles], properties)
+        if self.context.keep_source_properties:
+            xml = _keep_element_text(root, items, [t[0] if t else None for t in titles], properties)
             key = name or hashlib.sha256(f"{entry or ''}\0{xml}".encode()).hexdigest()[:DOCUMENT_KEY_DIGITS]
             documents[key] = {"xml": xml} if entry is None else {"xml": xml, "entry": entry}
             for item_properties in properties:
@@ -834,14 +842,14 @@ class _Reader:
             key = PartKey("objects", level, FAMILY)
             parts[key] = Features(tuple(ids), geometry, tuple(properties), np.zeros(len(ids), bool), document)
         for key, part_items in self.own.items():
-            part = self._own_part(key, part_items)
+            part = self._read_own_part(key, part_items)
             existing = parts.get(key)
-            parts[key] = _both(existing, part) if isinstance(existing, Features) else part
-        parts = self._credited(parts)
+            parts[key] = _concatenate(existing, part) if isinstance(existing, Features) else part
+        parts = self._with_credits(parts)
         levels = tuple(Level(n, e) for n, e in sorted(self.levels.items(), key=lambda v: (v[1], v[0])))
         return Layers(parts, self.datum, levels or (Level(self.context.level),))
 
-    def _credited(self, parts: dict[PartKey, Part]) -> dict[PartKey, Part]:
+    def _with_credits(self, parts: dict[PartKey, Part]) -> dict[PartKey, Part]:
         """Our map's description tells the licences and credits of all its parts; some parts tell their own besides."""
         stated = {
             k: texts if isinstance(texts := p.document.get("attribution"), list) else []
@@ -856,7 +864,7 @@ class _Reader:
                 out[key] = part.with_document({**part.document, "attribution": [*stated[key], *extra]})
         return out
 
-    def _own_part(self, key: PartKey, part_items: _OwnItems) -> Features:
+    def _read_own_part(self, key: PartKey, part_items: _OwnItems) -> Features:
         """Items of ours as they were: the exact metres where they were local, unless somebody has moved them."""
         n = len(part_items.ids)
         ids = unique_ids(part_items.ids)
@@ -872,10 +880,10 @@ class _Reader:
         if len(indices):
             metres = np.empty(len(indices), object)
             metres[:] = [part_items.local[k] for k in indices]
-            geometry[indices] = self._unmoved(geometry[indices], metres)
+            geometry[indices] = self._restore_metres(geometry[indices], metres)
         return Features(tuple(ids), geometry, tuple(part_items.properties), local, part_items.document)
 
-    def _unmoved(self, drawn: NDArray[np.object_], metres: NDArray[np.object_]) -> NDArray[np.object_]:
+    def _restore_metres(self, drawn: NDArray[np.object_], metres: NDArray[np.object_]) -> NDArray[np.object_]:
         """The exact metres, or what was drawn since, brought to metres."""
         if self.datum is None:
             return metres
@@ -896,12 +904,12 @@ _KINDS = ("poi", "path", "path", "region", "poi", "path", "region", "")
 """Kind of an object by its geometry's type number; a collection is judged by what is in it."""
 
 
-def _mixed(geometry: Any) -> str:
+def _mixed_type(geometry: Any) -> str:
     widest = shapely.get_dimensions(geometry)
     return "note" if geometry.is_empty else ("poi", "path", "region")[widest]
 
 
-def _both(a: Features, b: Features) -> Features:
+def _concatenate(a: Features, b: Features) -> Features:
     """Objects that were drawn and objects that we had written, in one part."""
     ids = unique_ids([*a.ids, *b.ids])
     return Features(
@@ -924,7 +932,7 @@ def _check_places(items: Sequence[_Item], parsed: Sequences) -> None:
     owner = next((i for i in items if any(k == sequence for _, k, _ in i.sequences)), None)
     x, y, _ = points[at]
     line = None if owner is None else owner.geometries[0].sourceline
-    raise UnreadableFile(f"the coordinates {x:g},{y:g} are not on earth", [_off_earth(x, y, line)])
+    raise UnreadableFile(f"the coordinates {x:g},{y:g} are not on earth", [_is_off_earth(x, y, line)])
 
 
 def _items(root: etree._Element) -> list[_Item]:
@@ -991,13 +999,13 @@ def _words(data: Iterable[tuple[str, etree._Element]], names: frozenset[str]) ->
     return values
 
 
-def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Element]]] | None:
+def _parse_plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Element]]] | None:
     """Shape and coordinate elements of a geometry without oddities of structure: ``P`` point, ``L`` line, ``A2`` area
     of two rings, ``M…`` several of them; (role, element) in the order of the geometry's own coordinates.
     """
     name = local_name(g)
     if name == "Polygon":
-        if len(g) == 1 and (c := _only_ring(g[0])) is not None:
+        if len(g) == 1 and (c := _single_ring(g[0])) is not None:
             return "A1", [("R", c)]
         coordinates = list(g.iter("{*}coordinates"))
         for k, c in enumerate(coordinates):
@@ -1021,7 +1029,7 @@ def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Ele
         return None
     shape, out = "M", []
     for c in g:
-        inner = _plain_sequences(c) if local_name(c) in SIMPLE else None
+        inner = _parse_plain_sequences(c) if local_name(c) in SIMPLE else None
         if inner is None:
             return None
         shape += inner[0]
@@ -1029,7 +1037,7 @@ def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Ele
     return (shape, out) if out else None
 
 
-def _only_ring(side: etree._Element) -> etree._Element | None:
+def _single_ring(side: etree._Element) -> etree._Element | None:
     """The coordinates of ``<outerBoundaryIs><LinearRing><coordinates/>`` with nothing else in it, as nearly all are."""
     if len(side) == 1 and local_name(side) == "outerBoundaryIs":
         ring = side[0]
@@ -1047,7 +1055,7 @@ def _geometries(items: Sequence[_Item], parsed: Sequences) -> NDArray[np.object_
         if item.shape in rows_by_shape:
             rows_by_shape[item.shape].append((n, item.sequences[0][1]))
         elif item.shape:
-            out[n] = _assembled(item, parsed)
+            out[n] = _assemble_geometry(item, parsed)
         else:
             out[n] = item_geometry(item.element)
     make: dict[str, Callable[..., Any]] = {
@@ -1076,7 +1084,7 @@ def _geometries(items: Sequence[_Item], parsed: Sequences) -> NDArray[np.object_
     return out
 
 
-def _assembled(item: _Item, parsed: Sequences) -> Any:
+def _assemble_geometry(item: _Item, parsed: Sequences) -> Any:
     """A plain geometry of several lists: an area with holes, or a collection."""
     lists = [parsed.points[parsed.start[k] : parsed.start[k + 1]] for _, k, _ in item.sequences]
     deep = any(p[:, 2].any() for p in lists)
@@ -1090,7 +1098,7 @@ def _assembled(item: _Item, parsed: Sequences) -> Any:
         else:
             rings = [shapely.linearrings(next(rows)) for _ in range(int(piece[1:]))]
             shapes.append(shapely.polygons(rings[0], holes=rings[1:] or None))
-    return _joined(shapes) if item.shape[0] == "M" else shapes[0]
+    return _join_geometries(shapes) if item.shape[0] == "M" else shapes[0]
 
 
 def _usable(text: str) -> str:
@@ -1127,7 +1135,7 @@ def _identify(
     return ids, titles
 
 
-def _keep_text(
+def _keep_element_text(
     root: etree._Element,
     items: Sequence[_Item],
     titles: Sequence[etree._Element | None],
@@ -1147,8 +1155,8 @@ def _keep_text(
             for _, _, c in item.sequences:
                 c.text = _M_COORDINATES
             coordinates += len(item.sequences)
-    text, begins = _serialised(root, [item.element for item in items])
-    pieces, counts = _slotted(text)
+    text, begins = _serialise(root, [item.element for item in items])
+    pieces, counts = _cut_into_slots(text)
     marks = (_M_ITEM, _M_NAME, _M_COORDINATES, _M_OPEN, _M_CLOSE)
     expected = [len(items) + sum(begins), names, coordinates, values, values]
     if [counts.pop(m[-1], 0) for m in marks] != expected or counts.pop(_M_END[-1], 0) > 1 or counts:
@@ -1162,7 +1170,7 @@ def _keep_text(
     return "".join([*skeleton, *pieces])
 
 
-def _slotted(text: str) -> tuple[Iterator[str], Counter[str]]:
+def _cut_into_slots(text: str) -> tuple[Iterator[str], Counter[str]]:
     """The text cut at its item marks, with slots for its other marks, and how many there are of each."""
     first, *chunks = text.split(_MARK)
     pieces: list[str] = []
@@ -1180,7 +1188,7 @@ def _slotted(text: str) -> tuple[Iterator[str], Counter[str]]:
     return iter(pieces), counts
 
 
-def _serialised(root: etree._Element, items: Sequence[etree._Element]) -> tuple[str, list[bool]]:
+def _serialise(root: etree._Element, items: Sequence[etree._Element]) -> tuple[str, list[bool]]:
     """The tree as text with a mark behind each item, before each that follows no other item directly (True in the
     list), and where more can be added.
     """

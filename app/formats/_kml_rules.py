@@ -14,7 +14,7 @@ from lxml import etree
 
 from app.errors import Problem
 from app.formats import Files, _archive, _xml
-from app.formats._rules import HEAD, LIMITS, brief, doubted, names, refused, repeated
+from app.formats._rules import HEAD_BYTES, LIMITS, duplicates, error_finding, is_brief, names, warning_finding
 
 SPACES = ("http://www.opengis.net/kml/", "http://earth.google.com/kml/")
 
@@ -34,48 +34,54 @@ def check_archive(files: Files) -> Iterator[Problem]:
     entries: Mapping[str, bytes] = _archive.unpack(files[main], LIMITS)
     kml = [name for name in entries if name.lower().endswith(".kml")]
     if not kml:
-        yield refused("there is no .kml in the archive", main)
+        yield error_finding("there is no .kml in the archive", main)
         return
     if len(kml) > 1:
-        yield doubted(f"has {len(kml)} .kml; readers take the first one, {kml[0]}", main)
+        yield warning_finding(f"has {len(kml)} .kml; readers take the first one, {kml[0]}", main)
     folder = posixpath.dirname(kml[0])
     entry_names = {posixpath.relpath(name, folder) if folder else name for name in entries}
     yield from _document(entries[kml[0]], main, entry_names)
 
 
 def _document(data: bytes, main: str, entries: Collection[str] | None) -> Iterator[Problem]:
-    if brief(data):
-        if not re.search(rb"<(\w+:)?kml\b[^>]*opengis\.net/kml|<(\w+:)?kml\b[^>]*earth\.google\.com/kml", data[:HEAD]):
-            yield refused("the root is not <kml> in its namespace", main)
+    if is_brief(data):
+        if not re.search(
+            rb"<(\w+:)?kml\b[^>]*opengis\.net/kml|<(\w+:)?kml\b[^>]*earth\.google\.com/kml", data[:HEAD_BYTES]
+        ):
+            yield error_finding("the root is not <kml> in its namespace", main)
         return
     root = _xml.parse(data, LIMITS)
     name = etree.QName(root)
     if name.localname != "kml":
-        one = refused if name.localname not in PARTS else doubted
+        one = error_finding if name.localname not in PARTS else warning_finding
         yield one(f"the root is <{name.localname}>, not <kml>", main, line=root.sourceline)
     elif not (name.namespace or "").startswith(SPACES):
-        yield doubted("the root is in no KML namespace: GDAL does not take it for KML", main, line=root.sourceline)
+        yield warning_finding(
+            "the root is in no KML namespace: GDAL does not take it for KML", main, line=root.sourceline
+        )
     ids = [str(i) for i in root.xpath("//@*[local-name() = 'id']")]
-    if repeats := repeated(ids):
-        yield doubted(
+    if repeats := duplicates(ids):
+        yield warning_finding(
             f"{len(repeats)} ids are given twice; styles and updates are found by them: {names(repeats)}", main
         )
     id_set = set(ids)
     urls = {(e.text or "").strip() for e in root.iter("{*}styleUrl")}
     if absent := sorted(u for u in urls if u.startswith("#") and u[1:] not in id_set):
-        yield doubted(f"{len(absent)} styles are not there: {names(absent)}", main)
-    bad_lines = [e.sourceline for e in root.iter("{*}coordinates") if not _on_earth(e.text)]
+        yield warning_finding(f"{len(absent)} styles are not there: {names(absent)}", main)
+    bad_lines = [e.sourceline for e in root.iter("{*}coordinates") if not _is_on_earth(e.text)]
     if bad_lines:
         reason = f"{len(bad_lines)} coordinates do not begin with a longitude and a latitude; the first is on this line"
-        yield refused(reason, main, line=bad_lines[0])
+        yield error_finding(reason, main, line=bad_lines[0])
     if entries is not None:
         hrefs = {(e.text or "").strip() for e in root.iter("{*}href")}
         inside = {h.partition("#")[0] for h in hrefs if h and ":" not in h and not h.startswith("#")}
         if absent := sorted(h for h in inside if h and posixpath.normpath(h) not in entries):
-            yield doubted(f"{len(absent)} files that it refers to are not in the archive: {names(absent)}", main)
+            yield warning_finding(
+                f"{len(absent)} files that it refers to are not in the archive: {names(absent)}", main
+            )
 
 
-def _on_earth(text: str | None) -> bool:
+def _is_on_earth(text: str | None) -> bool:
     """Whether the first position, if there is one, is degrees within bounds."""
     first = (text or "").split(None, 1)[:1]
     if not first:

@@ -23,27 +23,27 @@ from app.errors import Invalid
 from app.formats import LayerRequirements, WriteContext, _image, _text
 from app.formats._kml import (
     COORDINATES,
+    DEFAULT_PART,
     END,
     FAMILY,
     GEOMETRIES,
-    MARK,
     NAME,
-    OWN_WORDS,
+    OWN_ELEMENT,
+    OWN_KEYS,
     SLOT,
     STYLE,
-    USUAL_PART,
     child,
     escape,
     item_geometry,
     local_name,
-    quoted,
+    quote_attribute,
     spell,
 )
 from app.model.features import Features, Properties, concatenate, unique_ids
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import LOCAL, USUAL_COLOURS, GeoImage, displayed
+from app.model.imagery import DEFAULT_COLOURS, LOCAL, GeoImage, display_pixels
 from app.model.layers import Layer, Layers, PartKey
 
 KML = "http://www.opengis.net/kml/2.2"
@@ -107,8 +107,8 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
     documents: list[_Document] = []
     folders: list[str] = []
     drawn = {i for part in layers.vector("objects").values() for i in part.ids}
-    parts = _drawn_together(layers)
-    claimed = {text for part in parts.values() for text in _stated(part)}
+    parts = _group_by_drawing(layers)
+    claimed = {text for part in parts.values() for text in _attribution_texts(part)}
     shared = [text for text in context.attribution if text not in claimed]
     for key in sorted(parts):
         part = parts[key]
@@ -117,14 +117,14 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
             drawings, remainder = _drawings(key, part, frame, context)
             documents += drawings
         elif key.layer == "topology":
-            remainder = _undrawn(part, drawn)
+            remainder = _drop_drawing(part, drawn)
         if remainder is not None:
             folders.append(_folder(key, remainder, layers, frame, shared))
     overlays, pictures = _overlays(layers, context, with_pictures, taken)
     # A drawing that is all there is comes back as it was: the datum stands beside what is ours, not inside it.
     datum = [_datum(layers)] if folders or overlays or not documents else []
     ours = "".join([*datum, *folders, *overlays])
-    context.drop("voxels", len(layers.of("voxels")), "KML has no place for it")
+    context.drop("voxels", len(layers.parts_of("voxels")), "KML has no place for it")
     entry = documents[0].entry if len(documents) == 1 else None
     return WrittenKml((HEAD + _file(documents, ours, context)).encode(), pictures, entry)
 
@@ -137,8 +137,8 @@ def _file(documents: list[_Document], ours: str, context: WriteContext) -> str:
             return only.replace(END, "") + "\n"
         if END in only and not re.match(r"<[\w.-]+:", only):
             return only.replace(END, _map(ours, context, [])) + "\n"
-    inner = _distinct([d.xml.replace(END, "") for d in documents])
-    wrapped = [_wrapped(d, xml) for d, xml in zip(documents, inner, strict=True)]
+    inner = _unique_names([d.xml.replace(END, "") for d in documents])
+    wrapped = [_wrap_document(d, xml) for d, xml in zip(documents, inner, strict=True)]
     return f"<kml {_NAMESPACES}>{_map(ours, context, wrapped)}</kml>\n"
 
 
@@ -151,7 +151,7 @@ def _map(ours: str, context: WriteContext, documents: list[str]) -> str:
             f"<Document><name>{escape(context.title)}</name>",
             f"<description>{credit}</description>" if credit else "",
             styles,
-            f"<ExtendedData>{_data(MARK, 'map')}</ExtendedData>\n",
+            f"<ExtendedData>{_data(OWN_ELEMENT, 'map')}</ExtendedData>\n",
             *documents,
             ours,
             "</Document>",
@@ -160,7 +160,7 @@ def _map(ours: str, context: WriteContext, documents: list[str]) -> str:
 
 
 def _data(name: str, value: Any) -> str:
-    return f'<Data name="{quoted(name)}"><value>{spell(value)}</value></Data>'
+    return f'<Data name="{quote_attribute(name)}"><value>{spell(value)}</value></Data>'
 
 
 # --- coordinates ------------------------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ class _Texts:
     start: list[int]
     shape: list[str]
 
-    def of(self, k: int) -> list[str]:
+    def texts_of(self, k: int) -> list[str]:
         return self.texts[self.start[k] : self.start[k + 1]]
 
 
@@ -269,20 +269,20 @@ def _element(geometry: Any, lists: Iterator[str], extra: str = "") -> str:
 # --- our own words ----------------------------------------------------------------------------------------------------
 
 
-def _undrawn(part: Features, drawn: set[str]) -> Features | None:
+def _drop_drawing(part: Features, drawn: set[str]) -> Features | None:
     """A network without what was made from a drawing that is written too; None where nothing else is in it."""
     mask = [isinstance(i := p.get("drawn_from"), str) and i in drawn for p in part.properties]
     if not any(mask):
         return part
-    return part.take(~np.array(mask)) if not all(mask) else None
+    return part.select(~np.array(mask)) if not all(mask) else None
 
 
-def _place_words(key: PartKey) -> str:
+def _place_members(key: PartKey) -> str:
     """Where an item belongs, as far as it is not what a reader takes for granted."""
     data = _data("layer", key.layer)
     if key.level != GROUND:
         data += _data("level", key.level)
-    if key.name != (USUAL_PART[key.layer] or FAMILY):
+    if key.name != (DEFAULT_PART[key.layer] or FAMILY):
         data += _data("part", key.name)
     return data
 
@@ -300,7 +300,7 @@ def _datum(layers: Layers) -> str:
     )
 
 
-def _stated(part: Features) -> list[str]:
+def _attribution_texts(part: Features) -> list[str]:
     """The licences and credits that a part's own document tells."""
     attribution = part.document.get("attribution")
     return [text for text in attribution if isinstance(text, str)] if isinstance(attribution, list) else []
@@ -308,13 +308,13 @@ def _stated(part: Features) -> list[str]:
 
 def _folder(key: PartKey, part: Features, layers: Layers, frame: LocalFrame | None, shared: Sequence[str] = ()) -> str:
     """A part in our own words. shared: credits that no part's document tells."""
-    data = [_data(MARK, "part"), _place_words(key)]
+    data = [_data(OWN_ELEMENT, "part"), _place_members(key)]
     elevation = layers.elevation(key.level)
     if elevation:
         data.append(_data("elevation", elevation))
     document = part.document if key.name != FAMILY else {}
     if shared and key.name != FAMILY:
-        document = {**document, "attribution": [*_stated(part), *shared]}
+        document = {**document, "attribution": [*_attribution_texts(part), *shared]}
     if document:
         data.append(_data("document", dict(document)))
     title = key.layer if key.level == GROUND else f"{key.layer}, {key.level}"
@@ -331,8 +331,8 @@ def _placemarks(key: PartKey, part: Features, frame: LocalFrame | None) -> Itera
     """Every item of a part as a placemark that says all we know of it."""
     geometry = part.in_wgs84(frame)
     texts = _degrees(geometry)
-    exact = _local_words(part)
-    part_data = _place_words(key)
+    exact = _local_texts(part)
+    part_data = _place_members(key)
     opening: dict[str, str] = {}
     types = shapely.get_type_id(geometry).tolist()
     for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
@@ -348,8 +348,8 @@ def _placemarks(key: PartKey, part: Features, frame: LocalFrame | None) -> Itera
                     continue
             start = opening.get(label)
             if start is None:
-                plain = label not in OWN_WORDS and label and label.isprintable() and label == label.strip()
-                start = opening[label] = f'<Data name="{quoted(label)}"><value>' if plain else ""
+                plain = label not in OWN_KEYS and label and label.isprintable() and label == label.strip()
+                start = opening[label] = f'<Data name="{quote_attribute(label)}"><value>' if plain else ""
             if start:
                 data.append(f"{start}{spell(value)}</value></Data>")
             else:
@@ -364,7 +364,7 @@ def _placemarks(key: PartKey, part: Features, frame: LocalFrame | None) -> Itera
         if types[k] == 0 and texts.start[k] < texts.start[k + 1] and not geometry[k].is_empty:
             out.append(f"<Point><coordinates>{texts.texts[texts.start[k]]}</coordinates></Point>")
         else:
-            out.append(_element(geometry[k], iter(texts.of(k))))
+            out.append(_element(geometry[k], iter(texts.texts_of(k))))
         out.append("</Placemark>\n")
         yield "".join(out)
 
@@ -375,7 +375,7 @@ def _style(layer: Layer, properties: Properties) -> str:
     return {"location": "location", "zones": "zone"}.get(layer, "object")
 
 
-def _local_words(part: Features) -> list[str]:
+def _local_texts(part: Features) -> list[str]:
     """The exact metres of local items as JSON, an empty text for the others."""
     out = [""] * len(part)
     indices = np.flatnonzero(part.local)
@@ -384,7 +384,7 @@ def _local_words(part: Features) -> list[str]:
     geometry = part.geometry[indices]
     texts = _coordinate_texts(geometry, _text.METRES, _bracket, ",")
     for n, k in enumerate(indices.tolist()):
-        shape, lists = texts.shape[n], texts.of(n)
+        shape, lists = texts.shape[n], texts.texts_of(n)
         if shape == "P":
             out[k] = lists[0]
         elif shape == "L":
@@ -458,15 +458,15 @@ def _corners(
 def _png(key: PartKey, part: OccupancyGrid | GeoImage, context: WriteContext) -> bytes:
     if isinstance(part, OccupancyGrid):
         return _image.overlay_png(part)
-    if not _is_shown_as_it_is(part):
+    if not _is_displayable(part):
         why = "an overlay's image has 8-bit grey or colours: bands, values and palettes beyond them are drawn as shown"
         context.drop(f"imagery {key.level}/{key.name}: pixel values", 1, why)
-    return _image.encode_png(displayed(part))
+    return _image.encode_png(display_pixels(part))
 
 
-def _is_shown_as_it_is(picture: GeoImage) -> bool:
+def _is_displayable(picture: GeoImage) -> bool:
     """Whether a PNG holds the picture's very pixels."""
-    plain = picture.pixels.dtype == np.uint8 and picture.colours == USUAL_COLOURS.get(len(picture.colours))
+    plain = picture.pixels.dtype == np.uint8 and picture.colours == DEFAULT_COLOURS.get(len(picture.colours))
     return plain and picture.nodata is None
 
 
@@ -495,11 +495,11 @@ def _overlay(key: PartKey, part: OccupancyGrid | GeoImage, href: str, ring: NDAr
         parameters = {"crs": part.crs, "transform": list(part.transform)}
     if part.properties:
         properties = part.properties
-        plain = isinstance(part, OccupancyGrid) or _is_shown_as_it_is(part)
+        plain = isinstance(part, OccupancyGrid) or _is_displayable(part)
         parameters["properties"] = (
             dict(properties) if plain else {k: v for k, v in properties.items() if k == "attribution"}
         )
-    data = _place_words(key) + "".join(_data(n, v) for n, v in parameters.items())
+    data = _place_members(key) + "".join(_data(n, v) for n, v in parameters.items())
     box = zip(("north", "south", "east", "west", "rotation"), (north, south, east, west, turn), strict=True)
     sides_text = "".join(f"<{n}>{_text.number(v, _text.DEGREES)}</{n}>" for n, v in box if n != "rotation" or v)
     quad = _degrees(shapely.linestrings(ring[None])).texts[0]
@@ -520,7 +520,7 @@ _TITLE = re.compile(r"<(?:[\w.-]+:)?name>([^<]*)</")
 _XMLNS = re.compile(r"""\sxmlns(?::[\w.-]+)?="[^"]*\"""")
 
 
-def _drawn_together(layers: Layers) -> dict[PartKey, Features]:
+def _group_by_drawing(layers: Layers) -> dict[PartKey, Features]:
     """The vector parts; fences and zones that were drawn in a document stand with the objects of that document."""
     out = {key: part for key, part in layers.parts.items() if isinstance(part, Features)}
     for key in sorted(out):
@@ -529,16 +529,16 @@ def _drawn_together(layers: Layers) -> dict[PartKey, Features]:
             continue
         source_document = part.document.get(FAMILY)
         skeletons = _skeletons(part)
-        drawn = np.array([_kept(p, skeletons) is not None for p in part.properties])
+        drawn = np.array([_kept_element(p, skeletons) is not None for p in part.properties])
         if not drawn.any():
             continue
         home = PartKey("objects", key.level, FAMILY)
         siblings = [out[home]] if home in out else []
-        moved = part.take(drawn).with_document({FAMILY: source_document})
+        moved = part.select(drawn).with_document({FAMILY: source_document})
         ids = unique_ids(moved.ids, {i for other in siblings for i in other.ids})
         out[home] = concatenate([*siblings, replace(moved, ids=tuple(ids))])
         left = {name: value for name, value in part.document.items() if name != FAMILY}
-        out[key] = part.take(~drawn).with_document(left)
+        out[key] = part.select(~drawn).with_document(left)
         if drawn.all() and not left:
             del out[key]
     return out
@@ -557,7 +557,7 @@ def _skeletons(part: Features) -> dict[str, Mapping[str, Any]]:
     }
 
 
-def _kept(p: Properties, documents: Mapping[str, Any]) -> Mapping[str, Any] | None:
+def _kept_element(p: Properties, documents: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """What an item remembers of its element in one of the known drawings, where that can be made use of."""
     source_element = p.get(FAMILY)
     usable = (
@@ -582,36 +582,40 @@ def _drawings(
     loose = []
     roots = {name: _declarations(document["xml"]) for name, document in skeletons.items()}
     for k, p in enumerate(part.properties):
-        source_element = _kept(p, skeletons)
+        source_element = _kept_element(p, skeletons)
         if source_element is None:
             loose.append(k)
             continue
         name = source_element["document"]
         try:
             placed[name].append(
-                (source_element.get("place", 0), k, _filled(source_element, p, geometry[k], texts, k, roots[name]))
+                (
+                    source_element.get("place", 0),
+                    k,
+                    _fill_element(source_element, p, geometry[k], texts, k, roots[name]),
+                )
             )
         except (etree.LxmlError, ValueError, LookupError, AttributeError, StopIteration):
             loose.append(k)  # not an element as it was read from a file
     documents = []
     for name, document in sorted(skeletons.items()):
         items = sorted(placed[name])
-        text = _in_place(document["xml"], items)
-        if not _well_formed(text):
-            bad = {k for _, k, xml in items if not _well_formed(f"<w{roots[name]}>{xml}</w>")}
+        text = _fill_skeleton(document["xml"], items)
+        if not _is_well_formed(text):
+            bad = {k for _, k, xml in items if not _is_well_formed(f"<w{roots[name]}>{xml}</w>")}
             items = [item for item in items if item[1] not in bad]
-            text = _in_place(document["xml"], items)
-            if not _well_formed(text):
+            text = _fill_skeleton(document["xml"], items)
+            if not _is_well_formed(text):
                 bad.update(k for _, k, _ in items)
                 context.drop("drawing", 1, "what is remembered of its document is damaged; its objects are written")
                 text = ""
             loose += bad
         if text:
             documents.append(_Document(key.level, name, document.get("entry"), text))
-    return documents, part.take(sorted(loose)) if loose else None
+    return documents, part.select(sorted(loose)) if loose else None
 
 
-def _well_formed(xml: str) -> bool:
+def _is_well_formed(xml: str) -> bool:
     """Whether it is XML, its prefixes declared."""
     try:
         expat.ParserCreate(namespace_separator=" ").Parse(xml, True)
@@ -620,7 +624,7 @@ def _well_formed(xml: str) -> bool:
     return True
 
 
-def _in_place(skeleton: str, items: Sequence[tuple[int, int, str]]) -> str:
+def _fill_skeleton(skeleton: str, items: Sequence[tuple[int, int, str]]) -> str:
     """A document with its items where they stood."""
     pieces = _ITEMS.split(skeleton)
     starts = [int(n[:18]) for n in pieces[1::2]]
@@ -642,16 +646,16 @@ def _declarations(xml: str) -> str:
     return "".join(_XMLNS.findall(root[3])) if root else ""
 
 
-def _filled(
+def _fill_element(
     source_element: Mapping[str, Any], p: Properties, geometry: Any, texts: _Texts, k: int, declarations: str
 ) -> str:
     """A kept element with the name, the values and the place that the object has now."""
     xml: str = source_element["xml"]
     shape = source_element.get("shape")
     if shape is None:
-        xml = _same_or_redrawn(xml, geometry, declarations, texts.of(k))
+        xml = _update_geometry(xml, geometry, declarations, texts.texts_of(k))
     elif shape != texts.shape[k]:
-        xml = _redrawn(xml, geometry, declarations, texts.of(k))
+        xml = _redraw(xml, geometry, declarations, texts.texts_of(k))
     else:
         begin, end = texts.start[k], texts.start[k + 1]
         if end - begin == 1:
@@ -685,34 +689,34 @@ def _value(label: str, p: Properties, aside: Mapping[str, Any]) -> str:
     return escape(value if isinstance(value, str) else orjson.dumps(value, option=orjson.OPT_SORT_KEYS).decode())
 
 
-def _parsed(xml: str, declarations: str) -> etree._Element:
+def _parse_element(xml: str, declarations: str) -> etree._Element:
     """A kept element as a tree, inside a wrapper with its document's namespaces; slots stay as instructions."""
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     wrapper = etree.fromstring(f"<w{declarations}>{xml}</w>".encode(), parser)
     return wrapper[0]
 
 
-def _unparsed(element: etree._Element) -> str:
+def _serialise_element(element: etree._Element) -> str:
     text: str = etree.tostring(element.getparent(), encoding="unicode")
     return text[text.index(">") + 1 : text.rindex("<")]
 
 
-def _same_or_redrawn(xml: str, geometry: Any, declarations: str, lists: list[str]) -> str:
+def _update_geometry(xml: str, geometry: Any, declarations: str, lists: list[str]) -> str:
     """An element that holds its own geometry: as it is, unless the object lies elsewhere by now."""
-    element = _parsed(xml, declarations)
+    element = _parse_element(xml, declarations)
     before = item_geometry(element)
     both_empty = before.is_empty and geometry.is_empty
     if both_empty or shapely.equals_exact(before, geometry, tolerance=_SAME_PLACE):
         return xml
-    return _redrawn(xml, geometry, declarations, lists)
+    return _redraw(xml, geometry, declarations, lists)
 
 
-def _redrawn(xml: str, geometry: Any, declarations: str, lists: list[str]) -> str:
+def _redraw(xml: str, geometry: Any, declarations: str, lists: list[str]) -> str:
     """The element with another geometry. An overlay gets new corners, a model a new place."""
-    element = _parsed(xml, declarations)
+    element = _parse_element(xml, declarations)
     kind = local_name(element)
     if kind == "GroundOverlay":
-        return _moved_overlay(element, geometry, lists)
+        return _move_overlay(element, geometry, lists)
     old = [c for c in element if isinstance(c.tag, str) and local_name(c) in GEOMETRIES]
     spot = child(old[0], "Location") if len(old) == 1 and local_name(old[0]) == "Model" else None
     if spot is not None and geometry.geom_type == "Point" and not geometry.is_empty:
@@ -721,7 +725,7 @@ def _redrawn(xml: str, geometry: Any, declarations: str, lists: list[str]) -> st
             match = child(spot, name)
             if match is not None:
                 match.text = text
-        return _unparsed(element)
+        return _serialise_element(element)
     at = element.index(old[0]) if old else len(element)
     modes = old[0] if old and local_name(old[0]) in ("Point", "LineString", "LinearRing", "Polygon") else ()
     keep = [c for c in modes if isinstance(c.tag, str) and local_name(c) in ("extrude", "tessellate", "altitudeMode")]
@@ -733,10 +737,10 @@ def _redrawn(xml: str, geometry: Any, declarations: str, lists: list[str]) -> st
     if element_text:
         declared = f' xmlns="{namespace}"' if namespace else ""
         element.insert(at, etree.fromstring(f"<w{declared}>{element_text}</w>")[0])
-    return _unparsed(element)
+    return _serialise_element(element)
 
 
-def _moved_overlay(element: etree._Element, geometry: Any, lists: list[str]) -> str:
+def _move_overlay(element: etree._Element, geometry: Any, lists: list[str]) -> str:
     for name in ("LatLonBox", "LatLonQuad"):
         old_box = child(element, name)
         if old_box is not None:
@@ -751,14 +755,14 @@ def _moved_overlay(element: etree._Element, geometry: Any, lists: list[str]) -> 
         declared = f' xmlns="{namespace}"' if namespace else ""
         sides = "".join(f"<{n}>{v}</{n}>" for n, v in box)
         element.append(etree.fromstring(f"<LatLonBox{declared}>{sides}</LatLonBox>"))
-    return _unparsed(element)
+    return _serialise_element(element)
 
 
 _STYLE_ID = re.compile(r'(<(?:[\w.-]+:)?(?:Style|StyleMap|CascadingStyle)\s(?:[^>]*?\s)?(?:[\w.-]+:)?id=")([^"]*)(")')
 _STYLE_URL = re.compile(r"(<(?:[\w.-]+:)?styleUrl(?:\s[^>]*)?>\s*#)([^<\s]*)")
 
 
-def _distinct(documents: list[str]) -> list[str]:
+def _unique_names(documents: list[str]) -> list[str]:
     """The documents with style ids that no other one has, so that each placemark keeps its own style."""
     used: set[str] = set()
     out = []
@@ -771,18 +775,18 @@ def _distinct(documents: list[str]) -> list[str]:
                 n += 1
             names[i] = f"{i}-{n}"
         used |= {names.get(i, i) for i in style_ids}
-        out.append(_renamed(xml, names) if names else xml)
+        out.append(_rename(xml, names) if names else xml)
     return out
 
 
-def _renamed(xml: str, names: Mapping[str, str]) -> str:
+def _rename(xml: str, names: Mapping[str, str]) -> str:
     xml = _STYLE_ID.sub(lambda m: f"{m[1]}{names.get(m[2], m[2])}{m[3]}", xml)
     return _STYLE_URL.sub(lambda m: f"{m[1]}{names.get(m[2], m[2])}", xml)
 
 
-def _wrapped(document: _Document, xml: str) -> str:
+def _wrap_document(document: _Document, xml: str) -> str:
     """A whole document inside ours: its root becomes a Document that says where it came from."""
-    data = _data(MARK, "document") + _data("document", document.name)
+    data = _data(OWN_ELEMENT, "document") + _data("document", document.name)
     if document.entry is not None:
         data += _data("entry", document.entry)
     if document.level != GROUND:

@@ -21,10 +21,10 @@ Places = NDArray[np.intp]
 SAME_RATIO = 1e-6
 """Of a lane's length: bends of both bounds nearer than this along it are one bend of its middle."""
 
-STEEPEST = 0.2
+MIN_CROSSING_COSINE = 0.2
 """Cosine of the angle between a lane and a border across it; below it the lane would begin with a sliver."""
 
-LONGEST_MITRE = 2.0
+MAX_MITRE_RATIO = 2.0
 """How much longer than half the width a corner may reach out."""
 
 Point = tuple[float, float]
@@ -32,9 +32,10 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class LineSet:
-    """n lines of two and more points. at: places of their points. first: [n + 1], where each begins in ``at``."""
+    """n lines of two and more points. indices: places of their points. first: [n + 1], where each begins in
+    ``indices``."""
 
-    at: Places
+    indices: Places
     first: Places
 
     @property
@@ -43,21 +44,21 @@ class LineSet:
         return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
 
     @property
-    def begin(self) -> Places:
+    def first_points(self) -> Places:
         """[n] the first point of each line."""
-        return self.at[self.first[:-1]]
+        return self.indices[self.first[:-1]]
 
     @property
-    def end(self) -> Places:
+    def last_points(self) -> Places:
         """[n] the last point of each line."""
-        return self.at[self.first[1:] - 1]
+        return self.indices[self.first[1:] - 1]
 
-    def turned(self, mask: NDArray[np.bool_]) -> LineSet:
+    def reverse(self, mask: NDArray[np.bool_]) -> LineSet:
         """The same with these lines the other way round."""
         owner = self.owner
-        positions = np.arange(len(self.at))
+        positions = np.arange(len(self.indices))
         back = self.first[owner] + self.first[owner + 1] - 1 - positions
-        return LineSet(self.at[np.where(mask[owner], back, positions)], self.first)
+        return LineSet(self.indices[np.where(mask[owner], back, positions)], self.first)
 
 
 def runs(lines: Sequence[Sequence[int]]) -> LineSet:
@@ -67,27 +68,27 @@ def runs(lines: Sequence[Sequence[int]]) -> LineSet:
     return LineSet(np.array([k for line in lines for k in line], np.intp), first)
 
 
-def aligned(left: LineSet, right: LineSet, xy: Array) -> tuple[LineSet, LineSet]:
+def align_bounds(left: LineSet, right: LineSet, xy: Array) -> tuple[LineSet, LineSet]:
     """Both bounds along the lane. xy: [points, 2] in metres.
 
     Source: Lanelet2's ``geometry::align``, which its reader applies to every lanelet: a bound is turned where the
     middle of the other one is not on its proper side.
     """
-    turned = left.turned(_side(left, _middle(right, xy), xy) >= 0)
-    return turned, right.turned(_side(right, _middle(turned, xy), xy) <= 0)
+    turned = left.reverse(_side(left, _middle(right, xy), xy) >= 0)
+    return turned, right.reverse(_side(right, _middle(turned, xy), xy) <= 0)
 
 
 def _middle(lines: LineSet, xy: Array) -> Array:
     """[n, 2] the middle one of its points; of two the mean."""
     size = np.diff(lines.first)
-    inner = xy[lines.at[lines.first[:-1] + size // 2]]
-    return np.where((size > 2)[:, None], inner, (xy[lines.begin] + xy[lines.end]) / 2.0)
+    inner = xy[lines.indices[lines.first[:-1] + size // 2]]
+    return np.where((size > 2)[:, None], inner, (xy[lines.first_points] + xy[lines.last_points]) / 2.0)
 
 
 def _side(lines: LineSet, points: Array, xy: Array) -> Array:
     """[n] positive where a line's point is on its left, negative on its right."""
-    coordinates = xy[lines.at]
-    inner = np.ones(len(lines.at), bool)
+    coordinates = xy[lines.indices]
+    inner = np.ones(len(lines.indices), bool)
     inner[lines.first[1:] - 1] = False
     start = np.flatnonzero(inner)  # a segment begins at every point but a line's last
     owner = lines.owner[start]
@@ -137,7 +138,7 @@ def middles(left: LineSet, right: LineSet, xy: Array, places: Array) -> tuple[Ar
     sides = []
     for lines, ratios in zip((left, right), ratio, strict=True):
         knots = ratios + 2.0 * lines.owner
-        values = places[lines.at]
+        values = places[lines.indices]
         sides.append(np.column_stack([np.interp(query, knots, column) for column in values.T]))
     return (sides[0] + sides[1]) / 2.0, owner
 
@@ -145,7 +146,7 @@ def middles(left: LineSet, right: LineSet, xy: Array, places: Array) -> tuple[Ar
 def _ratios(lines: LineSet, xy: Array) -> Array:
     """Of each point, the share of its line's length that lies before it, 0 to 1."""
     owner = lines.owner
-    step = np.hypot(*(xy[lines.at[1:]] - xy[lines.at[:-1]]).T)
+    step = np.hypot(*(xy[lines.indices[1:]] - xy[lines.indices[:-1]]).T)
     step[owner[1:] != owner[:-1]] = 0.0
     run = np.concatenate([[0.0], np.cumsum(step)])
     run -= run[lines.first[:-1]][owner]
@@ -183,16 +184,16 @@ class Border:
     left: Point
     right: Point
 
-    def shared_by(self, arm: Arm) -> bool:
+    def is_shared_by(self, arm: Arm) -> bool:
         """Whether this lane can begin or end at the border."""
-        return abs(across(arm, self)) > STEEPEST
+        return abs(crossing_cosine(arm, self)) > MIN_CROSSING_COSINE
 
     def along(self, arm: Arm) -> bool:
         """Whether the lane passes along the axis, so that its left bound is at ``left``; else at ``right``."""
         return (_dot(arm.away, self.axis) > 0) != arm.far
 
 
-def across(arm: Arm, at: Border) -> float:
+def crossing_cosine(arm: Arm, at: Border) -> float:
     """The cosine between a lane's way out of the node and the border's axis."""
     return _dot(arm.away, at.axis)
 
@@ -208,23 +209,23 @@ def border(at: Point, arms: Sequence[Arm]) -> Border | None:
     best: tuple[int, float, Point] | None = None
     for axis in _axes(arms):
         shares = [_dot(arm.away, axis) for arm in arms]
-        count = through(arms, [a if abs(a) > STEEPEST else 0.0 for a in shares])
+        count = count_through(arms, [a if abs(a) > MIN_CROSSING_COSINE else 0.0 for a in shares])
         rank = (count, min(abs(a) for a in shares))
         if count and (best is None or rank > best[:2]):
             best = (*rank, axis)
     if best is None:
         return None
     axis = best[2]
-    half = min(arm.half for arm in arms if abs(_dot(arm.away, axis)) > STEEPEST)
+    half = min(arm.half for arm in arms if abs(_dot(arm.away, axis)) > MIN_CROSSING_COSINE)
     if len(arms) == 2:
-        half = min(half / max(abs(_dot(arms[0].away, axis)), 1e-9), half * LONGEST_MITRE)
+        half = min(half / max(abs(_dot(arms[0].away, axis)), 1e-9), half * MAX_MITRE_RATIO)
     x, y = -axis[1] * half, axis[0] * half
     return Border(axis, (at[0] + x, at[1] + y), (at[0] - x, at[1] - y))
 
 
-def through(arms: Sequence[Arm], shares: Sequence[float]) -> int:
-    """How many ways from one lane into another one lead over the border. shares: ``across`` of each arm, 0 where it
-    does not reach the border."""
+def count_through(arms: Sequence[Arm], shares: Sequence[float]) -> int:
+    """How many ways from one lane into another one lead over the border. shares: ``crossing_cosine`` of each arm, 0
+    where it does not reach the border."""
     return sum(
         a.inward and b.outward and p * q < 0
         for a, p in zip(arms, shares, strict=True)
@@ -233,7 +234,7 @@ def through(arms: Sequence[Arm], shares: Sequence[float]) -> int:
     )
 
 
-def ways(arms: Sequence[Arm]) -> int:
+def count_ways(arms: Sequence[Arm]) -> int:
     """How many ways there are from one lane into another one."""
     return sum(a.inward and b.outward for a in arms for b in arms if a is not b)
 
@@ -258,7 +259,7 @@ def _dot(a: Point, b: Point) -> float:
     return a[0] * b[0] + a[1] * b[1]
 
 
-def beside(middle: Array, half: float) -> tuple[Array, Array]:
+def offset_bounds(middle: Array, half: float) -> tuple[Array, Array]:
     """(left, right) bounds of a lane, [k, 2] each, at this distance from its middle [k, 2], with mitred corners.
 
     The middle must have two and more points, no two alike in a row.
@@ -273,7 +274,7 @@ def beside(middle: Array, half: float) -> tuple[Array, Array]:
     hairpin = length < 1e-6  # straight back: the corner goes on straight
     mitre[hairpin] = before[hairpin]
     length[hairpin] = 1.0
-    mitre *= np.minimum(1.0, LONGEST_MITRE / np.maximum(length, 1e-9))[:, None]
+    mitre *= np.minimum(1.0, MAX_MITRE_RATIO / np.maximum(length, 1e-9))[:, None]
     return middle + mitre * half, middle - mitre * half
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from app.errors import UnreadableFile
 from app.formats import ReadContext, WriteContext
-from app.formats._points import AXES, RGB, Cloud, check_count, wrong
+from app.formats._points import AXES, RGB, Cloud, check_count, unreadable_error
 
 MAGIC = b"LASF"
 SCALE = 0.001
@@ -44,7 +44,7 @@ SOFTWARE = "Fleet Map Server"
 NO_DATE = slice(90, 94)
 """Day and year of the header: 0 is unknown. A date of today would make other bytes tomorrow."""
 
-WHOLE = {"intensity": 65535, "classification": 255, "user_data": 255, "point_source_id": 65535}
+INTEGER_DIMENSIONS = {"intensity": 65535, "classification": 255, "user_data": 255, "point_source_id": 65535}
 """Dimensions of every point that other formats' columns of the same name go to, with their largest value."""
 
 
@@ -59,39 +59,39 @@ def parse(data: bytes, context: ReadContext) -> Cloud:
     import laspy
 
     count = _check(data, context)
-    with _said_as_ours():
+    with _convert_errors():
         las = laspy.read(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs)
     if len(las.points) != count:
-        raise wrong(f"the header says {count} points, the file has {len(las.points)}", where="header")
+        raise unreadable_error(f"the header says {count} points, the file has {len(las.points)}", where="header")
     return _cloud(las, count, context)
 
 
 def _check(data: bytes, context: ReadContext) -> int:
     """The number of points, after the header is held against limits and the file's size."""
     if len(data) < 227:
-        raise wrong("the file ends within the header", where="header")
+        raise unreadable_error("the file ends within the header", where="header")
     magic, major, minor, size, start, vlrs, form, record, count = HEADER.unpack_from(data)
     if magic != MAGIC or major != 1 or minor > 4:
-        raise wrong(f"only LAS 1.0 to 1.4 can be read, this is {magic!r} {major}.{minor}", where="header")
+        raise unreadable_error(f"only LAS 1.0 to 1.4 can be read, this is {magic!r} {major}.{minor}", where="header")
     need = {3: 235, 4: 375}.get(minor, 227)
     if size < need or start < size or start > len(data):
-        raise wrong("the sizes in the header contradict each other", where="header")
+        raise unreadable_error("the sizes in the header contradict each other", where="header")
     if vlrs * VLR_BYTES > start - size:
-        raise wrong(f"{vlrs} records do not go before the points", where="header")
+        raise unreadable_error(f"{vlrs} records do not go before the points", where="header")
     evlrs = 0
     if minor == 4:
         first, evlrs, count = struct.unpack_from("<QIQ", data, 235)
         if evlrs and (first > len(data) or evlrs * EVLR_BYTES > len(data) - first):
-            raise wrong(f"{evlrs} records do not go after the points", where="header")
+            raise unreadable_error(f"{evlrs} records do not go after the points", where="header")
     if any(not math.isfinite(v) for v in struct.unpack_from("<6d", data, 131)):
-        raise wrong("scales and offsets must be finite numbers", where="header")
+        raise unreadable_error("scales and offsets must be finite numbers", where="header")
     if form & 0x3F > 10:
-        raise wrong(f"there is no point format {form & 0x3F}", where="header")
+        raise unreadable_error(f"there is no point format {form & 0x3F}", where="header")
     check_count(count, context)
     if form & 0xC0 == 0:
         if start + count * record > len(data):
             have = len(data) - start
-            raise wrong(f"{count} points of {record} bytes take {count * record} bytes, the file has {have}")
+            raise unreadable_error(f"{count} points of {record} bytes take {count * record} bytes, the file has {have}")
     elif count:
         context.limits.check_unpacked(count * record, len(data) - start)
         _check_chunks(data, start, size, vlrs, count, record)
@@ -108,25 +108,27 @@ def _check_chunks(data: bytes, start: int, size: int, vlrs: int, count: int, rec
             break
         position += length
     else:
-        raise wrong("the file is compressed and has no LASzip record", where="header")
+        raise unreadable_error("the file is compressed and has no LASzip record", where="header")
     if length < 34 or position + length > start:
-        raise wrong("the LASzip record ends too early", where="laszip")
+        raise unreadable_error("the LASzip record ends too early", where="laszip")
     items = struct.unpack_from("<H", data, position + 32)[0]
     if length < 34 + 6 * items:
-        raise wrong("the LASzip record ends too early", where="laszip")
+        raise unreadable_error("the LASzip record ends too early", where="laszip")
     kinds = [struct.unpack_from("<HH", data, position + 34 + 6 * k) for k in range(items)]
     total = sum(bytes_ for _, bytes_ in kinds)
     if total != record:
-        raise wrong(f"the LASzip record tells points of {total} bytes, the header of {record}", where="laszip")
+        raise unreadable_error(
+            f"the LASzip record tells points of {total} bytes, the header of {record}", where="laszip"
+        )
     if len(data) - start < 8:
-        raise wrong("the compressed points are missing", where="laszip")
+        raise unreadable_error("the compressed points are missing", where="laszip")
     (table,) = struct.unpack_from("<q", data, start)
     if table == -1:  # a writer that could not go back has put the offset at the very end
         (table,) = struct.unpack_from("<q", data, len(data) - 8)
     if not start + 8 <= table <= len(data) - 8:
-        raise wrong("the table of chunks lies outside of the file", where="laszip")
+        raise unreadable_error("the table of chunks lies outside of the file", where="laszip")
     if struct.unpack_from("<I", data, table + 4)[0] > count:
-        raise wrong("there are more chunks than points", where="laszip")
+        raise unreadable_error("there are more chunks than points", where="laszip")
     if any(kind in LAYERS or kind == EXTRA_BYTES for kind, _ in kinds):
         _check_layers(data, start, table, data[position : position + length], kinds)
 
@@ -137,21 +139,21 @@ def _check_layers(data: bytes, start: int, table: int, laszip: bytes, kinds: lis
 
     stream = io.BytesIO(data)
     stream.seek(start)
-    with _said_as_ours():
+    with _convert_errors():
         chunks = lazrs.read_chunk_table(stream, lazrs.LazVlr(laszip))
     layers = sum(bytes_ if kind == EXTRA_BYTES else LAYERS.get(kind, 0) for kind, bytes_ in kinds)
     first = sum(bytes_ for _, bytes_ in kinds) + 4
     position = start + 8
     for _, size in chunks:
         if size < first + 4 * layers or position + size > table:
-            raise wrong("a chunk ends beyond the points, or before it begins", where="laszip")
+            raise unreadable_error("a chunk ends beyond the points, or before it begins", where="laszip")
         if first + 4 * layers + sum(struct.unpack_from(f"<{layers}I", data, position + first)) > size:
-            raise wrong("the layers of a chunk are larger than the chunk", where="laszip")
+            raise unreadable_error("the layers of a chunk are larger than the chunk", where="laszip")
         position += size
 
 
 @contextmanager
-def _said_as_ours() -> Iterator[None]:
+def _convert_errors() -> Iterator[None]:
     """Errors of laspy and lazrs as UnreadableFile. lazrs panics on some damage: an exception of Rust, and no other."""
     import laspy
     import lazrs
@@ -159,11 +161,13 @@ def _said_as_ours() -> Iterator[None]:
     try:
         yield
     except (laspy.errors.LaspyException, lazrs.LazrsError, AssertionError) as error:
-        raise wrong(f"{str(error)[:200] or type(error).__name__}") from error
+        raise unreadable_error(f"{str(error)[:200] or type(error).__name__}") from error
     except BaseException as error:
         if type(error).__name__ != "PanicException":
             raise
-        raise UnreadableFile("the compressed points are damaged", wrong("damaged points").problems) from error
+        raise UnreadableFile(
+            "the compressed points are damaged", unreadable_error("damaged points").problems
+        ) from error
 
 
 def _cloud(las: Any, count: int, context: ReadContext) -> Cloud:
@@ -201,11 +205,11 @@ def _crs(header: Any) -> str | None:
 
 
 # --- writing ------------------------------------------------------------------------------------------------------
-def again(data: bytes, compress: bool) -> bytes:
+def recompress(data: bytes, compress: bool) -> bytes:
     """An uploaded file, compressed or not, with all that it holds."""
     import laspy
 
-    with _said_as_ours():
+    with _convert_errors():
         las = laspy.read(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs)
         out = io.BytesIO()
         las.write(out, do_compress=compress, laz_backend=laspy.LazBackend.Lazrs)
@@ -243,11 +247,11 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
         if name in AXES or (coloured and name in RGB):
             continue
         values = column[valid]
-        if name == "gps_time" or (name in WHOLE and _within(values, WHOLE[name])):
+        if name == "gps_time" or (name in INTEGER_DIMENSIONS and _is_within(values, INTEGER_DIMENSIONS[name])):
             standard[name] = values
         else:
             taken = {d.lower() for d in header.point_format.dimension_names} | {n.lower() for n in extra}
-            extra[_free(name, taken)] = values
+            extra[_free_name(name, taken)] = values
     if extra:
         header.add_extra_dims(
             [laspy.ExtraBytesParams(name=n, type=c.dtype.newbyteorder("<")) for n, c in extra.items()]
@@ -270,7 +274,7 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
     return bytes(written)
 
 
-def _within(column: NDArray[Any], maximum: int) -> bool:
+def _is_within(column: NDArray[Any], maximum: int) -> bool:
     """Whether all values are whole numbers from 0 to this."""
     if not len(column):
         return True
@@ -279,7 +283,7 @@ def _within(column: NDArray[Any], maximum: int) -> bool:
     return int(column.min()) >= 0 and int(column.max()) <= maximum
 
 
-def _free(name: str, taken: set[str]) -> str:
+def _free_name(name: str, taken: set[str]) -> str:
     """A name for extra bytes: at most 32 bytes of ASCII, and not a dimension's that is there."""
     stem = re.sub(r"[^ -~]", "_", name)[:28] or "value"
     out, k = stem, 2

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-LITTLE = 2**22
+MAX_INTERPRETED_BYTES = 2**22
 """Bytes up to which compiling would take longer than it saves."""
 
-LONGEST = 264
-FARTHEST = 8192
+MAX_MATCH_BYTES = 264
+MAX_OFFSET_BYTES = 8192
 TABLE_BITS = 14
 
 Bytes = NDArray[np.uint8]
@@ -28,15 +28,15 @@ Bytes = NDArray[np.uint8]
 
 def expand(data: bytes, size: int) -> bytes:
     """The bytes of a stream that unfolds to this size. ValueError where it does not; nothing is allocated beyond."""
-    if size > len(data) * LONGEST:  # no reference of two or three bytes gives more
+    if size > len(data) * MAX_MATCH_BYTES:  # no reference of two or three bytes gives more
         raise ValueError(f"{len(data)} compressed bytes cannot unfold to {size}")
-    if size <= LITTLE and len(data) <= LITTLE:
+    if size <= MAX_INTERPRETED_BYTES and len(data) <= MAX_INTERPRETED_BYTES:
         little = bytearray(size)
         end = _expand(data, little)
         out = bytes(little)
     else:
         large = np.empty(size, np.uint8)
-        end = _compiled(_expand)(np.frombuffer(data, np.uint8), large)
+        end = _compile(_expand)(np.frombuffer(data, np.uint8), large)
         out = large.tobytes()
     if end < 0:
         raise ValueError(
@@ -50,17 +50,17 @@ def expand(data: bytes, size: int) -> bytes:
 def squeeze(data: bytes) -> bytes:
     """A stream that unfolds to the data; the same on every machine."""
     room = len(data) + len(data) // 32 + 16
-    if len(data) <= LITTLE // 16:
+    if len(data) <= MAX_INTERPRETED_BYTES // 16:
         little = bytearray(room)
         return bytes(little[: _squeeze(data, little, [-1] * 2**TABLE_BITS)])
     large = np.empty(room, np.uint8)
     table = np.full(2**TABLE_BITS, -1, np.int64)
-    end = _compiled(_squeeze)(np.frombuffer(data, np.uint8), large, table)
+    end = _compile(_squeeze)(np.frombuffer(data, np.uint8), large, table)
     return large[:end].tobytes()
 
 
 @cache
-def _compiled(function: Callable[..., int]) -> Callable[..., int]:
+def _compile(function: Callable[..., int]) -> Callable[..., int]:
     import numba
 
     compiled: Callable[..., int] = numba.njit(function)

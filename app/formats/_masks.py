@@ -49,14 +49,14 @@ def read(file: str, data: bytes, context: ReadContext) -> dict[str, Any]:
         return {}
     if len(servers) > 1:
         context.warn(f"it has parameters of {len(servers)} filter info servers: the first one counts", file=file)
-    faults = list(_wrong(servers[0]))
+    faults = list(_invalid_keys(servers[0]))
     if faults:
         places = [Problem(reason, file, where=location) for location, reason in faults]
         raise UnreadableFile(f"{file}: " + "; ".join(reason for _, reason in faults), places)
     return {masks.NAME: {"params": document}}
 
 
-def _wrong(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _invalid_keys(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """(key, what is wrong with it)."""
     kind = parameters.get("type", KEEPOUT)
     if isinstance(kind, bool) or not isinstance(kind, int) or kind not in masks.TYPES:
@@ -70,19 +70,19 @@ def _wrong(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             yield key, f"{key} must be a text, got {str(parameters[key])[:40]!r}"
 
 
-def _kept(grid: OccupancyGrid) -> dict[str, Any] | None:
+def _kept_parameters(grid: OccupancyGrid) -> dict[str, Any] | None:
     """The parameter file that a grid keeps, with base and multiplier as floats (ROS refuses whole numbers there)."""
     source_properties = grid.properties.get(masks.NAME)
     document = source_properties.get("params") if isinstance(source_properties, Mapping) else None
     server = next(masks.servers(document), None)
-    if server is None or list(_wrong(server)):  # whoever edited it meant something else
+    if server is None or list(_invalid_keys(server)):  # whoever edited it meant something else
         return None
-    normalised: dict[str, Any] = _with_floats(document, 0)
+    normalised: dict[str, Any] = _to_floats(document, 0)
     return normalised
 
 
-def _with_floats(value: Any, depth: int) -> Any:
-    if not isinstance(value, Mapping) or depth > masks.DEEPEST:
+def _to_floats(value: Any, depth: int) -> Any:
+    if not isinstance(value, Mapping) or depth > masks.MAX_NAMESPACES:
         return value
     out: dict[str, Any] = {}
     for name, node in value.items():
@@ -91,14 +91,14 @@ def _with_floats(value: Any, depth: int) -> Any:
             floats = {k: float(v) for k, v in parameters.items() if k in ("base", "multiplier") and isinstance(v, int)}
             out[name] = {**node, masks.PARAMETERS: {**parameters, **floats}}
         else:
-            out[name] = _with_floats(node, depth + 1)
+            out[name] = _to_floats(node, depth + 1)
     return out
 
 
 def write(grid: OccupancyGrid, stem: str, context: WriteContext) -> dict[str, bytes]:
     """``<grid>_filter_info.yaml`` of a mask; nothing of a grid that is none. stem: of the grid's files."""
     file = f"{stem}{SUFFIX}.yaml"
-    document = _kept(grid)
+    document = _kept_parameters(grid)
     if document is None:
         info = next((info for pattern, info in _BY_NAME if pattern.search(stem)), None)
         if info is None:

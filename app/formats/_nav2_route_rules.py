@@ -15,15 +15,15 @@ import orjson
 
 from app.errors import Problem
 from app.formats import Files
-from app.formats._rules import doubted, is_number, names, refused, shown
+from app.formats._rules import error_finding, is_number, names, shown, warning_finding
 
-MOST_ID = 2**32 - 1
-MOST_SHORT_ID = 2**16 - 1
+MAX_ID = 2**32 - 1
+MAX_SHORT_ID = 2**16 - 1
 FLOATS = frozenset({"speed_limit", "abs_speed_limit", "penalty", "abs_time_taken"})
 TRIGGERS = ("NODE", "ON_ENTER", "ON_EXIT")
 LINES = ("LineString", "MultiLineString")
 ON_EARTH = ("CRS84", "4326")
-FAR = 16_384.0
+MAX_EXACT_METRES = 16_384.0
 
 
 def check(files: Files) -> Iterator[Problem]:
@@ -32,11 +32,11 @@ def check(files: Files) -> Iterator[Problem]:
     top = orjson.loads(files[main])
     rows = top.get("features") if isinstance(top, dict) else None
     if not isinstance(rows, list):
-        yield refused("there is no array of features", main, where="features")
+        yield error_finding("there is no array of features", main, where="features")
         return
     if not isinstance(top.get("crs", {}), dict) or any(name in str(top.get("crs")) for name in ON_EARTH):
         reason = "says longitude and latitude; the route server ignores it and takes the numbers for metres"
-        yield doubted(reason, main, where="crs")
+        yield warning_finding(reason, main, where="crs")
     nodes: list[int] = []
     edges: list[tuple[int, Any, Any]] = []
     far = 0
@@ -44,95 +44,102 @@ def check(files: Files) -> Iterator[Problem]:
         location = f"features[{k}]"
         geometry, properties = (row.get("geometry"), row.get("properties")) if isinstance(row, dict) else (None, None)
         if not isinstance(geometry, dict):
-            yield refused("has no geometry", main, where=location)
+            yield error_finding("has no geometry", main, where=location)
             continue
         kind = geometry.get("type")
         if kind != "Point" and kind not in LINES:
             continue  # the route server passes over it
         if not isinstance(properties, dict):
-            yield refused("has no properties", main, where=location)
+            yield error_finding("has no properties", main, where=location)
             continue
         if not _is_id(properties.get("id")):
-            reason = f"must be a whole number from 0 to {MOST_ID}, is {shown(properties.get('id'))}"
-            yield refused(reason, main, where=f"{location}.properties.id")
+            reason = f"must be a whole number from 0 to {MAX_ID}, is {shown(properties.get('id'))}"
+            yield error_finding(reason, main, where=f"{location}.properties.id")
             continue
         if kind == "Point":
             nodes.append(properties["id"])
             at = geometry.get("coordinates")
             if not isinstance(at, list) or len(at) < 2 or not all(map(is_number, at[:2])):
-                yield refused("a node needs the coordinates [x, y]", main, where=location)
+                yield error_finding("a node needs the coordinates [x, y]", main, where=location)
             else:
-                far += max(abs(at[0]), abs(at[1])) > FAR
+                far += max(abs(at[0]), abs(at[1])) > MAX_EXACT_METRES
             if not isinstance(properties.get("frame", ""), str):
-                yield refused(
+                yield error_finding(
                     f"must be a text, is {shown(properties['frame'])}", main, where=f"{location}.properties.frame"
                 )
         else:
             edges.append((properties["id"], properties.get("startid"), properties.get("endid")))
             if not is_number(properties.get("cost", 0.0)):
-                yield refused(
+                yield error_finding(
                     f"must be a number, is {shown(properties['cost'])}", main, where=f"{location}.properties.cost"
                 )
             if not isinstance(properties.get("overridable", True), bool):
                 reason = f"must be true or false, is {shown(properties['overridable'])}"
-                yield refused(reason, main, where=f"{location}.properties.overridable")
+                yield error_finding(reason, main, where=f"{location}.properties.overridable")
         if "metadata" in properties:
             yield from _metadata(properties["metadata"], main, f"{location}.properties.metadata")
         if "operations" in properties:
             yield from _operations(properties["operations"], main, f"{location}.properties.operations")
     yield from _graph(nodes, edges, main)
     if far:
-        reason = f"{far} nodes lie more than {FAR:g} m from the origin; the server's 32 bit floats step by 2 mm there"
-        yield doubted(reason, main)
+        reason = (
+            f"{far} nodes lie more than {MAX_EXACT_METRES:g} m from the origin; the server's 32 bit floats step by "
+            "2 mm there"
+        )
+        yield warning_finding(reason, main)
 
 
 def _is_id(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MOST_ID
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_ID
 
 
 def _graph(nodes: list[int], edges: list[tuple[int, Any, Any]], main: str) -> Iterator[Problem]:
     if not nodes:
-        yield refused("there is no node (a Point with an id)", main, where="features")
+        yield error_finding("there is no node (a Point with an id)", main, where="features")
     if not edges:
-        yield refused("there is no edge (a LineString with an id)", main, where="features")
+        yield error_finding("there is no edge (a LineString with an id)", main, where="features")
     node_ids = set(nodes)
     dangling = [n for n, *ends in edges if not all(_is_id(end) and end in node_ids for end in ends)]
     if dangling:
-        yield refused(f"{len(dangling)} edges begin or end at a node that is not there: {names(dangling)}", main)
+        yield error_finding(f"{len(dangling)} edges begin or end at a node that is not there: {names(dangling)}", main)
     for noun, ids in (("nodes", nodes), ("edges", [n for n, _, _ in edges])):
         if repeats := [n for n, count in Counter(ids).items() if count > 1]:
-            yield doubted(f"{len(repeats)} ids are given to several {noun}; one of them wins: {names(repeats)}", main)
-        if large := [n for n in ids if n > MOST_SHORT_ID]:
+            yield warning_finding(
+                f"{len(repeats)} ids are given to several {noun}; one of them wins: {names(repeats)}", main
+            )
+        if large := [n for n in ids if n > MAX_SHORT_ID]:
             use = "ComputeRoute and ComputeAndTrackRoute" if noun == "nodes" else "DynamicEdges"
-            reason = f"{len(large)} {noun} have an id above {MOST_SHORT_ID}, which {use} cannot name: {names(large)}"
-            yield doubted(reason, main)
+            reason = f"{len(large)} {noun} have an id above {MAX_SHORT_ID}, which {use} cannot name: {names(large)}"
+            yield warning_finding(reason, main)
 
 
 def _metadata(metadata: Any, main: str, location: str) -> Iterator[Problem]:
     if not isinstance(metadata, dict):
-        yield refused(f"must be an object, is {shown(metadata)}", main, where=location)
+        yield error_finding(f"must be an object, is {shown(metadata)}", main, where=location)
         return
     for key, value in metadata.items():
         inside = f"{location}.{key[:60]}"
         if isinstance(value, dict):
             yield from _metadata(value, main, inside)
         elif any(v is None or isinstance(v, (dict, list)) for v in (value if isinstance(value, list) else [value])):
-            yield refused("the loader takes numbers, texts, truth values and lists of these only", main, where=inside)
+            yield error_finding(
+                "the loader takes numbers, texts, truth values and lists of these only", main, where=inside
+            )
         elif key in FLOATS and isinstance(value, int):
             reason = f"is read as a float, at which the integer {shown(value)} throws: write it with a point"
-            yield refused(reason, main, where=inside)
+            yield error_finding(reason, main, where=inside)
 
 
 def _operations(operations: Any, main: str, location: str) -> Iterator[Problem]:
     if not isinstance(operations, (dict, list)):
-        yield refused("must be an object of operations", main, where=location)
+        yield error_finding("must be an object of operations", main, where=location)
         return
     for name, one in operations.items() if isinstance(operations, dict) else enumerate(operations):
         inside = f"{location}.{str(name)[:60]}"
         if not isinstance(one, dict) or not isinstance(one.get("type"), str):
-            yield refused("an operation needs a type", main, where=inside)
+            yield error_finding("an operation needs a type", main, where=inside)
         elif one.get("trigger") not in TRIGGERS:
             reason = f"its trigger must be one of {', '.join(TRIGGERS)}, is {shown(one.get('trigger'))}"
-            yield refused(reason, main, where=inside)
+            yield error_finding(reason, main, where=inside)
         elif "metadata" in one:
             yield from _metadata(one["metadata"], main, f"{inside}.metadata")

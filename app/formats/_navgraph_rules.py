@@ -11,7 +11,17 @@ from typing import Any
 
 from app.errors import Problem
 from app.formats import Files, _yaml
-from app.formats._rules import LARGEST, LIMITS, brief, cpp_number, doubted, names, refused, repeated, shown
+from app.formats._rules import (
+    LIMITS,
+    MAX_WHOLE_YAML_BYTES,
+    cpp_number,
+    duplicates,
+    error_finding,
+    is_brief,
+    names,
+    shown,
+    warning_finding,
+)
 
 PREFIX = "tag:fawkesrobotics.org,navgraph/"
 OURS = (PREFIX, "!")
@@ -22,61 +32,63 @@ EDGE_TAGS = frozenset({"dir", "bidir", "allow-intersection", "no-intersection", 
 def check(files: Files) -> Iterator[Problem]:
     """A graph as Fawkes loads it."""
     main = next(iter(files))
-    if brief(files[main]):
+    if is_brief(files[main]):
         return
-    if len(files[main]) > LARGEST:
-        yield doubted(f"not checked: it is larger than {LARGEST} bytes", main)
+    if len(files[main]) > MAX_WHOLE_YAML_BYTES:
+        yield warning_finding(f"not checked: it is larger than {MAX_WHOLE_YAML_BYTES} bytes", main)
         return
     top = _yaml.load(files[main], LIMITS, tags=OURS, typed=False)
     if not isinstance(top, dict):
-        yield refused("a graph is a mapping", main)
+        yield error_finding("a graph is a mapping", main)
         return
     if not isinstance(top.get("graph-name"), str):
-        yield refused("a graph needs a name", main, where="graph-name")
+        yield error_finding("a graph needs a name", main, where="graph-name")
     if "default-properties" in top:
         yield from _properties(top["default-properties"], main, "default-properties")
     nodes, alone = top.get("nodes"), set()
     called: list[str] = []
     tags: list[str] = []
     for k, item in enumerate(nodes if isinstance(nodes, list) else ()):
-        tag, node = _untagged(item)
+        tag, node = _split_tag(item)
         tags += [tag] if tag else []
         location = f"nodes[{k}]"
         if not isinstance(node, dict) or not isinstance(node.get("name"), str):
-            yield refused("a node is a mapping with a name", main, where=location)
+            yield error_finding("a node is a mapping with a name", main, where=location)
             continue
         called.append(node["name"])
         if tag == PREFIX + "unconnected":
             alone.add(node["name"])
         elif tag and tag.removeprefix(PREFIX) not in NODE_TAGS and tag.startswith(PREFIX):
-            yield doubted(f"Fawkes knows no tag {shown(tag.removeprefix(PREFIX))} of a node", main, where=location)
+            yield warning_finding(
+                f"Fawkes knows no tag {shown(tag.removeprefix(PREFIX))} of a node", main, where=location
+            )
         at = node.get("pos")
         if not isinstance(at, list) or len(at) != 2 or any(cpp_number(v) is None for v in at):
-            yield refused(f"must be [x, y], is {shown(at)}", main, where=f"{location}.pos")
+            yield error_finding(f"must be [x, y], is {shown(at)}", main, where=f"{location}.pos")
         if "properties" in node:
             yield from _properties(node["properties"], main, f"{location}.properties")
-    if repeats := repeated(called):
-        yield refused(f"{len(repeats)} nodes have a name that is taken: {names(repeats)}", main, where="nodes")
+    if repeats := duplicates(called):
+        yield error_finding(f"{len(repeats)} nodes have a name that is taken: {names(repeats)}", main, where="nodes")
     yield from _connections(top.get("connections"), set(called), alone, tags, main)
     if foreign := [tag for tag in tags if not tag.startswith(PREFIX)]:
         reason = (
             f"without the line %TAG ! {PREFIX} the tags are not Fawkes' and mean nothing: {names(sorted(set(foreign)))}"
         )
-        yield refused(reason, main)
+        yield error_finding(reason, main)
 
 
-def _untagged(item: Any) -> tuple[str, Any]:
+def _split_tag(item: Any) -> tuple[str, Any]:
     return (item.tag, item.value) if isinstance(item, _yaml.Tagged) else ("", item)
 
 
 def _properties(properties: Any, main: str, location: str) -> Iterator[Problem]:
     if not isinstance(properties, list):
-        yield refused(f"must be a list of properties, is {shown(properties)}", main, where=location)
+        yield error_finding(f"must be a list of properties, is {shown(properties)}", main, where=location)
         return
     for k, one in enumerate(properties):
         values = one.values() if isinstance(one, dict) else [one]
         if not all(isinstance(v, str) for v in values):
-            yield refused("a property is a word or a key with a single value", main, where=f"{location}[{k}]")
+            yield error_finding("a property is a word or a key with a single value", main, where=f"{location}[{k}]")
 
 
 def _connections(
@@ -86,22 +98,24 @@ def _connections(
     dangling: list[str] = []
     pairs: list[tuple[str, str]] = []
     for k, item in enumerate(connections if isinstance(connections, list) else ()):
-        tag, ends = _untagged(item)
+        tag, ends = _split_tag(item)
         tags += [tag] if tag else []
         if not isinstance(ends, list) or len(ends) != 2 or not all(isinstance(end, str) for end in ends):
-            yield refused("a connection is a list of two names", main, where=f"connections[{k}]")
+            yield error_finding("a connection is a list of two names", main, where=f"connections[{k}]")
             continue
         if tag.startswith(PREFIX) and tag.removeprefix(PREFIX) not in EDGE_TAGS:
             reason = f"Fawkes knows no tag {shown(tag.removeprefix(PREFIX))} of a connection"
-            yield doubted(reason, main, where=f"connections[{k}]")
+            yield warning_finding(reason, main, where=f"connections[{k}]")
         dangling += [str(end) for end in ends if end not in node_names]
         reached.update(map(str, ends))
         pairs.append((str(ends[0]), str(ends[1])))
     if dangling:
-        yield refused(f"{len(dangling)} ends of connections are no nodes: {names(dangling)}", main, where="connections")
-    if repeats := repeated(pairs):
+        yield error_finding(
+            f"{len(dangling)} ends of connections are no nodes: {names(dangling)}", main, where="connections"
+        )
+    if repeats := duplicates(pairs):
         pair_names = names("-".join(pair) for pair in repeats)
-        yield doubted(f"{len(repeats)} connections stand there twice: {pair_names}", main, where="connections")
+        yield warning_finding(f"{len(repeats)} connections stand there twice: {pair_names}", main, where="connections")
     if lonely := sorted(node_names - reached - alone):
         reason = f"{len(lonely)} nodes have no connection and are not !unconnected: {names(lonely)}"
-        yield refused(reason, main, where="nodes")
+        yield error_finding(reason, main, where="nodes")

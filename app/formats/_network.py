@@ -24,16 +24,16 @@ from app.model.layers import Layers
 Array = NDArray[np.float64]
 
 MAX_NAME = 256
-LONGEST_ID = 480
+MAX_ID_CHARACTERS = 480
 
 SAME_ANGLE = 1e-9
 """Radians: a quaternion made from an angle gives it back this exactly."""
 
-AMONG_PARTS = frozenset({"drawn_from"})
+CROSS_PART_PROPERTIES = frozenset({"drawn_from"})
 """Canonical properties that speak of other parts of the environment, not of the item."""
 
 
-def refuse(reason: str, location: str) -> NoReturn:
+def raise_unreadable(reason: str, location: str) -> NoReturn:
     """UnreadableFile for what stands at this key."""
     raise UnreadableFile(f"{location}: {reason}", [Problem(reason, where=location)])
 
@@ -43,35 +43,37 @@ def is_name(name: str) -> bool:
     return 0 < len(name) <= MAX_NAME and is_writable(name)
 
 
-def checked_name(name: str, location: str) -> str:
+def check_name(name: str, location: str) -> str:
     """The name, refused where it is none."""
     if not is_name(name):
-        refuse(f"a name must have 1 to {MAX_NAME} characters and no control characters, got {name[:60]!r}", location)
+        raise_unreadable(
+            f"a name must have 1 to {MAX_NAME} characters and no control characters, got {name[:60]!r}", location
+        )
     return name
 
 
 def identifier(name: str) -> str:
     """The name as an id, or where it is too long for one its beginning and a hash of all of it."""
-    if len(name) <= LONGEST_ID:
+    if len(name) <= MAX_ID_CHARACTERS:
         return name
-    return f"{name[: LONGEST_ID - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+    return f"{name[: MAX_ID_CHARACTERS - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
 
 def number(value: Any, location: str) -> float:
     """A finite number; refused are texts, booleans and what is too large for a float."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        refuse(f"{str(value)[:60]!r} is not a number", location)
+        raise_unreadable(f"{str(value)[:60]!r} is not a number", location)
     if not math.isfinite(value):
-        refuse("the number is not finite", location)
+        raise_unreadable("the number is not finite", location)
     return float(value)
 
 
-def some(names: Sequence[Any]) -> str:
+def shorten_list(names: Sequence[Any]) -> str:
     """The first of the names, for a message."""
     return ", ".join(map(str, names[:5])) + (" …" if len(names) > 5 else "")
 
 
-def natural(name: str) -> tuple[int, str]:
+def natural_sort_key(name: str) -> tuple[int, str]:
     """Sorts WayPoint9 before WayPoint10."""
     return len(name), name
 
@@ -120,7 +122,7 @@ def is_flat(orientation: Any) -> bool:
     return yaw(orientation) is None or max(abs(orientation[0]), abs(orientation[1])) < SAME_ANGLE
 
 
-def said_yaw(source_yaw: Any, orientation: Any) -> float | None:
+def yaw_or_source(source_yaw: Any, orientation: Any) -> float | None:
     """The angle of a quaternion in radians: as its source said it where that is the same angle, else from -π to π."""
     now = yaw(orientation)
     if now is None:
@@ -166,7 +168,7 @@ class MergedNetwork:
     levels: list[str] = field(default_factory=list)
 
 
-def joined(layers: Layers, context: WriteContext) -> MergedNetwork:
+def merge_networks(layers: Layers, context: WriteContext) -> MergedNetwork:
     """All networks, nodes and edges in the order of their parts. MissingDatum where one is on earth without a datum.
 
     Edges find their nodes in their own part first, then in another one. What is neither a node with a point nor an
@@ -198,7 +200,7 @@ def joined(layers: Layers, context: WriteContext) -> MergedNetwork:
         net.levels.append(key.level)
     dropped_count = _join_edges(net, parts, shapes, homes, everywhere)
     if renamed:
-        context.warn(f"{len(renamed)} ids stand in several networks and got a number: {some(renamed)}")
+        context.warn(f"{len(renamed)} ids stand in several networks and got a number: {shorten_list(renamed)}")
     context.drop("items that are neither a node with a point nor an edge", strange, "they are no part of a network")
     context.drop("edges that begin or end at no node", dropped_count, "there is nothing that they could join")
     return net
@@ -227,7 +229,7 @@ def _join_edges(
     return dropped_count
 
 
-def known_document(layers: Layers, name: str) -> dict[str, Any]:
+def source_document(layers: Layers, name: str) -> dict[str, Any]:
     """What the first network's source of this format says as a whole; empty where there is none."""
     for part in layers.vector("topology").values():
         document = part.document.get(name)
@@ -236,7 +238,7 @@ def known_document(layers: Layers, name: str) -> dict[str, Any]:
     return {}
 
 
-def own(properties: Properties, name: str) -> dict[str, Any]:
+def get_source_properties(properties: Properties, name: str) -> dict[str, Any]:
     """What a format knows of an item; empty where it knows nothing."""
     members = properties.get(name)
     return members if isinstance(members, dict) else {}
@@ -247,14 +249,14 @@ def count(items: Any) -> int:
     return len(items) if isinstance(items, list) else 0
 
 
-def only_2d(net: MergedNetwork, context: WriteContext, why: str) -> None:
+def report_3d_loss(net: MergedNetwork, context: WriteContext, why: str) -> None:
     """Declare what a flat format without levels loses."""
     context.drop("altitudes of nodes", sum(bool(n.z) for n in net.nodes), why)
     if len(set(net.levels)) > 1:
         context.drop("levels of nodes", len(net.nodes), "all networks are joined into one")
 
 
-def without_repeats(names: Sequence[str]) -> list[str]:
+def duplicates(names: Sequence[str]) -> list[str]:
     """The names that stand more than once, each once, in order."""
     seen: set[str] = set()
     repeats: dict[str, None] = {}

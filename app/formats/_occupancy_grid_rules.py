@@ -16,12 +16,12 @@ import numpy as np
 
 from app.errors import BadUpload, Problem
 from app.formats import Files, Limits, _image, _yaml
-from app.formats._rules import LIMITS, cpp_bool, cpp_number, doubted, refused, shown
+from app.formats._rules import LIMITS, cpp_bool, cpp_number, error_finding, shown, warning_finding
 
 REQUIRED = ("image", "resolution", "origin", "free_thresh", "occupied_thresh", "negate")
 MODES = ("trinary", "scale", "raw")
-MOST_CELLS = 32767
-LEAST_RESOLUTION = 1e-6
+MAX_CELLS = 32767
+MIN_RESOLUTION = 1e-6
 SAVED_UNKNOWN = 205
 """The grey that map_saver writes for unknown; 1 - 205/255 = 0.19608 is just above its free_thresh of 0.196."""
 
@@ -33,40 +33,40 @@ _YAML = Limits(yaml_nodes=10_000)
 
 def check(files: Files) -> Iterator[Problem]:
     """A YAML as map_server reads it, and its picture's header. A picture alone has no rules."""
-    main = next((n for n in files if _image.kind_of(files[n]) is None), None)
+    main = next((n for n in files if _image.detect_kind(files[n]) is None), None)
     if main is None:
         return
     members = _yaml.load(files[main], _YAML, typed=False)
     if not isinstance(members, dict):
-        yield refused("a map's YAML is a mapping", main)
+        yield error_finding("a map's YAML is a mapping", main)
         return
     for key in REQUIRED:
         if members.get(key) is None:
-            yield refused("map_server refuses a map without this key", main, where=key)
+            yield error_finding("map_server refuses a map without this key", main, where=key)
     thresholds: dict[str, float] = {}
     for key in ("resolution", "free_thresh", "occupied_thresh"):
         if members.get(key) is not None:
             number = cpp_number(members[key])
             if number is None or not math.isfinite(number):
-                yield refused(f"must be a finite number, is {shown(members[key])}", main, where=key)
+                yield error_finding(f"must be a finite number, is {shown(members[key])}", main, where=key)
                 continue
             thresholds[key] = number
             yield from _for_python(members[key], main, key)
-    if thresholds.get("resolution", 1.0) < LEAST_RESOLUTION:
-        yield refused(f"Nav2 refuses a resolution below {LEAST_RESOLUTION:g} m", main, where="resolution")
+    if thresholds.get("resolution", 1.0) < MIN_RESOLUTION:
+        yield error_finding(f"Nav2 refuses a resolution below {MIN_RESOLUTION:g} m", main, where="resolution")
     yield from _origin(members.get("origin"), main)
     mode = members.get("mode", "trinary")
     if mode not in MODES:
-        yield refused(f"must be one of {', '.join(MODES)}, is {shown(mode)}", main, where="mode")
+        yield error_finding(f"must be one of {', '.join(MODES)}, is {shown(mode)}", main, where="mode")
     negate = _negate(members.get("negate"))
     if members.get("negate") is not None and negate is None:
-        yield refused(f"must be 0, 1, true or false, is {shown(members['negate'])}", main, where="negate")
+        yield error_finding(f"must be 0, 1, true or false, is {shown(members['negate'])}", main, where="negate")
     free, occupied = thresholds.get("free_thresh", 0.0), thresholds.get("occupied_thresh", 1.0)
     for key in ("free_thresh", "occupied_thresh"):
         if not 0.0 <= thresholds.get(key, 0.0) <= 1.0:
-            yield doubted("lies outside of 0 to 1, so it never or always holds", main, where=key)
+            yield warning_finding("lies outside of 0 to 1, so it never or always holds", main, where=key)
     if mode in ("trinary", "scale") and free > occupied:
-        yield doubted("is above occupied_thresh: where both hold a cell is free", main, where="free_thresh")
+        yield warning_finding("is above occupied_thresh: where both hold a cell is free", main, where="free_thresh")
     if members.get("image") is not None:
         yield from _picture(members, main, files, str(mode), bool(negate), (free, occupied))
 
@@ -82,7 +82,7 @@ def _negate(value: Any) -> bool | None:
 def _for_python(text: str, main: str, key: str) -> Iterator[Problem]:
     if re.fullmatch(r"[-+]?\d+[eE][-+]?\d+|[-+]?[\d.]+[eE]\d+", text.strip()):
         reason = f"{shown(text)} is a text for tools in Python (PyYAML): write a point and a sign, as in 1.0e-05"
-        yield doubted(reason, main, where=key)
+        yield warning_finding(reason, main, where=key)
 
 
 def _origin(origin: Any, main: str) -> Iterator[Problem]:
@@ -90,13 +90,13 @@ def _origin(origin: Any, main: str) -> Iterator[Problem]:
         return
     pose = [cpp_number(v) for v in origin] if isinstance(origin, list) else []
     if len(pose) != 3 or any(v is None or not math.isfinite(v) for v in pose):
-        yield refused(f"must be three finite numbers [x, y, yaw], is {shown(origin)}", main, where="origin")
+        yield error_finding(f"must be three finite numbers [x, y, yaw], is {shown(origin)}", main, where="origin")
         return
     for text in origin:
         yield from _for_python(text, main, "origin")
     if pose[2]:
         reason = f"Nav2's static layer and AMCL ignore the yaw of {pose[2]:g} rad: bake it into the cells, yaw 0"
-        yield doubted(reason, main, where="origin")
+        yield warning_finding(reason, main, where="origin")
 
 
 def _picture(
@@ -104,34 +104,38 @@ def _picture(
 ) -> Iterator[Problem]:
     image = members["image"]
     if not isinstance(image, str) or not image:
-        yield refused(f"must be the name of a picture, is {shown(image)}", main, where="image")
+        yield error_finding(f"must be the name of a picture, is {shown(image)}", main, where="image")
         return
     if image.startswith("/"):
         reason = "an absolute path: each robot must have the picture there. A name beside the YAML goes along with it"
-        yield doubted(reason, main, where="image")
+        yield warning_finding(reason, main, where="image")
         return
     name = posixpath.normpath(posixpath.join(posixpath.dirname(main), image))
     if name not in files:
-        yield refused(f"the picture {shown(image)} is not there, seen from the YAML's folder", main, where="image")
+        yield error_finding(
+            f"the picture {shown(image)} is not there, seen from the YAML's folder", main, where="image"
+        )
         return
     data = files[name]
-    kind = _image.kind_of(data)
+    kind = _image.detect_kind(data)
     if kind is None:
-        yield doubted("neither PGM, PNG, BMP nor JPEG: whether map_server reads it depends on its GraphicsMagick", name)
+        yield warning_finding(
+            "neither PGM, PNG, BMP nor JPEG: whether map_server reads it depends on its GraphicsMagick", name
+        )
         return
     try:
-        width, height = _image.size_of(data, LIMITS)
+        width, height = _image.read_size(data, LIMITS)
     except BadUpload as error:
-        yield refused(error.detail, name)
+        yield error_finding(error.detail, name)
         return
-    if max(width, height) > MOST_CELLS:
-        yield refused(f"has {width} × {height} cells; Nav2 takes at most {MOST_CELLS} each way", name)
+    if max(width, height) > MAX_CELLS:
+        yield error_finding(f"has {width} × {height} cells; Nav2 takes at most {MAX_CELLS} each way", name)
     if kind == "jpeg":
-        yield doubted("a JPEG blurs the greys, so that cells beside a wall may change: use PGM or PNG", name)
+        yield warning_finding("a JPEG blurs the greys, so that cells beside a wall may change: use PGM or PNG", name)
     speed = "speed" in posixpath.basename(main).lower()
     if speed and mode == "trinary":
         reason = "a speed mask says shares of the speed, and trinary knows 0 and 100 only: use scale or raw"
-        yield doubted(reason, main, where="mode")
+        yield warning_finding(reason, main, where="mode")
     if mode in MODES and (speed or (mode == "trinary" and not negate and thresholds[0] >= 1 - SAVED_UNKNOWN / 255)):
         yield from _greys(data, name, main, width * height, mode, negate, thresholds, speed=speed)
 
@@ -160,16 +164,16 @@ def _greys(
         try:
             pixels = _image.read_grey(data, LIMITS).pixels()[0].tobytes()
         except BadUpload as error:
-            yield refused(error.detail, name)
+            yield error_finding(error.detail, name)
             return
     else:
         return
     if speed and unknown.any() and len(pixels.translate(None, bytes(np.flatnonzero(~unknown).tolist()))):
         reason = "some cells are unknown: Nav2's speed filter tells an error wherever a robot drives on one"
-        yield doubted(reason, name)
+        yield warning_finding(reason, name)
     if not speed and SAVED_UNKNOWN in pixels:
         reason = (
             f"with {thresholds[0]:g} the grey 205, map_saver's unknown, is read as free: write 0.196 where such cells "
             "mean unknown"
         )
-        yield doubted(reason, main, where="free_thresh")
+        yield warning_finding(reason, main, where="free_thresh")

@@ -15,12 +15,12 @@ import numpy as np
 
 from app.errors import Problem
 from app.formats import Files
-from app.formats._rules import doubted, refused, shown
+from app.formats._rules import error_finding, shown, warning_finding
 
 BINARY, FULL = b"# Octomap OcTree binary file", b"# Octomap OcTree file"
 NODE_BYTES = {"OcTree": 5, "ColorOcTree": 8, "OcTreeStamped": 5}
-HEAD = 2**16
-MOST_CELLS = 65536
+MAX_HEADER_BYTES = 2**16
+MAX_CELLS = 65536
 _KEYS = re.compile(rb"^(id|size|res)[ \t]+([^\r\n]*?)[ \t]*\r?$", re.MULTILINE)
 
 _codes = np.arange(65536)
@@ -35,27 +35,27 @@ def check(files: Files) -> Iterator[Problem]:
     data = files[main]
     if data[:4] == b"\x03\0\0\0":
         reason = "the headerless form of 2010: newer tools do not read it; ask for .bt or .ot anew"
-        yield doubted(reason, main)
+        yield warning_finding(reason, main)
         _, resolution, size = struct.unpack("<IdI", data[:16])
         yield from _binary(data[16:], size, main)
         yield from _resolution(resolution, main)
         return
     kind = next((k for k in (BINARY, FULL) if data.startswith(k)), None)
-    start = re.search(rb"^data[ \t]*\r?\n", data[:HEAD], re.MULTILINE)
+    start = re.search(rb"^data[ \t]*\r?\n", data[:MAX_HEADER_BYTES], re.MULTILINE)
     if kind is None or start is None:
         reason = "the first line must be '# Octomap OcTree file' or '… binary file', and a line 'data' end the header"
-        yield refused(reason, main, line=1)
+        yield error_finding(reason, main, line=1)
         return
     header = {key.decode(): value.decode("latin1") for key, value in _KEYS.findall(data[: start.start()])}
     tree, size, res = header.get("id"), header.get("size"), header.get("res")
     if tree not in NODE_BYTES:
-        yield refused(f"octomap itself knows no tree of the type {shown(tree)}", main, where="id")
+        yield error_finding(f"octomap itself knows no tree of the type {shown(tree)}", main, where="id")
     if size is None or not size.isdigit():
-        yield refused(f"must be the number of nodes, is {shown(size)}", main, where="size")
+        yield error_finding(f"must be the number of nodes, is {shown(size)}", main, where="size")
     try:
         yield from _resolution(float(res or "nan"), main)
     except ValueError:
-        yield refused(f"must be a number, is {shown(res)}", main, where="res")
+        yield error_finding(f"must be a number, is {shown(res)}", main, where="res")
     body = data[start.end() :]
     count = int(size) if size is not None and size.isdigit() else None
     if kind == BINARY:
@@ -63,14 +63,14 @@ def check(files: Files) -> Iterator[Problem]:
     elif tree in NODE_BYTES and count is not None:
         need = count * NODE_BYTES[tree]
         if len(body) < need:
-            yield refused(f"{count} nodes are {need} bytes; the file has {len(body)}", main, where="size")
+            yield error_finding(f"{count} nodes are {need} bytes; the file has {len(body)}", main, where="size")
         elif len(body) > need:
-            yield doubted(f"{len(body) - need} bytes follow the last node", main, where="size")
+            yield warning_finding(f"{len(body) - need} bytes follow the last node", main, where="size")
 
 
 def _resolution(value: float, main: str) -> Iterator[Problem]:
     if not math.isfinite(value) or value <= 0:
-        yield refused(f"must be a length above 0, is {value:g}", main, where="res")
+        yield error_finding(f"must be a length above 0, is {value:g}", main, where="res")
 
 
 def _binary(body: bytes, count: int | None, main: str) -> Iterator[Problem]:
@@ -84,13 +84,13 @@ def _binary(body: bytes, count: int | None, main: str) -> Iterator[Problem]:
     open_nodes = 1 + np.cumsum(_INNER[masks].astype(np.int64) - 1)
     ends = np.flatnonzero(open_nodes == 0)
     if not len(ends):
-        yield refused("it is cut short: an inner node's children are missing", main)
+        yield error_finding("it is cut short: an inner node's children are missing", main)
         return
     used = int(ends[0]) + 1
     if used < len(masks):
-        yield doubted(f"{len(body) - 2 * used} bytes follow the tree", main)
+        yield warning_finding(f"{len(body) - 2 * used} bytes follow the tree", main)
     nodes = 1 + int(_CHILDREN[masks[:used]].sum(dtype=np.int64))
     if count is not None and nodes != count:
-        yield doubted(
+        yield warning_finding(
             f"the header says {count} nodes, the tree has {nodes}: octomap tells an error", main, where="size"
         )

@@ -14,18 +14,18 @@ from typing import Any
 from app.errors import Problem
 from app.formats import Files, _yaml
 from app.formats._rules import (
-    LARGEST,
     LIMITS,
-    brief,
-    doubted,
+    MAX_WHOLE_YAML_BYTES,
+    duplicates,
+    error_finding,
+    is_brief,
     is_number,
     mappings,
     missing,
     names,
     numbers,
-    refused,
-    repeated,
     shown,
+    warning_finding,
 )
 
 SYSTEMS = ("reference_image", "web_mercator", "cartesian_meters", "wgs84")
@@ -42,36 +42,36 @@ EASTING_FIRST = re.compile(r"\s*EPSG:\s*(32[67]\d\d|258\d\d|27700|2154|3857)\s*"
 def check(files: Files) -> Iterator[Problem]:
     """A building as its generator and its editor load it."""
     main = next(iter(files))
-    if brief(files[main]):
+    if is_brief(files[main]):
         return
-    if len(files[main]) > LARGEST:
-        yield doubted(f"not checked: it is larger than {LARGEST} bytes", main)
+    if len(files[main]) > MAX_WHOLE_YAML_BYTES:
+        yield warning_finding(f"not checked: it is larger than {MAX_WHOLE_YAML_BYTES} bytes", main)
         return
     top = _yaml.load(files[main], LIMITS)
     if not isinstance(top, dict):
-        yield refused("a building is a mapping", main)
+        yield error_finding("a building is a mapping", main)
         return
     if top.get("name") is None and top.get("building_name") is None:
-        yield refused("a building needs a name", main, where="name")
+        yield error_finding("a building needs a name", main, where="name")
     system = top.get("coordinate_system", SYSTEMS[0])
     if system not in SYSTEMS:
-        yield refused(f"must be one of {', '.join(SYSTEMS)}, is {shown(system)}", main, where="coordinate_system")
+        yield error_finding(f"must be one of {', '.join(SYSTEMS)}, is {shown(system)}", main, where="coordinate_system")
     yield from _parameters(top.get("parameters"), main, "parameters")
     levels = top.get("levels")
     if not isinstance(levels, dict) or not levels:
-        yield refused("a building needs one level at least", main, where="levels")
+        yield error_finding("a building needs one level at least", main, where="levels")
         return
     reference = top.get("reference_level_name", next(iter(levels)))
     if reference not in levels:
-        yield refused(f"there is no level {shown(reference)}", main, where="reference_level_name")
+        yield error_finding(f"there is no level {shown(reference)}", main, where="reference_level_name")
     for name, level in levels.items():
         if isinstance(level, dict):
             yield from _level(level, main, f"levels.{name}", files, measured=system == SYSTEMS[0] and name == reference)
         else:
-            yield refused("must be a mapping", main, where=f"levels.{name}")
+            yield error_finding("must be a mapping", main, where=f"levels.{name}")
     if system == SYSTEMS[0] and isinstance(levels.get(reference), dict):
-        yield from _aligned(levels, reference, main)
-    yield from _on_earth(top, str(system), levels, main)
+        yield from _check_alignment(levels, reference, main)
+    yield from _check_coordinates(top, str(system), levels, main)
     lifts = top.get("lifts")
     for name, lift in lifts.items() if isinstance(lifts, dict) else ():
         yield from _lift(lift, levels, main, f"lifts.{name}")
@@ -82,15 +82,15 @@ def _parameters(parameters: Any, main: str, location: str) -> Iterator[Problem]:
     if not parameters:
         return
     if not isinstance(parameters, dict):
-        yield refused(f"must be a mapping, is {shown(parameters)}", main, where=location)
+        yield error_finding(f"must be a mapping, is {shown(parameters)}", main, where=location)
         return
     for key, value in parameters.items():
         item_location = f"{location}.{key}"
         if not isinstance(value, list) or len(value) != 2 or value[0] not in KINDS or isinstance(value[0], bool):
             reason = f"must be [type, value] (1 text, 2 integer, 3 decimal, 4 truth value), is {shown(value)}"
-            yield refused(reason, main, where=item_location)
+            yield error_finding(reason, main, where=item_location)
         elif not isinstance(value[1], KINDS[value[0]]) or (value[0] in (2, 3) and isinstance(value[1], bool)):
-            yield refused(f"the value {shown(value[1])} is not of its type {value[0]}", main, where=item_location)
+            yield error_finding(f"the value {shown(value[1])} is not of its type {value[0]}", main, where=item_location)
 
 
 def _level(level: dict[str, Any], main: str, location: str, files: Files, *, measured: bool) -> Iterator[Problem]:
@@ -98,39 +98,43 @@ def _level(level: dict[str, Any], main: str, location: str, files: Files, *, mea
     if drawing is not None:
         image = drawing.get("filename") if isinstance(drawing, dict) else None
         if not isinstance(image, str):
-            yield refused("a drawing needs a filename", main, where=f"{location}.drawing")
+            yield error_finding("a drawing needs a filename", main, where=f"{location}.drawing")
         elif image and posixpath.normpath(posixpath.join(posixpath.dirname(main), image)) not in files:
-            yield doubted(f"the drawing {shown(image)} is not there", main, where=f"{location}.drawing.filename")
+            yield warning_finding(
+                f"the drawing {shown(image)} is not there", main, where=f"{location}.drawing.filename"
+            )
     if "elevation" in level and not is_number(level["elevation"]):
-        yield refused(f"must be a number, is {shown(level['elevation'])}", main, where=f"{location}.elevation")
+        yield error_finding(f"must be a number, is {shown(level['elevation'])}", main, where=f"{location}.elevation")
     vertices = level.get("vertices") or []
     if not isinstance(vertices, list):
-        yield refused("must be a list", main, where=f"{location}.vertices")
+        yield error_finding("must be a list", main, where=f"{location}.vertices")
         return
     for k, row in enumerate(vertices):
         if not isinstance(row, list) or len(row) < 4 or not numbers(row[:3], 3):
-            yield refused("a vertex is [x, y, z, name, {…}]", main, where=f"{location}.vertices[{k}]")
+            yield error_finding("a vertex is [x, y, z, name, {…}]", main, where=f"{location}.vertices[{k}]")
         elif len(row) > 4:
             yield from _parameters(row[4], main, f"{location}.vertices[{k}]")
     called = [
         row[3] for row in vertices if isinstance(row, list) and len(row) > 3 and isinstance(row[3], str) and row[3]
     ]
-    if repeats := repeated(called):
+    if repeats := duplicates(called):
         reason = f"{len(repeats)} names are given to several vertices; fleet adapters refuse that: {names(repeats)}"
-        yield doubted(reason, main, where=f"{location}.vertices")
+        yield warning_finding(reason, main, where=f"{location}.vertices")
     for section in EDGES:
         yield from _edges(level.get(section), section, vertices, main, f"{location}.{section}")
     if measured and not level.get("measurements"):
         reason = "the reference level has no measurement: a pixel counts as a metre"
-        yield doubted(reason, main, where=f"{location}.measurements")
+        yield warning_finding(reason, main, where=f"{location}.measurements")
     for section in ("floors", "holes"):
         for k, area in mappings(level.get(section)):
             ring = area.get("vertices")
             if not isinstance(ring, list) or len(ring) < 3 or not all(_is_index(i, vertices) for i in ring):
-                yield refused("needs three vertices or more that are there", main, where=f"{location}.{section}[{k}]")
+                yield error_finding(
+                    "needs three vertices or more that are there", main, where=f"{location}.{section}[{k}]"
+                )
     for k, row in enumerate(level.get("fiducials") or ()):
         if not isinstance(row, list) or len(row) < 3 or not numbers(row[:2], 2):
-            yield refused("a fiducial is [x, y, name]", main, where=f"{location}.fiducials[{k}]")
+            yield error_finding("a fiducial is [x, y, name]", main, where=f"{location}.fiducials[{k}]")
 
 
 def _is_index(value: Any, vertices: list[Any]) -> bool:
@@ -141,35 +145,37 @@ def _edges(rows: Any, section: str, vertices: list[Any], main: str, location: st
     if not rows:
         return
     if not isinstance(rows, list):
-        yield refused("must be a list", main, where=location)
+        yield error_finding("must be a list", main, where=location)
         return
     for k, row in enumerate(rows):
         item_location = f"{location}[{k}]"
         if not isinstance(row, list) or len(row) < 2 or not all(_is_index(i, vertices) for i in row[:2]):
-            yield refused(f"must be [i, j, {{…}}] with vertices below {len(vertices)}", main, where=item_location)
+            yield error_finding(f"must be [i, j, {{…}}] with vertices below {len(vertices)}", main, where=item_location)
             continue
         parameters = row[2] if len(row) > 2 and isinstance(row[2], dict) else {}
         yield from _parameters(row[2] if len(row) > 2 else None, main, item_location)
         value = {key: v[1] for key, v in parameters.items() if isinstance(v, list) and len(v) == 2}
         if section == "measurements":
             if not is_number(value.get("distance")):
-                yield refused("a measurement needs a distance", main, where=item_location)
+                yield error_finding("a measurement needs a distance", main, where=item_location)
             a, b = vertices[row[0]], vertices[row[1]]
             if isinstance(a, list) and isinstance(b, list) and a[:2] == b[:2]:
-                yield refused("a measurement of length 0: the scale is a division by it", main, where=item_location)
+                yield error_finding(
+                    "a measurement of length 0: the scale is a division by it", main, where=item_location
+                )
         elif section == "doors":
             if absent := [key for key in ("name", "type") if value.get(key) is None]:
-                yield refused(f"a door needs {' and '.join(absent)}", main, where=item_location)
+                yield error_finding(f"a door needs {' and '.join(absent)}", main, where=item_location)
             elif value["type"] not in DOORS:
-                yield doubted(
+                yield warning_finding(
                     f"the generator has no door of the type {shown(value['type'])}", main, where=item_location
                 )
         elif section == "lanes" and value.get("graph_idx", 0) not in range(GRAPHS):
             reason = f"only graphs 0 to {GRAPHS - 1} are generated; this lane is of {shown(value['graph_idx'])}"
-            yield doubted(reason, main, where=item_location)
+            yield warning_finding(reason, main, where=item_location)
 
 
-def _aligned(levels: Mapping[str, Any], reference: str, main: str) -> Iterator[Problem]:
+def _check_alignment(levels: Mapping[str, Any], reference: str, main: str) -> Iterator[Problem]:
     """Levels of drawings come to the reference level's place by two fiducials of the same names."""
 
     def marks(level: Any) -> set[str]:
@@ -180,51 +186,53 @@ def _aligned(levels: Mapping[str, Any], reference: str, main: str) -> Iterator[P
         common = marks(level) & marks(levels[reference])
         if name != reference and len(common) < 2:
             reason = f"it shares {len(common)} fiducials with {reference}; two bring its drawing to the right place"
-            yield doubted(reason, main, where=f"levels.{name}.fiducials")
+            yield warning_finding(reason, main, where=f"levels.{name}.fiducials")
 
 
-def _on_earth(top: Mapping[str, Any], system: str, levels: Mapping[str, Any], main: str) -> Iterator[Problem]:
+def _check_coordinates(top: Mapping[str, Any], system: str, levels: Mapping[str, Any], main: str) -> Iterator[Problem]:
     parameters = top.get("parameters") if isinstance(top.get("parameters"), dict) else {}
     assert isinstance(parameters, dict)
     value = {key: v[1] for key, v in parameters.items() if isinstance(v, list) and len(v) == 2}
     crs = value.get("generate_crs")
     if system in ("web_mercator", "wgs84") and not crs:
-        yield refused(f"{system} needs the parameter generate_crs", main, where="parameters.generate_crs")
+        yield error_finding(f"{system} needs the parameter generate_crs", main, where="parameters.generate_crs")
     if system == "wgs84":
         for key in ("suggested_offset_x", "suggested_offset_y"):
             if value.get(key) is None:
-                yield refused(f"wgs84 needs the parameter {key}", main, where=f"parameters.{key}")
+                yield error_finding(f"wgs84 needs the parameter {key}", main, where=f"parameters.{key}")
         if isinstance(crs, str) and EASTING_FIRST.fullmatch(crs):
             reason = (
                 f"{crs} gives the easting first and the generator takes the northing first: x and y come out swapped"
             )
-            yield doubted(reason, main, where="parameters.generate_crs")
+            yield warning_finding(reason, main, where="parameters.generate_crs")
     if system == "web_mercator":
         origin = value.get("generate_origin_vertex", "origin")
         rows = [row for lv in levels.values() if isinstance(lv, dict) for row in lv.get("vertices") or ()]
         if not any(isinstance(row, list) and len(row) > 3 and row[3] == origin for row in rows):
             reason = f"no vertex is called {shown(origin)}: the map keeps its origin at 0° N 0° E"
-            yield doubted(reason, main, where="parameters.generate_origin_vertex")
+            yield warning_finding(reason, main, where="parameters.generate_origin_vertex")
 
 
 def _lift(lift: Any, levels: Mapping[str, Any], main: str, location: str) -> Iterator[Problem]:
     if not isinstance(lift, dict):
-        yield refused("must be a mapping", main, where=location)
+        yield error_finding("must be a mapping", main, where=location)
         return
     if absent := [key for key in LIFT if not is_number(lift.get(key))]:
-        yield refused(f"a lift needs the numbers {', '.join(absent)}", main, where=location)
+        yield error_finding(f"a lift needs the numbers {', '.join(absent)}", main, where=location)
     for key in ("reference_floor_name", "highest_floor", "lowest_floor"):
         floor = lift.get(key)
         if (floor or (key == "reference_floor_name" and floor is not None)) and floor not in levels:
-            yield refused(f"there is no level {shown(floor)}", main, where=f"{location}.{key}")
+            yield error_finding(f"there is no level {shown(floor)}", main, where=f"{location}.{key}")
     doors = lift.get("doors")
     for name, door in doors.items() if isinstance(doors, dict) else ():
         if absent := missing(door, DOOR):
-            yield refused(f"a lift door needs {', '.join(absent)}", main, where=f"{location}.doors.{name}")
+            yield error_finding(f"a lift door needs {', '.join(absent)}", main, where=f"{location}.doors.{name}")
     stops = lift.get("level_doors")
     for floor, listed in stops.items() if isinstance(stops, dict) else ():
         if floor not in levels:
-            yield refused(f"there is no level {shown(floor)}", main, where=f"{location}.level_doors")
+            yield error_finding(f"there is no level {shown(floor)}", main, where=f"{location}.level_doors")
         absent = [d for d in listed if d not in (doors or {})] if isinstance(listed, list) else []
         if absent:
-            yield doubted(f"the lift has no door {names(absent)}", main, where=f"{location}.level_doors.{floor}")
+            yield warning_finding(
+                f"the lift has no door {names(absent)}", main, where=f"{location}.level_doors.{floor}"
+            )

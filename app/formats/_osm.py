@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
 from app.formats import Limits, _xml
-from app.model.features import alike
+from app.model.features import shared_key_dict
 
 Attributes = dict[str, str]
 Tags = dict[str, str]
@@ -183,10 +183,10 @@ def _pair(two: bytes) -> int:
     return two[0] * 256 + two[1]
 
 
-SCANNED = 2**20
+SCAN_BYTES = 2**20
 """Bytes of nodes that are looked at together."""
 
-KNOWN_TEXTS, PATTERNS = 2**14, 64
+MAX_CACHED_TEXTS, PATTERNS = 2**14, 64
 """Attribute values, and lists of attribute names, that are kept for the next element."""
 
 _KNOWN = {_pair(p) for p in (b"?x", b"os", b"/o", b"bo", b"no", b"/n", b"wa", b"/w", b"re", b"/r", b"nd", b"ta", b"me")}
@@ -211,7 +211,7 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
     if not {int(c) for c in np.flatnonzero(codes)} <= _KNOWN or codes[_pair(b"os")] != 1 or codes[_pair(b"?x")] > 1:
         return None
     del buffer, opened
-    _well_formed(data)
+    _check_well_formed(data)
     count = {p: int(codes[_pair(p)]) for p in (b"no", b"/n", b"wa", b"re", b"nd", b"ta", b"me", b"bo")}
     ids: list[int] = []
     places: list[NDArray[np.float64]] = []
@@ -219,7 +219,7 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
     tagged: list[int] = []
     at = 0
     while at < len(data):  # a piece at a time: the matches take far more memory than what is kept of them
-        end = data.find(b"<node ", at + SCANNED)
+        end = data.find(b"<node ", at + SCAN_BYTES)
         end = len(data) if end < 0 else end
         rows = _NODE.findall(data, at, end)
         tagged += [k for k, row in enumerate(rows, len(ids)) if not row[5]]
@@ -282,7 +282,7 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
     return osm_data
 
 
-def _well_formed(data: bytes) -> None:
+def _check_well_formed(data: bytes) -> None:
     parser = expat.ParserCreate()
 
     def refuse(*_: object) -> NoReturn:
@@ -301,7 +301,7 @@ class _Texts(dict[bytes, str]):
     """Raw attribute values -> text, the repeated ones worked out once: keys and values of tags repeat a lot."""
 
     def __missing__(self, raw: bytes) -> str:
-        if len(self) >= KNOWN_TEXTS:
+        if len(self) >= MAX_CACHED_TEXTS:
             self.clear()  # times and changesets hardly repeat
         text = self[raw] = unescape(raw)
         return text
@@ -330,7 +330,7 @@ class _Children:
         if pattern is None:
             if len(self.alike) >= PATTERNS or len(set(keys)) != len(keys):
                 return {texts[k]: texts[v] for k, v in pairs}
-            pattern = self.alike[keys] = alike(*[texts[k] for k in keys])
+            pattern = self.alike[keys] = shared_key_dict(*[texts[k] for k in keys])
         out = pattern.copy()
         for name, (_, v) in zip(pattern, pairs, strict=True):
             out[name] = texts[v]
@@ -434,12 +434,12 @@ def _events(data: bytes, limits: Limits) -> Data:
         if event == "start":
             depth += 1
             if depth == 1:
-                reader.begin(element)
+                reader.read_root(element)
             elif depth == 2:
                 reader.check_name(element)
         else:
             if depth == 2:
-                reader.take(element)
+                reader.read_element(element)
                 element.clear()
                 while element.getprevious() is not None:
                     del element.getparent()[0]
@@ -464,25 +464,25 @@ class _StrictParser:
         self.node_children: dict[int, list[Unknown]] = {}
         self.problems: list[tuple[str, int | None, str]] = []
 
-    def begin(self, root: etree._Element) -> None:
+    def read_root(self, root: etree._Element) -> None:
         if root.tag != "osm":
-            _refuse(f"this is not an OSM file: its root is <{root.tag}>, not <osm>", root)
+            _raise_unreadable(f"this is not an OSM file: its root is <{root.tag}>, not <osm>", root)
         if root.getroottree().docinfo.internalDTD is not None:
-            _refuse("DOCTYPE and entity declarations are not accepted: remove them", root)
+            _raise_unreadable("DOCTYPE and entity declarations are not accepted: remove them", root)
         self.root = self.attributes(root)
 
     def check_name(self, element: etree._Element) -> None:
         if element.tag not in DATA | EXTRAS | {"bounds", "bound"}:
-            _refuse(f"<{element.tag}> is no element of an OSM file", element)
+            _raise_unreadable(f"<{element.tag}> is no element of an OSM file", element)
 
     def attributes(self, element: etree._Element) -> Attributes:
         out = _xml.attributes(element)
         limit = self.limits.xml_attribute_bytes
         if any(len(v) > limit for v in out.values()):
-            _refuse(f"an attribute is longer than {limit} characters", element)
+            _raise_unreadable(f"an attribute is longer than {limit} characters", element)
         return out
 
-    def take(self, element: etree._Element) -> None:
+    def read_element(self, element: etree._Element) -> None:
         attributes = self.attributes(element)
         if element.tag in ("bounds", "bound"):
             self.bounds.append(attributes)
@@ -509,7 +509,7 @@ class _StrictParser:
             elif child.tag == "member" and element.tag == "relation":
                 kind = child_attributes.get("type", "")
                 if kind not in ("node", "way", "relation"):
-                    _refuse(f"a member's type must be node, way or relation, not {kind!r}", child)
+                    _raise_unreadable(f"a member's type must be node, way or relation, not {kind!r}", child)
                 members.append(
                     (kind, _integer(child_attributes.get("ref"), child, "ref"), child_attributes.get("role", ""))
                 )
@@ -528,7 +528,7 @@ class _StrictParser:
     def unknown(self, element: etree._Element, depth: int = 1) -> Unknown:
         """An element as it stands, and those in it. Data inside other data is refused."""
         if (element.tag in DATA and len(element)) or depth > MAX_UNKNOWN_DEPTH:
-            _refuse(f"<{element.tag}> inside <{element.getparent().tag}> is no part of an OSM file", element)
+            _raise_unreadable(f"<{element.tag}> inside <{element.getparent().tag}> is no part of an OSM file", element)
         inner = [self.unknown(child, depth + 1) for child in element]
         row: Unknown = [str(element.tag), self.attributes(element), (element.text or "").strip(), inner]
         while not row[-1] and len(row) > 2:
@@ -580,19 +580,19 @@ class _StrictParser:
         return osm_data
 
 
-def _refuse(reason: str, element: etree._Element) -> NoReturn:
+def _raise_unreadable(reason: str, element: etree._Element) -> NoReturn:
     raise UnreadableFile(reason, [Problem(reason, line=element.sourceline, where=f"<{element.tag}>")])
 
 
 def _integer(text: str | None, element: etree._Element, name: str) -> int:
     if text is None or not _INTEGER.fullmatch(text):
-        _refuse(f"<{element.tag}> needs a whole number as its {name}, not {str(text)[:40]!r}", element)
+        _raise_unreadable(f"<{element.tag}> needs a whole number as its {name}, not {str(text)[:40]!r}", element)
     return int(text)
 
 
 def _degrees(text: str, element: etree._Element) -> float:
     if len(text) > 64 or not _DECIMAL.fullmatch(text):
-        _refuse(f"a node's place must be a finite number of degrees, not {text[:40]!r}", element)
+        _raise_unreadable(f"a node's place must be a finite number of degrees, not {text[:40]!r}", element)
     return float(text)
 
 
@@ -644,7 +644,7 @@ def _pbf(data: bytes, limits: Limits) -> Data:
             )
         size, bound = 0, limits.max_unpacked(len(data))
         for item in file:
-            size += _take_pbf(out, item)
+            size += _read_pbf_object(out, item)
             if size > bound:
                 limits.check_unpacked(size, len(data))
             if len(out.ids) + len(out.ways) + len(out.relations) > limits.features:
@@ -654,7 +654,7 @@ def _pbf(data: bytes, limits: Limits) -> Data:
     return out.finish()
 
 
-def _take_pbf(out: _StrictParser, item: Any) -> int:
+def _read_pbf_object(out: _StrictParser, item: Any) -> int:
     """Keep one object; roughly how many bytes it takes."""
     attributes: Attributes = {}
     if item.version:

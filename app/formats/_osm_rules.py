@@ -17,10 +17,10 @@ from lxml import etree
 
 from app.errors import Problem
 from app.formats import Files, _osm, _xml
-from app.formats._rules import HEAD, LIMITS, brief, doubted, names, refused, repeated
+from app.formats._rules import HEAD_BYTES, LIMITS, duplicates, error_finding, is_brief, names, warning_finding
 
 KINDS = ("node", "way", "relation")
-MOST_NODES = 2000
+MAX_WAY_NODES = 2000
 """Of a way: the API's limit."""
 
 
@@ -29,39 +29,43 @@ def check(files: Files) -> Iterator[Problem]:
     main = next(iter(files))
     if _osm.is_pbf(files[main]):
         return
-    if brief(files[main]):
-        if not re.search(rb"""<osm\b[^>]*\bversion=["']0\.6["']""", files[main][:HEAD]):
-            yield refused("must be 0.6", main, where="version")
+    if is_brief(files[main]):
+        if not re.search(rb"""<osm\b[^>]*\bversion=["']0\.6["']""", files[main][:HEAD_BYTES]):
+            yield error_finding("must be 0.6", main, where="version")
         return
     root = _xml.parse(_osm.unpack(files[main], LIMITS), LIMITS)
     if root.tag not in ("osm", "osmChange"):
-        yield refused(f"the root is <{root.tag}>, not <osm>", main, line=root.sourceline)
+        yield error_finding(f"the root is <{root.tag}>, not <osm>", main, line=root.sourceline)
         return
     if root.get("version") != "0.6":
-        yield refused(f"must be 0.6, is {root.get('version')!r}", main, line=root.sourceline, where="version")
+        yield error_finding(f"must be 0.6, is {root.get('version')!r}", main, line=root.sourceline, where="version")
     elements = _ElementScan()
     try:
-        elements.take(root)
+        elements.read_element(root)
     except (TypeError, ValueError):
-        yield refused("an id or a ref is missing or no whole number", main, line=elements.line)
+        yield error_finding("an id or a ref is missing or no whole number", main, line=elements.line)
         return
     for kind, ids in elements.ids.items():
-        if repeats := repeated(ids):
-            yield doubted(f"{len(repeats)} ids are given to several {kind}s: {names(repeats)}", main)
+        if repeats := duplicates(ids):
+            yield warning_finding(f"{len(repeats)} ids are given to several {kind}s: {names(repeats)}", main)
         if new := [i for i in ids if i < 0]:
             reason = (
                 f"{len(new)} {kind}s have negative ids, as JOSM gives them to what is new: GDAL reads them with "
                 "OSM_USE_CUSTOM_INDEXING=NO"
             )
-            yield doubted(reason, main)
+            yield warning_finding(reason, main)
         if bare := elements.bare[kind]:
-            yield doubted(f"{bare} {kind}s have no version from 1: osmium's merging of changes needs them", main)
+            yield warning_finding(
+                f"{bare} {kind}s have no version from 1: osmium's merging of changes needs them", main
+            )
     if elements.nowhere:
-        yield refused(f"{len(elements.nowhere)} nodes have no place: {names(elements.nowhere)}", main)
+        yield error_finding(f"{len(elements.nowhere)} nodes have no place: {names(elements.nowhere)}", main)
     if absent := sorted(elements.refs - set(elements.ids["node"])):
-        yield doubted(f"{len(absent)} nodes of ways are not in the file: {names(absent)}", main)
+        yield warning_finding(f"{len(absent)} nodes of ways are not in the file: {names(absent)}", main)
     if elements.long:
-        yield doubted(f"{len(elements.long)} ways have more than {MOST_NODES} nodes: {names(elements.long)}", main)
+        yield warning_finding(
+            f"{len(elements.long)} ways have more than {MAX_WAY_NODES} nodes: {names(elements.long)}", main
+        )
     if root.tag == "osm":
         yield from _order(elements, main)
 
@@ -78,13 +82,13 @@ class _ElementScan:
     kinds: list[str] = field(default_factory=list)
     line: int | None = None
 
-    def take(self, parent: etree._Element) -> None:
+    def read_element(self, parent: etree._Element) -> None:
         """All elements below; a change file has blocks of them. TypeError or ValueError for what is no number."""
         for element in parent:
             kind = element.tag
             if kind not in self.ids:
                 if kind in ("create", "modify", "delete"):
-                    self.take(element)
+                    self.read_element(element)
                 continue
             attributes = element.attrib
             self.line = element.sourceline
@@ -105,15 +109,19 @@ class _ElementScan:
             elif kind == "way":
                 refs = [int(nd.get("ref", "")) for nd in element.iterchildren("nd")]
                 self.refs.update(refs)
-                if len(refs) > MOST_NODES:
+                if len(refs) > MAX_WAY_NODES:
                     self.long.append(i)
 
 
 def _order(elements: _ElementScan, main: str) -> Iterator[Problem]:
     if elements.kinds != [kind for kind in KINDS if kind in elements.kinds]:
-        yield doubted("types are mixed: GDAL and osmium want all nodes, then all ways, then all relations", main)
+        yield warning_finding(
+            "types are mixed: GDAL and osmium want all nodes, then all ways, then all relations", main
+        )
         return
     for kind, ids in elements.ids.items():
         if any(b < a for a, b in pairwise(i for i in ids if i > 0)):
-            yield doubted(f"the {kind}s are not sorted by id: some of osmium's commands need `osmium sort`", main)
+            yield warning_finding(
+                f"the {kind}s are not sorted by id: some of osmium's commands need `osmium sort`", main
+            )
             return

@@ -15,10 +15,10 @@ from typing import Any
 from app.formats._osm import INT64, MAX_UNKNOWN_DEPTH
 from app.formats._text import DEGREES, numbers
 
-SHARED = 4096
+MAX_CACHED_ATTRIBUTES = 4096
 """Mappings of attributes whose text is kept for the next element."""
 
-NOTHING: Mapping[str, str] = {}
+NO_ATTRIBUTES: Mapping[str, str] = {}
 
 LINES = 10_000
 """That are turned into bytes at once."""
@@ -83,7 +83,7 @@ def _lines(
         cached = cache.get(id(values))
         if cached is None:
             # Keyed by identity: thousands of elements of one changeset share one mapping, which lives here.
-            if len(cache) >= SHARED:
+            if len(cache) >= MAX_CACHED_ATTRIBUTES:
                 cache.clear()  # a file in which every element has its own history
             cached = cache[id(values)] = attribute_text(values, RESERVED)
         return cached
@@ -190,7 +190,7 @@ def integers(value: Any) -> list[int] | None:
 def as_texts(value: Any) -> Mapping[str, str]:
     """A mapping of texts to texts, whatever was stored."""
     if not isinstance(value, Mapping):
-        return NOTHING
+        return NO_ATTRIBUTES
     try:
         "".join(value.values())
     except TypeError:

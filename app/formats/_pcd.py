@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from app.errors import TooLarge
 from app.formats import ReadContext
 from app.formats._lzf import expand, squeeze
-from app.formats._points import RGB, UNTURNED, Cloud, check_columns, check_count, table, wrong
+from app.formats._points import IDENTITY_VIEWPOINT, RGB, Cloud, check_columns, check_count, table, unreadable_error
 
 Data = Literal["ascii", "binary", "binary_compressed"]
 KINDS: tuple[Data, ...] = get_args(Data)
@@ -70,7 +70,7 @@ def parse(data: bytes, context: ReadContext) -> Cloud:
     check_count(count, context)
     record = sum(f.dtype.itemsize * f.count for f in header.fields)
     if record > RECORD_BYTES:
-        raise wrong(f"a point takes {record} bytes; at most {RECORD_BYTES} can be read", where="SIZE")
+        raise unreadable_error(f"a point takes {record} bytes; at most {RECORD_BYTES} can be read", where="SIZE")
     if header.data == "ascii":
         columns = _from_text(data, header, count, context)
     elif header.data == "binary":
@@ -88,7 +88,7 @@ def _header(data: bytes, context: ReadContext) -> _Header:
     while "DATA" not in entries:
         end = data.find(b"\n", position, HEADER_BYTES)
         if end < 0:
-            raise wrong("the header does not end: the line DATA is missing", number + 1, "DATA")
+            raise unreadable_error("the header does not end: the line DATA is missing", number + 1, "DATA")
         number += 1
         line, position = data[position:end].decode("utf-8", "replace").strip(), end + 1
         if line.startswith("#"):
@@ -101,17 +101,17 @@ def _header(data: bytes, context: ReadContext) -> _Header:
             context.warn(f"unknown word {key[:40]!r} in the header: left out", line=number, where=key[:40])
     for key in ("SIZE", "TYPE", "WIDTH"):
         if key not in entries:
-            raise wrong(f"the header does not tell {key}", where=key)
+            raise unreadable_error(f"the header does not tell {key}", where=key)
     fields = _fields(entries)
-    width = _whole(entries, "WIDTH")
-    height = _whole(entries, "HEIGHT") if "HEIGHT" in entries else 1
-    if "POINTS" in entries and _whole(entries, "POINTS") != width * height:
-        reason = f"POINTS is {_whole(entries, 'POINTS')}, but WIDTH times HEIGHT is {width * height}"
-        raise wrong(reason, entries["POINTS"][1], "POINTS")
+    width = _integer(entries, "WIDTH")
+    height = _integer(entries, "HEIGHT") if "HEIGHT" in entries else 1
+    if "POINTS" in entries and _integer(entries, "POINTS") != width * height:
+        reason = f"POINTS is {_integer(entries, 'POINTS')}, but WIDTH times HEIGHT is {width * height}"
+        raise unreadable_error(reason, entries["POINTS"][1], "POINTS")
     (kind, *_), line_number = entries["DATA"][0] or [""], entries["DATA"][1]
     data_kind = next((k for k in KINDS if k == kind), None)
     if data_kind is None:
-        raise wrong(f"DATA must be one of {', '.join(KINDS)}, got {kind[:40]!r}", line_number, "DATA")
+        raise unreadable_error(f"DATA must be one of {', '.join(KINDS)}, got {kind[:40]!r}", line_number, "DATA")
     user_comments = [c for c in comments if not c.startswith("# .PCD")]
     return _Header(fields, width, height, _viewpoint(entries), tuple(user_comments), data_kind, position, number)
 
@@ -119,47 +119,49 @@ def _header(data: bytes, context: ReadContext) -> _Header:
 def _fields(entries: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
     key = "FIELDS" if "FIELDS" in entries else "COLUMNS"
     if key not in entries:
-        raise wrong("the header does not tell FIELDS", where="FIELDS")
+        raise unreadable_error("the header does not tell FIELDS", where="FIELDS")
     names, line = entries[key]
     counts, count_line = entries.get("COUNT", (["1"] * len(names), line))
     (sizes, size_line), (types, type_line) = entries["SIZE"], entries["TYPE"]
     for label, values, at in (("SIZE", sizes, size_line), ("TYPE", types, type_line), ("COUNT", counts, count_line)):
         if len(values) != len(names):
-            raise wrong(f"{label} has {len(values)} values for {len(names)} fields", at, label)
+            raise unreadable_error(f"{label} has {len(values)} values for {len(names)} fields", at, label)
     out = []
     seen: set[str] = set()
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         dtype = _TYPES.get(f"{kind}{size}")
         if dtype is None:
-            raise wrong(f"field {name[:40]}: there is no type {kind[:8]} of {size[:8]} bytes", type_line, "TYPE")
+            raise unreadable_error(
+                f"field {name[:40]}: there is no type {kind[:8]} of {size[:8]} bytes", type_line, "TYPE"
+            )
         if not re.fullmatch(r"[1-9][0-9]{0,4}", count):
-            raise wrong(
+            raise unreadable_error(
                 f"field {name[:40]}: COUNT must be a number from 1 to 99999, got {count[:8]!r}", count_line, "COUNT"
             )
         if name != PADDING and name in seen:
-            raise wrong(f"two fields are called {name[:40]!r}", line, key)
+            raise unreadable_error(f"two fields are called {name[:40]!r}", line, key)
         seen.add(name)
         out.append(_Field(name, np.dtype(dtype), int(count)))
     return tuple(out)
 
 
-def _whole(entries: Mapping[str, tuple[list[str], int]], key: str) -> int:
+def _integer(entries: Mapping[str, tuple[list[str], int]], key: str) -> int:
     values, line = entries[key]
     if len(values) != 1 or not re.fullmatch(r"[0-9]{1,12}", values[0]):
-        raise wrong(f"{key} must be a whole number, got {' '.join(values)[:40]!r}", line, key)
+        raise unreadable_error(f"{key} must be a whole number, got {' '.join(values)[:40]!r}", line, key)
     return int(values[0])
 
 
 def _viewpoint(entries: Mapping[str, tuple[list[str], int]]) -> tuple[float, ...]:
     if "VIEWPOINT" not in entries:
-        return UNTURNED
+        return IDENTITY_VIEWPOINT
     values, line = entries["VIEWPOINT"]
     pattern = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
     if len(values) != 7 or not all(re.fullmatch(pattern, v, re.ASCII) for v in values):
-        raise wrong(f"VIEWPOINT must be seven numbers, got {' '.join(values)[:80]!r}", line, "VIEWPOINT")
+        raise unreadable_error(f"VIEWPOINT must be seven numbers, got {' '.join(values)[:80]!r}", line, "VIEWPOINT")
     numbers = tuple(float(v) + 0.0 for v in values)
     if not all(map(math.isfinite, numbers)):
-        raise wrong("VIEWPOINT must be seven finite numbers", line, "VIEWPOINT")
+        raise unreadable_error("VIEWPOINT must be seven finite numbers", line, "VIEWPOINT")
     return numbers
 
 
@@ -188,7 +190,7 @@ def _from_binary(
 ) -> dict[str, NDArray[Any]]:
     body_size = len(data) - header.body
     if body_size < count * record:
-        raise wrong(
+        raise unreadable_error(
             f"{count} points of {record} bytes take {count * record} bytes, the file has {body_size}", where="DATA"
         )
     if body_size > count * record:
@@ -200,7 +202,7 @@ def _from_compressed(data: bytes, header: _Header, count: int, context: ReadCont
     if not count and len(data) - header.body < 8:
         return {f.name: np.empty(0, f.dtype) for f in header.fields if f.name != PADDING}
     if len(data) - header.body < 8:
-        raise wrong("the sizes of the compressed data are missing", where="DATA")
+        raise unreadable_error("the sizes of the compressed data are missing", where="DATA")
     packed, size = struct.unpack_from("<II", data, header.body)
     real = tuple(f for f in header.fields if f.name != PADDING)
     fields = next(
@@ -208,15 +210,19 @@ def _from_compressed(data: bytes, header: _Header, count: int, context: ReadCont
         None,
     )
     if fields is None:
-        raise wrong(f"{count} points do not take the {size} bytes that the compressed data says", where="DATA")
+        raise unreadable_error(
+            f"{count} points do not take the {size} bytes that the compressed data says", where="DATA"
+        )
     start = header.body + 8
     if len(data) - start < packed:
-        raise wrong(f"the compressed data has {len(data) - start} bytes, the file says {packed}", where="DATA")
+        raise unreadable_error(
+            f"the compressed data has {len(data) - start} bytes, the file says {packed}", where="DATA"
+        )
     context.limits.check_unpacked(size, packed)
     try:
         flat = expand(data[start : start + packed], size)
     except ValueError as error:
-        raise wrong(str(error), where="DATA") from error
+        raise unreadable_error(str(error), where="DATA") from error
     out: dict[str, NDArray[Any]] = {}
     offset = 0
     for f in fields:
@@ -280,7 +286,7 @@ def text_rows(columns: list[NDArray[Any]], n: int) -> bytes:
     return "".join(out).encode()
 
 
-def for_pcl(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def add_padding(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Columns under common names as PCL calls them: normals ``normal_x`` …, colours packed into one ``rgb``."""
     out: dict[str, NDArray[Any]] = {}
     names = {"nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from app.errors import TooLarge
 from app.formats import ReadContext
 from app.formats._pcd import text_rows
-from app.formats._points import Cloud, check_columns, check_count, table, wrong
+from app.formats._points import Cloud, check_columns, check_count, table, unreadable_error
 
 Data = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 KINDS: tuple[Data, ...] = get_args(Data)
@@ -87,12 +87,12 @@ def parse(data: bytes, context: ReadContext) -> Cloud:
     header = _header(data)
     vertices = [e for e in header.elements if e.name == VERTEX]
     if len(vertices) != 1:
-        raise wrong(f"a PLY needs one element {VERTEX}, this one has {len(vertices)}", where=VERTEX)
+        raise unreadable_error(f"a PLY needs one element {VERTEX}, this one has {len(vertices)}", where=VERTEX)
     for element in header.elements:
         check_count(element.count, context)
     if vertices[0].lists:
         reason = "vertices with lists cannot be read: save them with a single value in each property"
-        raise wrong(reason, vertices[0].line, VERTEX)
+        raise unreadable_error(reason, vertices[0].line, VERTEX)
     columns = (_from_text if header.data == "ascii" else _from_binary)(data, header, context)
     check_columns(columns)
     further = {e.name: e.count for e in header.elements if e.name != VERTEX and e.count}
@@ -107,33 +107,35 @@ def _header(data: bytes) -> _Header:
     while True:
         end = data.find(b"\n", position, HEADER_BYTES)
         if end < 0:
-            raise wrong("the header does not end: the line end_header is missing", number + 1, "end_header")
+            raise unreadable_error("the header does not end: the line end_header is missing", number + 1, "end_header")
         number += 1
         line, position = data[position:end].decode("utf-8", "replace").strip(), end + 1
         key, *values = line.split() or [""]
         if number == 1:
             if line != "ply":
-                raise wrong("the first line must be 'ply'", 1)
+                raise unreadable_error("the first line must be 'ply'", 1)
         elif key in ("comment", "obj_info"):
             comments.append(line)
         elif key == "format":
             kind = next((k for k in KINDS if values == [k, "1.0"]), None)
             if kind is None:
-                raise wrong(f"the format must be one of {', '.join(KINDS)} in version 1.0, got {line[:80]!r}", number)
+                raise unreadable_error(
+                    f"the format must be one of {', '.join(KINDS)} in version 1.0, got {line[:80]!r}", number
+                )
         elif key == "element":
             if len(values) != 2 or not re.fullmatch(r"[0-9]{1,12}", values[1]):
-                raise wrong(f"an element has a name and a number, got {line[:80]!r}", number, "element")
+                raise unreadable_error(f"an element has a name and a number, got {line[:80]!r}", number, "element")
             elements.append(_Element(values[0], int(values[1]), [], number))
         elif key == "property":
             if not elements:
-                raise wrong("a property stands before the first element", number, "property")
+                raise unreadable_error("a property stands before the first element", number, "property")
             _add_property(elements[-1], values, line, number)
         elif key == "end_header":
             break
         elif key:
-            raise wrong(f"unknown word {key[:40]!r} in the header", number, key[:40])
+            raise unreadable_error(f"unknown word {key[:40]!r} in the header", number, key[:40])
     if kind is None:
-        raise wrong("the header does not tell the format", where="format")
+        raise unreadable_error("the header does not tell the format", where="format")
     return _Header(kind, tuple(elements), tuple(comments), position, number)
 
 
@@ -142,13 +144,13 @@ def _add_property(element: _Element, values: list[str], line: str, number: int) 
     listed = types[:1] == ["list"]
     types = types[1:] if listed else types
     if len(types) != (2 if listed else 1) or any(t not in _TYPES for t in types):
-        raise wrong(f"a property has a known type and a name, got {line[:80]!r}", number, "property")
+        raise unreadable_error(f"a property has a known type and a name, got {line[:80]!r}", number, "property")
     if listed and _TYPES[types[0]][0] == "f":
-        raise wrong(f"the number of a list's values must be whole, got {types[0]}", number, name[:40])
+        raise unreadable_error(f"the number of a list's values must be whole, got {types[0]}", number, name[:40])
     if any(p.name == name for p in element.properties):
-        raise wrong(f"two properties of {element.name[:40]} are called {name[:40]!r}", number, name[:40])
+        raise unreadable_error(f"two properties of {element.name[:40]} are called {name[:40]!r}", number, name[:40])
     if len(element.properties) >= 1000:
-        raise wrong("an element has more than 1000 properties", number, element.name[:40])
+        raise unreadable_error("an element has more than 1000 properties", number, element.name[:40])
     element.properties.append(_Property(name, _TYPES[types[-1]], _TYPES[types[0]] if listed else None))
 
 
@@ -159,7 +161,9 @@ def _from_text(data: bytes, header: _Header, context: ReadContext) -> dict[str, 
     total = sum(e.count for e in header.elements)
     lines = text.count(b"\n") + (not text.endswith(b"\n"))
     if lines < total:
-        raise wrong(f"the header says {total} elements, the file has {lines} lines of them", header.lines + 1)
+        raise unreadable_error(
+            f"the header says {total} elements, the file has {lines} lines of them", header.lines + 1
+        )
     before = 0
     for element in header.elements:
         if element.name == VERTEX:
@@ -184,7 +188,7 @@ def _from_binary(data: bytes, header: _Header, context: ReadContext) -> dict[str
         need = dtype.itemsize * element.count
         if len(data) - position < need:
             reason = f"{element.count} × {element.name[:40]} take {need} bytes, the file has {len(data) - position}"
-            raise wrong(reason, element.line, element.name[:40])
+            raise unreadable_error(reason, element.line, element.name[:40])
         if element.name == VERTEX:
             rows = np.frombuffer(data, dtype, element.count, position)
             columns = {p.name: rows[f"{k}"] for k, p in enumerate(element.properties)}
@@ -198,7 +202,7 @@ def _end_of_lists(data: bytes, start: int, element: _Element, order: str) -> int
     """Where an element with lists ends. Equal lengths (triangles) are checked at once, else row by row."""
     if not element.count:
         return start
-    short = wrong(f"the file ends within {element.name[:40]}", element.line, element.name[:40])
+    short = unreadable_error(f"the file ends within {element.name[:40]}", element.line, element.name[:40])
 
     # For each property: what reads a list's length, the bytes of that length (or of the value), of a list's value.
     parts = [

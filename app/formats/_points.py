@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Limits, Parts, ReadContext, WriteContext
-from app.formats._select import file_stem, the_one
+from app.formats._select import file_stem, select_part
 from app.model.frame import MAX_DATUM_LATITUDE, Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.layers import MAP, Layers, Part, PartKey, Resources, cloud_name
-from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, expanded, morton
+from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, expand_leaves, morton
 from app.parameters import parameter
 
 PROPERTY = "points"
@@ -39,16 +39,16 @@ PROPERTY = "points"
 RESOLUTIONS = tuple(digit * 10.0**power for power in range(-2, 4) for digit in (1, 2, 5))[2:]
 """Metres: 0.05 is the default, the next ones are for clouds that it does not reach around."""
 
-FAR = 10.0
+FAR_RATIO = 10.0
 """A cloud lies far away where it is so many times farther from the origin than it is long."""
 
-FARTHEST = 1e9
+MAX_METRES = 1e9
 """Metres: numbers beyond are marks for "no return", not places."""
 
 CHUNK = 2**20
 """Points that are looked at at once: bounded memory beside the file's own."""
 
-UNTURNED = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+IDENTITY_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """The viewpoint of a cloud that says nothing of it: at the origin, not turned."""
 
 AXES = ("x", "y", "z")
@@ -89,7 +89,7 @@ class Cloud:
     columns: Mapping[str, NDArray[Any]]
     width: int
     height: int = 1
-    viewpoint: tuple[float, ...] = UNTURNED
+    viewpoint: tuple[float, ...] = IDENTITY_VIEWPOINT
     comments: tuple[str, ...] = ()
     further: Mapping[str, int] = field(default_factory=dict)
     crs: str | None = None
@@ -105,7 +105,7 @@ class Cloud:
 Parse = Callable[[bytes, ReadContext], Cloud]
 
 
-def wrong(reason: str, line: int | None = None, where: str | None = None) -> UnreadableFile:
+def unreadable_error(reason: str, line: int | None = None, where: str | None = None) -> UnreadableFile:
     """A file that cannot be read, and where."""
     return UnreadableFile(reason, [Problem(reason, line=line, where=where)])
 
@@ -120,7 +120,9 @@ def check_columns(columns: Mapping[str, NDArray[Any]]) -> None:
     """UnreadableFile where a coordinate is missing."""
     missing = [axis for axis in AXES if axis not in columns or columns[axis].ndim != 1]
     if missing:
-        raise wrong(f"points need x, y and z with one value each; missing: {', '.join(missing)}", where=missing[0])
+        raise unreadable_error(
+            f"points need x, y and z with one value each; missing: {', '.join(missing)}", where=missing[0]
+        )
 
 
 def table(
@@ -136,7 +138,7 @@ def table(
     if not rows:
         return np.empty(0, dtype)
     if text.count(b"\n", 0, len(text)) + 1 < rows:  # cheaper than to find out row by row
-        raise wrong(f"the header says {rows} points, the file has fewer lines", first_line)
+        raise unreadable_error(f"the header says {rows} points, the file has fewer lines", first_line)
     try:
         out = np.loadtxt(io.BytesIO(text), dtype, comments=None, skiprows=skip, max_rows=rows + alone, ndmin=1)
     except (ValueError, OverflowError) as error:
@@ -144,9 +146,9 @@ def table(
         # NumPy counts rows from 0 where a value is wrong, from 1 where there are too many or too few.
         line = first_line + skip + int(match[1]) - (" columns " in str(error)) if match else None
         reason = str(error).partition(";")[0][:200]
-        raise wrong(f"a row of numbers cannot be read: {reason}", line) from error
+        raise unreadable_error(f"a row of numbers cannot be read: {reason}", line) from error
     if len(out) < rows:
-        raise wrong(f"the header says {rows} points, the file has {len(out)} rows", first_line)
+        raise unreadable_error(f"the header says {rows} points, the file has {len(out)} rows", first_line)
     return np.asarray(out)
 
 
@@ -167,7 +169,7 @@ def read(files: Files, context: ReadContext, form: str, parse: Parse) -> Layers:
         context.warn("the VIEWPOINT turns the cloud: it is kept, and the points are taken as they stand")
     for noun, count in cloud.further.items():
         context.warn(f"{count} × {noun}: kept with the file, only the points become voxels", where=noun)
-    voxels, placed, datum = _voxelised(cloud, options, context)
+    voxels, placed, datum = _voxelise(cloud, options, context)
     path = f"{name}.{form}"
     source_properties = {
         "file": path,
@@ -191,14 +193,14 @@ def read(files: Files, context: ReadContext, form: str, parse: Parse) -> Layers:
     return Layers(parts, datum)
 
 
-def _voxelised(
+def _voxelise(
     cloud: Cloud, options: ReadOptions, context: ReadContext
 ) -> tuple[VoxelMap, dict[str, Any], Datum | None]:
     """The voxels, how the points came to their places, and the datum where the cloud brought one."""
     frame, corner = context.frame, None
     local: Array | None = None
     placed: dict[str, Any] = {}
-    crs, earth = _on_earth(cloud, options, context)
+    crs, earth = _to_wgs84(cloud, options, context)
     if earth is not None:
         if frame is None:
             corner = _corner(earth)
@@ -229,7 +231,7 @@ def _voxelised(
         resolution = options.resolution or RESOLUTIONS[0]
         none = np.empty(0, np.uint64)
         return VoxelMap(resolution, np.empty(0, np.uint8), none, np.empty(0, np.float32)), placed, corner
-    resolution, shift = _fitted(low, high, options, context)
+    resolution, shift = _fit_resolution(low, high, options, context)
     if any(shift):
         placed["origin"] = list(shift)
     codes, rows = [], []
@@ -242,13 +244,13 @@ def _voxelised(
         codes.append(morton(index[:, 0], index[:, 1], index[:, 2]))
         rows.append(start + np.flatnonzero(usable))
         start += len(places)
-    code, colour = _merged(np.concatenate(codes), rows, colours(cloud))
+    code, colour = _merge_codes(np.concatenate(codes), rows, colours(cloud))
     depth = np.full(len(code), DEPTH, np.uint8)
     odds = np.full(len(code), LOG_ODDS[1], np.float32)
     return VoxelMap(resolution, depth, code, odds, colour, colour is None), placed, corner
 
 
-def _merged(
+def _merge_codes(
     code: NDArray[np.uint64], rows: Sequence[NDArray[np.intp]], shade: NDArray[np.uint8] | None
 ) -> tuple[NDArray[np.uint64], NDArray[np.uint8] | None]:
     """Each code once, ascending, with the mean colour of its points."""
@@ -266,7 +268,7 @@ def _merged(
     return code[first], mean
 
 
-def _on_earth(cloud: Cloud, options: ReadOptions, context: ReadContext) -> tuple[str, Array | None]:
+def _to_wgs84(cloud: Cloud, options: ReadOptions, context: ReadContext) -> tuple[str, Array | None]:
     """The CRS and the points' (longitude, latitude, height), where there is a CRS that is known."""
     crs = options.crs or cloud.crs
     if crs is None or crs == "local" or not len(cloud):
@@ -281,13 +283,15 @@ def _on_earth(cloud: Cloud, options: ReadOptions, context: ReadContext) -> tuple
         context.warn(f"{error.detail}, with crs=…; until then the points are taken as local metres", where="crs")
         return "", None
     if not np.isfinite(earth[:, :2]).all(axis=1).any():
-        raise wrong(f"none of the points lies where the coordinate reference system {crs[:80]} has places", where="crs")
+        raise unreadable_error(
+            f"none of the points lies where the coordinate reference system {crs[:80]} has places", where="crs"
+        )
     return crs, earth
 
 
 def _usable(places: Array) -> NDArray[np.bool_]:
     """Which points have a place."""
-    return np.asarray((np.abs(places) <= FARTHEST).all(axis=1))
+    return np.asarray((np.abs(places) <= MAX_METRES).all(axis=1))
 
 
 def _corner(earth: Array) -> Datum:
@@ -297,15 +301,15 @@ def _corner(earth: Array) -> Datum:
     return Datum(float(np.clip(south, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), float(west))
 
 
-def _fitted(low: Array, high: Array, options: ReadOptions, context: ReadContext) -> tuple[float, Offset]:
+def _fit_resolution(low: Array, high: Array, options: ReadOptions, context: ReadContext) -> tuple[float, Offset]:
     """Resolution, and what is subtracted from the points, so that their box lies in the tree."""
     candidates = RESOLUTIONS if options.resolution is None else (options.resolution,)
     shift = np.zeros(3) if options.origin is None else np.array(options.origin)
-    if options.origin is None and not _fits(low, high, candidates[0]):
+    if options.origin is None and not _check_fit(low, high, candidates[0]):
         away = float(np.maximum(np.abs(low), np.abs(high))[:2].max())
-        if away > FAR * float((high - low).max()):
+        if away > FAR_RATIO * float((high - low).max()):
             shift[:2] = np.round((low + high)[:2] / 2)
-            if not all(_fits(low[2:], high[2:], r) for r in candidates[:1]):
+            if not all(_check_fit(low[2:], high[2:], r) for r in candidates[:1]):
                 shift[2] = np.round((low[2] + high[2]) / 2)
             context.warn(
                 f"the points lie up to {away:.0f} m from the origin, beyond the octree's ±{HALF * candidates[0]:g} m: "
@@ -313,19 +317,19 @@ def _fitted(low: Array, high: Array, options: ReadOptions, context: ReadContext)
                 "or origin=x,y,z to place them"
             )
     for resolution in candidates:
-        if _fits(low - shift, high - shift, resolution):
+        if _check_fit(low - shift, high - shift, resolution):
             if options.resolution is None and resolution != candidates[0]:
                 context.warn(f"the cloud is too large for voxels of {candidates[0]:g} m: they have {resolution:g} m")
             return resolution, (float(shift[0]), float(shift[1]), float(shift[2]))
     need = float(np.maximum(np.abs(low - shift), np.abs(high - shift)).max()) / HALF
-    raise wrong(
+    raise unreadable_error(
         f"voxels of {candidates[-1]:g} m reach {HALF * candidates[-1]:g} m from the origin, the points go beyond: set "
         f"resolution to {need:.3g} or more, or another origin",
         where="resolution",
     )
 
 
-def _fits(low: Array, high: Array, resolution: float) -> bool:
+def _check_fit(low: Array, high: Array, resolution: float) -> bool:
     return bool((low >= -HALF * resolution).all() and (high < HALF * resolution).all())
 
 
@@ -405,7 +409,7 @@ FRAME_DOC = (
 NAME_DOC = "name of the voxel map; *: all; default: map, else the only one"
 LEVEL_DOC = "level of the voxel map; *: all; default: the one it is on"
 
-MOST = 2**25
+MAX_POINTS = 2**25
 """Points that voxels are made into at most."""
 
 
@@ -432,12 +436,12 @@ def source(
 
     forms: endings of the wanted format. Raises MissingLayer, NotFound, Ambiguous, or Invalid for too many points.
     """
-    keys = choose(sorted(layers.of("voxels")), name, level)
+    keys = choose(sorted(layers.parts_of("voxels")), name, level)
     voxels = layers.parts[keys[0]]
     if not isinstance(voxels, VoxelMap):
         raise AssertionError(f"{keys[0]} is no voxel map")
     source_properties = voxels.properties.get(PROPERTY)
-    data = _kept(layers, keys[0], voxels, source_properties) if isinstance(source_properties, Mapping) else None
+    data = _stored_file(layers, keys[0], voxels, source_properties) if isinstance(source_properties, Mapping) else None
     if data is None or not isinstance(source_properties, Mapping):
         if frame == "source":
             raise Invalid("frame=source asks for an uploaded cloud, and this voxel map was not made of one")
@@ -452,7 +456,7 @@ def source(
 
     def load() -> Cloud:
         cloud = parse(data, ReadContext(limits=_NO_LIMITS))
-        return _moved(cloud, source_properties, context) if local else cloud
+        return _to_local(cloud, source_properties, context) if local else cloud
 
     return CloudToWrite(load, data if same_form else None, form, local)
 
@@ -464,12 +468,12 @@ _NO_LIMITS = Limits(voxels=2**62, text_bytes=2**62, unpacked_bytes=2**62)
 def choose(keys: Sequence[PartKey], name: str | None, level: str | None) -> list[PartKey]:
     """The voxel map that is asked for, and the file that belongs to it."""
     supply = "upload one (a point cloud or an OctoMap file)"
-    matches = the_one(keys, "voxels", name, level, noun="voxel map", option="name", supply=supply)
+    matches = select_part(keys, "voxels", name, level, noun="voxel map", option="name", supply=supply)
     belongs = [PartKey("resources", key.level, cloud_name(key.name)) for key in matches]
     return [*matches, *(key for key in keys if key in belongs)]
 
 
-def _kept(layers: Layers, key: PartKey, voxels: VoxelMap, source_properties: Mapping[str, Any]) -> bytes | None:
+def _stored_file(layers: Layers, key: PartKey, voxels: VoxelMap, source_properties: Mapping[str, Any]) -> bytes | None:
     """The file that a voxel map was made of, if it is there and tells of these very leaves."""
     part = layers.parts.get(PartKey("resources", key.level, cloud_name(key.name)))
     data = part.files.get(str(source_properties.get("file"))) if isinstance(part, Resources) else None
@@ -478,7 +482,7 @@ def _kept(layers: Layers, key: PartKey, voxels: VoxelMap, source_properties: Map
     return data if hashlib.sha256(data).hexdigest() == source_properties.get("sha256") else None
 
 
-def _moved(cloud: Cloud, source_properties: Mapping[str, Any], context: WriteContext) -> Cloud:
+def _to_local(cloud: Cloud, source_properties: Mapping[str, Any], context: WriteContext) -> Cloud:
     """The points in the local frame, as they were when they became voxels; normals turn along."""
     columns = dict(cloud.columns)
     places = cloud.places(0, len(cloud))
@@ -490,7 +494,7 @@ def _moved(cloud: Cloud, source_properties: Mapping[str, Any], context: WriteCon
         places = frame.to_local(crs_to_wgs84(str(source_properties["crs"]), places))
     places = places - np.array(source_properties.get("origin", (0.0, 0.0, 0.0)))
     columns |= {axis: places[:, k] for k, axis in enumerate(AXES)}
-    if cloud.viewpoint != UNTURNED:
+    if cloud.viewpoint != IDENTITY_VIEWPOINT:
         context.drop("viewpoint", 1, "it stands in the coordinates of the source: ask with frame=source")
     return Cloud(columns, cloud.width, cloud.height, comments=cloud.comments, further=cloud.further)
 
@@ -515,16 +519,16 @@ def centres(voxels: VoxelMap, context: WriteContext) -> Cloud:
     float32: to within a hundredth of a voxel everywhere in the tree. Raises Invalid where there are more than MOST.
     """
     counts = voxels.voxel_counts()
-    if counts["occupied"] > MOST:
+    if counts["occupied"] > MAX_POINTS:
         raise Invalid(
-            f"the {counts['occupied']} occupied voxels would be more than {MOST} points: ask for octomap with a depth "
-            "or a bbox instead"
+            f"the {counts['occupied']} occupied voxels would be more than {MAX_POINTS} points: ask for octomap with a "
+            "depth or a bbox instead"
         )
     context.drop("free voxels", voxels.leaf_counts()["free"], "a cloud has points where something is only")
     if not voxels.binary:
         other = int(np.count_nonzero(voxels.log_odds[voxels.occupied] != LOG_ODDS[1]))
         context.drop("log-odds", other, "a point is there or not")
-    code, rows = expanded(voxels, voxels.occupied)
+    code, rows = expand_leaves(voxels, voxels.occupied)
     smallest = VoxelMap(
         voxels.resolution, np.full(len(code), DEPTH, np.uint8), code, np.zeros(len(code), np.float32), None
     )
@@ -545,7 +549,7 @@ def file_name(name: str | None, ending: str) -> str:
 PARTS = Parts("voxels", "name", file_stem)
 
 
-def by_file(endings: Sequence[str]) -> Callable[[str], dict[str, str]]:
+def options_from_filename(endings: Sequence[str]) -> Callable[[str], dict[str, str]]:
     """``lab.pcd`` asks for the voxel map ``lab``."""
 
     def parse_name(name: str) -> dict[str, str]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from app.errors import BadUpload, Problem, TooLarge, UnreadableFile
 from app.formats import Limits
 from app.model.frame import MAX_METRES
-from app.model.gdal import CACHE, DATA_TYPES, gdal, native, opened, taken
+from app.model.gdal import CACHE, DATA_TYPES, buffer_bytes, gdal, native, open_memory_dataset
 from app.model.geodesy import crs_bounds
 from app.model.imagery import LOCAL, Affine, GeoImage
 
@@ -35,7 +35,7 @@ OWN_TAG = "FLEETMAP_CRS"
 MAX_WKT = 2**16
 """Characters. PROJ's largest definitions have a tenth of it."""
 
-MEMORY_SHARE = 3
+MEMORY_DIVISOR = 3
 """Decoded pixels may fill this part of a worker's memory, since the rest is needed to keep and write them."""
 
 GEO_TAGS = frozenset({33550, 33922, 34264, 34735})
@@ -83,7 +83,7 @@ GEO_KEYS = 34735
 GEOGRAPHIC, PROJECTED, USER_DEFINED = 2048, 3072, 32767
 
 
-def stated_code(data: bytes) -> int | None:
+def read_epsg_code(data: bytes) -> int | None:
     """The EPSG code that the first page of a TIFF says it lies in; None where it says none, or defines its own.
 
     Source: OGC GeoTIFF 1.1, section 7.
@@ -166,7 +166,7 @@ def crs_from_wkt(text: str) -> str:
             raise UnreadableFile(f"its CRS cannot be read: {_reason(error)}") from error
 
 
-def lies_nowhere(picture: GeoImage) -> str | None:
+def position_problem(picture: GeoImage) -> str | None:
     """Why a picture has no place, beyond the local frame or where PROJ knows none on earth; None where it has one."""
     ends = picture.outline()
     if picture.crs == LOCAL:
@@ -199,12 +199,12 @@ def read_tiff(data: bytes, limits: Limits) -> Raster:
         try:
             with MemoryFile(data) as file, file.open(driver="GTiff", GEOREF_SOURCES="INTERNAL") as dataset:
                 _check_size(dataset, limits)
-                raster = _decoded(dataset, rasterio)
+                raster = _decode(dataset, rasterio)
         except BadUpload:
             raise
         except errors as error:
             raise UnreadableFile(f"the TIFF is damaged or of a kind that is not read: {_reason(error)}") from error
-    code = stated_code(data)
+    code = read_epsg_code(data)
     if code is not None and raster.crs in (None, LOCAL):  # what GDAL makes of a code that it does not know
         reason = f"its GeoTIFF keys name EPSG:{code}, and no CRS that is known comes of them: correct them"
         raise UnreadableFile(reason, [Problem(reason, where="crs")])
@@ -226,12 +226,12 @@ def _check_size(dataset: Any, limits: Limits) -> None:
     if len(kinds) != 1 or kinds[0] not in DATA_TYPES:
         raise UnreadableFile(f"the TIFF's pixels are {', '.join(kinds)}; whole and floating numbers are read")
     size = width * height * count * np.dtype(kinds[0]).itemsize
-    limit = limits.memory_bytes // MEMORY_SHARE
+    limit = limits.memory_bytes // MEMORY_DIVISOR
     if size > limit:
         raise TooLarge(f"the TIFF's pixels take {size} bytes ({count} bands of {kinds[0]}); the limit is {limit}")
 
 
-def _decoded(dataset: Any, rasterio: Any) -> Raster:
+def _decode(dataset: Any, rasterio: Any) -> Raster:
     count, height, width = dataset.count, dataset.height, dataset.width
     doubts = []
     pages = len(dataset.subdatasets)
@@ -260,7 +260,7 @@ def _decoded(dataset: Any, rasterio: Any) -> Raster:
         transform = None
         points, points_crs = dataset.gcps
         if points:
-            plane = fitted([(p.col, p.row, p.x, p.y) for p in points])
+            plane = fit_affine([(p.col, p.row, p.x, p.y) for p in points])
             if plane is None:
                 raise UnreadableFile("its ground control points lie on one line: they do not say where it lies")
             transform, off = plane
@@ -333,7 +333,7 @@ def _texts(tags: Mapping[str, str]) -> dict[str, str]:
     }
 
 
-def fitted(points: Sequence[tuple[float, float, float, float]]) -> tuple[Affine, float] | None:
+def fit_affine(points: Sequence[tuple[float, float, float, float]]) -> tuple[Affine, float] | None:
     """The affine transform nearest to (column, row, x, y) points, and how far the worst of them is off, in pixels."""
     table = np.array(points, np.float64)
     if not np.isfinite(table).all():
@@ -376,12 +376,12 @@ def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> by
     # Room for two rows of the largest overview's tiles, which are written once only if they are there in full.
     cache = max(CACHE // 4, BLOCK * pixels.shape[1] * pixels.shape[2] * pixels.itemsize)
     with gdal(cache) as rasterio, MemoryFile() as out:
-        with opened(rasterio, pixels, count, described=True) as dataset:
+        with open_memory_dataset(rasterio, pixels, count, described=True) as dataset:
             _describe(dataset, picture, colours[:count], crs, tags, rasterio)
             if masked:
                 dataset.write_mask(pixels[..., count] != 0)
             shutil.copy(dataset, out.name, driver="COG", **options)
-        return taken(out.getbuffer())
+        return buffer_bytes(out.getbuffer())
 
 
 def _is_shade(picture: GeoImage) -> bool:
@@ -397,7 +397,7 @@ def _describe(
     if crs is not None:
         dataset.crs = rasterio.crs.CRS.from_user_input(crs)
     nodata = picture.nodata
-    if nodata is not None and _holds(picture.pixels.dtype, nodata):
+    if nodata is not None and _can_represent(picture.pixels.dtype, nodata):
         dataset.nodata = nodata
     dataset.colorinterp = [
         interpretations[c] if c in interpretations.__members__ else interpretations.undefined for c in colours
@@ -425,7 +425,7 @@ def _describe(
     dataset.update_tags(**{name: tags[name] for name in sorted(tags)})
 
 
-def _holds(kind: np.dtype[Any], value: float) -> bool:
+def _can_represent(kind: np.dtype[Any], value: float) -> bool:
     """Whether pixels of this type can have the value."""
     if kind.kind == "f":
         return True
@@ -435,7 +435,7 @@ def _holds(kind: np.dtype[Any], value: float) -> bool:
     return info is not None and info.min <= value <= info.max
 
 
-def wkt_of(crs: str) -> str:
+def crs_to_wkt(crs: str) -> str:
     """A CRS as WKT 1 where that can say it (older tools read no other), else WKT 2."""
     with gdal() as rasterio:
         return str(rasterio.crs.CRS.from_user_input(crs).to_wkt())

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import WriteContext, _yaml
-from app.formats._network import natural
+from app.formats._network import natural_sort_key
 from app.model.features import Features, Properties
 from app.model.frame import MAX_METRES
 from app.model.layers import Layers
@@ -33,13 +33,13 @@ CABIN_HEIGHT = 2.5
 MAX_GRAPHS = 9
 """building_map_generator writes graphs 0 … 8 and leaves out lanes of any other."""
 
-LONGEST = 240
+MAX_ID_CHARACTERS = 240
 """Characters of a node's id, so that an edge's id, made of two of them, is one, too."""
 
 Array = NDArray[np.float64]
 
 
-def refuse(reason: str, location: str) -> NoReturn:
+def raise_unreadable(reason: str, location: str) -> NoReturn:
     """Raise UnreadableFile that names the place."""
     raise UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, where=location or None)])
 
@@ -49,7 +49,7 @@ def mapping(value: Any, location: str) -> dict[str, Any]:
     if value is None:
         return {}
     if not isinstance(value, dict):
-        refuse("must be a mapping", location)
+        raise_unreadable("must be a mapping", location)
     return value
 
 
@@ -58,7 +58,7 @@ def listing(value: Any, location: str) -> list[Any]:
     if value is None or value == {}:
         return []
     if not isinstance(value, list):
-        refuse("must be a list", location)
+        raise_unreadable("must be a list", location)
     return value
 
 
@@ -70,9 +70,9 @@ def number(value: Any, location: str) -> float:
         except ValueError:
             value = None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        refuse("must be a number", location)
+        raise_unreadable("must be a number", location)
     if abs(value) > MAX_METRES:
-        refuse(f"is beyond ±{MAX_METRES:g}", location)
+        raise_unreadable(f"is beyond ±{MAX_METRES:g}", location)
     return float(value)
 
 
@@ -82,7 +82,7 @@ def places(rows: Sequence[Any], location: str) -> Array:
         flat = [v for row in rows for v in (row[0], row[1])]
     except (TypeError, LookupError):
         k = next(k for k, row in enumerate(rows) if not isinstance(row, list) or len(row) < 2)
-        refuse("must be a list that begins with x and y", f"{location}[{k}]")
+        raise_unreadable("must be a list that begins with x and y", f"{location}[{k}]")
     if not all(map((float, int).__contains__, map(type, flat))):
         flat = [number(v, f"{location}[{k // 2}][{k % 2}]") for k, v in enumerate(flat)]
     return np.array(flat, np.float64).reshape(-1, 2)
@@ -93,24 +93,24 @@ def index(value: Any, location: str) -> int:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int):
-        refuse("must be the number of a vertex", location)
+        raise_unreadable("must be the number of a vertex", location)
     return value
 
 
-def value_of(parameters: Any, key: str, default: Any = None) -> Any:
+def parameter_value(parameters: Any, key: str, default: Any = None) -> Any:
     """The value of a parameter ``[type, value]``."""
     pair = parameters.get(key) if isinstance(parameters, Mapping) else None
     return pair[1] if isinstance(pair, list) and len(pair) == 2 else default
 
 
-def typed(value: Any) -> Any:
+def typed_parameter(value: Any) -> Any:
     """A value as a typed parameter: 1 text, 2 integer, 3 decimal, 4 truth value; nested ones stay as they are."""
     kinds: dict[type, int] = {str: 1, int: 2, float: 3, bool: 4}
     kind = kinds.get(type(value))
     return value if kind is None else [kind, value]
 
 
-def short(text: str, max_length: int = LONGEST) -> str:
+def short(text: str, max_length: int = MAX_ID_CHARACTERS) -> str:
     """The text, or where it is too long for an id its beginning and a hash of all of it."""
     if len(text) <= max_length:
         return text
@@ -124,12 +124,12 @@ def limit(p: Properties) -> float:
     return float(speed) if valid and speed is not None else 0.0
 
 
-def turned(orientation: Any) -> Any:
+def reverse_orientation(orientation: Any) -> Any:
     """The orientation of a lane that is driven the other way round."""
     return {"forward": "backward", "backward": "forward"}.get(orientation, orientation)
 
 
-def pose_of(p: Properties) -> list[float] | None:
+def object_pose(p: Properties) -> list[float] | None:
     """An object's pose [x, y, z, roll, pitch, yaw], or None."""
     pose = p.get("pose")
     if not isinstance(pose, (list, tuple)) or len(pose) != 6:
@@ -139,7 +139,7 @@ def pose_of(p: Properties) -> list[float] | None:
     return list(map(float, pose))
 
 
-def size_of(p: Properties) -> tuple[float, float] | None:
+def object_size(p: Properties) -> tuple[float, float] | None:
     """An object's width (along x) and depth (along y), metres, or None."""
     size = p.get("size")
     if not isinstance(size, (list, tuple)) or len(size) < 2:
@@ -177,7 +177,7 @@ def storeys(layers: Layers) -> list[Storey]:
     for key, objects in layers.vector("objects").items():
         part = objects
         if key.name == NAV_GRAPH:  # graphs repeat the doors and lifts of the building that they were made from
-            part = part.take(
+            part = part.select(
                 [k for k, p in enumerate(part.properties) if (str(p.get("kind")), str(p.get("name"))) not in own_names]
             )
         if key.name in (BUILDING, NAV_GRAPH) and (len(part) or BUILDING in part.document):
@@ -235,11 +235,11 @@ class Robots:
         self._more: dict[tuple[str, str], dict[str, Any]] = {}
         self._unknown: list[str] = []
         if options.chargers or options.robot_name is not None:
-            self._find(sorted(nodes, key=lambda node: (node[0], natural(node[1]))))
+            self._find(sorted(nodes, key=lambda node: (node[0], natural_sort_key(node[1]))))
 
     def _find(self, nodes: Sequence[tuple[str, str, Properties]]) -> None:
         charger_names = {name.strip() for name in self._options.chargers or ()} - {""}
-        parameter_sets = [_vertex_says(p) for _, _, p in nodes]
+        parameter_sets = [_vertex_parameters(p) for _, _, p in nodes]
         taken = {str(parameters[ROBOT]) for parameters in parameter_sets if parameters.get(ROBOT)}
         met: set[str] = set()
         number = 0
@@ -259,7 +259,7 @@ class Robots:
                 self._more[level, i] = more
         self._unknown = sorted(charger_names - met)
 
-    def at(self, level: str, i: str) -> dict[str, Any]:
+    def vertex_properties(self, level: str, i: str) -> dict[str, Any]:
         """What a vertex' parameters say more, by word."""
         return self._more.get((level, i), {})
 
@@ -268,7 +268,7 @@ class Robots:
         many = list(self._more.values())
         if charger_count := sum(CHARGER[0] in more for more in many):
             context.fill("vertices: " + ", ".join(CHARGER), True, f"{charger_count} nodes do not say it", "chargers")
-        if names := sorted((str(more[ROBOT]) for more in many if ROBOT in more), key=natural):
+        if names := sorted((str(more[ROBOT]) for more in many if ROBOT in more), key=natural_sort_key):
             why = f"{len(names)} chargers name no robot"
             context.fill(f"vertices: {ROBOT}", names if len(names) <= 20 else [*names[:20], "…"], why, "robot_name")
             context.fill(f"vertices: {ROBOT_TYPE}", self._options.robot_type, why, "robot_type")
@@ -278,23 +278,23 @@ class Robots:
             )
 
 
-def _vertex_says(p: Properties) -> dict[str, Any]:
+def _vertex_parameters(p: Properties) -> dict[str, Any]:
     """A vertex' parameters without their types."""
     graph, building = p.get(NAV_GRAPH), p.get(BUILDING)
     plain = graph.get("parameters") if isinstance(graph, Mapping) else None
     typed_ = building.get("parameters") if isinstance(building, Mapping) else None
     out = dict(plain) if isinstance(plain, Mapping) else {}
-    return out | ({key: value_of(typed_, key) for key in typed_} if isinstance(typed_, Mapping) else {})
+    return out | ({key: parameter_value(typed_, key) for key in typed_} if isinstance(typed_, Mapping) else {})
 
 
 class Flow:
     """Writes values in flow style, on one line. Equal mappings are written once."""
 
-    MOST = 4096
+    MAX_CACHED = 4096
     """Mappings whose text is kept for the next one: those with a name of their own never come again."""
 
     def __init__(self) -> None:
-        self._known: dict[str, str] = {}
+        self._cache: dict[str, str] = {}
 
     def __call__(self, value: Any) -> str:
         """The value as YAML that PyYAML and yaml-cpp read alike; mappings by sorted keys."""
@@ -302,12 +302,12 @@ class Flow:
             if not value:
                 return "{}"
             key = orjson.dumps(value).decode()  # the bytes take 4 kB, however few they are
-            text = self._known.get(key)
+            text = self._cache.get(key)
             if text is None:
-                if len(self._known) >= self.MOST:
-                    self._known.clear()
+                if len(self._cache) >= self.MAX_CACHED:
+                    self._cache.clear()
                 text = "{" + ", ".join(f"{_yaml.text(k)}: {self(value[k])}" for k in sorted(value)) + "}"
-                self._known[key] = text
+                self._cache[key] = text
             return text
         if isinstance(value, (list, tuple)):
             return "[" + ", ".join(map(self, value)) + "]"

@@ -11,10 +11,10 @@ from pathlib import PurePosixPath
 
 from app.formats import Files, ReadContext
 
-_ELSEWHERE = re.compile(r"^[A-Za-z]:|^[/~\\]|^\$|://|\\")
+_OUTSIDE_UPLOAD = re.compile(r"^[A-Za-z]:|^[/~\\]|^\$|://|\\")
 
 
-def companions_of(pattern: re.Pattern[bytes]) -> Callable[[str, bytes, Sequence[str]], Iterable[str]]:
+def companion_hook(pattern: re.Pattern[bytes]) -> Callable[[str, bytes, Sequence[str]], Iterable[str]]:
     """The hook that finds the images which a main file names; one of the pattern's groups is a name."""
 
     def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
@@ -22,7 +22,7 @@ def companions_of(pattern: re.Pattern[bytes]) -> Callable[[str, bytes, Sequence[
         image_names = {
             match[match.lastindex or 0].decode("utf-8", "replace").strip() for match in pattern.finditer(data)
         }
-        by_base = _by_base(names)
+        by_base = _by_base_name(names)
         files = (_find(name, main, by_base) for name in sorted(image_names) if name)
         return [name for name in dict.fromkeys(files) if name]
 
@@ -32,7 +32,7 @@ def companions_of(pattern: re.Pattern[bytes]) -> Callable[[str, bytes, Sequence[
 def images(files: Files, main: str, named: Iterable[tuple[str, str]], context: ReadContext) -> dict[str, bytes]:
     """The images by the path that the served map names them with. named: (place, name) as the main file says it."""
     out: dict[str, bytes] = {}
-    by_base = _by_base(files)
+    by_base = _by_base_name(files)
     for location, reference in named:
         if not reference:
             continue
@@ -50,7 +50,7 @@ def images(files: Files, main: str, named: Iterable[tuple[str, str]], context: R
     return out
 
 
-def stored(reference: str, resources: Mapping[str, bytes]) -> str | None:
+def find_stored_image(reference: str, resources: Mapping[str, bytes]) -> str | None:
     """The name of the stored image that a map names, or None."""
     return next((name for name in (_plain(reference), _base(reference)) if name in resources), None)
 
@@ -58,14 +58,14 @@ def stored(reference: str, resources: Mapping[str, bytes]) -> str | None:
 def _plain(reference: str) -> str | None:
     """The name as a safe path below the map's folder, or None where it leads elsewhere."""
     path = PurePosixPath(reference)
-    return None if _ELSEWHERE.search(reference) or ".." in path.parts or not path.name else str(path)
+    return None if _OUTSIDE_UPLOAD.search(reference) or ".." in path.parts or not path.name else str(path)
 
 
 def _base(reference: str) -> str:
     return reference.replace("\\", "/").rpartition("/")[2]
 
 
-def _by_base(names: Iterable[str]) -> dict[str, list[str]]:
+def _by_base_name(names: Iterable[str]) -> dict[str, list[str]]:
     """The files by their base names."""
     out: dict[str, list[str]] = {}
     for name in sorted(names):

@@ -20,7 +20,7 @@ import orjson
 
 from app.formats import _ron
 from app.formats._network import number
-from app.formats._rmf import CABIN_HEIGHT, mapping, refuse, value_of
+from app.formats._rmf import CABIN_HEIGHT, mapping, parameter_value, raise_unreadable
 from app.model.frame import MAX_METRES
 
 NAME = "rmf_site"
@@ -108,7 +108,7 @@ CABIN_WALL, CABIN_DOOR, CABIN_GAP = 0.1, 0.05, 0.01
 """Metres; a cabin's wall, its door and the gap before it where the site does not say."""
 
 SAME_METRES = 1e-9
-SINGLE = 1e-6
+SINGLE_PRECISION = 1e-6
 """Relative: the editor keeps numbers in single precision."""
 
 
@@ -118,32 +118,32 @@ SINGLE = 1e-6
 def reference(value: Any, location: str) -> str:
     """The id of an element, as the key that it has in its mapping."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
-        refuse("must be the id of an element, a whole number below 2^32", location)
+        raise_unreadable("must be the id of an element, a whole number below 2^32", location)
     return str(value)
 
 
 def references(value: Any, location: str, count: int | None = None) -> list[str]:
     """The ids of a list; count: how many there must be."""
     if not isinstance(value, list) or (count is not None and len(value) != count):
-        refuse(f"must be a list of {count} ids" if count else "must be a list of ids", location)
+        raise_unreadable(f"must be a list of {count} ids" if count else "must be a list of ids", location)
     return [reference(v, f"{location}[{k}]") for k, v in enumerate(value)]
 
 
-def by_id(value: Any, location: str) -> list[tuple[str, Any]]:
+def members_by_id(value: Any, location: str) -> list[tuple[str, Any]]:
     """The members of a mapping whose keys are ids, by number."""
     members = mapping(value, location)
     for key in members:
         if not key.isascii() or not key.isdigit() or len(key) > 10 or int(key) >= 2**32 or str(int(key)) != key:
-            refuse(f"{key[:40]!r} is no id: a whole number below 2^32", location)
+            raise_unreadable(f"{key[:40]!r} is no id: a whole number below 2^32", location)
     return [(key, members[key]) for key in sorted(members, key=int)]
 
 
 def elements(value: Any, location: str) -> list[tuple[str, dict[str, Any]]]:
     """The elements of a mapping by id, by number; each is a mapping."""
-    listed = by_id(value, location)
+    listed = members_by_id(value, location)
     for key, element in listed:
         if not isinstance(element, dict):
-            refuse("must be a mapping", f"{location}.{key}")
+            raise_unreadable("must be a mapping", f"{location}.{key}")
     return listed
 
 
@@ -152,17 +152,17 @@ def variant(value: Any, location: str) -> tuple[str, Any]:
     if isinstance(value, str):
         return value, None
     if not isinstance(value, dict) or len(value) != 1:
-        refuse('must be a variant: a text or {"Variant": content}', location)
+        raise_unreadable('must be a variant: a text or {"Variant": content}', location)
     return next(iter(value.items()))
 
 
 def vector(value: Any, size: int, location: str) -> list[float]:
     """That many numbers."""
     if not isinstance(value, list) or len(value) != size:
-        refuse(f"must be a list of {size} numbers", location)
+        raise_unreadable(f"must be a list of {size} numbers", location)
     out = [number(v, f"{location}[{k}]") for k, v in enumerate(value)]
     if max(map(abs, out)) > MAX_METRES:
-        refuse(f"is beyond ±{MAX_METRES:g}", location)
+        raise_unreadable(f"is beyond ±{MAX_METRES:g}", location)
     return out
 
 
@@ -171,7 +171,7 @@ def text(value: Any, where: str) -> str:
     if value is None:
         return ""
     if not isinstance(value, str):
-        refuse("must be a text", where)
+        raise_unreadable("must be a text", where)
     return value
 
 
@@ -179,10 +179,10 @@ def angle(value: Any, location: str) -> float:
     """Radians."""
     name, content = variant(value, location)
     if name not in ("deg", "rad"):
-        refuse(f"must be deg or rad, is {name[:40]!r}", location)
+        raise_unreadable(f"must be deg or rad, is {name[:40]!r}", location)
     amount = number(content, location)
     if abs(amount) > MAX_METRES:
-        refuse(f"is beyond ±{MAX_METRES:g}", location)
+        raise_unreadable(f"is beyond ±{MAX_METRES:g}", location)
     return math.radians(amount) if name == "deg" else amount
 
 
@@ -195,20 +195,20 @@ def pose(value: Any, location: str) -> list[float]:
         return [*at, 0.0, 0.0, angle(content, f"{location}.rot")]
     if name == "euler_xyz":
         if not isinstance(content, list) or len(content) != 3:
-            refuse("must be three angles", f"{location}.rot")
+            raise_unreadable("must be three angles", f"{location}.rot")
         return [*at, *(angle(v, f"{location}.rot[{k}]") for k, v in enumerate(content))]
     if name != "quat":
-        refuse(f"must be yaw, euler_xyz or quat, is {name[:40]!r}", f"{location}.rot")
+        raise_unreadable(f"must be yaw, euler_xyz or quat, is {name[:40]!r}", f"{location}.rot")
     x, y, z, w = vector(content, 4, f"{location}.rot")
     length = x * x + y * y + z * z + w * w
     if not 1e-12 < length < 1e12:
-        refuse("is no rotation: the quaternion has no length", f"{location}.rot")
+        raise_unreadable("is no rotation: the quaternion has no length", f"{location}.rot")
     roll = math.atan2(2 * (w * x + y * z), length - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x) / length)))
     return [*at, roll, pitch, math.atan2(2 * (w * z + x * y), length - 2 * (y * y + z * z))]
 
 
-def said_pose(now: Sequence[float], source_pose: Any) -> dict[str, Any]:
+def pose_or_source(now: Sequence[float], source_pose: Any) -> dict[str, Any]:
     """The pose as a site says it; as it was said where it is the same."""
     if isinstance(source_pose, dict):
         was = pose(source_pose, "pose")
@@ -235,11 +235,11 @@ def place(anchor: Any, category: str, location: str) -> list[float]:
         members = mapping(content, location)
         return [*vector(members.get(category, members.get("General")), 2, location), 0.0]
     if name != "Pose3D":
-        refuse(f"must be Translate2D, CategorizedTranslate2D or Pose3D, is {name[:40]!r}", location)
+        raise_unreadable(f"must be Translate2D, CategorizedTranslate2D or Pose3D, is {name[:40]!r}", location)
     return pose(content, location)[:3]
 
 
-def said_anchor(now: Sequence[float], source_anchor: Any) -> dict[str, Any]:
+def anchor_or_source(now: Sequence[float], source_anchor: Any) -> dict[str, Any]:
     """The anchor at this place [x, y, z]; as it was said, moved there with all its categories."""
     if not isinstance(source_anchor, dict):
         return {"Translate2D": [metres(now[0]), metres(now[1])]}
@@ -253,18 +253,18 @@ def said_anchor(now: Sequence[float], source_anchor: Any) -> dict[str, Any]:
     return {name: {key: [metres(v) for v in np.add(at, moved)] for key, at in content.items()}}
 
 
-def ordered(value: Any) -> Any:
+def sort_members(value: Any) -> Any:
     """The value with its members in the format's order: equal values give equal bytes."""
     if isinstance(value, dict):
         last = len(ORDER)
         key = sorted(value, key=lambda k: (ORDER.get(k, last), len(k) if k.isdigit() else 0, k))
-        return {k: ordered(value[k]) for k in key}
-    return list(map(ordered, value)) if isinstance(value, (list, tuple)) else value
+        return {k: sort_members(value[k]) for k in key}
+    return list(map(sort_members, value)) if isinstance(value, (list, tuple)) else value
 
 
 def digest(site: Mapping[str, Any]) -> str:
     """What tells parts of one site from those of another."""
-    return hashlib.sha256(orjson.dumps(ordered(site))).hexdigest()[:16]
+    return hashlib.sha256(orjson.dumps(sort_members(site))).hexdigest()[:16]
 
 
 def unknown(members: Mapping[str, Any], section: str) -> list[str]:
@@ -278,7 +278,7 @@ def height(value: Any, location: str) -> float | None:
         return None
     name, content = variant(value, location)
     if name not in ("fixed", "level_height_ratio"):
-        refuse(f"must be fixed or level_height_ratio, is {name[:40]!r}", location)
+        raise_unreadable(f"must be fixed or level_height_ratio, is {name[:40]!r}", location)
     amount = number(content, location)
     return amount if name == "fixed" else None
 
@@ -293,7 +293,7 @@ def door_parameters(kind: Any, location: str) -> dict[str, Any]:
     """A door's kind in a building's words; a swing to both sides is of the forward one."""
     name, content = variant(kind, location)
     if name not in DOORS or not isinstance(content, dict):
-        refuse(f"must be one of {', '.join(DOORS)} and its members", location)
+        raise_unreadable(f"must be one of {', '.join(DOORS)} and its members", location)
     if name == "Model":
         return {}
     members, sliding = content, name.endswith("Sliding")
@@ -322,21 +322,21 @@ def door_kind(parameters: Mapping[str, Any], source_kind: Any) -> dict[str, Any]
     """The door's kind in a site's words; what it was said as where the building's words are still the same."""
     if source_kind is not None:
         was = door_parameters(source_kind, "kind")
-        if not was or all(value_of(was, k) == value_of(parameters, k) for k in was):
+        if not was or all(parameter_value(was, k) == parameter_value(parameters, k) for k in was):
             return dict(source_kind)
-    kind = str(value_of(parameters, "type", "hinged"))
+    kind = str(parameter_value(parameters, "type", "hinged"))
     double = kind.startswith("double_")
-    right = value_of(parameters, "motion_axis", "start") == "end"
-    ratio = value_of(parameters, "right_left_ratio", 1.0)
+    right = parameter_value(parameters, "motion_axis", "start") == "end"
+    ratio = parameter_value(parameters, "right_left_ratio", 1.0)
     valid = isinstance(ratio, (int, float)) and not isinstance(ratio, bool) and ratio > 1e-9
     shares = {"left_right_ratio": 1.0 / ratio if valid else 1.0}
     if kind.removeprefix("double_") in ("sliding", "telescope"):
         if double:
             return {"DoubleSliding": shares}
         return {"SingleSliding": {"towards": "Left" if right else "Right"}}
-    degrees = value_of(parameters, "motion_degrees", 90.0)
+    degrees = parameter_value(parameters, "motion_degrees", 90.0)
     valid = isinstance(degrees, (int, float)) and not isinstance(degrees, bool)
-    forward = (value_of(parameters, "motion_direction", 1) != -1) == right
+    forward = (parameter_value(parameters, "motion_direction", 1) != -1) == right
     swing = {"Forward" if forward else "Backward": {"deg": float(degrees) if valid else 90.0}}
     if double:
         return {"DoubleSwing": {"swing": swing, **shares}}
@@ -398,11 +398,11 @@ def rectangle(properties: Mapping[str, Any], location: str) -> dict[str, Any]:
     """The parameters of a lift's cabin."""
     name, content = variant(properties.get("cabin"), f"{location}.cabin")
     if name != "Rect":
-        refuse(f"must be Rect, is {name[:40]!r}", f"{location}.cabin")
+        raise_unreadable(f"must be Rect, is {name[:40]!r}", f"{location}.cabin")
     return mapping(content, f"{location}.cabin")
 
 
-def offset_of(rect: Mapping[str, Any], location: str) -> tuple[float, float]:
+def cabin_offset(rect: Mapping[str, Any], location: str) -> tuple[float, float]:
     """The cabin's middle from the middle of its reference anchors."""
     front = mapping(rect.get("front_door"), f"{location}.front_door")
     depth = number(rect.get("depth"), f"{location}.depth")
@@ -411,17 +411,17 @@ def offset_of(rect: Mapping[str, Any], location: str) -> tuple[float, float]:
     return -depth / 2.0 - wall - gap - door / 2.0, _or(rect.get("shift"), 0.0, location)
 
 
-def cabin_of(properties: Mapping[str, Any], left: Sequence[float], right: Sequence[float], location: str) -> Cabin:
+def parse_cabin(properties: Mapping[str, Any], left: Sequence[float], right: Sequence[float], location: str) -> Cabin:
     """The cabin by its parameters and the places of its reference anchors."""
     rect = rectangle(properties, location)
     dx, dy = left[0] - right[0], left[1] - right[1]
     yaw = math.atan2(-dx, dy) if dx or dy else 0.0
-    x, y = offset_of(rect, f"{location}.cabin")
+    x, y = cabin_offset(rect, f"{location}.cabin")
     c, s = math.cos(yaw), math.sin(yaw)
     middle = (left[0] + right[0]) / 2.0, (left[1] + right[1]) / 2.0
     depth, width = (number(rect.get(key), f"{location}.cabin.{key}") for key in ("depth", "width"))
     if depth <= 0 or width <= 0:
-        refuse("must have a depth and a width above 0", f"{location}.cabin")
+        raise_unreadable("must have a depth and a width above 0", f"{location}.cabin")
     return Cabin(middle[0] + c * x - s * y, middle[1] + s * x + c * y, yaw, depth, width, (x, y))
 
 
@@ -484,11 +484,11 @@ def cabin_size(cabin: Cabin) -> list[float]:
 # --- graphs, models, textures ----------------------------------------------------------------------------------------
 
 
-def graphs_of(choice: Any, numbers_by_id: Mapping[str, int], location: str) -> tuple[int, int]:
+def parse_graphs(choice: Any, numbers_by_id: Mapping[str, int], location: str) -> tuple[int, int]:
     """(the first graph of an element, how many it is of). known: the graphs' numbers by id, smallest first."""
     name, content = variant("All" if choice is None else choice, location)
     if name not in ("All", "Only", "AllExcept"):
-        refuse(f"must be All, Only or AllExcept, is {name[:40]!r}", location)
+        raise_unreadable(f"must be All, Only or AllExcept, is {name[:40]!r}", location)
     ids = set() if name == "All" else set(references(content, location)) & numbers_by_id.keys()
     if name == "Only":
         return min((numbers_by_id[i] for i in ids), default=0), len(ids)
@@ -534,15 +534,15 @@ def texture_parameters(group: Mapping[str, Any], kind: str) -> dict[str, Any]:
 
 def texture_group(parameters: Mapping[str, Any], kind: str) -> dict[str, Any] | None:
     """A building's texture as a site's group of textures."""
-    name = value_of(parameters, "texture_name")
+    name = parameter_value(parameters, "texture_name")
     if not isinstance(name, str) or not name:
         return None
     texture: dict[str, Any] = {"source": {"Remote": f"{TEXTURES}{name}.png"}}
-    scale = value_of(parameters, "texture_scale", 1.0)
+    scale = parameter_value(parameters, "texture_scale", 1.0)
     scale = float(scale) if isinstance(scale, (int, float)) and scale > 0 else 1.0
     if kind == "floor":
         texture |= {"width": scale, "height": scale}
-        turn = value_of(parameters, "texture_rotation")
+        turn = parameter_value(parameters, "texture_rotation")
         if isinstance(turn, (int, float)):
             texture["rotation"] = {"deg": float(turn)}
     else:
@@ -551,7 +551,7 @@ def texture_group(parameters: Mapping[str, Any], kind: str) -> dict[str, Any] | 
             ("width", "texture_width", scale),
             ("height", "texture_height", scale),
         ):
-            value = value_of(parameters, key)
+            value = parameter_value(parameters, key)
             if isinstance(value, (int, float)):
                 texture[member] = float(value) / by
     return {"name": name, "texture": texture}

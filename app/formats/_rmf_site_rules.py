@@ -10,7 +10,18 @@ from typing import Any
 
 from app.errors import Problem
 from app.formats import Files, _json, _ron
-from app.formats._rules import LIMITS, brief, doubted, is_number, missing, names, numbers, refused, repeated, shown
+from app.formats._rules import (
+    LIMITS,
+    duplicates,
+    error_finding,
+    is_brief,
+    is_number,
+    missing,
+    names,
+    numbers,
+    shown,
+    warning_finding,
+)
 
 REQUIRED: Mapping[str, tuple[str, ...]] = {
     "doors": ("anchors", "name", "kind"),
@@ -27,24 +38,24 @@ REQUIRED: Mapping[str, tuple[str, ...]] = {
 def check(files: Files) -> Iterator[Problem]:
     """A site as its editor loads it."""
     main = next(iter(files))
-    if brief(files[main]):
+    if is_brief(files[main]):
         return
     top = _ron.load(files[main], LIMITS) if main.endswith(".ron") else _json.load(files[main], LIMITS)
     if not isinstance(top, dict):
-        yield refused("a site is a mapping", main)
+        yield error_finding("a site is a mapping", main)
         return
     version = top.get("format_version")
     if not isinstance(version, str) or not version.startswith("0.") or not version[2:].isdigit():
-        yield refused(f'must be "0.MINOR", is {shown(version)}', main, where="format_version")
+        yield error_finding(f'must be "0.MINOR", is {shown(version)}', main, where="format_version")
     properties = top.get("properties")
     if not isinstance(properties, dict) or not isinstance(properties.get("name"), str):
-        yield refused("a site needs a name", main, where="properties.name")
+        yield error_finding("a site needs a name", main, where="properties.name")
     elif (offset := properties.get("geographic_offset")) is not None:
         if absent := missing(offset, ("anchor", "zoom", "visible")):
-            yield refused(f"needs {', '.join(absent)}", main, where="properties.geographic_offset")
+            yield error_finding(f"needs {', '.join(absent)}", main, where="properties.geographic_offset")
         elif not numbers(offset["anchor"], 2, 2) or not -80 <= offset["anchor"][0] <= 84:
             reason = "must be [latitude, longitude] within the zones of UTM (80° S to 84° N)"
-            yield refused(reason, main, where="properties.geographic_offset.anchor")
+            yield error_finding(reason, main, where="properties.geographic_offset.anchor")
     yield from _site(top, main)
 
 
@@ -52,7 +63,7 @@ def _section(members: Any, section: str, main: str, location: str) -> Iterator[P
     """Elements that lack a member."""
     for i, one in _elements(members):
         if absent := missing(one, REQUIRED[section]):
-            yield refused(f"needs {', '.join(absent)}", main, where=f"{location}.{i}")
+            yield error_finding(f"needs {', '.join(absent)}", main, where=f"{location}.{i}")
 
 
 def _elements(members: Any) -> list[tuple[str, Any]]:
@@ -62,7 +73,7 @@ def _elements(members: Any) -> list[tuple[str, Any]]:
 def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
     levels = _elements(top.get("levels"))
     if not levels:
-        yield refused("a site needs a level", main, where="levels")
+        yield error_finding("a site needs a level", main, where="levels")
     site = {i for i, _ in _elements(top.get("anchors"))}
     ids = list(site)
     anchor_ids = set(site)
@@ -70,7 +81,7 @@ def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
         location = f"levels.{i}"
         properties = level.get("properties") if isinstance(level, dict) else None
         if not isinstance(properties, dict) or not is_number(properties.get("elevation")) or "name" not in properties:
-            yield refused("needs a name and an elevation", main, where=f"{location}.properties")
+            yield error_finding("needs a name and an elevation", main, where=f"{location}.properties")
             continue
         level_anchors = {a for a, _ in _elements(level.get("anchors"))}
         ids += [i, *level_anchors]
@@ -79,16 +90,16 @@ def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
             yield from _section(level.get(section), section, main, f"{location}.{section}")
             ids += [key for key, _ in _elements(level.get(section))]
         for section in ("doors", "walls", "floors"):
-            yield from _stands(level.get(section), level_anchors | site, main, f"{location}.{section}")
-    if repeats := repeated(level["properties"].get("name") for _, level in levels if _is_named(level)):
-        yield doubted(f"levels with the same name: {names(repeats)}", main, where="levels")
+            yield from _check_anchors(level.get(section), level_anchors | site, main, f"{location}.{section}")
+    if repeats := duplicates(level["properties"].get("name") for _, level in levels if _is_named(level)):
+        yield warning_finding(f"levels with the same name: {names(repeats)}", main, where="levels")
     for i, lift in _elements(top.get("lifts")):
         yield from _section({i: lift}, "lifts", main, "lifts")
         cabin = {a for a, _ in _elements(lift.get("cabin_anchors"))} if isinstance(lift, dict) else set()
         ids += [i, *cabin]
         anchor_ids |= cabin
         properties = lift.get("properties") if isinstance(lift, dict) else None
-        yield from _stands({i: _ends(properties)}, site, main, "lifts")
+        yield from _check_anchors({i: _ends(properties)}, site, main, "lifts")
     yield from _navigation(top.get("navigation"), anchor_ids, ids, main)
     yield from _section(top.get("model_instances"), "model_instances", main, "model_instances")
     described = {i for i, _ in _elements(top.get("model_descriptions"))}
@@ -98,9 +109,9 @@ def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
         if isinstance(one, dict) and one.get("description") is not None and str(one["description"]) not in described
     ]
     if dangling:
-        yield refused(f"no description of the models {names(dangling)}", main, where="model_instances")
-    if repeats := repeated(ids):
-        yield refused(f"ids that several elements have: {names(repeats)}", main)
+        yield error_finding(f"no description of the models {names(dangling)}", main, where="model_instances")
+    if repeats := duplicates(ids):
+        yield error_finding(f"ids that several elements have: {names(repeats)}", main)
 
 
 def _is_named(level: Any) -> bool:
@@ -111,7 +122,7 @@ def _ends(properties: Any) -> dict[str, Any]:
     return {"anchors": properties.get("reference_anchors")} if isinstance(properties, dict) else {}
 
 
-def _stands(members: Any, anchors: set[str], main: str, location: str) -> Iterator[Problem]:
+def _check_anchors(members: Any, anchors: set[str], main: str, location: str) -> Iterator[Problem]:
     """Elements on anchors that are not there."""
     dangling = [
         i
@@ -119,7 +130,7 @@ def _stands(members: Any, anchors: set[str], main: str, location: str) -> Iterat
         if isinstance(one, dict) and any(str(a) not in anchors for a in one.get("anchors") or ())
     ]
     if dangling:
-        yield refused(f"{names(dangling)} stand on anchors that are not there", main, where=location)
+        yield error_finding(f"{names(dangling)} stand on anchors that are not there", main, where=location)
 
 
 def _navigation(navigation: Any, anchors: set[str], ids: list[str], main: str) -> Iterator[Problem]:
@@ -128,15 +139,15 @@ def _navigation(navigation: Any, anchors: set[str], ids: list[str], main: str) -
         return
     location = "navigation.guided"
     if absent := missing(guided, ("graphs", "ranking", "lanes", "locations")):
-        yield refused(f"needs {', '.join(absent)}", main, where=location)
+        yield error_finding(f"needs {', '.join(absent)}", main, where=location)
     for section in ("lanes", "locations"):
         yield from _section(guided.get(section), section, main, f"{location}.{section}")
         ids += [i for i, _ in _elements(guided.get(section))]
-    yield from _stands(guided.get("lanes"), anchors, main, f"{location}.lanes")
+    yield from _check_anchors(guided.get("lanes"), anchors, main, f"{location}.lanes")
     places = {
         i: {"anchors": [one.get("anchor")]} for i, one in _elements(guided.get("locations")) if isinstance(one, dict)
     }
-    yield from _stands(places, anchors, main, f"{location}.locations")
+    yield from _check_anchors(places, anchors, main, f"{location}.locations")
     called = [one.get("name") for _, one in _elements(guided.get("locations")) if isinstance(one, dict)]
-    if repeats := repeated(name for name in called if name and name != "<Unnamed>"):
-        yield doubted(f"locations with the same name: {names(repeats)}", main, where=f"{location}.locations")
+    if repeats := duplicates(name for name in called if name and name != "<Unnamed>"):
+        yield warning_finding(f"locations with the same name: {names(repeats)}", main, where=f"{location}.locations")

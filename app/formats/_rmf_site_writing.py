@@ -19,9 +19,9 @@ import shapely
 
 from app.errors import MissingLayer
 from app.formats import WriteContext, _rmf, _rmf_site, _ron
-from app.formats._network import own
-from app.formats._rmf import BUILDING, NAV_GRAPH, Storey, mapping, value_of
-from app.formats._rmf_images import stored
+from app.formats._network import get_source_properties
+from app.formats._rmf import BUILDING, NAV_GRAPH, Storey, mapping, parameter_value
+from app.formats._rmf_images import find_stored_image
 from app.formats._rmf_site import NAME, SAME_METRES, VERSION, Cabin, metres, place
 from app.model.features import Features, Properties
 from app.model.layers import Layers, Resources
@@ -37,7 +37,7 @@ TAGS: Mapping[str, str] = {
     "is_holding_point": "HoldingPoint",
 }
 ORIENTATIONS: Mapping[Any, str] = {"forward": "Forwards", "backward": "Backwards"}
-SAID_ELSEWHERE = frozenset({"name", "lift", "lift_cabin", "mutex", "dock_name", _rmf.ROBOT, _rmf.ROBOT_TYPE, *TAGS})
+WRITTEN_ELSEWHERE = frozenset({"name", "lift", "lift_cabin", "mutex", "dock_name", _rmf.ROBOT, _rmf.ROBOT_TYPE, *TAGS})
 """What vertices say that a site says of its locations, lanes, lifts and models."""
 
 COLOURS = ([1.0, 0.5, 0.3], [0.6, 1.0, 0.5], [0.6, 0.8, 1.0], [0.6, 0.2, 0.3])
@@ -60,7 +60,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if not storeys:
         raise MissingLayer("rmf_site needs a network: upload a site.json, building.yaml, tmap2 or OSM file")
     writer = _Writer(layers, context, storeys)
-    site = _rmf_site.ordered(writer.site())
+    site = _rmf_site.sort_members(writer.site())
     if writer.options.encoding == "ron":
         main = {FILE_RON: _ron.dump(site, _rmf_site.SHAPE)}
     else:
@@ -117,12 +117,12 @@ class _Writer:
     def __init__(self, layers: Layers, context: WriteContext, storeys: Sequence[Storey]) -> None:
         self.layers, self.context = layers, context
         self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-        self.robots = _rmf.Robots(self.options, _nodes_of(storeys))
-        self.lost: Counter[str] = Counter()
+        self.robots = _rmf.Robots(self.options, _iterate_nodes(storeys))
+        self.dropped: Counter[str] = Counter()
         self.made: Counter[str] = Counter()
         self.used: dict[str, bytes] = {}
         self.resources: dict[str, bytes] = {}
-        for part in layers.of("resources", name=BUILDING).values():
+        for part in layers.parts_of("resources", name=BUILDING).values():
             self.resources.update(part.files if isinstance(part, Resources) else {})
         documents = [_document(storey) for storey in storeys]
         first = next((d for d in documents if isinstance(d.get("site"), dict)), {})
@@ -132,7 +132,7 @@ class _Writer:
         documents = [d if first and d.get("of") == first.get("of") else {} for d in documents]
         self.same = {s.name for s, d in zip(storeys, documents, strict=True) if d}
         self.mentioned = _ids(documents, storeys, self.same)
-        self.claimed: set[str] = set(_ids_of(self.known))
+        self.claimed: set[str] = set(_element_ids(self.known))
         self.next = 0
         self.anchors: dict[str, Any] = dict(mapping(self.known.get("anchors"), "anchors"))
         guided = mapping(mapping(self.known.get("navigation"), "navigation").get("guided"), "guided")
@@ -147,7 +147,7 @@ class _Writer:
         self.descriptions: dict[str, Any] = dict(mapping(self.known.get("model_descriptions"), "model_descriptions"))
         self.robot_types: dict[str, Any] = dict(mapping(self.known.get("robots"), "robots"))
         self.description_ids = {_key([d, i in self.robot_types]): i for i, d in self.descriptions.items()}
-        self.mutex_ids, self.group_ids = _by_name(self.mutexes), _by_name(self.groups)
+        self.mutex_ids, self.group_ids = _ids_by_name(self.mutexes), _ids_by_name(self.groups)
         self.instances: dict[str, Any] = {}
         self.fresh: list[str] = []
         self.moved: dict[str, tuple[Any, Any]] = {}
@@ -170,9 +170,9 @@ class _Writer:
         self.claimed.add(key)
         return key
 
-    def _rest(self, floor: _Floor, p: Properties) -> dict[str, Any]:
+    def _source_members(self, floor: _Floor, p: Properties) -> dict[str, Any]:
         """What the site says of an item; nothing where it is of another site."""
-        return own(p, NAME) if floor.storey.name in self.same else {}
+        return get_source_properties(p, NAME) if floor.storey.name in self.same else {}
 
     # the whole
 
@@ -272,7 +272,7 @@ class _Writer:
         level = dict(mapping(document.get("level"), "level"))
         level_id = level.pop("id", None)
         i = self._claim(int(level_id) if isinstance(level_id, str) and level_id.isdigit() else None)
-        self.claimed.update(_ids_of(level))
+        self.claimed.update(_element_ids(level))
         source_properties = mapping(level.get("properties"), "properties")
         listed = next((level.elevation for level in self.layers.levels if level.name == storey.name), None)
         old = mapping(storey.document.get("level"), "level").get("elevation", 0.0)
@@ -282,7 +282,7 @@ class _Writer:
         if not document:
             spoken = mapping(storey.document.get("level"), "level")
             for section in ("layers", "features", "constraints", "lights", "physical_cameras"):
-                self.lost[f"a building's {section}"] += bool(spoken.get(section))
+                self.dropped[f"a building's {section}"] += bool(spoken.get(section))
         return floor
 
     def _coordinates(self, part: Features) -> np.ndarray[Any, np.dtype[np.object_]]:
@@ -297,15 +297,18 @@ class _Writer:
                 if p.get("kind") != "node":
                     continue
                 if g.geom_type != "Point" or g.is_empty:
-                    self.lost["nodes without a point"] += 1
+                    self.dropped["nodes without a point"] += 1
                     continue
-                at = own(p, BUILDING).get("index", own(p, NAV_GRAPH).get("index"))
+                at = get_source_properties(p, BUILDING).get("index", get_source_properties(p, NAV_GRAPH).get("index"))
                 order = (not isinstance(at, int), at if isinstance(at, int) else 0, len(i), i)
                 xyz = [g.x, g.y, g.z - floor.elevation if g.has_z else 0.0]
                 nodes.append((order, i, p, xyz))
-                self.lost["nodes' orientations"] += p.get("orientation") is not None
+                self.dropped["nodes' orientations"] += p.get("orientation") is not None
         for _, i, p, xyz in sorted(nodes, key=lambda item: item[0]):
-            members, parameters = self._rest(floor, p), {**_words(p), **self.robots.at(floor.storey.name, i)}
+            members, parameters = (
+                self._source_members(floor, p),
+                {**_plain_parameters(p), **self.robots.vertex_properties(floor.storey.name, i)},
+            )
             lift = self.lifts.get(
                 str(members.get("lift") or parameters.get("lift_cabin") or parameters.get("lift") or "")
             )
@@ -316,30 +319,30 @@ class _Writer:
                 self.docks[floor.storey.name, i] = str(parameters["dock_name"])
             self._location(anchor, name, parameters, mapping(members.get("locations"), "locations"))
             self._robot(floor, parameters, members, xyz)
-            for key in parameters.keys() - SAID_ELSEWHERE:
-                self.lost[f"vertices' {key}"] += 1
+            for key in parameters.keys() - WRITTEN_ELSEWHERE:
+                self.dropped[f"vertices' {key}"] += 1
             if BUILDING not in p and NAV_GRAPH not in p:
-                self.lost["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
+                self.dropped["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
 
     def _node_anchor(
         self, floor: _Floor, lift: _Lift | None, xyz: list[float], members: Mapping[str, Any], name: str
     ) -> str:
         if lift is None:
             anchor = self._claim(members.get("anchor"))
-            floor.anchors[anchor] = self._said_anchor(xyz, members.get("says"))
+            floor.anchors[anchor] = self._anchor_or_source(xyz, members.get("says"))
             floor.by_place.setdefault(_spot(xyz), anchor)
             return anchor
         inside = lift.cabin.inward(xyz)
         spot = (round(inside[0], 6) + 0.0, round(inside[1], 6) + 0.0, name)
         if spot not in lift.by_place:
             lift.by_place[spot] = anchor = self._claim(members.get("anchor"))
-            lift.anchors[anchor] = self._said_anchor([*inside, 0.0], members.get("says"))
+            lift.anchors[anchor] = self._anchor_or_source([*inside, 0.0], members.get("says"))
         return lift.by_place[spot]
 
-    def _said_anchor(self, xyz: Sequence[float], source_anchor: Any) -> dict[str, Any]:
+    def _anchor_or_source(self, xyz: Sequence[float], source_anchor: Any) -> dict[str, Any]:
         if source_anchor is None and abs(xyz[2]) > SAME_METRES:
-            self.lost["heights of nodes above their level"] += 1
-        return _rmf_site.said_anchor(xyz if source_anchor is not None else [*xyz[:2], 0.0], source_anchor)
+            self.dropped["heights of nodes above their level"] += 1
+        return _rmf_site.anchor_or_source(xyz if source_anchor is not None else [*xyz[:2], 0.0], source_anchor)
 
     def _location(self, anchor: str, name: str, parameters: Mapping[str, Any], locations: Mapping[str, Any]) -> None:
         """A node's locations; a new one where it has a name, a tag or a mutex group."""
@@ -365,9 +368,9 @@ class _Writer:
             self.locations[self._claim(int(i))] = now
 
     def _mutex(self, name: str) -> str:
-        return self._named(self.mutexes, self.mutex_ids, name)
+        return self._group_named(self.mutexes, self.mutex_ids, name)
 
-    def _named(self, groups: dict[str, Any], ids: dict[str, str], name: str) -> str:
+    def _group_named(self, groups: dict[str, Any], ids: dict[str, str], name: str) -> str:
         """The group of this name; a new one where there is none."""
         if name not in ids:
             ids[name] = self._claim()
@@ -384,13 +387,13 @@ class _Writer:
                 ends = [str(p.get("source")), str(p.get("target"))]
                 anchors = [floor.nodes.get(e, everywhere.get(e)) for e in ends]
                 if anchors[0] is None or anchors[1] is None:
-                    self.lost["edges without two nodes"] += 1
+                    self.dropped["edges without two nodes"] += 1
                     continue
-                self.lost["edges' bends between their nodes"] += bends > 2
-                self.lost["edges' actions"] += p.get("action") is not None
-                self.lost["edges' widths"] += p.get("width") is not None
-                direction = self._way(floor, p, (anchors[0], anchors[1]), ends)
-                lane = self._rest(floor, p).get("lane")
+                self.dropped["edges' bends between their nodes"] += bends > 2
+                self.dropped["edges' actions"] += p.get("action") is not None
+                self.dropped["edges' widths"] += p.get("width") is not None
+                direction = self._find_way(floor, p, (anchors[0], anchors[1]), ends)
+                lane = self._source_members(floor, p).get("lane")
                 group: Any = lane if isinstance(lane, int) else (floor.id, i if order is None else order)
                 if order is None and not isinstance(lane, int):  # with the edge back that says the same
                     signature = _key([direction.motion, direction.rest])
@@ -410,18 +413,24 @@ class _Writer:
             counts = shapely.get_num_coordinates(part.geometry)
             for i, p, bends in zip(part.ids, part.properties, counts.tolist(), strict=True):
                 if p.get("kind") == "edge":
-                    at = own(p, BUILDING).get("index")
+                    at = get_source_properties(p, BUILDING).get("index")
                     lane_id = at if isinstance(at, int) else None
                     listed.append((lane_id, i, p, bends))
                 else:
-                    self.lost["items of networks that are neither node nor edge"] += p.get("kind") != "node"
+                    self.dropped["items of networks that are neither node nor edge"] += p.get("kind") != "node"
         listed.sort(
-            key=lambda e: (e[0] is None, e[0] or 0, own(e[2], BUILDING).get("reverse") is True, len(e[1]), e[1])
+            key=lambda e: (
+                e[0] is None,
+                e[0] or 0,
+                get_source_properties(e[2], BUILDING).get("reverse") is True,
+                len(e[1]),
+                e[1],
+            )
         )
         return iter(listed)
 
-    def _way(self, floor: _Floor, p: Properties, anchors: tuple[str, str], ends: Sequence[str]) -> _Way:
-        members, parameters = self._rest(floor, p), _words(p)
+    def _find_way(self, floor: _Floor, p: Properties, anchors: tuple[str, str], ends: Sequence[str]) -> _Way:
+        members, parameters = self._source_members(floor, p), _plain_parameters(p)
         lane = mapping(members.get("says"), "lane")
         limit = _rmf.limit(p)
         if members:
@@ -436,16 +445,18 @@ class _Writer:
         new = BUILDING not in p and NAV_GRAPH not in p
         if new:
             self.made["lanes"] += 1
-            self.lost["edges' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
+            self.dropped["edges' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
             limit = limit or self.options.speed_limit
-        reverse = own(p, BUILDING).get("reverse") is True
+        reverse = get_source_properties(p, BUILDING).get("reverse") is True
         orientation = parameters.get("orientation", parameters.get("orientation_constraint"))
-        orientation = _rmf.turned(orientation) if reverse else orientation
+        orientation = _rmf.reverse_orientation(orientation) if reverse else orientation
         motion = {"orientation_constraint": ORIENTATIONS[orientation]} if orientation in ORIENTATIONS else {}
         motion |= {"speed_limit": limit} if limit else {}
         dock = parameters.get("dock_name") or self.docks.get((floor.storey.name, ends[1]))
         motion |= {"dock": {"name": str(dock)}} if dock else {}
-        number = parameters.get("graph_idx", own(p, NAV_GRAPH).get("graph", self.options.graph if new else 0))
+        number = parameters.get(
+            "graph_idx", get_source_properties(p, NAV_GRAPH).get("graph", self.options.graph if new else 0)
+        )
         number = number if isinstance(number, int) and not isinstance(number, bool) else 0
         mutex = parameters.get("mutex")
         group = {"mutex": int(self._mutex(str(mutex)))} if mutex else {}
@@ -482,16 +493,19 @@ class _Writer:
 
     def _objects(self, floor: _Floor) -> None:
         sections = {"wall": "walls", "door": "doors", "floor": "floors"}
-        self._drawings_of(floor)
+        self._write_drawings(floor)
         for kind, p, geometry, _ in self._items(floor):
-            members = self._rest(floor, p)
+            members = self._source_members(floor, p)
             lines = geometry.geom_type == "LineString" and len(geometry.coords) >= 2
             point = geometry.geom_type == "Point" and not geometry.is_empty
             if kind in ("wall", "door") and lines:
-                element = {**mapping(members.get("says"), kind), "anchors": self._stands(floor, p, geometry, kind)}
+                element = {
+                    **mapping(members.get("says"), kind),
+                    "anchors": self._corner_anchors(floor, p, geometry, kind),
+                }
                 self._solid(kind, p, element)
                 floor.said.setdefault(sections[kind], {})[self._claim(members.get("id"))] = element
-                self.lost["bends of walls and doors"] += len(geometry.coords) > 2
+                self.dropped["bends of walls and doors"] += len(geometry.coords) > 2
             elif kind == "floor" and not geometry.is_empty:
                 self._floors(floor, p, geometry, members)
             elif kind == "measurement" and lines:
@@ -501,7 +515,7 @@ class _Writer:
             elif kind in ("model", "robot") and point:
                 self._model(floor, kind, p, geometry, members)
             elif kind != "lift":
-                self.lost["objects that are no part of a site"] += 1
+                self.dropped["objects that are no part of a site"] += 1
 
     def _items(self, floor: _Floor) -> Iterator[tuple[str, Properties, Any, str]]:
         """(kind, properties, geometry in metres, id) of the level's objects in the order of their source."""
@@ -510,7 +524,7 @@ class _Writer:
 
             def order(k: int, part: Features = part) -> tuple[str, bool, int, int, str]:
                 p = part.properties[k]
-                at = own(p, BUILDING).get("index", own(p, NAV_GRAPH).get("index"))
+                at = get_source_properties(p, BUILDING).get("index", get_source_properties(p, NAV_GRAPH).get("index"))
                 has_position = isinstance(at, int)
                 return (
                     str(p.get("kind")),
@@ -523,11 +537,11 @@ class _Writer:
             for k in sorted(range(len(part)), key=order):
                 yield str(part.properties[k].get("kind")), part.properties[k], geometry[k], part.ids[k]
 
-    def _stands(self, floor: _Floor, p: Properties, geometry: Any, kind: str) -> list[int]:
+    def _corner_anchors(self, floor: _Floor, p: Properties, geometry: Any, kind: str) -> list[int]:
         """The anchors of a line's ends or a ring's corners."""
         at = shapely.get_coordinates(geometry)
         at = at if kind == "floor" else at[[0, -1]]
-        hints = self._rest(floor, p).get("anchors")
+        hints = self._source_members(floor, p).get("anchors")
         hints = hints if isinstance(hints, list) else []
         if kind == "floor" and geometry.geom_type == "Polygon" and len(at) != len(hints):
             at = at[:-1]  # a polygon repeats its first corner, a floor need not
@@ -538,26 +552,26 @@ class _Writer:
         """The anchor at this place: the one that it was, else any of the level, else a new one."""
         key = str(hint)
         for home in (floor.anchors, self.anchors):
-            if key in home and _near(place(home[key], category, "anchor"), xy):
+            if key in home and _is_near(place(home[key], category, "anchor"), xy):
                 return int(key)
         form = mapping(floor.document.get("forms"), "forms").get(key)
-        if form is not None and not _near(place(form, category, "anchor"), xy):
+        if form is not None and not _is_near(place(form, category, "anchor"), xy):
             form = None
         spot = _spot(xy)
         if (existing := floor.by_place.get(spot)) is not None and form is None:
             return int(existing)
         anchor = self._claim(hint)
-        floor.anchors[anchor] = form or _rmf_site.said_anchor([*xy, 0.0], None)
+        floor.anchors[anchor] = form or _rmf_site.anchor_or_source([*xy, 0.0], None)
         floor.by_place.setdefault(spot, anchor)
         return int(anchor)
 
     def _solid(self, kind: str, p: Properties, element: dict[str, Any]) -> None:
         """A door's kind, a wall's texture, and the heights of both."""
-        parameters = mapping(own(p, BUILDING).get("parameters"), "parameters")
+        parameters = mapping(get_source_properties(p, BUILDING).get("parameters"), "parameters")
         if kind == "door":
-            element["name"] = str(p.get("name") or value_of(parameters, "name") or "")
-            was = str(value_of(parameters, "type", "hinged"))
-            self.lost["telescope doors, written as sliding ones"] += was.endswith("telescope")
+            element["name"] = str(p.get("name") or parameter_value(parameters, "name") or "")
+            was = str(parameter_value(parameters, "type", "hinged"))
+            self.dropped["telescope doors, written as sliding ones"] += was.endswith("telescope")
             element["kind"] = _rmf_site.door_kind(parameters, element.get("kind"))
         elif "texture" not in element and (group := _rmf_site.texture_group(parameters, kind)) is not None:
             element["texture"] = int(self._texture(group))
@@ -578,22 +592,25 @@ class _Writer:
         pieces = list(geometry.geoms) if geometry.geom_type == "MultiPolygon" else [geometry]
         for k, piece in enumerate(pieces):
             ring = shapely.Polygon(piece.exterior) if piece.geom_type == "Polygon" else piece
-            self.lost["holes in floors"] += len(getattr(piece, "interiors", ()))
-            element = {**mapping(members.get("says"), "floor"), "anchors": self._stands(floor, p, ring, "floor")}
-            parameters = mapping(own(p, BUILDING).get("parameters"), "parameters")
+            self.dropped["holes in floors"] += len(getattr(piece, "interiors", ()))
+            element = {
+                **mapping(members.get("says"), "floor"),
+                "anchors": self._corner_anchors(floor, p, ring, "floor"),
+            }
+            parameters = mapping(get_source_properties(p, BUILDING).get("parameters"), "parameters")
             if "texture" not in element and (group := _rmf_site.texture_group(parameters, "floor")) is not None:
                 element["texture"] = int(self._texture(group))
             floor.said.setdefault("floors", {})[self._claim(None if k else members.get("id"))] = element
 
     # drawings
 
-    def _drawings_of(self, floor: _Floor) -> None:
+    def _write_drawings(self, floor: _Floor) -> None:
         """The drawings of the level's source, without what stands on them."""
         drawings = {
             i: {**drawing, "anchors": dict(mapping(drawing.get("anchors"), "anchors"))}
             for i, drawing in mapping(floor.document.get("drawings"), "drawings").items()
         }
-        self.claimed.update(_ids_of({"drawings": drawings}))
+        self.claimed.update(_element_ids({"drawings": drawings}))
         drawing = mapping(mapping(floor.storey.document.get("level"), "level").get("drawing"), "drawing")
         turn = floor.storey.document.get("transform")
         file = drawing.get("filename")
@@ -605,7 +622,7 @@ class _Writer:
             and len(turn) == 4
             and turn[0] > 0
         ):
-            pose = _rmf_site.said_pose([turn[2], turn[3], 0.0, 0.0, 0.0, turn[1]], None)
+            pose = _rmf_site.pose_or_source([turn[2], turn[3], 0.0, 0.0, 0.0, turn[1]], None)
             properties = {"name": PurePosixPath(file).stem, "source": {"Local": file}, "pose": pose}
             properties["pixels_per_meter"] = 1.0 / turn[0]
             i = self._claim()
@@ -623,7 +640,7 @@ class _Writer:
             kind, name = _rmf_site.asset(properties.get("source"), location)
             if not name or kind not in ("Local", "Remote"):
                 continue
-            file = stored(name, self.resources)
+            file = find_stored_image(name, self.resources)
             if file is None:
                 problem = f"the image {name[:200]!r} was not in the upload: it is named and not served"
                 self.context.warn(problem, where=location)
@@ -632,7 +649,7 @@ class _Writer:
             if file != name or kind != "Local":
                 drawing["properties"] = {**properties, "source": {"Local": file}}
 
-    def _on_drawing(
+    def _place_on_drawing(
         self, floor: _Floor, geometry: Any, members: Mapping[str, Any]
     ) -> tuple[dict[str, Any], list[int]] | None:
         """(drawing, anchors on it) of what is measured in its pixels."""
@@ -640,7 +657,7 @@ class _Writer:
         i = str(members.get("drawing"))
         i = i if i in drawings else next(iter(drawings), "")
         if i not in drawings:
-            self.lost["measurements and fiducials of levels without a drawing"] += 1
+            self.dropped["measurements and fiducials of levels without a drawing"] += 1
             return None
         drawing = drawings[i]
         scale, turn, x, y = drawing["transform"]
@@ -661,17 +678,17 @@ class _Writer:
 
     def _measurement(self, floor: _Floor, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
         ends = shapely.LineString([geometry.coords[0][:2], geometry.coords[-1][:2]])
-        placement = self._on_drawing(floor, ends, members)
+        placement = self._place_on_drawing(floor, ends, members)
         if placement is None:
             return
         drawing, anchors = placement
-        distance = value_of(own(p, BUILDING).get("parameters"), "distance")
+        distance = parameter_value(get_source_properties(p, BUILDING).get("parameters"), "distance")
         length = {} if distance is None else {"distance": distance}
         element = {**mapping(members.get("says"), "measurement"), "anchors": anchors, **length}
         drawing.setdefault("measurements", {})[self._claim(members.get("id"))] = element
 
     def _fiducial(self, floor: _Floor, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
-        placement = self._on_drawing(floor, geometry, members)
+        placement = self._place_on_drawing(floor, geometry, members)
         if placement is None:
             return
         drawing, (anchor,) = placement
@@ -680,15 +697,15 @@ class _Writer:
         if self.groups.get(str(element.get("affiliation")), {}).get("name", "") != name:
             element.pop("affiliation", None)
             if name:
-                element["affiliation"] = int(self._named(self.groups, self.group_ids, name))
+                element["affiliation"] = int(self._group_named(self.groups, self.group_ids, name))
         drawing.setdefault("fiducials", {})[self._claim(members.get("id"))] = element
 
     # models
 
     def _model(self, floor: _Floor, kind: str, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
         element = mapping(members.get("says"), "model")
-        building = mapping(own(p, BUILDING).get("says"), "model")
-        pose = _rmf.pose_of(p) or [0.0, 0.0, floor.elevation, 0.0, 0.0, float(building.get("yaw") or 0.0)]
+        building = mapping(get_source_properties(p, BUILDING).get("says"), "model")
+        pose = _rmf.object_pose(p) or [0.0, 0.0, floor.elevation, 0.0, 0.0, float(building.get("yaw") or 0.0)]
         now = [geometry.x, geometry.y, metres(pose[2] - floor.elevation), *pose[3:]]
         name = str(p.get("name") or "")
         static = building.get("static") is True
@@ -714,7 +731,7 @@ class _Writer:
             is_static = element.get("is_static", static) is True
             description = self._description(source, is_static, element.get("scale"), model, robot=kind == "robot")
         i = self._claim(hint)
-        pose = _rmf_site.said_pose(now, element.get("pose"))
+        pose = _rmf_site.pose_or_source(now, element.get("pose"))
         older = ("source", "is_static", "scale")
         self.instances[i] = {
             **{k: v for k, v in element.items() if k not in older},
@@ -743,7 +760,7 @@ class _Writer:
         """The robot that starts at a node."""
         name, model = parameters.get(_rmf.ROBOT), parameters.get(_rmf.ROBOT_TYPE)
         if not name or not model:
-            self.lost["robots without a name or a type"] += bool(name or model)
+            self.dropped["robots without a name or a type"] += bool(name or model)
             return
         robot = mapping(members.get("robot"), "robot")
         element = mapping(robot.get("says"), "robot") if robot.get("name") == name else {}
@@ -789,23 +806,23 @@ class _Writer:
                 if kind != "lift":
                     continue
                 if geometry.geom_type != "Point" or geometry.is_empty:
-                    self.lost["lifts without a point"] += 1
+                    self.dropped["lifts without a point"] += 1
                     continue
-                at = own(p, BUILDING).get("index")
+                at = get_source_properties(p, BUILDING).get("index")
                 lifts.append((not isinstance(at, int), at if isinstance(at, int) else 0, i, floor, p, geometry))
         for _, _, i, floor, p, geometry in sorted(lifts, key=lambda item: item[:3]):
             self.lifts.setdefault(str(p.get("name") or i), self._lift(floor, p, geometry, i))
 
     def _lift(self, floor: _Floor, p: Properties, geometry: Any, i: str) -> _Lift:
-        members = self._rest(floor, p)
-        building = mapping(own(p, BUILDING).get("says"), "lift")
-        pose = _rmf.pose_of(p)
+        members = self._source_members(floor, p)
+        building = mapping(get_source_properties(p, BUILDING).get("says"), "lift")
+        pose = _rmf.object_pose(p)
         yaw = pose[5] if pose is not None else float(building.get("yaw") or 0.0)
-        depth, width = _rmf.size_of(p) or (1.0, 1.0)
+        depth, width = _rmf.object_size(p) or (1.0, 1.0)
         lift = dict(mapping(members.get("says"), "lift"))
         was = members.get("was")
         now = [geometry.x, geometry.y, yaw, depth, width]
-        self.claimed.update(_ids_of(lift))
+        self.claimed.update(_element_ids(lift))
         cabin_anchors: dict[str, Any] = dict(mapping(lift.get("cabin_anchors"), "cabin_anchors"))
         properties = dict(mapping(lift.get("properties"), "properties"))
         rect = dict(_rmf_site.rectangle(properties, "cabin")) if lift else {}
@@ -818,13 +835,13 @@ class _Writer:
             properties |= {} if start is None else {"initial_level": int(start.id)}
             self.made["lifts"] += BUILDING not in p
         properties |= {"name": str(p.get("name") or i), "cabin": {"Rect": rect}}
-        cabin = Cabin(geometry.x, geometry.y, yaw, depth, width, _rmf_site.offset_of(rect, "cabin"))
+        cabin = Cabin(geometry.x, geometry.y, yaw, depth, width, _rmf_site.cabin_offset(rect, "cabin"))
         if not isinstance(was, list) or not np.allclose(was, now, rtol=0, atol=SAME_METRES):
             old = properties.get("reference_anchors")
             old = old if isinstance(old, list) and len(old) == 2 else [None, None]
             keys = [str(o) if str(o) in self.anchors else self._claim() for o in old]
             for key, at in zip(keys, cabin.ends(), strict=True):
-                self.anchors[key] = _rmf_site.said_anchor(at, None)
+                self.anchors[key] = _rmf_site.anchor_or_source(at, None)
             properties["reference_anchors"] = [int(key) for key in keys]
         element = {**lift, "cabin_doors": cabin_doors, "properties": properties, "id": self._claim(members.get("id"))}
         return _Lift(cabin, element, cabin_anchors)
@@ -838,7 +855,7 @@ class _Writer:
         for name, door in mapping(building.get("doors"), "doors").items():
             face, placement = _rmf_site.door_placement(mapping(door, "door"), rect, f"doors.{name}")
             if face in rect:
-                self.lost["further doors on one face of a lift's cabin"] += 1
+                self.dropped["further doors on one face of a lift's cabin"] += 1
                 continue
             i = self._claim()
             rect[face] = {"door": int(i), **placement}
@@ -854,7 +871,7 @@ class _Writer:
     # the report
 
     def _report(self) -> None:
-        for noun, count in sorted(self.lost.items()):
+        for noun, count in sorted(self.dropped.items()):
             self.context.drop(noun, count, "a site has no place for it")
         if self.made["lanes"]:
             why = f"{self.made['lanes']} edges come from another format"
@@ -867,12 +884,12 @@ class _Writer:
             self.context.fill("lifts: doors", "none", f"{self.made['lifts']} lifts come from a navigation graph")
 
 
-def _by_name(groups: Mapping[str, Any]) -> dict[str, str]:
+def _ids_by_name(groups: Mapping[str, Any]) -> dict[str, str]:
     """The id of the first group of each name."""
     return {str(group.get("name")): i for i, group in reversed(list(groups.items()))}
 
 
-def _near(a: Sequence[float], b: Sequence[float]) -> bool:
+def _is_near(a: Sequence[float], b: Sequence[float]) -> bool:
     return abs(a[0] - b[0]) < SAME_METRES and abs(a[1] - b[1]) < SAME_METRES
 
 
@@ -880,11 +897,11 @@ def _spot(at: Sequence[float]) -> tuple[float, float]:
     return metres(at[0]), metres(at[1])
 
 
-def _words(p: Properties) -> dict[str, Any]:
+def _plain_parameters(p: Properties) -> dict[str, Any]:
     """What a building or a navigation graph says of a vertex or lane, without types."""
-    plain = dict(mapping(own(p, NAV_GRAPH).get("parameters"), "parameters"))
-    typed = mapping(own(p, BUILDING).get("parameters"), "parameters")
-    return plain | {key: value_of(typed, key) for key in typed}
+    plain = dict(mapping(get_source_properties(p, NAV_GRAPH).get("parameters"), "parameters"))
+    typed = mapping(get_source_properties(p, BUILDING).get("parameters"), "parameters")
+    return plain | {key: parameter_value(typed, key) for key in typed}
 
 
 def _document(storey: Storey) -> dict[str, Any]:
@@ -893,7 +910,7 @@ def _document(storey: Storey) -> dict[str, Any]:
     return next((document for document in documents if isinstance(document, dict)), {})
 
 
-def _nodes_of(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Properties]]:
+def _iterate_nodes(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Properties]]:
     for storey in storeys:
         for part in storey.networks:
             for i, p in zip(part.ids, part.properties, strict=True):
@@ -901,26 +918,26 @@ def _nodes_of(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Properties]
                     yield storey.name, i, p
 
 
-def _ids_of(value: Any) -> set[str]:
+def _element_ids(value: Any) -> set[str]:
     """The ids of the elements in mappings, wherever they stand; a scenario's are those of models elsewhere."""
     if not isinstance(value, dict):
         return set()
     ids = {k for k in value if k.isascii() and k.isdigit()}
-    return ids.union(*(_ids_of(v) for k, v in value.items() if k not in ("extensions", "tasks", "instances")))
+    return ids.union(*(_element_ids(v) for k, v in value.items() if k not in ("extensions", "tasks", "instances")))
 
 
 def _ids(documents: Iterable[Mapping[str, Any]], storeys: Iterable[Storey], same: set[str]) -> set[str]:
     """All ids that the site's items and documents had, so that no new element takes one of them."""
     out: set[str] = set()
     for document in documents:
-        out |= _ids_of(document)
+        out |= _element_ids(document)
         out.add(str(mapping(document.get("level"), "level").get("id")))
     for storey in storeys:
         if storey.name not in same:
             continue
         for part in (*storey.objects, *storey.networks):
             for p in part.properties:
-                members = own(p, NAME)
+                members = get_source_properties(p, NAME)
                 listed = members.get("anchors")
                 ids = [
                     members.get("id"),
@@ -929,5 +946,5 @@ def _ids(documents: Iterable[Mapping[str, Any]], storeys: Iterable[Storey], same
                     mapping(members.get("robot"), "").get("id"),
                 ]
                 out.update(str(i) for i in [*ids, *(listed if isinstance(listed, list) else ())] if i is not None)
-                out |= _ids_of({k: v for k, v in members.items() if k in ("locations", "says")})
+                out |= _element_ids({k: v for k, v in members.items() if k in ("locations", "says")})
     return out

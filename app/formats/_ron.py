@@ -74,7 +74,7 @@ class _Parser:
             self._at = match.end()
             self._space()
         self._next()
-        out = self._any(0)
+        out = self._parse_value(0)
         if self._kind != "end":
             self._fail("something stands behind the value")
         return out
@@ -118,12 +118,12 @@ class _Parser:
     def _is(self, mark: str) -> bool:
         return self._kind == "mark" and self._value == mark
 
-    def _take(self, mark: str) -> None:
+    def _expect(self, mark: str) -> None:
         if not self._is(mark):
             self._fail(f"{mark!r} is missing before {self._value[:20]!r}" if self._value else f"{mark!r} is missing")
         self._next()
 
-    def _any(self, depth: int) -> Any:
+    def _parse_value(self, depth: int) -> Any:
         """One value."""
         self._left -= 1
         if depth > MAX_DEPTH:
@@ -134,13 +134,13 @@ class _Parser:
             read = {"(": self._brackets, "[": self._sequence, "{": self._map}[self._value]
             return read(depth)
         if self._kind == "word":
-            return self._word(depth)
+            return self._parse_word(depth)
         return self._scalar()
 
     def _scalar(self) -> Any:
         kind, value = self._kind, self._value
         if kind in ("text", "character", "raw"):
-            out: Any = value if kind == "raw" else self._unescaped(value)
+            out: Any = value if kind == "raw" else self._unescape(value)
         elif kind == "number":
             out = self._number(value)
         else:
@@ -162,7 +162,7 @@ class _Parser:
             self._fail(f"the number {literal[:40]!r} is not finite")
         return float(out) if isinstance(out, int) and not -(2**63) <= out < 2**63 else out
 
-    def _unescaped(self, literal: str) -> str:
+    def _unescape(self, literal: str) -> str:
         literal = literal.removeprefix("b")[1:-1]
         if "\\" not in literal:
             return literal
@@ -182,7 +182,7 @@ class _Parser:
 
         return _ESCAPE.sub(one, literal)
 
-    def _word(self, depth: int) -> Any:
+    def _parse_word(self, depth: int) -> Any:
         """A word of the language, or a variant or struct with what belongs to it."""
         name = self._value.removeprefix("r#")
         if name in ("inf", "NaN", "inff32", "inff64"):
@@ -195,35 +195,35 @@ class _Parser:
 
     def _brackets(self, depth: int) -> Any:
         """A struct, a tuple, a newtype or nothing."""
-        self._take("(")
+        self._expect("(")
         if self._is(")"):
             self._next()
             return None
         if self._kind == "word" and _FIELD.match(self._text, self._at):
             return self._pairs(depth, ")")
-        out = [self._any(depth + 1)]
+        out = [self._parse_value(depth + 1)]
         if self._is(")"):
             self._next()
             return out[0]
         while not self._is(")"):
-            self._take(",")
+            self._expect(",")
             if not self._is(")"):
-                out.append(self._any(depth + 1))
+                out.append(self._parse_value(depth + 1))
         self._next()
         return out
 
     def _sequence(self, depth: int) -> list[Any]:
-        self._take("[")
+        self._expect("[")
         out: list[Any] = []
         while not self._is("]"):
-            out.append(self._any(depth + 1))
+            out.append(self._parse_value(depth + 1))
             if not self._is("]"):
-                self._take(",")
+                self._expect(",")
         self._next()
         return out
 
     def _map(self, depth: int) -> dict[str, Any]:
-        self._take("{")
+        self._expect("{")
         return self._pairs(depth, "}")
 
     def _pairs(self, depth: int, closing: str) -> dict[str, Any]:
@@ -234,10 +234,10 @@ class _Parser:
             if key in out:
                 self._start = start
                 self._fail(f"{key[:60]!r} stands twice")
-            self._take(":")
-            out[key] = self._any(depth + 1)
+            self._expect(":")
+            out[key] = self._parse_value(depth + 1)
             if not self._is(closing):
-                self._take(",")
+                self._expect(",")
         self._next()
         return out
 

@@ -9,29 +9,33 @@ from collections.abc import Iterable
 from typing import Any, TypeGuard
 
 from app.errors import Problem
-from app.formats import SERVED, Limits
+from app.formats import JUST_WRITTEN, Limits
 
 LIMITS = Limits()
 """A check reads what is served, or files that the user of a command line has: within the usual bounds."""
 
-BRIEFLY = 2**19
-HEAD = 2**13
+MAX_QUICK_BYTES = 2**19
+HEAD_BYTES = 2**13
 """Of a larger text that was just written here, only so much of its beginning is looked at."""
 
-SHOWN = 5
+MAX_NAMES_SHOWN = 5
 
 
-def brief(data: bytes) -> bool:
+def is_brief(data: bytes) -> bool:
     """Whether this text is too large to be read once more while somebody waits for it."""
-    return len(data) > BRIEFLY and SERVED.get()
+    return len(data) > MAX_QUICK_BYTES and JUST_WRITTEN.get()
 
 
-def refused(problem: str, file: str | None = None, *, line: int | None = None, where: str | None = None) -> Problem:
+def error_finding(
+    problem: str, file: str | None = None, *, line: int | None = None, where: str | None = None
+) -> Problem:
     """A finding: the consumer does not load the map, or takes it for another one."""
     return Problem(problem, file, line, where, "error")
 
 
-def doubted(problem: str, file: str | None = None, *, line: int | None = None, where: str | None = None) -> Problem:
+def warning_finding(
+    problem: str, file: str | None = None, *, line: int | None = None, where: str | None = None
+) -> Problem:
     """A finding: the consumer loads the map, and may not do with it what its maker meant."""
     return Problem(problem, file, line, where, "warning")
 
@@ -39,8 +43,8 @@ def doubted(problem: str, file: str | None = None, *, line: int | None = None, w
 def names(items: Iterable[object]) -> str:
     """The first few, and how many more there are: one finding for all that break one rule."""
     every = [str(item)[:60] for item in items]
-    more = f" and {len(every) - SHOWN} more" if len(every) > SHOWN else ""
-    return ", ".join(every[:SHOWN]) + more
+    more = f" and {len(every) - MAX_NAMES_SHOWN} more" if len(every) > MAX_NAMES_SHOWN else ""
+    return ", ".join(every[:MAX_NAMES_SHOWN]) + more
 
 
 def shown(value: Any) -> str:
@@ -86,7 +90,7 @@ def cpp_bool(text: Any) -> bool | None:
     return None
 
 
-LARGEST = 8 * 2**20
+MAX_WHOLE_YAML_BYTES = 8 * 2**20
 """Bytes of YAML up to which a check reads a file as a whole."""
 
 
@@ -95,7 +99,7 @@ def mappings(value: Any) -> list[tuple[int, dict[str, Any]]]:
     return [(k, v) for k, v in enumerate(value) if isinstance(v, dict)] if isinstance(value, list) else []
 
 
-def repeated(items: Iterable[Any]) -> list[Any]:
+def duplicates(items: Iterable[Any]) -> list[Any]:
     """Each item that occurs more than once, in order."""
     return [item for item, count in Counter(items).items() if count > 1]
 

@@ -36,10 +36,10 @@ Matrix = NDArray[np.float64]
 VERSIONS = ("1.4", "1.5", "1.6", "1.7", "1.8", "1.9", "1.10", "1.11")
 NEWEST = (1, 11)
 
-DEEPEST = 32
+MAX_NESTED_MODELS = 32
 """Models in models: real worlds have three."""
 
-MOST_SHAPES = 250_000
+MAX_SHAPES = 250_000
 """Shapes of one file, all includes unfolded."""
 
 MODELS = "models"
@@ -66,7 +66,7 @@ def is_sdf(data: bytes) -> bool:
     return _ROOT.match(data, at) is not None
 
 
-def holds(data: bytes, *tags: bytes) -> bool:
+def contains_element(data: bytes, *tags: bytes) -> bool:
     """Whether there is an element of one of these names outside of comments."""
     bare = without_comments(data)
     return any(re.search(rb"<" + tag + rb"[\s>/]", bare) for tag in tags)
@@ -84,14 +84,14 @@ def without_comments(data: bytes) -> bytes:
     return b"".join([*out, data[at:]])
 
 
-def wrong(reason: str, element: etree._Element | None = None, where: str | None = None) -> UnreadableFile:
+def unreadable_error(reason: str, element: etree._Element | None = None, where: str | None = None) -> UnreadableFile:
     """The error for something that cannot be used, with the element's line."""
     line = None if element is None else element.sourceline
-    location = where or (None if element is None else place_of(element))
+    location = where or (None if element is None else element_path(element))
     return UnreadableFile(reason, [Problem(reason, line=line, where=location)])
 
 
-def place_of(element: etree._Element) -> str:
+def element_path(element: etree._Element) -> str:
     """An element as users find it: its names from the world down."""
     parts: list[str] = []
     at: etree._Element | None = element
@@ -106,7 +106,7 @@ def parse(data: bytes, limits: Limits) -> etree._Element:
     """The ``<sdf>`` element without comments and indentation."""
     root = _xml.parse(data, limits, remove_blank_text=True)
     if root.tag != "sdf":
-        raise wrong(f"the root element must be <sdf>, it is <{str(root.tag)[:80]}>", root)
+        raise unreadable_error(f"the root element must be <sdf>, it is <{str(root.tag)[:80]}>", root)
     return root
 
 
@@ -114,17 +114,17 @@ _EXTENTS = ("radius", "length", "size", "scale")
 _BOOLEANS = ("static", "self_collide", "allow_auto_disable", "cast_shadows")
 
 
-def warn_of_values(root: etree._Element, context: ReadContext) -> None:
+def report_suspicious_values(root: etree._Element, context: ReadContext) -> None:
     """Report values that SDFormat reads but that hardly mean what they say: turns in degrees, sizes of zero."""
     doubts: dict[str, list[etree._Element]] = {}
     for pose in root.iter("pose"):
         turned = pose.get("degrees") or pose.get("rotation_format")
-        angles = [] if turned else text_of(pose).split()[3:6]
-        if any(_FLOAT.match(a) and abs(float(a)) > _fields.ANGLE_USUAL for a in angles):
+        angles = [] if turned else element_text(pose).split()[3:6]
+        if any(_FLOAT.match(a) and abs(float(a)) > _fields.MAX_USUAL_ANGLE for a in angles):
             doubts.setdefault("a <pose> turned by more than 2π: are its angles in radians?", []).append(pose)
     for name in _EXTENTS:
         for extent in root.iter(name):
-            tokens = text_of(extent).split()
+            tokens = element_text(extent).split()
             if (
                 tokens
                 and "geometry" in {a.tag for a in extent.iterancestors()}
@@ -133,17 +133,17 @@ def warn_of_values(root: etree._Element, context: ReadContext) -> None:
                 doubts.setdefault(f"a <{name}> of 0: the shape has no extent", []).append(extent)
     for name in _BOOLEANS:
         for flag in root.iter(name):
-            if text_of(flag).lower() not in ("0", "1", "true", "false"):
-                doubts.setdefault(f"<{name}> is {text_of(flag)[:40]!r}, which is taken for false", []).append(flag)
+            if element_text(flag).lower() not in ("0", "1", "true", "false"):
+                doubts.setdefault(f"<{name}> is {element_text(flag)[:40]!r}, which is taken for false", []).append(flag)
     for reason, elements in doubts.items():
         often = f" ({len(elements)} times)" if len(elements) > 1 else ""
-        context.warn(f"{reason}{often}", line=elements[0].sourceline, where=place_of(elements[0]))
+        context.warn(f"{reason}{often}", line=elements[0].sourceline, where=element_path(elements[0]))
 
 
 _FLOAT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\Z", re.ASCII)
 
 
-def text_of(element: etree._Element | None, tag: str | None = None) -> str:
+def element_text(element: etree._Element | None, tag: str | None = None) -> str:
     """An element's (or its child's) text without blanks around it; empty where there is none."""
     if element is not None and tag is not None:
         element = element.find(tag)
@@ -164,7 +164,7 @@ def numbers(text: str, element: etree._Element, maximum: float = MAX_METRES) -> 
         except ValueError:
             value = math.nan
         if not abs(value) <= maximum:
-            raise wrong(f"{token[:40]!r} is no finite number within ±{maximum:g}", element)
+            raise unreadable_error(f"{token[:40]!r} is no finite number within ±{maximum:g}", element)
         out.append(value + 0.0)
     return out
 
@@ -172,11 +172,11 @@ def numbers(text: str, element: etree._Element, maximum: float = MAX_METRES) -> 
 def vector(element: etree._Element | None, tag: str, count: int, default: Sequence[float]) -> list[float]:
     """So many numbers of a child, or the default where it is not there. Raises UnreadableFile for another count."""
     child = None if element is None else element.find(tag)
-    if child is None or not text_of(child):
+    if child is None or not element_text(child):
         return list(default)
-    values = numbers(text_of(child), child)
+    values = numbers(element_text(child), child)
     if len(values) != count:
-        raise wrong(f"<{tag}> must have {count} numbers, it has {len(values)}", child)
+        raise unreadable_error(f"<{tag}> must have {count} numbers, it has {len(values)}", child)
     return values
 
 
@@ -199,19 +199,19 @@ class Pose:
 ZERO = Pose()
 
 
-def pose_of(parent: etree._Element) -> Pose | None:
+def parse_pose(parent: etree._Element) -> Pose | None:
     """The pose of an element, or None where it says none."""
     element = parent.find("pose")
     if element is None:
         return None
-    values = numbers(text_of(element), element)
+    values = numbers(element_text(element), element)
     attributes = {k: v for k, v in _xml.attributes(element).items() if v and k != "degrees"}
     if element.get("rotation_format") == "quat_xyzw":
         if len(values) not in (0, 7):
-            raise wrong(f"a pose with a quaternion must have 7 numbers, it has {len(values)}", element)
-        values = [*values[:3], *_angles_of(values[3:], element)] if values else [0.0] * 6
+            raise unreadable_error(f"a pose with a quaternion must have 7 numbers, it has {len(values)}", element)
+        values = [*values[:3], *_quaternion_angles(values[3:], element)] if values else [0.0] * 6
     elif len(values) > 6:
-        raise wrong(f"a pose must have 6 numbers, it has {len(values)}", element)
+        raise unreadable_error(f"a pose must have 6 numbers, it has {len(values)}", element)
     else:
         values += [0.0] * (6 - len(values))
         if is_true(element.get("degrees", "")):
@@ -220,11 +220,11 @@ def pose_of(parent: etree._Element) -> Pose | None:
     return Pose(tuple(values), relative, not attributes and not len(element))
 
 
-def _angles_of(quaternion: Sequence[float], element: etree._Element) -> list[float]:
+def _quaternion_angles(quaternion: Sequence[float], element: etree._Element) -> list[float]:
     x, y, z, w = quaternion
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if length < 1e-9:
-        raise wrong("a pose's quaternion must not be zero", element)
+        raise unreadable_error("a pose's quaternion must not be zero", element)
     x, y, z, w = (v / length for v in (x, y, z, w))
     turn = np.eye(4)
     turn[:3, :3] = [
@@ -268,22 +268,22 @@ class Library:
             for k in range(1, len(parts)):
                 self._folders.setdefault(parts[k - 1], set()).add("/".join(parts[:k]))
         self._inside: dict[str, list[str]] = {}
-        self._found: dict[tuple[str, str], str | None] = {}
+        self._cache: dict[tuple[str, str], str | None] = {}
 
     def find(self, reference: str, near: str) -> str | None:
         """The file or folder of the upload that a reference in the file ``near`` means; None where there is none."""
         folder = near.rpartition("/")[0]
         key = (reference, folder)
-        if key not in self._found:
-            self._found[key] = self._find(reference, folder)
-        return self._found[key]
+        if key not in self._cache:
+            self._cache[key] = self._find(reference, folder)
+        return self._cache[key]
 
     def _find(self, reference: str, folder: str) -> str | None:
         path = plain_path(reference)
         if path is None:
             return None
         if not re.match(r"[a-z]+://", reference, re.IGNORECASE):
-            beside = _joined(folder, path)
+            beside = _join_path(folder, path)
             if beside is not None and (beside in self.files or self._is_folder(beside)):
                 return beside
         if path.startswith(f"{MODELS}/") and reference.lower().startswith("file://"):
@@ -298,9 +298,9 @@ class Library:
         base = path.rpartition("/")[2]
         candidates = [*self._by_base.get(base, ()), *self._folders.get(base, ())]
         fitting = [name for name in candidates if name == path or name.endswith("/" + path)]
-        return min(fitting, key=lambda name: (-_shared(name, folder), name.count("/"), name), default=None)
+        return min(fitting, key=lambda name: (-_common_folders(name, folder), name.count("/"), name), default=None)
 
-    def root_of(self, reference: str, file: str) -> str:
+    def model_root(self, reference: str, file: str) -> str:
         """The folder around the model that a reference begins with: ``a/b`` for ``model://NAME/x`` in a/b/NAME/x."""
         path = plain_path(reference) or ""
         if reference.lower().startswith("file://") and path.startswith(f"{MODELS}/"):
@@ -313,7 +313,7 @@ class Library:
             self._inside[folder] = sorted(n for n in self.files if n.startswith(folder + "/"))
         return self._inside[folder]
 
-    def beside(self, file: str) -> list[str]:
+    def files_beside(self, file: str) -> list[str]:
         """A file and those beside it that are called like it: a mesh's materials and texture."""
         folder, _, base = file.rpartition("/")
         name = base.rpartition(".")[0] or base
@@ -325,9 +325,9 @@ class Library:
         config = self.files.get(f"{folder}/model.config") or self.files.get(f"{folder}/manifest.xml") or b""
         candidates: list[tuple[tuple[int, int], str]] = []
         for version, name in _CONFIG.findall(without_comments(config)):
-            path = _joined(folder, name.decode("utf-8", "replace").strip())
+            path = _join_path(folder, name.decode("utf-8", "replace").strip())
             if path in self.files and path is not None:
-                sdf_version = version_of(version.decode("ascii", "replace"))
+                sdf_version = parse_version(version.decode("ascii", "replace"))
                 candidates.append((sdf_version or (0, 0), path))
         usable = [f for f in candidates if f[0] <= NEWEST] or candidates
         if usable:
@@ -339,7 +339,7 @@ class Library:
 _CONFIG = re.compile(rb"<sdf(?:\s+version\s*=\s*[\"']([^\"'<>]{0,20})[\"'])?[^<>]*>([^<>]{1,512})</sdf>")
 
 
-def version_of(text: str | None) -> tuple[int, int] | None:
+def parse_version(text: str | None) -> tuple[int, int] | None:
     """``1.7`` as (1, 7); None where it is no version."""
     match = re.fullmatch(r"\s*(\d{1,3})\.(\d{1,3})(\.\d{1,3})?\s*", text or "", re.ASCII)
     return (int(match[1]), int(match[2])) if match else None
@@ -379,7 +379,7 @@ def references(data: bytes) -> list[str]:
     return list(out)
 
 
-def needed(library: Library, main: str, more: Iterable[str] = ()) -> dict[str, str]:
+def required_files(library: Library, main: str, more: Iterable[str] = ()) -> dict[str, str]:
     """What a world needs of an upload, directly or through other models: path in the upload -> path as it is served.
 
     A model's folder is needed as a whole and is served as ``models/NAME/…``; a mesh beside the models as
@@ -399,8 +399,10 @@ def needed(library: Library, main: str, more: Iterable[str] = ()) -> dict[str, s
             file = library.find(reference, name)
             if file is None:
                 continue
-            is_beside = name == main and "://" not in reference and file == _joined(main.rpartition("/")[0], reference)
-            root = main.rpartition("/")[0] if is_beside else library.root_of(reference, file)
+            is_beside = (
+                name == main and "://" not in reference and file == _join_path(main.rpartition("/")[0], reference)
+            )
+            root = main.rpartition("/")[0] if is_beside else library.model_root(reference, file)
             below = file[len(root) + 1 :] if root else file
             entry = file if is_beside else (root + "/" if root else "") + below.split("/")[0]
             entry = file if entry in library.files or not library.inside(entry) else entry
@@ -412,7 +414,7 @@ def needed(library: Library, main: str, more: Iterable[str] = ()) -> dict[str, s
     taken = {"world.sdf"}
     for entry in sorted(roots, key=lambda w: (w.count("/"), w)):
         root, folder = roots[entry]
-        for name in library.beside(entry) if entry in library.files else library.inside(entry):
+        for name in library.files_beside(entry) if entry in library.files else library.inside(entry):
             path = folder + (name[len(root) + 1 :] if root else name)
             if name == main or name in out or path in taken:
                 continue
@@ -421,7 +423,7 @@ def needed(library: Library, main: str, more: Iterable[str] = ()) -> dict[str, s
     return out
 
 
-def _joined(folder: str, path: str) -> str | None:
+def _join_path(folder: str, path: str) -> str | None:
     """A path relative to a folder, without leaving the upload; None where it would."""
     parts = folder.split("/") if folder else []
     for part in path.split("/"):
@@ -436,7 +438,7 @@ def _joined(folder: str, path: str) -> str | None:
     return "/".join(parts)
 
 
-def _shared(name: str, folder: str) -> int:
+def _common_folders(name: str, folder: str) -> int:
     """How many folders two paths have in common, from the first on."""
     count = 0
     for a, b in zip(name.split("/"), folder.split("/") if folder else [], strict=False):
@@ -502,11 +504,11 @@ class ModelFlattener:
 
     def body(self, model: etree._Element, file: str) -> Body:
         """A model, or a light, without its own pose."""
-        out = Body(name=model.get("name", ""), pose=pose_of(model), kind=str(model.tag))
+        out = Body(name=model.get("name", ""), pose=parse_pose(model), kind=str(model.tag))
         if model.tag != "model":
             return out
-        if self._depth >= DEEPEST:
-            raise wrong(f"models in models are nested more than {DEEPEST} deep", model)
+        if self._depth >= MAX_NESTED_MODELS:
+            raise unreadable_error(f"models in models are nested more than {MAX_NESTED_MODELS} deep", model)
         self._depth += 1
         frames = _Frames(self, file)
         inner: list[tuple[str, Body]] = []
@@ -514,48 +516,48 @@ class ModelFlattener:
         for child in model.iterchildren("link", "frame", "joint", "model", "include"):
             name = child.get("name", "")
             if child.tag == "link":
-                frames.add(name, pose_of(child), "", child)
+                frames.add(name, parse_pose(child), "", child)
             elif child.tag == "frame":
-                frames.add(name, pose_of(child), child.get("attached_to", ""), child)
+                frames.add(name, parse_pose(child), child.get("attached_to", ""), child)
             elif child.tag == "joint":
-                frames.add(name, pose_of(child), text_of(child, "child"), child)
+                frames.add(name, parse_pose(child), element_text(child, "child"), child)
             else:
                 inside = self.include(child, file) if child.tag == "include" else self.body(child, file)
                 if inside is None:
                     absent.append(child)
                     continue
-                include_pose = pose_of(child) if child.tag == "include" else inside.pose
-                name = (text_of(child, "name") if child.tag == "include" else name) or inside.name
+                include_pose = parse_pose(child) if child.tag == "include" else inside.pose
+                name = (element_text(child, "name") if child.tag == "include" else name) or inside.name
                 frames.add_model(name, include_pose or inside.pose or ZERO, inside, placement(child, inside), child)
                 inner.append((name, inside))
         for link in model.iterchildren("link"):
             at = frames.place(link.get("name", ""))
             for tag, target in (("collision", out.collisions), ("visual", out.visuals)):
                 for part in link.iterchildren(tag):
-                    pose = frames.within(pose_of(part), at, part)
+                    pose = frames.within(parse_pose(part), at, part)
                     shapes = self.geometry(part.find("geometry"), file)
                     target += [Shape(shape, pose) for shape in shapes if tag == "collision" or not is_absent(shape)]
         for child in absent:
-            pose = frames.within(pose_of(child), np.eye(4), child)
+            pose = frames.within(parse_pose(child), np.eye(4), child)
             out.collisions += [Shape(shape, pose) for shape in absent_model(child)]
         for name, inside in inner:
             at = frames.place(name)
             out.collisions += [Shape(s.words, at @ s.place) for s in inside.collisions]
             out.visuals += [Shape(s.words, at @ s.place) for s in inside.visuals]
-            self._counted(len(inside.collisions) + len(inside.visuals), model)
+            self._check_count(len(inside.collisions) + len(inside.visuals), model)
         out.frames = frames
         self._depth -= 1
         return out
 
-    def _counted(self, more: int, element: etree._Element) -> None:
+    def _check_count(self, more: int, element: etree._Element) -> None:
         self._count += more
-        if self._count > MOST_SHAPES:
-            reason = f"the models have more than {MOST_SHAPES} shapes once their includes are unfolded"
-            raise TooLarge(reason, [Problem(reason, line=element.sourceline, where=place_of(element))])
+        if self._count > MAX_SHAPES:
+            reason = f"the models have more than {MAX_SHAPES} shapes once their includes are unfolded"
+            raise TooLarge(reason, [Problem(reason, line=element.sourceline, where=element_path(element))])
 
     def include(self, element: etree._Element, file: str) -> Body | None:
         """The model that an ``<include>`` names; None, noted as missing, where the upload does not have it."""
-        reference = text_of(element, "uri")
+        reference = element_text(element, "uri")
         target = self.library.find(reference, file) if reference else None
         path = None
         if target is not None:
@@ -572,7 +574,7 @@ class ModelFlattener:
     def file(self, path: str, element: etree._Element | None = None) -> Body | None:
         """The model of a file; each file is unfolded once. Raises UnreadableFile for one that includes itself."""
         if path in self._open:
-            raise wrong(f"{path} includes itself", element)
+            raise unreadable_error(f"{path} includes itself", element)
         if path not in self._files:
             self._open.append(path)
             main, self.context.main = self.context.main, path
@@ -581,7 +583,7 @@ class ModelFlattener:
                 model = next((c for c in root.iterchildren("model", "light", "actor")), None)
                 self._files[path] = None if model is None else self.body(model, path)
             except (UnreadableFile, TooLarge) as error:
-                raise _in(error, path) from error
+                raise _with_path(error, path) from error
             except etree.XMLSyntaxError as error:
                 reason = f"{path} cannot be read: {error.msg}"
                 raise UnreadableFile(reason, [Problem(error.msg or "no XML", path, error.lineno)]) from error
@@ -607,7 +609,7 @@ class ModelFlattener:
             if shape is not None:
                 out.append(shape)
         out += [{"type": "polyline", "points": points, "height": height} for height, points in rings.items()]
-        self._counted(len(out), element)
+        self._check_count(len(out), element)
         return out
 
     def _shape(self, tag: str, e: etree._Element, file: str) -> dict[str, Any] | None:
@@ -626,7 +628,7 @@ class ModelFlattener:
             size = vector(e, "size", 2, (1.0, 1.0))
             return {"type": tag, "normal": vector(e, "normal", 3, (0.0, 0.0, 1.0)), "size": size}
         if tag in ("mesh", "heightmap"):
-            reference = text_of(e, "uri") or text_of(e, "filename")
+            reference = element_text(e, "uri") or element_text(e, "filename")
             target = self.library.find(reference, file) if reference else None
             path = self.served.get(target) if target is not None and target in self.library.files else None
             if path is None:
@@ -635,8 +637,8 @@ class ModelFlattener:
             if tag == "mesh":
                 out: dict[str, Any] = {"type": tag, "file": path, "scale": vector(e, "scale", 3, (1.0, 1.0, 1.0))}
                 part = e.find("submesh")
-                if part is not None and text_of(part, "name"):
-                    out |= {"submesh": text_of(part, "name"), "center": is_true(text_of(part, "center"))}
+                if part is not None and element_text(part, "name"):
+                    out |= {"submesh": element_text(part, "name"), "center": is_true(element_text(part, "center"))}
                 return out
             size, position = vector(e, "size", 3, (1.0, 1.0, 1.0)), vector(e, "pos", 3, (0.0, 0.0, 0.0))
             return {"type": tag, "file": path, "size": size, "position": position}
@@ -667,26 +669,26 @@ def is_absent(shape: Mapping[str, Any]) -> bool:
 
 def absent_model(include: etree._Element) -> list[dict[str, Any]]:
     """The solids of an ``<include>`` whose model is not in the upload: unknown, but for Gazebo's own sun and ground."""
-    reference = text_of(include, "uri")
+    reference = element_text(include, "uri")
     name = reference.rstrip("/").rpartition("/")[2].lower().replace(" ", "_")
     return [] if name in BODILESS else [{"type": "model", "uri": reference}]
 
 
-def _in(error: UnreadableFile | TooLarge, path: str) -> UnreadableFile | TooLarge:
+def _with_path(error: UnreadableFile | TooLarge, path: str) -> UnreadableFile | TooLarge:
     problems = [p if p.file else Problem(p.problem, path, p.line, p.where) for p in error.problems]
     return type(error)(error.detail, problems or [Problem(error.detail, path)])
 
 
 def _pair(point: etree._Element) -> list[float]:
-    values = numbers(text_of(point), point)
+    values = numbers(element_text(point), point)
     if len(values) != 2:
-        raise wrong(f"a point must have 2 numbers, it has {len(values)}", point)
+        raise unreadable_error(f"a point must have 2 numbers, it has {len(values)}", point)
     return values
 
 
 def placement(element: etree._Element, inside: Body) -> Matrix | None:
     """The inverse of the frame in a model that its pose is meant for (``placement_frame``), if there is one."""
-    name = element.get("placement_frame") or text_of(element, "placement_frame")
+    name = element.get("placement_frame") or element_text(element, "placement_frame")
     at = inside.frame(name) if name else None
     return None if at is None else np.asarray(np.linalg.inv(at), np.float64)
 
@@ -741,7 +743,7 @@ class _Frames:
         element = self._said[chain[-1]][3] if chain else None
         circle = "goes round in a circle" if name in chain else "is not known"
         line = None if element is None else element.sourceline
-        location = None if element is None else place_of(element)
+        location = None if element is None else element_path(element)
         self.unfolder.context.warn(
             f"the frame {name[:80]!r} {circle}: its parent's is taken", line=line, where=location
         )
@@ -756,7 +758,7 @@ class _Frames:
         if pose.relative in self._said or "::" in pose.relative or pose.relative == "__model__":
             return np.asarray(self._relative(pose.relative) @ pose.matrix, np.float64)
         reason = f"the frame {pose.relative[:80]!r} is not known: its parent's is taken"
-        self.unfolder.context.warn(reason, line=element.sourceline, where=place_of(element))
+        self.unfolder.context.warn(reason, line=element.sourceline, where=element_path(element))
         return np.asarray(parent @ pose.matrix, np.float64)
 
     def _relative(self, name: str) -> Matrix:
@@ -782,7 +784,7 @@ def child(parent: etree._Element, tag: str, text: str | None = None, **attribute
     return element
 
 
-def words(values: Iterable[float]) -> str:
+def format_numbers(values: Iterable[float]) -> str:
     """Numbers as an SDF text."""
     return " ".join(number(float(v)) for v in values)
 
@@ -795,8 +797,8 @@ def geometry_element(shape: Mapping[str, Any], uri: str | None) -> etree._Elemen
         for ring in shape["points"]:
             line = child(out, kind)
             for point in ring:
-                child(line, "point", words(point))
-            child(line, "height", words([shape["height"]]))
+                child(line, "point", format_numbers(point))
+            child(line, "height", format_numbers([shape["height"]]))
         return out
     element = child(out, kind)
     if kind in ("mesh", "heightmap"):
@@ -804,7 +806,7 @@ def geometry_element(shape: Mapping[str, Any], uri: str | None) -> etree._Elemen
     for key, tag in _WORDS[kind]:
         if key in shape:
             value = shape[key]
-            child(element, tag, words(value if isinstance(value, (list, tuple)) else [value]))
+            child(element, tag, format_numbers(value if isinstance(value, (list, tuple)) else [value]))
     if kind == "mesh" and shape.get("submesh"):
         part = child(element, "submesh")
         child(part, "name", str(shape["submesh"]))
@@ -826,7 +828,7 @@ _WORDS: Mapping[str, tuple[tuple[str, str], ...]] = {
 SHAPES = frozenset(_WORDS) | {"polyline"}
 
 
-def printed(root: etree._Element) -> bytes:
+def serialise(root: etree._Element) -> bytes:
     """The document as indented text; the same each time."""
     etree.indent(root, "  ")
     root.tail = None

@@ -108,7 +108,7 @@ class BodyDefaults:
     sun: bool = parameter(True, "a light, where a world is made that has none")
 
 
-LARGEST_GROUND = 1e5
+MAX_GROUND_METRES = 1e5
 
 Rings = list[list[list[float]]]
 
@@ -158,40 +158,40 @@ class Bodies:
         self.newest = (1, 4)
         self.hilly = False  # whether a height map is the ground
         self._filled: set[tuple[str, float | Colour, str, str]] = set()
-        self._lost: Counter[tuple[str, str]] = Counter()
+        self._dropped: Counter[tuple[str, str]] = Counter()
         self._box: list[tuple[float, float, float, float]] = []
 
     def report(self) -> None:
         """Declare what was filled in and dropped so far."""
         for noun, value, why, option in sorted(self._filled, key=lambda item: (item[0], item[2])):
             self.context.fill(noun, list(value) if isinstance(value, tuple) else value, why, option or None)
-        for (noun, why), count in sorted(self._lost.items()):
+        for (noun, why), count in sorted(self._dropped.items()):
             self.context.drop(noun, count, why)
         self._filled.clear()
-        self._lost.clear()
+        self._dropped.clear()
 
     def model(self, one: Feature, elevation: float, taken: set[str]) -> etree._Element | None:
         """A static model of an object in local metres, or None where it has no body. elevation: metres, its level's."""
         properties = one.properties
         kind = str(properties.get("kind"))
         try:
-            shapes = [dict(s) for s in solids.shapes_of(properties)]
-            pose = list(solids.pose_of(properties))
+            shapes = [dict(s) for s in solids.object_shapes(properties)]
+            pose = list(solids.parse_pose(properties))
         except Invalid as error:
-            self._lost[f"objects of kind {kind}", error.detail[:200]] += 1
+            self._dropped[f"objects of kind {kind}", error.detail[:200]] += 1
             return None
         try:
             if shapes:
                 shapes = self._with_files(shapes, kind)
-                if obstacles.role_of(properties) == "mark":
+                if obstacles.object_role(properties) == "mark":
                     shapes = [{**shape, "visual": True} for shape in shapes]
             else:
                 shapes, pose = self._from_geometry(one, kind, elevation)
         except Invalid as error:
-            self._lost[f"objects of kind {kind}", error.detail[:200]] += 1
+            self._dropped[f"objects of kind {kind}", error.detail[:200]] += 1
             return None
         if not shapes:
-            self._lost[f"objects of kind {kind}", "no solid is known: supply a height, shapes or a model"] += 1
+            self._dropped[f"objects of kind {kind}", "no solid is known: supply a height, shapes or a model"] += 1
             return None
         name = properties.get("name")
         name = free_name(name if isinstance(name, str) and name else one.id, taken)
@@ -199,7 +199,9 @@ class Bodies:
         self.hilly = self.hilly or any(shape.get("type") == "heightmap" for shape in shapes)
         return self._static(name, pose, shapes, COLOURS.get(kind), properties.get("gazebo"))
 
-    def _taken(self, noun: str, option: str, why: str = "the objects tell none", *, otherwise: float = 0.0) -> float:
+    def _measure_or_default(
+        self, noun: str, option: str, why: str = "the objects tell none", *, otherwise: float = 0.0
+    ) -> float:
         """A measure that the options say, else the other one; it is declared."""
         setting = getattr(self.usual, option)
         value = float(otherwise if setting is None else setting)
@@ -218,15 +220,17 @@ class Bodies:
         for shape in shapes:
             if _sdf.is_absent(shape):
                 reason = f"{str(shape['uri'])[:200]} is not stored: upload it"
-                self._lost[f"solids of objects of kind {kind}", reason] += 1
+                self._dropped[f"solids of objects of kind {kind}", reason] += 1
                 continue
             if str(shape.get("type")) not in _sdf.SHAPES:
-                self._lost[f"shapes of objects of kind {kind}", f"Gazebo knows no {str(shape.get('type'))[:40]}"] += 1
+                self._dropped[
+                    f"shapes of objects of kind {kind}", f"Gazebo knows no {str(shape.get('type'))[:40]}"
+                ] += 1
                 continue
             if shape["type"] in ("mesh", "heightmap"):
                 file = str(shape.get("file"))
                 if file not in self.resources:
-                    self._lost[f"meshes of objects of kind {kind}", f"{file[:200]} is not stored: upload it"] += 1
+                    self._dropped[f"meshes of objects of kind {kind}", f"{file[:200]} is not stored: upload it"] += 1
                     continue
                 path = file if file.startswith(f"{_sdf.MODELS}/") else f"{_sdf.MODELS}/{file}"
                 self.files[path] = self.resources[file]
@@ -236,7 +240,7 @@ class Bodies:
             try:
                 _sdf.geometry_element(shape, shape.get("uri"))
             except (LookupError, TypeError, ValueError):
-                self._lost[f"shapes of objects of kind {kind}", f"a {shape['type']} without its measures"] += 1
+                self._dropped[f"shapes of objects of kind {kind}", f"a {shape['type']} without its measures"] += 1
                 continue
             out.append(shape)
         return out
@@ -247,42 +251,44 @@ class Bodies:
         properties, geometry = one.properties, one.geometry
         if shapely.is_empty(geometry):
             return [], []
-        role = obstacles.role_of(properties)
+        role = obstacles.object_role(properties)
         body = (
-            obstacles.body_of(properties, geometry, self._width(one)) if role == "outline" or kind == "lift" else None
+            obstacles.object_body(properties, geometry, self._width(one))
+            if role == "outline" or kind == "lift"
+            else None
         )
-        base, top = obstacles.heights_of(properties, geometry) if body is None else (body.base, body.top)
+        base, top = obstacles.object_heights(properties, geometry) if body is None else (body.base, body.top)
         base = base if math.isfinite(base) else 0.0
         middle = np.round(shapely.get_coordinates(shapely.centroid(geometry))[0], 3) + 0.0
         shapes: list[dict[str, Any]] = []
-        if role == "ground" and (area := obstacles.ground_of(properties, geometry)) is not None:
+        if role == "ground" and (area := obstacles.object_ground(properties, geometry)) is not None:
             height = _positive(properties.get("height"), 0.0) if kind == "floor" else 0.0
-            height = height or self._taken(f"thickness of {kind}", "floor_thickness")
-            shapes += _lowered(_areas(_around(area, middle), height), height)
+            height = height or self._measure_or_default(f"thickness of {kind}", "floor_thickness")
+            shapes += _lower(_areas(_relative_to(area, middle), height), height)
         if body is not None:
             height = top - base if math.isfinite(top) else self._height(kind)
             if shapely.get_type_id(geometry) in (1, 5):
-                width, square = self._width(one) or obstacles.width_of(properties) or 0.0, kind in obstacles.SQUARE
-                for line in shapely.get_parts(_around(geometry, middle)):
+                width, square = self._width(one) or obstacles.object_width(properties) or 0.0, kind in obstacles.SQUARE
+                for line in shapely.get_parts(_relative_to(geometry, middle)):
                     shapes += _segments(line, height, width, square=square)
-            elif shapely.get_type_id(geometry) in (0, 4) and obstacles.size_of(properties) is None:
-                radius = (self._width(one) or obstacles.width_of(properties) or 0.0) / 2
-                for x, y in shapely.get_coordinates(_around(geometry, middle)).tolist():
+            elif shapely.get_type_id(geometry) in (0, 4) and obstacles.box_size(properties) is None:
+                radius = (self._width(one) or obstacles.object_width(properties) or 0.0) / 2
+                for x, y in shapely.get_coordinates(_relative_to(geometry, middle)).tolist():
                     pose = [x, y, height / 2, 0.0, 0.0, 0.0]
                     shapes.append({"type": "cylinder", "radius": radius, "length": height, "pose": pose})
             else:
-                shapes += _areas(_around(body.area, middle), height)
+                shapes += _areas(_relative_to(body.area, middle), height)
         elif role == "mark":
-            shapes += self._drawn(properties, kind, _around(geometry, middle), top - base)
+            shapes += self._flat_shapes(properties, kind, _relative_to(geometry, middle), top - base)
         return shapes, [float(middle[0]), float(middle[1]), round(elevation + base, 9) + 0.0, 0.0, 0.0, 0.0]
 
-    def _drawn(self, properties: Mapping[str, Any], kind: str, flat: Any, height: float) -> list[dict[str, Any]]:
+    def _flat_shapes(self, properties: Mapping[str, Any], kind: str, flat: Any, height: float) -> list[dict[str, Any]]:
         """What is seen of an outline that stands in no way: as high as it says, a door as it stands open, else a plate
         on the ground; none of a kind that is not drawn and says no height."""
         if not (math.isfinite(height) and height > 0.0):
             if kind == "door":
                 why = "the objects tell none; doors stand open: nothing collides"
-                height = self._taken("height of door", "door_height", why)
+                height = self._measure_or_default("height of door", "door_height", why)
             elif kind in DRAWN:
                 height = PLATE
                 self._filled.add((f"height of {kind}", PLATE, "drawn on the ground, nothing collides with it", ""))
@@ -294,29 +300,29 @@ class Bodies:
                 shapes += _areas(part, height)
             elif shapely.get_dimensions(part) == 1:
                 width = _positive(properties.get("width"), 0.0)
-                width = width or self._taken(f"width of {kind}", "wall_thickness", otherwise=WALL)
+                width = width or self._measure_or_default(f"width of {kind}", "wall_thickness", otherwise=WALL)
                 shapes += _segments(part, height, width, square=False)
         return [{**shape, "visual": True} for shape in shapes]
 
     def _height(self, kind: str) -> float:
         """How high a body is that does not say it; the top of what is solid for a laser, whatever it is."""
-        return self._taken(f"height of {kind}", HEIGHTS.get(kind, "obstacle_height"))
+        return self._measure_or_default(f"height of {kind}", HEIGHTS.get(kind, "obstacle_height"))
 
     def _width(self, one: Feature) -> float | None:
         """How wide a line or a point is that does not say it, where the options do; declared in any case."""
         kind = str(one.properties.get("kind"))
         dimension = shapely.get_dimensions(one.geometry)
-        if dimension > 1 or obstacles.says_width(one.properties) or obstacles.width_of(one.properties) is None:
+        if dimension > 1 or obstacles.has_width(one.properties) or obstacles.object_width(one.properties) is None:
             return None
-        default = obstacles.width_of(one.properties) or 0.0
+        default = obstacles.object_width(one.properties) or 0.0
         if dimension == 1 and default > WALL:  # a hedge or a river is none of the lines that are as thin as walls
             self._filled.add((f"width of {kind}", default, "the objects tell none", ""))
             return None
         if dimension == 1:
-            return self._taken(f"width of {kind}", "wall_thickness", otherwise=default)
-        if obstacles.size_of(one.properties) is not None:
+            return self._measure_or_default(f"width of {kind}", "wall_thickness", otherwise=default)
+        if obstacles.box_size(one.properties) is not None:
             return None
-        return 2.0 * self._taken(f"radius of {kind}", "pole_radius", otherwise=default / 2)
+        return 2.0 * self._measure_or_default(f"radius of {kind}", "pole_radius", otherwise=default / 2)
 
     def _static(
         self,
@@ -347,11 +353,11 @@ class Bodies:
                 if tag == "visual":
                     own_colour = _colour(shape)
                     if own_colour is None and colour is not None and not _is_script(material):
-                        own_colour = self._tinted(colour)
+                        own_colour = self._colour_or_default(colour)
                     _material(part, own_colour, material)
         return model
 
-    def _tinted(self, option: str) -> str:
+    def _colour_or_default(self, option: str) -> str:
         """A colour that the options say; it is declared."""
         value: Colour = getattr(self.usual, option)
         noun = next((kind for kind, name in COLOURS.items() if name == option), option.removesuffix("_colour"))
@@ -370,7 +376,7 @@ class Bodies:
         boxes = np.array(self._box)
         low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
         middle = np.round((low + high) / 2, 3) + 0.0
-        size = np.clip(np.ceil((high - low + 20.0) / 10.0) * 10.0, 100.0, LARGEST_GROUND)
+        size = np.clip(np.ceil((high - low + 20.0) / 10.0) * 10.0, 100.0, MAX_GROUND_METRES)
         return [float(v) for v in middle], [float(v) for v in size]
 
     def ground(self) -> etree._Element:
@@ -386,7 +392,7 @@ class Bodies:
             self.context.warn(f"no cell has a value of {threshold} or more: there are no walls", where=name)
             return None
         file = f"{name}/meshes/{name}.stl"
-        self.files[f"{_sdf.MODELS}/{file}"] = stl(extruded(occupied, grid.resolution, self.usual.wall_height))
+        self.files[f"{_sdf.MODELS}/{file}"] = stl(extrude(occupied, grid.resolution, self.usual.wall_height))
         self.context.fill("height of walls", self.usual.wall_height, "a grid tells none", "wall_height")
         x, y, yaw = grid.origin
         corners = grid.corners()
@@ -403,7 +409,7 @@ def _colour(shape: Mapping[str, Any]) -> str | None:
         return None
     if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and 0.0 <= v <= 1.0 for v in colour):
         return None
-    return _sdf.words([*colour, 1.0][:4])
+    return _sdf.format_numbers([*colour, 1.0][:4])
 
 
 def _is_script(material: Any) -> bool:
@@ -433,12 +439,12 @@ def _positive(value: Any, otherwise: float) -> float:
     return float(value) if usable else otherwise
 
 
-def _around(geometry: Any, middle: NDArray[np.float64]) -> Any:
+def _relative_to(geometry: Any, middle: NDArray[np.float64]) -> Any:
     """A geometry seen from above, in metres around a point."""
     return shapely.transform(shapely.force_2d(geometry), lambda at: at - middle)
 
 
-def _lowered(shapes: list[dict[str, Any]], depth: float) -> list[dict[str, Any]]:
+def _lower(shapes: list[dict[str, Any]], depth: float) -> list[dict[str, Any]]:
     """The shapes so much lower."""
     poses = [shape.get("pose", [0.0] * 6) for shape in shapes]
     return [{**shape, "pose": [*p[:2], p[2] - depth, *p[3:]]} for shape, p in zip(shapes, poses, strict=True)]
@@ -516,7 +522,7 @@ def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]
     return rows[::2], columns[::2], columns[1::2]
 
 
-def extruded(occupied: NDArray[np.bool_], resolution: float, height: float) -> NDArray[np.float32]:
+def extrude(occupied: NDArray[np.bool_], resolution: float, height: float) -> NDArray[np.float32]:
     """The surface of all occupied cells from 0 to this height: float32 [n, 3, 3], outward, metres from the corner of
     cell (0, 0). Tops and bottoms are rectangles, sides the runs of cell edges between occupied and not."""
     x0, x1, y0, y1 = rectangles(occupied).T

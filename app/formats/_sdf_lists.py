@@ -26,7 +26,7 @@ from app.formats import ReadContext, _sdf, _yaml
 from app.model.frame import MAX_METRES, is_writable
 from app.model.solids import matrix
 
-OWN = "gazebo"
+NAMESPACE = "gazebo"
 
 _COMPONENTS = re.compile(rb"^components[ \t]*:", re.MULTILINE)
 _TYPED = re.compile(rb"^[ \t-]*type[ \t]*:|[{,][ \t]*type[ \t]*:", re.MULTILINE)
@@ -39,7 +39,7 @@ _CUSTOM = re.compile(rb"reference[ \t]*:[ \t]*[\"']?([^\"'\s,}#]{1,256})")
 _MESH = re.compile(rb"dae[ \t]*:[ \t]*[\"']?([^\"'\s,}#]{1,256})")
 _TYPE = re.compile(rb"^[ \t-]*type[ \t]*:[ \t]*[\"']?([^\"'\s,{}#]{1,256})", re.MULTILINE)
 
-DEEPEST = 8
+MAX_NESTED_OBJECTS = 8
 """Custom objects in custom objects; the generator itself knows one step."""
 
 Place = tuple[float, ...]
@@ -66,7 +66,7 @@ def _custom(library: _sdf.Library, reference: str, near: str) -> str | None:
     return None
 
 
-def needed(library: _sdf.Library, main: str) -> list[str]:
+def required_files(library: _sdf.Library, main: str) -> list[str]:
     """The custom objects, models and meshes that a list needs, directly or through others, and ``models.yaml``."""
     out: dict[str, None] = {}
     todo = [main]
@@ -83,9 +83,9 @@ def needed(library: _sdf.Library, main: str) -> list[str]:
                 if detect(file, library.files[file]):
                     todo.append(file)
             else:
-                out.update(dict.fromkeys(_sdf.needed(library, main, [f"model://{reference}"])))
+                out.update(dict.fromkeys(_sdf.required_files(library, main, [f"model://{reference}"])))
         meshes = [t.decode("utf-8", "replace") for t in _MESH.findall(data)]
-        out.update(dict.fromkeys(_sdf.needed(library, name, meshes)))
+        out.update(dict.fromkeys(_sdf.required_files(library, name, meshes)))
     beside = main.rpartition("/")[0] + "/" if "/" in main else ""
     catalogue = beside + "models.yaml"
     if catalogue in library.files and catalogue != main and not detect(catalogue, library.files[catalogue]):
@@ -116,7 +116,7 @@ def read(library: _sdf.Library, main: str, context: ReadContext) -> ParsedList:
         reader.rows(data)
         section_names = set(data) if isinstance(data, Mapping) else set()
     else:
-        raise _refused("it must be a list of objects", "")
+        raise _unreadable_error("it must be a list of objects", "")
     if isinstance(data, Mapping):
         reader.found.rest = (
             {"rest": extra_members}
@@ -127,13 +127,13 @@ def read(library: _sdf.Library, main: str, context: ReadContext) -> ParsedList:
     return reader.found
 
 
-def _refused(reason: str, location: str) -> UnreadableFile:
+def _unreadable_error(reason: str, location: str) -> UnreadableFile:
     return UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, where=location or None)])
 
 
 def _number(value: Any, location: str, maximum: float = MAX_METRES) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= maximum:
-        raise _refused(f"must be a finite number within ±{maximum:g}, got {str(value)[:40]!r}", location)
+        raise _unreadable_error(f"must be a finite number within ±{maximum:g}, got {str(value)[:40]!r}", location)
     return float(value) + 0.0
 
 
@@ -142,7 +142,7 @@ def _members(members: Any, names: Sequence[str], location: str, default: float =
     if members is None:
         members = {}
     if not isinstance(members, Mapping):
-        raise _refused(f"must be a mapping with {', '.join(names)}", location)
+        raise _unreadable_error(f"must be a mapping with {', '.join(names)}", location)
     return [_number(members.get(name, default), f"{location}.{name}") for name in names]
 
 
@@ -156,7 +156,7 @@ def _pose(members: Mapping[str, Any], location: str) -> Place:
 def _text(value: Any, location: str) -> str:
     text = str(value)
     if isinstance(value, (Mapping, list)) or not text or len(text) > 256 or not is_writable(text):
-        raise _refused("must be a name of 1 to 256 characters without control characters", location)
+        raise _unreadable_error("must be a name of 1 to 256 characters without control characters", location)
     return text
 
 
@@ -164,7 +164,7 @@ def _list(items: Any, location: str) -> list[Mapping[str, Any]]:
     if items is None:
         return []
     if not isinstance(items, list) or not all(isinstance(item, Mapping) for item in items):
-        raise _refused("must be a list of mappings", location)
+        raise _unreadable_error("must be a list of mappings", location)
     return items
 
 
@@ -202,7 +202,7 @@ class _Reader:
             else:
                 shapes = [self._shape(item, reference, self.main, location)]
                 pose = _sdf.six(matrix(anchor) @ matrix(_pose(item, location)))
-            properties: dict[str, Any] = {"kind": "model", "name": name, "pose": pose, OWN: source_properties}
+            properties: dict[str, Any] = {"kind": "model", "name": name, "pose": pose, NAMESPACE: source_properties}
             if shapes:
                 properties["shapes"] = shapes
             self._add(name, properties)
@@ -210,7 +210,7 @@ class _Reader:
     def _type(self, item: Mapping[str, Any], location: str) -> tuple[str, str]:
         members = item.get("type")
         if not isinstance(members, Mapping) or "reference" not in members:
-            raise _refused("must say {object: custom or primitive, reference: what}", f"{location}.type")
+            raise _unreadable_error("must say {object: custom or primitive, reference: what}", f"{location}.type")
         return str(members.get("object", "")), _text(members["reference"], f"{location}.type.reference")
 
     def _anchor(self, item: Mapping[str, Any], location: str) -> Place:
@@ -218,7 +218,7 @@ class _Reader:
         if anchor is None:
             return (0.0,) * 6
         if not isinstance(anchor, Mapping):
-            raise _refused("must be a mapping with position and orientation", f"{location}.anchor")
+            raise _unreadable_error("must be a mapping with position and orientation", f"{location}.anchor")
         return _pose(anchor, f"{location}.anchor")
 
     def _custom(self, reference: str, near: str, location: str, above: tuple[str, ...]) -> Iterator[dict[str, Any]]:
@@ -231,9 +231,9 @@ class _Reader:
                 self.unfolder.missing(f"custom_models/{reference}")
                 yield {"type": "model", "uri": f"custom_models/{reference}"}
             return
-        if path in above or len(above) >= DEEPEST:
-            raise _refused(
-                f"custom object {reference} includes itself, or is nested more than {DEEPEST} deep", location
+        if path in above or len(above) >= MAX_NESTED_OBJECTS:
+            raise _unreadable_error(
+                f"custom object {reference} includes itself, or is nested more than {MAX_NESTED_OBJECTS} deep", location
             )
         if path not in self._lists:
             document = _yaml.load(self.library.files[path], self.context.limits)
@@ -244,16 +244,16 @@ class _Reader:
             anchor = matrix(self._anchor(item, item_location))
             if kind == "custom":
                 for shape in self._custom(inner, path, item_location, (*above, path)):
-                    yield self._placed(shape, anchor @ matrix(shape.get("pose", (0.0,) * 6)))
+                    yield self._place_shape(shape, anchor @ matrix(shape.get("pose", (0.0,) * 6)))
             else:
-                yield self._placed(
+                yield self._place_shape(
                     self._shape(item, inner, path, item_location), anchor @ matrix(_pose(item, item_location))
                 )
 
-    def _placed(self, shape: Mapping[str, Any], at: _sdf.Matrix) -> dict[str, Any]:
+    def _place_shape(self, shape: Mapping[str, Any], at: _sdf.Matrix) -> dict[str, Any]:
         self._count += 1
-        if self._count > _sdf.MOST_SHAPES:
-            raise TooLarge(f"the custom objects have more than {_sdf.MOST_SHAPES} shapes")
+        if self._count > _sdf.MAX_SHAPES:
+            raise TooLarge(f"the custom objects have more than {_sdf.MAX_SHAPES} shapes")
         out = {k: v for k, v in shape.items() if k != "pose"}
         pose = _sdf.six(at)
         return out | {"pose": pose} if any(pose) else out
@@ -273,7 +273,7 @@ class _Reader:
             out = {"type": reference, "normal": [0.0, 0.0, 1.0], "size": size}
         elif reference == "mesh":
             uri = _text(item.get("dae"), f"{location}.dae")
-            self.found.served.update(_sdf.needed(self.library, near, [uri]))
+            self.found.served.update(_sdf.required_files(self.library, near, [uri]))
             file = self.library.find(uri, near)
             path = self.found.served.get(file) if file is not None else None
             if path is None:
@@ -297,7 +297,13 @@ class _Reader:
             source_properties = {"ground": dict(ground)}
             self._add(
                 "ground_plane",
-                {"kind": "model", "name": "ground_plane", "pose": pose, "shapes": [plane], OWN: source_properties},
+                {
+                    "kind": "model",
+                    "name": "ground_plane",
+                    "pose": pose,
+                    "shapes": [plane],
+                    NAMESPACE: source_properties,
+                },
             )
         elif ground is not None:
             self.found.rest["ground"] = ground
@@ -309,7 +315,7 @@ class _Reader:
         for k, (called, item) in enumerate(items):
             location = f"models[{k}]"
             if not isinstance(item, Mapping):
-                raise _refused("must be a mapping with type, position and orientation", location)
+                raise _unreadable_error("must be a mapping with type, position and orientation", location)
             name = _text(called, f"{location}.name")
             kind = _text(item.get("type"), f"{location}.type")
             source_properties = {str(a): b for a, b in item.items() if a not in ("name", "position", "orientation")}
@@ -317,7 +323,7 @@ class _Reader:
                 "kind": "model",
                 "name": name,
                 "pose": list(_pose(item, location)),
-                OWN: source_properties,
+                NAMESPACE: source_properties,
             }
             if shapes := list(self._custom(kind, self.main, location, ())):
                 properties["shapes"] = shapes
@@ -325,14 +331,14 @@ class _Reader:
 
     def _model(self, folder: str, reference: str) -> list[dict[str, Any]]:
         """The shapes of a model folder."""
-        self.found.served.update(_sdf.needed(self.library, self.main, [f"model://{reference}"]))
+        self.found.served.update(_sdf.required_files(self.library, self.main, [f"model://{reference}"]))
         file = self.library.model_file(folder)
         body = None if file is None else self.unfolder.file(file)
         if body is None:
             self.unfolder.missing(f"custom_models/{reference}")
             return [{"type": "model", "uri": f"custom_models/{reference}"}]
         body_pose = _sdf.ZERO if body.pose is None else body.pose
-        return [self._placed(s, body_pose.matrix @ matrix(s.get("pose", (0.0,) * 6))) for s in body.shapes()]
+        return [self._place_shape(s, body_pose.matrix @ matrix(s.get("pose", (0.0,) * 6))) for s in body.shapes()]
 
     # rows
 
@@ -348,7 +354,7 @@ class _Reader:
             for inner in node:
                 self.rows(inner, path)
         elif node is not None:
-            raise _refused(f"must be rows with coordinates, got {str(node)[:40]!r}", "/".join(path))
+            raise _unreadable_error(f"must be rows with coordinates, got {str(node)[:40]!r}", "/".join(path))
 
     def _row(self, row: Mapping[str, Any], path: tuple[str, ...]) -> None:
         location = "/".join(path)
@@ -359,4 +365,4 @@ class _Reader:
             position = _members(item, ("x", "y", "z"), f"{location}[{k}]")
             name = _text(f"{location}/{k}".strip("/"), location)
             pose = [*position, 0.0, 0.0, yaw]
-            self._add(name, {"kind": "obstacle", "name": name, "pose": pose, OWN: source_properties})
+            self._add(name, {"kind": "obstacle", "name": name, "pose": pose, NAMESPACE: source_properties})

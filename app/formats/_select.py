@@ -17,7 +17,7 @@ def file_stem(name: str, default: str = MAP) -> str:
     return re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", name.lstrip(".")).lstrip(".") or default
 
 
-def the_one(
+def select_part(
     keys: Sequence[PartKey],
     layer: Layer,
     name: str | None,

@@ -99,7 +99,7 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
         if literals is not None:
             values, end = literals
             for name, value in values.items():
-                reason = _unfit(name, value, variables)
+                reason = _unfit_reason(name, value, variables)
                 if reason:
                     variables.pop(name, None)
                     warnings.append(f"line {line}: {name} is left out: {reason}")
@@ -127,7 +127,7 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
     return variables, warnings
 
 
-def handed_on(variables: object) -> tuple[dict[str, str], list[str], list[str]]:
+def exported_variables(variables: object) -> tuple[dict[str, str], list[str], list[str]]:
     """Stored variables that robots may source; the names that say where files are; why others are left out."""
     items = variables.items() if isinstance(variables, Mapping) else ()
     out: dict[str, str] = {}
@@ -151,7 +151,7 @@ def exports(values: Mapping[str, str]) -> bytes:
     """Lines that a shell sources to exactly these values. ValueError for a name or value that must not be handed on."""
     lines = []
     for name, value in values.items():
-        reason = "it is not a variable's name" if not _NAME.fullmatch(name) else _unfit(name, value, {})
+        reason = "it is not a variable's name" if not _NAME.fullmatch(name) else _unfit_reason(name, value, {})
         if reason:
             raise ValueError(f"{name[:80]!r} cannot be exported: {reason}")
         quoted = value.replace("'", "'\\''")
@@ -159,7 +159,7 @@ def exports(values: Mapping[str, str]) -> bytes:
     return "".join(lines).encode()
 
 
-def _unfit(name: str, value: str, variables: Mapping[str, str]) -> str:
+def _unfit_reason(name: str, value: str, variables: Mapping[str, str]) -> str:
     """Why this variable is not handed on, or an empty text."""
     if _DANGEROUS.fullmatch(name):
         return "the variable decides how programs run"

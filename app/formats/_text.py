@@ -31,7 +31,7 @@ def numbers(values: NDArray[np.float64] | Iterable[float], decimals: int = METRE
     return list(map(repr, rounded.tolist()))
 
 
-def encoded(pieces: list[str]) -> bytes:
+def encode_pieces(pieces: list[str]) -> bytes:
     """The pieces as UTF-8, one after the other. The list is emptied meanwhile, so that no text is held twice."""
     pieces.reverse()
     out = BytesIO()  # whose content is taken out without a copy

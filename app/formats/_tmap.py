@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, ReadContext, WriteContext, _fields, _yaml, all_formats
 from app.formats._fields import ANY, COORDINATE, NOT_NEGATIVE, POINT, SPEED, WIDTH, Number, Quaternion, Text, record
-from app.formats._text import METRES, encoded, numbers
+from app.formats._text import METRES, encode_pieces, numbers
 from app.model.features import Features, Properties, from_columns, points, unique_ids
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, PartKey
@@ -46,16 +46,16 @@ EPOCH = "1970-01-01_00-00-00"
 """Where a source tells no time: the schema asks for one, and the same network must give the same bytes."""
 
 MAX_NAME = 256
-LONGEST_ID = 480
+MAX_ID_CHARACTERS = 480
 
 NODE_WORDS = frozenset({"edges", "name", "pose"})
 EDGE_WORDS = frozenset({"edge_id", "node", "action"})
 CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME})
 CANONICAL_EDGE = frozenset({"kind", "source", "target", "action", NAME})
-UNWRITTEN = frozenset({"drawn_from"})
+CROSS_PART_PROPERTIES = frozenset({"drawn_from"})
 """Canonical properties that speak of other parts of the environment, not of the item."""
 
-BULKY = frozenset({"osm"})
+WRITTEN_ON_DEMAND = frozenset({"osm"})
 """What these formats know of an item is written on demand: OSM's tags and history are larger than all the rest."""
 
 NUMERIC_WORDS = ("speed_limit", "width")
@@ -219,7 +219,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         node_properties: dict[str, Any] = {"kind": kind, "name": name}
         if orientations[k] is not None:
             node_properties["orientation"] = orientations[k]
-        node_properties[NAME] = source_properties = _node_rest(entry, node, name, common)
+        node_properties[NAME] = source_properties = _extra_node_members(entry, node, name, common)
         if name != ids[k]:
             source_properties["node"]["name"] = name
         if k in dangling:
@@ -241,7 +241,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
     sources = np.array([r[0] for r in rows], np.intp)
     targets = np.array([r[1] for r in rows], np.intp)
-    _warn_lonely(names, sources, targets, dangling, context)
+    _warn_isolated(names, sources, targets, dangling, context)
     edge_ids = unique_ids((_identifier(r[2]) for r in rows), set(ids))
     repeated = []
     for (source, target, source_id, edge), edge_id in zip(rows, edge_ids, strict=True):
@@ -259,7 +259,7 @@ def read(files: Files, context: ReadContext) -> Layers:
             _lift(line, extra_members)
         properties.append(line)
     if repeated:
-        context.warn(f"{len(repeated)} edge ids stand for several things: {_some(repeated)}; all are kept")
+        context.warn(f"{len(repeated)} edge ids stand for several things: {_shorten(repeated)}; all are kept")
     both = np.concatenate([geometry, _edge_lines(xyz, sources, targets)])
     key = PartKey("topology", context.level, NETWORK)
     return Layers({key: from_columns([*ids, *edge_ids], both, properties, "local", collection_document)})
@@ -321,12 +321,12 @@ def _name(raw_name: Any, k: int, context: ReadContext) -> str:
 
 def _identifier(name: str) -> str:
     """A usable id: the name itself but for invisible characters, other Unicode forms of it, and its length."""
-    if name.isascii() and name.isprintable() and len(name) <= LONGEST_ID:
+    if name.isascii() and name.isprintable() and len(name) <= MAX_ID_CHARACTERS:
         return name
     plain = unicodedata.normalize("NFC", name)
     plain = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in plain)
-    if len(plain) > LONGEST_ID:
-        plain = f"{plain[: LONGEST_ID - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+    if len(plain) > MAX_ID_CHARACTERS:
+        plain = f"{plain[: MAX_ID_CHARACTERS - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
     return plain
 
 
@@ -334,14 +334,14 @@ def _warn_names(names: Sequence[str], context: ReadContext) -> None:
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         context.warn(
-            f"{len(repeated)} node names stand twice or more: {_some(repeated)}; edges to them go to the first"
+            f"{len(repeated)} node names stand twice or more: {_shorten(repeated)}; edges to them go to the first"
         )
     for name in names:
         if not name.isascii() and not name.isprintable():
             context.warn(f"the name {name!r} has invisible characters", where=name)
 
 
-def _some(names: Sequence[Any]) -> str:
+def _shorten(names: Sequence[Any]) -> str:
     return ", ".join(map(str, names[:5])) + (" …" if len(names) > 5 else "")
 
 
@@ -376,11 +376,11 @@ def _edges(
                 loops.append(edge_id)
             rows.append((k, target, edge_id or f"{names[k]}_{to}", edge))
     if loops:
-        context.warn(f"{len(loops)} edges lead from a node to itself: {_some(loops)}")
+        context.warn(f"{len(loops)} edges lead from a node to itself: {_shorten(loops)}")
     return rows, dangling
 
 
-def _warn_lonely(
+def _warn_isolated(
     names: Sequence[str],
     sources: NDArray[np.intp],
     targets: NDArray[np.intp],
@@ -391,7 +391,7 @@ def _warn_lonely(
     linked[sources] = linked[targets] = linked[list(dangling)] = True
     lonely = [names[k] for k in np.flatnonzero(~linked).tolist()]
     if lonely:
-        context.warn(f"{len(lonely)} nodes have no edges: {_some(lonely)}")
+        context.warn(f"{len(lonely)} nodes have no edges: {_shorten(lonely)}")
 
 
 def _poses(nodes: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[Array, list[list[float] | None]]:
@@ -436,7 +436,7 @@ def _number(value: Any, location: str) -> float:
     return float(number)
 
 
-def _node_rest(
+def _extra_node_members(
     entry: Mapping[str, Any], node: Mapping[str, Any], name: str, common: Mapping[str, Any]
 ) -> dict[str, Any]:
     """What of a node's entry is neither canonical nor said by the document."""
@@ -619,7 +619,7 @@ class _Writer:
         self.turn = _turn(self.document)
         self.ring = ring(self.options.verts_radius)
         self.legacy = False  # whether the network at hand came as the older list, which lacks much that tmap2 asks for
-        self.unwritten = UNWRITTEN if self.options.osm else UNWRITTEN | BULKY
+        self.unwritten = CROSS_PART_PROPERTIES if self.options.osm else CROSS_PART_PROPERTIES | WRITTEN_ON_DEMAND
         # Properties without anything for an item's own ``properties``.
         self.plain_node, self.plain_edge = CANONICAL_NODE | self.unwritten, CANONICAL_EDGE | self.unwritten
         self.templates: dict[Any, list[str]] = {}
@@ -638,7 +638,7 @@ class _Writer:
             more = [key for key in document if key not in ("metric_map", "pointset")]
             if document.get("name") == document.get("pointset"):
                 more = [key for key in more if key != "name"]
-            self.context.drop("top level keys of a tmap2 file", len(more), "a list has no place for " + _some(more))
+            self.context.drop("top level keys of a tmap2 file", len(more), "a list has no place for " + _shorten(more))
             document = {key: document[key] for key in ("metric_map", "pointset") if key in document}
         for key in ("metric_map", "pointset") if self.listed else ("metric_map", "name", "pointset"):
             value = document.get(key)
@@ -682,11 +682,11 @@ class _Writer:
         items = [text for _, _, text in sorted(nodes)]
         nodes.clear()
         if self.listed:
-            return encoded([items[0].lstrip(" "), *items[1:]] if items else ["[]\n"])
+            return encode_pieces([items[0].lstrip(" "), *items[1:]] if items else ["[]\n"])
         before, after = _split({**self.document, "nodes": None}, 0, "nodes")
         pieces = [before, "\n" if items else " []\n", *items, after]
         items.clear()
-        return encoded(pieces)
+        return encode_pieces(pieces)
 
     def _network(self, part: Features, level: str, taken: set[str]) -> Lines:
         """The nodes of a network, each with its edges."""
@@ -707,7 +707,7 @@ class _Writer:
                 self.filled["nodes"] += 1
                 self.filled["orientations"] += 1
                 self.filled["any yaw"] += 1
-                text = plain(name_texts[i], _listed(edges.pop(i)), at)
+                text = plain(name_texts[i], _list_text(edges.pop(i)), at)
             else:
                 text = self._node(p, name, name_texts[i], at, edges.pop(i))
             out.append((len(name), name, text))
@@ -741,7 +741,7 @@ class _Writer:
         if clashing:
             renamed = dict(zip(clashing, unique_ids(clashing, taken | set(names)), strict=True))
             names = [renamed.get(name, name) for name in names]
-            self.context.warn(f"{len(clashing)} names stand in several networks and got a number: {_some(clashing)}")
+            self.context.warn(f"{len(clashing)} names stand in several networks and got a number: {_shorten(clashing)}")
         taken.update(names)
         return {part.ids[k]: name for k, name in zip(places, names, strict=True)}
 
@@ -769,16 +769,16 @@ class _Writer:
 
     def _positions(self, part: Features, places: Sequence[int], elevation: float) -> list[tuple[str, str, str]]:
         """x, y, z as texts: metres in the frame that each node's parent_frame names."""
-        nodes = part.take(places)
+        nodes = part.select(places)
         xyz: Array = shapely.get_coordinates(nodes.in_local(self.layers.frame), include_z=True).reshape(-1, 3)
         xyz[np.isnan(xyz[:, 2]), 2] = elevation
         if self.turn is not None:
-            inside = [k for k, p in enumerate(nodes.properties) if self._turned(p)]
+            inside = [k for k, p in enumerate(nodes.properties) if self._is_in_child_frame(p)]
             xyz[inside] = (xyz[inside] - self.turn.shift) @ self.turn.matrix()
         texts = list(map(_yaml.decimal, numbers(xyz.ravel(), METRES)))
         return list(zip(texts[::3], texts[1::3], texts[2::3], strict=True))
 
-    def _turned(self, p: Properties) -> bool:
+    def _is_in_child_frame(self, p: Properties) -> bool:
         """Whether a node's pose stands in the child frame of the transformation."""
         source_properties = p.get(NAME)
         node = source_properties.get("node") if isinstance(source_properties, dict) else None
@@ -816,19 +816,21 @@ class _Writer:
             }
             out = {**fixed, **extra_members}
         else:
-            out = {**EDGE_TEMPLATE, **self._usual_edge(self.options), **extra_members} if fill else dict(extra_members)
+            out = (
+                {**EDGE_TEMPLATE, **self._default_edge(self.options), **extra_members} if fill else dict(extra_members)
+            )
         if action is not None:
             out["action"] = action
         if fill or self.listed:
             out.setdefault("action", self.options.action)
         if more:
-            out["properties"] = {**_mapping_of(extra_members.get("properties")), **more}
+            out["properties"] = {**_mapping_text(extra_members.get("properties")), **more}
         pieces = _split({**out, "edge_id": None, "node": None}, 6, "edge_id", "node")
         pieces[0] = f"    - {pieces[0][6:]}"
         return pieces
 
     @staticmethod
-    def _usual_edge(options: WriteOptions) -> dict[str, Any]:
+    def _default_edge(options: WriteOptions) -> dict[str, Any]:
         """What the options say of a new edge of a tmap2 file."""
         return {
             "action_type": options.action_type,
@@ -839,7 +841,7 @@ class _Writer:
             "restrictions_runtime": options.restrictions,
         }
 
-    def _usual_node(self) -> dict[str, Any]:
+    def _default_node(self) -> dict[str, Any]:
         """What the options say of a new node of a tmap2 file."""
         assert isinstance(self.options, WriteOptions)
         return {
@@ -853,7 +855,7 @@ class _Writer:
         """The text of a node's entry. said: its name as YAML. at: its position as texts."""
         source_properties = p.get(NAME)
         extra_members: dict[str, Any] = source_properties if isinstance(source_properties, dict) else {}
-        node = _mapping_of(extra_members.get("node"))
+        node = _mapping_text(extra_members.get("node"))
         more = None
         if not p.keys() <= self.plain_node or p.get("name", name) != name:
             more = self._more(p, CANONICAL_NODE)
@@ -869,7 +871,7 @@ class _Writer:
         fill = source_properties is None or self.legacy
         self.filled["nodes"] += source_properties is None if self.listed else fill
         if fill or self.listed:
-            node_members = {**({} if self.listed else node), **_mapping_of(node.get("properties"))}
+            node_members = {**({} if self.listed else node), **_mapping_text(node.get("properties"))}
             self.filled["any yaw" if quaternion is None else "yaw"] += "yaw_goal_tolerance" not in node_members
         key = (
             "node",
@@ -884,8 +886,10 @@ class _Writer:
             )
         meta = extra_members.get("meta")
         called = _yaml.text(str(meta["node"])) if isinstance(meta, dict) and "node" in meta else name_text
-        pose = self._pose(node.get("pose"), at, quaternion or [0.0, 0.0, 0.0, 1.0], turned=self._turned(p))
-        return f"{pieces[0]} {called}\n{pieces[1]}{_listed(edges)}{pieces[2]} {name_text}\n{pieces[3]}{pose}{pieces[4]}"
+        pose = self._pose(node.get("pose"), at, quaternion or [0.0, 0.0, 0.0, 1.0], turned=self._is_in_child_frame(p))
+        return (
+            f"{pieces[0]} {called}\n{pieces[1]}{_list_text(edges)}{pieces[2]} {name_text}\n{pieces[3]}{pose}{pieces[4]}"
+        )
 
     def _pose(self, extra: Any, at: tuple[str, str, str], quaternion: list[float], *, turned: bool) -> str:
         """What stands behind ``pose:``."""
@@ -893,8 +897,8 @@ class _Writer:
             x, y, z, w = self.turn.quaternion
             quaternion = _times((-x, -y, -z, w), quaternion)
         if isinstance(extra, dict):
-            position = {**dict(zip("xyz", map(float, at), strict=True)), **_mapping_of(extra.get("position"))}
-            orientation = {**dict(zip("xyzw", quaternion, strict=True)), **_mapping_of(extra.get("orientation"))}
+            position = {**dict(zip("xyz", map(float, at), strict=True)), **_mapping_text(extra.get("position"))}
+            orientation = {**dict(zip("xyzw", quaternion, strict=True)), **_mapping_text(extra.get("orientation"))}
             return _yaml.block({**extra, "orientation": orientation, "position": position}, 4)
         ox, oy, oz, ow = map(_yaml.text, quaternion)
         return (
@@ -919,23 +923,23 @@ class _Writer:
         """The text of a node's entry in five pieces, around meta.node, edges, name and pose."""
         inner = dict(node)
         if self.listed:
-            inner_properties = _mapping_of(inner.get("properties"))
+            inner_properties = _mapping_text(inner.get("properties"))
             tolerances = {key: inner_properties.get(key, value) for key, value in self._tolerances(has_yaw).items()}
             fixed = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
             fixed |= {"localise_by_topic": self.options.localise_by_topic}
             inner = {"verts": self.ring, **fixed, **tolerances, **inner}
         elif fill:
-            inner = {**self._usual_node(), "verts": self.ring, **inner}
+            inner = {**self._default_node(), "verts": self.ring, **inner}
             tolerances = self._tolerances(has_yaw)
             # The older layout has its tolerances beside the name.
             tolerances = {key: inner.get(key, value) for key, value in tolerances.items()}
-            inner["properties"] = {**tolerances, **_mapping_of(inner.get("properties"))}
+            inner["properties"] = {**tolerances, **_mapping_text(inner.get("properties"))}
         elif "nav_frame" not in inner:
             inner.setdefault("parent_frame", FRAME)
         if more:
-            inner["properties"] = {**_mapping_of(inner.get("properties")), **more}
+            inner["properties"] = {**_mapping_text(inner.get("properties")), **more}
         meta = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
-        meta = {**meta, **_mapping_of(extra_members.get("meta")), "node": None}
+        meta = {**meta, **_mapping_text(extra_members.get("meta")), "node": None}
         head, middle = _split(meta, 4, "node")
         pieces = _split({**inner, "edges": None, "name": None, "pose": None}, 4, "edges", "name", "pose")
         before, between, after = _split({**extra_members, "meta": None, "node": None}, 2, "meta", "node")
@@ -984,17 +988,17 @@ class _Writer:
             fill("nodes: pose.orientation", [0.0, 0.0, 0.0, 1.0], f"{filled['orientations']} nodes have none")
         for noun, count in sorted(self.dropped.items()):
             self.context.drop(noun, count, "the format has no place for it")
-        for family in sorted(BULKY & self.unwritten):
+        for family in sorted(WRITTEN_ON_DEMAND & self.unwritten):
             items = [p for part in self.layers.vector("topology").values() for p in part.properties if family in p]
             self.context.drop(f"{family} tags and attributes", len(items), f"left out for size; ask with {family}=true")
 
 
-def _listed(items: Lines) -> str:
+def _list_text(items: Lines) -> str:
     """What stands behind ``edges:`` or ``nodes:``."""
     return "\n" + "".join([text for _, _, text in sorted(items)]) if items else " []\n"
 
 
-def _mapping_of(value: Any) -> dict[str, Any]:
+def _mapping_text(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 

@@ -15,7 +15,17 @@ from typing import Any
 
 from app.errors import Problem
 from app.formats import Files, _yaml
-from app.formats._rules import HEAD, LIMITS, brief, doubted, missing, names, refused, repeated, shown
+from app.formats._rules import (
+    HEAD_BYTES,
+    LIMITS,
+    duplicates,
+    error_finding,
+    is_brief,
+    missing,
+    names,
+    shown,
+    warning_finding,
+)
 
 TOP = ("meta", "metric_map", "name", "nodes", "pointset")
 META = ("map", "node", "pointset")
@@ -43,21 +53,21 @@ def check(files: Files) -> Iterator[Problem]:
     """A map as the schema and the map manager want it."""
     main = next(iter(files))
     data = files[main]
-    if brief(data):
-        if not _is_dated(data[:HEAD]):
-            yield refused("must be a text like 2024-05-01_10-00-00", main, where="meta.last_updated")
+    if is_brief(data):
+        if not _is_dated(data[:HEAD_BYTES]):
+            yield error_finding("must be a text like 2024-05-01_10-00-00", main, where="meta.last_updated")
         return
     network = _regular(data)
     if network is None:
         network = ([], [])
-        yield from _whole(_yaml.load(data, LIMITS), main, *network)
+        yield from _check_document(_yaml.load(data, LIMITS), main, *network)
     yield from _network(*network, main)
 
 
 def _regular(data: bytes) -> tuple[list[str], Edges] | None:
     """Nodes and edges (source, id, target) of a regular file in which all is there that must be; else None."""
     count = data.count(b"\n- meta:\n")
-    if not count or not _is_dated(data[:HEAD]) or b"&" in data:
+    if not count or not _is_dated(data[:HEAD_BYTES]) or b"&" in data:
         return None
     if any(data.count(line) != count for line in _COUNTED) or any(data.count(line) != 1 for line in _TOPS):
         return None
@@ -91,68 +101,70 @@ def _is_dated(head: bytes) -> bool:
     return time is not None and LAST_UPDATED.fullmatch(time[2].decode("latin1")) is not None
 
 
-def _whole(top: Any, main: str, nodes: list[str], edges: Edges) -> Iterator[Problem]:
+def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iterator[Problem]:
     """The schema's rules, one by one; fills in nodes and edges."""
     if not isinstance(top, dict):
-        yield refused("a topological map is a mapping; a list is the older tmap", main)
+        yield error_finding("a topological map is a mapping; a list is the older tmap", main)
         return
     for key in missing(top, TOP):
-        yield refused("the schema requires this key", main, where=key)
+        yield error_finding("the schema requires this key", main, where=key)
     for key in ("metric_map", "name", "pointset"):
         if top.get(key) is not None and not isinstance(top[key], str):
-            yield refused(f"must be a text, is {shown(top[key])}", main, where=key)
+            yield error_finding(f"must be a text, is {shown(top[key])}", main, where=key)
     time = top["meta"].get("last_updated") if isinstance(top.get("meta"), dict) else None
     if not isinstance(time, str) or not LAST_UPDATED.fullmatch(time):
         reason = f"must be a text like 2024-05-01_10-00-00, is {shown(time)}"
-        yield refused(reason, main, where="meta.last_updated")
+        yield error_finding(reason, main, where="meta.last_updated")
     rows = top.get("nodes")
     if not isinstance(rows, list):
         if rows is not None:
-            yield refused(f"must be a list, is {shown(rows)}", main, where="nodes")
+            yield error_finding(f"must be a list, is {shown(rows)}", main, where="nodes")
         return
     for k, row in enumerate(rows):
         location = f"nodes[{k}]"
         meta, node = (row.get("meta"), row.get("node")) if isinstance(row, dict) else (None, None)
         if absent := missing(meta, META):
-            yield refused(f"the schema requires {', '.join(absent)}", main, where=f"{location}.meta")
+            yield error_finding(f"the schema requires {', '.join(absent)}", main, where=f"{location}.meta")
         if absent := missing(node, NODE):
-            yield refused(f"the schema requires {', '.join(absent)}", main, where=f"{location}.node")
+            yield error_finding(f"the schema requires {', '.join(absent)}", main, where=f"{location}.node")
         if not isinstance(node, dict):
             continue
         if missing(node.get("pose"), ("orientation", "position")):
-            yield refused("localisation reads the pose of each node", main, where=f"{location}.node.pose")
+            yield error_finding("localisation reads the pose of each node", main, where=f"{location}.node.pose")
         for key in ("name", "parent_frame"):
             if node.get(key) is not None and not isinstance(node[key], str):
-                yield refused(f"must be a text, is {shown(node[key])}", main, where=f"{location}.node.{key}")
+                yield error_finding(f"must be a text, is {shown(node[key])}", main, where=f"{location}.node.{key}")
         name = str(node.get("name"))
         if isinstance(meta, dict) and meta.get("node") not in (None, node.get("name")):
-            yield doubted(
+            yield warning_finding(
                 f"is {shown(meta['node'])}, and the node is called {name!r}", main, where=f"{location}.meta.node"
             )
         nodes.append(name)
         listed = node.get("edges")
         if listed is not None and not isinstance(listed, list):
-            yield refused(f"must be a list, is {shown(listed)}", main, where=f"{location}.node.edges")
+            yield error_finding(f"must be a list, is {shown(listed)}", main, where=f"{location}.node.edges")
             continue
         for j, edge in enumerate(listed or ()):
             if absent := missing(edge, EDGE):
-                yield refused(f"the schema requires {', '.join(absent)}", main, where=f"{location}.node.edges[{j}]")
+                yield error_finding(
+                    f"the schema requires {', '.join(absent)}", main, where=f"{location}.node.edges[{j}]"
+                )
                 continue
             edges.append((name, str(edge["edge_id"]), str(edge["node"])))
 
 
 def _network(nodes: list[str], edges: Edges, main: str) -> Iterator[Problem]:
     node_names = set(nodes)
-    if repeats := repeated(nodes):
-        yield doubted(
+    if repeats := duplicates(nodes):
+        yield warning_finding(
             f"{len(repeats)} nodes share a name, and edges lead to names: {names(repeats)}", main, where="nodes"
         )
     if dangling := [i for _, i, target in edges if target not in node_names]:
         reason = f"{len(dangling)} edges lead to a node that is not there: {names(dangling)}"
-        yield refused(reason, main, where="nodes")
-    if repeats := repeated(i for _, i, _ in edges):
+        yield error_finding(reason, main, where="nodes")
+    if repeats := duplicates(i for _, i, _ in edges):
         reason = f"{len(repeats)} edges share an edge_id, by which the map manager finds them: {names(repeats)}"
-        yield doubted(reason, main, where="nodes")
+        yield warning_finding(reason, main, where="nodes")
     if other := [i for source, i, target in edges if i != f"{source}_{target}"]:
         reason = f"{len(other)} edges are not called <from>_<to>, as the map manager calls them: {names(other)}"
-        yield doubted(reason, main, where="nodes")
+        yield warning_finding(reason, main, where="nodes")

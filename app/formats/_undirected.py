@@ -13,7 +13,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.formats import ReadContext, WriteContext
-from app.formats._network import Array, Edge, MergedNetwork, edge_lines, natural, own, some
+from app.formats._network import (
+    Array,
+    Edge,
+    MergedNetwork,
+    edge_lines,
+    get_source_properties,
+    natural_sort_key,
+    shorten_list,
+)
 from app.model.features import Properties, unique_ids
 
 ONEWAY = "oneway"
@@ -78,14 +86,17 @@ def edges(
 
 def lines(net: MergedNetwork, context: WriteContext, name: str) -> list[Line]:
     """Directed edges as lines, in the order of their nodes' places; what lines cannot say is declared."""
-    ordered = sorted(net.edges, key=lambda e: (own(e.properties, name).get("backward") is True, natural(e.id)))
+    ordered = sorted(
+        net.edges,
+        key=lambda e: (get_source_properties(e.properties, name).get("backward") is True, natural_sort_key(e.id)),
+    )
     pairs: list[tuple[Edge, Edge | None]] = []
     waiting = ordered
     for exact in (True, False):  # first the two edges of one line of a file, then whatever leads back
         open_: dict[tuple[Any, ...], list[Edge]] = defaultdict(list)
         closed: list[tuple[Edge, Edge]] = []
         for edge in waiting:
-            key = own(edge.properties, name).get("line") if exact else None
+            key = get_source_properties(edge.properties, name).get("line") if exact else None
             key = key if isinstance(key, int) else None
             partners = open_[edge.target, edge.source, key]
             if edge.source != edge.target and partners and (key is not None or not exact):
@@ -103,7 +114,7 @@ def lines(net: MergedNetwork, context: WriteContext, name: str) -> list[Line]:
         canonical_members = canonical(WORDS, dict(edge.properties))
         if back is not None:
             differing += canonical_members != canonical(WORDS, dict(back.properties))
-        more = own(edge.properties, name).get("more")
+        more = get_source_properties(edge.properties, name).get("more")
         members = {**(more if isinstance(more, dict) else {}), **canonical_members}
         if back is None and edge.source != edge.target:
             members[ONEWAY] = True
@@ -117,9 +128,9 @@ def lines(net: MergedNetwork, context: WriteContext, name: str) -> list[Line]:
     return sorted(out, key=lambda line: (line.a, line.b))
 
 
-def warn_lonely(count: int, linked: Iterable[int], names: Sequence[str], context: ReadContext) -> None:
+def warn_isolated(count: int, linked: Iterable[int], names: Sequence[str], context: ReadContext) -> None:
     """Name nodes that no line reaches."""
     reached = set(linked)
     lonely = [names[k] for k in range(count) if k not in reached]
     if lonely:
-        context.warn(f"{len(lonely)} nodes have no lines: {some(lonely)}")
+        context.warn(f"{len(lonely)} nodes have no lines: {shorten_list(lonely)}")

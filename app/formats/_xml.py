@@ -56,7 +56,7 @@ _ACTIVE: tuple[tuple[str, re.Pattern[bytes]], ...] = (
 _ACTIVE_WORDS = (b"<?", b"/2001/xinclude", b"/xsl/transform", b"script")
 
 
-def warn_of_active_content(data: bytes, context: ReadContext, *, has_scripts: bool = False) -> None:
+def report_active_content(data: bytes, context: ReadContext, *, has_scripts: bool = False) -> None:
     """Report what some viewer of an XML file may run or fetch, and this server does not: each kind by name, once.
 
     has_scripts: the format's own elements are called so (SDFormat's materials).
@@ -76,7 +76,7 @@ def warn_of_active_content(data: bytes, context: ReadContext, *, has_scripts: bo
             context.warn(f"{noun}{name}{often}: it is not run or followed here; a viewer may do so", line=line)
 
 
-def warn_of_unknown(
+def report_unknown_elements(
     data: bytes,
     root: etree._Element,
     format_names: Set[str],

@@ -54,7 +54,7 @@ _WIDE = r"\u00a0-\u1fff\u2030-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010f
 _QUOTABLE = re.compile(rf"[ -~{_WIDE}]*\Z")
 
 INT64 = range(-(2**63), 2**63)
-LONGEST_NUMBER = 400
+MAX_NUMBER_CHARACTERS = 400
 """Characters; the longest float64 written out in full has fewer than 350."""
 
 UNFOLD_FREE, UNFOLD_TIMES = 16 * 2**20, 4
@@ -100,7 +100,7 @@ def scalar(text: str) -> Any:
         return CONSTANTS[text]
     if text[0] not in "-+.0123456789":
         return text
-    if len(text) > LONGEST_NUMBER:
+    if len(text) > MAX_NUMBER_CHARACTERS:
         if INTEGER.match(text) or HEXADECIMAL.match(text) or FLOAT.match(text):
             raise ValueError(f"a number of {len(text)} characters")
         return text
@@ -120,7 +120,7 @@ _JOINTS = str.maketrans(":-.", "___")
 
 _RESERVED = frozenset(word.lower() for word in CONSTANTS) | {"y", "n", "nan", "inf", "infinity"}
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "\0": "\\0"}
-LONGEST_KEY = 200
+MAX_KEY_CHARACTERS = 200
 
 
 def text(value: str | float | None) -> str:
@@ -136,7 +136,7 @@ def text(value: str | float | None) -> str:
             return value
         if _QUOTABLE.match(value):
             return "'" + value.replace("'", "''") + "'"
-        return '"' + "".join(_escaped(c) for c in value) + '"'
+        return '"' + "".join(_escape(c) for c in value) + '"'
     if isinstance(value, float):
         return decimal(repr(value))
     return "null" if value is None else str(value).lower()
@@ -162,7 +162,7 @@ def mapping(value: dict[str, Any], column: int) -> str:
     out = []
     for key in sorted(value):
         name = text(key)
-        if len(name) > LONGEST_KEY:  # beyond 1024 characters a key must be marked as one
+        if len(name) > MAX_KEY_CHARACTERS:  # beyond 1024 characters a key must be marked as one
             out.append(f"{pad}? {name}\n{pad}:{block(value[key], column + 2)}")
         else:
             out.append(f"{pad}{name}:{block(value[key], column)}")
@@ -176,7 +176,7 @@ def _item(value: Any, column: int) -> str:
     return f"{pad}-{block(value, column + 2)}"
 
 
-def _escaped(character: str) -> str:
+def _escape(character: str) -> str:
     if character in _ESCAPES:
         return _ESCAPES[character]
     code = ord(character)
@@ -197,13 +197,15 @@ def _finite(value: float) -> float:
     return value
 
 
-def _refuse(reason: str, line: int | None, error: type[UnreadableFile] | type[TooLarge] = UnreadableFile) -> Exception:
+def _yaml_error(
+    reason: str, line: int | None, error: type[UnreadableFile] | type[TooLarge] = UnreadableFile
+) -> Exception:
     """The error to raise. line: from 0, as YAML marks count."""
     at = None if line is None else line + 1
     return error(reason if at is None else f"line {at}: {reason}", [Problem(reason, line=at)])
 
 
-def _tagged(tag: str, text: str) -> Any:
+def _tagged_scalar(tag: str, text: str) -> Any:
     """The value of a scalar with an explicit tag."""
     if tag in (TAG + "str", "!"):
         return text
@@ -247,7 +249,7 @@ def _load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed
                         raise ValueError("merge keys (<<) are not supported; write the keys out")
                     value: Any = literal
                 elif event.tag is not None:
-                    value = _tagged(event.tag, literal)
+                    value = _tagged_scalar(event.tag, literal)
                 elif typed:
                     value = scalar(literal) if plain else literal
                 else:
@@ -282,7 +284,9 @@ def _load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed
                 nodes += 1
                 budget -= weight
                 if budget < 0:
-                    raise _refuse("the aliases unfold to far more than the file holds", event.start_mark.line, TooLarge)
+                    raise _yaml_error(
+                        "the aliases unfold to far more than the file holds", event.start_mark.line, TooLarge
+                    )
             elif kind is yaml.DocumentStartEvent:
                 documents += 1
                 if documents > 1:
@@ -295,7 +299,7 @@ def _load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed
             else:
                 continue
             if nodes > limits.yaml_nodes:
-                raise _refuse(f"more than {limits.yaml_nodes} nodes", event.start_mark.line, TooLarge)
+                raise _yaml_error(f"more than {limits.yaml_nodes} nodes", event.start_mark.line, TooLarge)
             if anchor_slot is not None:
                 anchor_slot.append((value, weight))
             top = stack[-1]
@@ -312,13 +316,13 @@ def _load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed
                 top[0][top[1]] = value
                 top[1] = None
     except ValueError as error:
-        raise _refuse(str(error), event.start_mark.line) from error
+        raise _yaml_error(str(error), event.start_mark.line) from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         reason = " ".join(filter(None, [error.context, error.problem])) or "not YAML"
-        raise _refuse(reason, mark.line if mark else None) from error
+        raise _yaml_error(reason, mark.line if mark else None) from error
     except yaml.YAMLError as error:
-        raise _refuse(f"not YAML: {error}", None) from error
+        raise _yaml_error(f"not YAML: {error}", None) from error
     finally:
         loader.dispose()
     return root[0] if root else None
@@ -352,7 +356,9 @@ _LINE = re.compile(
 )
 """``- key: value``, each of the three optional. A plain value has no ``:`` and no ``#``, a quoted one no escapes."""
 
-_USUAL = re.compile(r"( *)([A-Za-z_]\w{0,200}): (?:(-?[0-9]{1,16}\.[0-9]{1,24})|([A-Za-z_$][\w./$]*))\Z", re.ASCII)
+_COMMON_LINE = re.compile(
+    r"( *)([A-Za-z_]\w{0,200}): (?:(-?[0-9]{1,16}\.[0-9]{1,24})|([A-Za-z_$][\w./$]*))\Z", re.ASCII
+)
 """Most lines of most files: a key with a number or a word, which need no further look."""
 
 _BLANK = re.compile(rf" *(?:#[ -~{_WIDE}]*)?\Z")
@@ -533,7 +539,7 @@ class _Lines(dict[str, _Line]):
         return self._block(line)
 
     def _block(self, line: str) -> _Line:
-        match = _USUAL.match(line)
+        match = _COMMON_LINE.match(line)
         if match:
             spaces, key, decimal, literal = match.groups()
             first = len(spaces)
@@ -620,7 +626,7 @@ def _load_lines(text: str, limits: Limits) -> Any:
         opened = stack[-1][0]
         if waiting and (first > opened or (first == opened and dash and type(current) is dict)):
             new: Any = [] if dash else {}
-            _put(current, key, new)
+            _insert(current, key, new)
             if anchor is not None:
                 anchors[anchor] = new
             stack.append((first, new, anchor is not None))
@@ -629,7 +635,7 @@ def _load_lines(text: str, limits: Limits) -> Any:
             if waiting:
                 if anchor is not None:
                     raise _NotSimpleError
-                _put(current, key, None)
+                _insert(current, key, None)
             while first < stack[-1][0] or (first == stack[-1][0] and not dash and type(current) is list):
                 stack.pop()
                 current = stack[-1][1]
@@ -655,21 +661,21 @@ def _load_lines(text: str, limits: Limits) -> Any:
             budget -= weights[value]
             if budget < 0:
                 raise _NotSimpleError
-            _put(current, key, anchors[value])
+            _insert(current, key, anchors[value])
         elif not waiting:
-            _put(current, key, value)
+            _insert(current, key, value)
         at = stack[-1][0] if type(current) is dict and not waiting else -1
         item = -10 - first if dash and name is not None and not waiting else -1
     if waiting:
         if anchor is not None:
             raise _NotSimpleError
-        _put(current, key, None)
+        _insert(current, key, None)
     if 4 * len(lines) + flows.nodes > limits.yaml_nodes:
         raise _NotSimpleError
     return root[0]
 
 
-def _put(collection: Any, key: str | None, value: Any) -> None:
+def _insert(collection: Any, key: str | None, value: Any) -> None:
     if key is None or type(collection) is list:
         collection.append(value)
     else:
@@ -682,7 +688,7 @@ def _weight(value: Any) -> int:
         return 8 + sum(8 + len(k) + _weight(v) for k, v in value.items())
     if isinstance(value, list):
         return 8 + sum(map(_weight, value))
-    return 8 + (len(value) if isinstance(value, str) else LONGEST_NUMBER)
+    return 8 + (len(value) if isinstance(value, str) else MAX_NUMBER_CHARACTERS)
 
 
 def _text(data: bytes) -> str:
@@ -690,7 +696,7 @@ def _text(data: bytes) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise _refuse(
+        raise _yaml_error(
             f"not UTF-8 text (byte 0x{data[error.start]:02x}); save the file as UTF-8",
             data.count(b"\n", 0, error.start),
         ) from error

@@ -101,7 +101,7 @@ SHAPE = record(
 )
 """What the file holds. Source: environment_template, robot_localization's navsat_transform_node, mapviz."""
 
-FAR_METRES = 100_000.0
+MAX_USUAL_METRES = 100_000.0
 """From the datum to a corner of the fence; beyond it the two are most likely not of one place."""
 
 NAVSAT = tuple(f.name for f in fields(NavSat))
@@ -130,10 +130,10 @@ def read(files: Files, context: ReadContext) -> Layers:
     """
     top = _yaml.load(files[context.main or next(iter(files))], context.limits)
     if not isinstance(top, dict):
-        raise _refuse("must be a mapping with datum_latitude and datum_longitude", "")
+        raise _unreadable_error("must be a mapping with datum_latitude and datum_longitude", "")
     for key in ("gmapping", "mapviz_initialize_origin", "navsat_transform_node"):
         if not isinstance(top.get(key, {}), (dict, type(None))):
-            raise _refuse("must be a mapping", key)
+            raise _unreadable_error("must be a mapping", key)
     latitude = _degrees(top.get("datum_latitude"), "datum_latitude", MAX_DATUM_LATITUDE)
     longitude = _degrees(top.get("datum_longitude"), "datum_longitude", 180.0)
     altitude = _number(top.get("datum_altitude", 0.0), "datum_altitude")
@@ -162,15 +162,15 @@ def _check_place(latitude: float, longitude: float, ring: NDArray[np.float64] | 
     if ring is None:
         return
     location = "gnss_fence.gnss_fence_coords"
-    far = [k for k, (x, y) in enumerate(ring.tolist()) if distance((longitude, latitude), (x, y)) > FAR_METRES]
+    far = [k for k, (x, y) in enumerate(ring.tolist()) if distance((longitude, latitude), (x, y)) > MAX_USUAL_METRES]
     if far:
-        reason = f"{len(far)} of {len(ring)} points are more than {FAR_METRES / 1000:g} km from the datum"
+        reason = f"{len(far)} of {len(ring)} points are more than {MAX_USUAL_METRES / 1000:g} km from the datum"
         context.warn(f"{reason}: are latitude and longitude swapped?", where=f"{location}[{far[0]}]")
     if not shapely.Polygon(ring).is_valid:
         context.warn("the fence crosses itself: what is inside of it is not defined", where=location)
 
 
-def _refuse(reason: str, location: str) -> UnreadableFile:
+def _unreadable_error(reason: str, location: str) -> UnreadableFile:
     return UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, where=location or None)])
 
 
@@ -182,16 +182,16 @@ def _number(value: Any, location: str) -> float:
         except ValueError:
             value = None
     if value is None or isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _refuse("must be a number", location)
+        raise _unreadable_error("must be a number", location)
     return float(value)
 
 
 def _degrees(value: Any, location: str, bound: float) -> float:
     if value is None:
-        raise _refuse("is missing: the datum needs datum_latitude and datum_longitude in degrees", location)
+        raise _unreadable_error("is missing: the datum needs datum_latitude and datum_longitude in degrees", location)
     degrees = _number(value, location)
     if not -bound <= degrees <= bound:
-        raise _refuse(f"must be between {-bound:g} and {bound:g} degrees, got {degrees:g}", location)
+        raise _unreadable_error(f"must be between {-bound:g} and {bound:g} degrees, got {degrees:g}", location)
     return degrees
 
 
@@ -202,7 +202,7 @@ def _yaw(navsat: Mapping[str, Any], latitude: float, longitude: float, context: 
     if raw_datum is None:
         return 0.0
     if not isinstance(raw_datum, list) or len(raw_datum) < 2:
-        raise _refuse("must be [latitude, longitude, yaw in radians]", location)
+        raise _unreadable_error("must be [latitude, longitude, yaw in radians]", location)
     other = [_number(v, f"{location}[{k}]") for k, v in enumerate(raw_datum[:3])]
     if abs(other[0] - latitude) > 1e-9 or abs(other[1] - longitude) > 1e-9:
         context.warn("differs from datum_latitude and datum_longitude, which count", where=location)
@@ -225,21 +225,21 @@ def _fence(members: Any, context: ReadContext) -> NDArray[np.float64] | None:
     """float64 [n, 2] (longitude, latitude) as the file lists them, or None where there is no fence."""
     location = "gnss_fence.gnss_fence_coords"
     if members is not None and not isinstance(members, dict):
-        raise _refuse("must be a mapping with gnss_fence_coords", "gnss_fence")
+        raise _unreadable_error("must be a mapping with gnss_fence_coords", "gnss_fence")
     listed = (members or {}).get("gnss_fence_coords")
     if listed is None or listed == []:
         context.warn("is missing: the environment has a datum but no fence", where=location)
         return None
     if not isinstance(listed, list):
-        raise _refuse("must be a list of [latitude, longitude]", location)
+        raise _unreadable_error("must be a list of [latitude, longitude]", location)
     ring = np.empty((len(listed), 2))
     for k, pair in enumerate(listed):
         at = f"{location}[{k}]"
         if not isinstance(pair, list) or len(pair) != 2:
-            raise _refuse("must be [latitude, longitude]", at)
+            raise _unreadable_error("must be [latitude, longitude]", at)
         ring[k] = _degrees(pair[1], f"{at}[1]", 180.0), _degrees(pair[0], f"{at}[0]", 90.0)
     if len(np.unique(ring, axis=0)) < 3:
-        raise _refuse(
+        raise _unreadable_error(
             f"a fence needs at least 3 different points, this one has {len(np.unique(ring, axis=0))}", location
         )
     return ring
@@ -253,7 +253,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     datum, frame = layers.datum, layers.frame
     if datum is None or frame is None:
         raise ValueError("a datum is needed")
-    fence, document, closed = _chosen(layers, context)
+    fence, document, closed = _select_fence(layers, context)
     latitude, longitude = _yaml.text(datum.latitude), _yaml.text(datum.longitude)
     out = [HEAD, f"datum_latitude: {latitude}\ndatum_longitude: {longitude}\n"]
     if datum.altitude:
@@ -270,7 +270,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if isinstance(more_fence, dict) and more_fence:
         out.append(_yaml.mapping(more_fence, 2))
     out.append(f"{SIZE_HEAD}gmapping:\n")
-    out.append(_ordered(_size(document, layers, ring, context), 2, ("xmin", "xmax", "ymin", "ymax")))
+    out.append(_mapping_text(_size(document, layers, ring, context), 2, ("xmin", "xmax", "ymin", "ymax")))
     old = (document.get("datum_latitude"), document.get("datum_longitude"))
     out.append("\nmapviz_initialize_origin:" + _mapviz(document, datum, old, context))
     out.append("\nnavsat_transform_node:\n" + _navsat(document, datum, context))
@@ -285,7 +285,7 @@ _KNOWN = frozenset(
 )
 
 
-def _chosen(layers: Layers, context: WriteContext) -> tuple[Any, dict[str, Any], bool]:
+def _select_fence(layers: Layers, context: WriteContext) -> tuple[Any, dict[str, Any], bool]:
     """(the fence as a polygon in degrees or None, the source's other keys, whether its first point was repeated)."""
     source_document: dict[str, Any] = {}
     candidates: list[tuple[bool, float, str, Any, bool]] = []
@@ -399,10 +399,10 @@ def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) ->
     if isinstance(yaw, bool) or not isinstance(yaw, (int, float)) or _heading(yaw) != datum.heading:
         yaw = -math.radians(datum.heading) + 0.0
     values = [_yaml.text(datum.latitude), _yaml.text(datum.longitude), *map(_yaml.text, [yaw, *more])]
-    return _ordered({**defaults, **navsat}, 2, NAVSAT) + f"  datum: [{', '.join(values)}]\n"
+    return _mapping_text({**defaults, **navsat}, 2, NAVSAT) + f"  datum: [{', '.join(values)}]\n"
 
 
-def _ordered(values: Mapping[str, Any], column: int, first: Sequence[str]) -> str:
+def _mapping_text(values: Mapping[str, Any], column: int, first: Sequence[str]) -> str:
     """A mapping's text: these keys in this order, then the others sorted."""
     out = [_yaml.mapping({key: values[key]}, column) for key in first if key in values]
     extra_members = {key: value for key, value in values.items() if key not in first}
@@ -424,7 +424,7 @@ register(
         title="Datum and GNSS fence (environment_template)",
         files=("datum.yaml",),
         media_types=("application/yaml",),
-        carries=frozenset({"location"}),
+        layers=frozenset({"location"}),
         detect=detect,
         read=read,
         check=_datum_rules.check,
@@ -432,7 +432,7 @@ register(
         needs=LayerRequirements(one_of=(frozenset({"location"}),), anchor="wgs84", datum=True),
         write_options=WriteOptions,
         family=NAME,
-        rank=60,
+        priority=60,
         extensions=(".yaml", ".yml"),
     )
 )

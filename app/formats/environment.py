@@ -40,7 +40,7 @@ from app.formats import (
     _shell,
     register,
 )
-from app.formats._network import some
+from app.formats._network import shorten_list
 from app.model.features import Features
 from app.model.frame import GROUND, Level
 from app.model.layers import LAYERS, MAP, NETWORK, Layer, Layers, Part, PartKey, cloud_name, is_empty
@@ -64,7 +64,7 @@ _FOLDER_NAMES = tuple(f"{CONFIG}/{folder}/".encode() for folder in FOLDERS)
 _PATH = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*/?")
 """Paths as they may stand between double quotes in a script: nothing there means anything to a shell."""
 
-HELD: tuple[Layer, ...] = tuple(layer for layer in LAYERS if layer != "resources")
+STORED_LAYERS: tuple[Layer, ...] = tuple(layer for layer in LAYERS if layer != "resources")
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class _Writer:
         self.complete = bool(getattr(context.options, "complete", False))
         self.out: dict[str, bytes] = {}
         self.paths: dict[str, str] = {}
-        self.told: set[PartKey] = set()
+        self.reported: set[PartKey] = set()
 
     def files(self) -> dict[str, bytes]:
         """All of them. Each layer's maps are made in turn; what a format cannot hold is told by path."""
@@ -128,7 +128,7 @@ class _Writer:
         variables = self.variables()
         if not self.out and not variables:
             raise MissingLayer("there is nothing to make an environment package of: supply a map of any kind")
-        self.left_over()
+        self.report_unwritten()
         self.scripts(variables)
         if self.context.stored is not None and not self.complete:  # else the maps say something else
             content = _content.pack(self.layers, self.out, self.context.stored)
@@ -140,7 +140,7 @@ class _Writer:
 
     # --- one map ---
 
-    def made(
+    def write_map(
         self, name: str, layers: Layers, values: Mapping[str, Any] | None = None, *, derived: bool = False
     ) -> NestedMap | None:
         """A map by another format's writer; None, with the reason in the report, where there is none."""
@@ -150,7 +150,7 @@ class _Writer:
             self.context.warn(f"no {name} is in it: {error.detail}")
         return None
 
-    def put(self, names: Mapping[str, str], inner: NestedMap, *, copy: bool = False) -> str:
+    def add_files(self, names: Mapping[str, str], inner: NestedMap, *, copy: bool = False) -> str:
         """Add a map's files and return the path of its main file, with a number where another map has that path.
 
         Args:
@@ -176,10 +176,10 @@ class _Writer:
         """A path that no other content has, also where upper and lower case are the same."""
         if self.out.get(path) == data:
             return path
-        end = _ending(path)
-        return _distinct(path.removesuffix(end), end, {other.casefold() for other in self.out})
+        end = _file_ending(path)
+        return _unique_names(path.removesuffix(end), end, {other.casefold() for other in self.out})
 
-    def only(self, *layers: Layer) -> Layers:
+    def select_layers(self, *layers: Layer) -> Layers:
         """The stored parts of these layers."""
         parts = {k: p for k, p in self.layers.parts.items() if k.layer in layers and not is_empty(p)}
         return Layers(parts, self.layers.datum, self.layers.levels)
@@ -190,51 +190,53 @@ class _Writer:
     # --- the folders ---
 
     def location(self) -> None:
-        site = self.only("location")
-        self.told.update(site.parts)
+        site = self.select_layers("location")
+        self.reported.update(site.parts)
         if self.layers.datum is not None:
             # The grids say how large the map is.
-            inner = self.made("datum", self.only("location", "occupancy"))
+            inner = self.write_map("datum", self.select_layers("location", "occupancy"))
             if inner is not None:
-                self.put(dict.fromkeys(inner.files, "location/datum.yaml"), inner)
+                self.add_files(dict.fromkeys(inner.files, "location/datum.yaml"), inner)
                 self.paths["DATUM_FILE"] = "location/datum.yaml"
         if any(isinstance(part, Features) and len(part) for part in site.parts.values()):
-            inner = self.made("kml", _picture_of(site))
+            inner = self.write_map("kml", _display_layers(site))
             if inner is not None:
-                self.put(dict.fromkeys(inner.files, "location/fence.kml"), inner, copy="DATUM_FILE" in self.paths)
+                self.add_files(dict.fromkeys(inner.files, "location/fence.kml"), inner, copy="DATUM_FILE" in self.paths)
 
     def pictures(self) -> None:
-        for key, part in self.layers.of("imagery").items():
-            inner = self.made("satellite", self.with_parts({key: part}))
+        for key, part in self.layers.parts_of("imagery").items():
+            inner = self.write_map("satellite", self.with_parts({key: part}))
             if inner is None:
                 continue
-            self.told.add(key)
+            self.reported.add(key)
             stem = self.stem(key, {k for k in self.layers.parts if k.layer == "imagery"})
-            self.put({n: f"location/{stem}{_ending(n)}" for n in inner.files}, inner)
+            self.add_files({n: f"location/{stem}{_file_ending(n)}" for n in inner.files}, inner)
 
     def grids(self) -> None:
         """Each grid in a folder of its name, which is how it is called when the folder is read."""
         grids = self.layers.grids()
         if not grids and self.complete:
-            inner = self.made("occupancy_grid", self.layers, derived=True)
+            inner = self.write_map("occupancy_grid", self.layers, derived=True)
             if inner is not None:
-                self.put({n: f"metric/{MAP}/{n.rpartition('/')[2]}" for n in inner.files}, inner)
+                self.add_files({n: f"metric/{MAP}/{n.rpartition('/')[2]}" for n in inner.files}, inner)
                 main = f"metric/{MAP}/{next(iter(inner.files)).rpartition('/')[2]}"
                 self.paths["COSTMAP_YAML_FILE"] = main
         names: dict[str, list[str]] = {}
         for key, grid in grids.items():
             stem = self.stem(key, set(grids))
-            inner = self.made("occupancy_grid", self.with_parts({PartKey("occupancy", GROUND, MAP): grid}))
+            inner = self.write_map("occupancy_grid", self.with_parts({PartKey("occupancy", GROUND, MAP): grid}))
             if inner is None:
                 continue
-            self.told.add(key)
-            self.put({n: f"metric/{stem}/{n}" for n in inner.files}, inner)
+            self.reported.add(key)
+            self.add_files({n: f"metric/{stem}/{n}" for n in inner.files}, inner)
             names.setdefault(key.name, []).append(f"metric/{stem}/{next(iter(inner.files))}")
         paths = names.get(MAP) or ([p for row in names.values() for p in row] if len(grids) == 1 else [])
         if paths:
             self.paths["COSTMAP_YAML_FILE"] = paths[0]
         elif len(names) > 1:
-            self.context.warn(f"none of the grids {some(sorted(names))} is called {MAP}: COSTMAP_YAML_FILE is empty")
+            self.context.warn(
+                f"none of the grids {shorten_list(sorted(names))} is called {MAP}: COSTMAP_YAML_FILE is empty"
+            )
         for name in NO_GO:
             if name in names:
                 self.paths.setdefault("NOGO_COSTMAP_YAML_FILE", names[name][0])
@@ -245,7 +247,7 @@ class _Writer:
         for key in sorted(keys):
             part = self.layers.parts[key]
             stem = self.stem(key, keys)
-            inner = self.made("octomap", self.with_parts({key: part}))
+            inner = self.write_map("octomap", self.with_parts({key: part}))
             cloud = PartKey("resources", key.level, cloud_name(key.name))
             source_properties = part.properties.get("points") if isinstance(part, VoxelMap) else None
             end = (
@@ -255,30 +257,30 @@ class _Writer:
             )
             made_of = end if cloud in self.layers.parts else ""
             if inner is not None:
-                self.told.add(key)
+                self.reported.add(key)
                 # Of two files with as much to say the shorter name is believed: the points, which the voxels lack.
                 name = "octomap" if made_of else MAP
-                self.put({n: f"metric/{stem}/{name}{_ending(n)}" for n in inner.files}, inner)
+                self.add_files({n: f"metric/{stem}/{name}{_file_ending(n)}" for n in inner.files}, inner)
             if not made_of:
                 continue
-            points = self.made(CLOUDS.get(end, end), self.with_parts({key: part, cloud: self.layers.parts[cloud]}))
+            points = self.write_map(CLOUDS.get(end, end), self.with_parts({key: part, cloud: self.layers.parts[cloud]}))
             if points is not None:
-                self.told.add(cloud)
-                self.put({n: f"metric/{stem}/cloud{_ending(n)}" for n in points.files}, points, copy=True)
+                self.reported.add(cloud)
+                self.add_files({n: f"metric/{stem}/cloud{_file_ending(n)}" for n in points.files}, points, copy=True)
 
     def network(self) -> None:
-        networks = self.only("topology")
-        self.told.update(networks.parts)
+        networks = self.select_layers("topology")
+        self.reported.update(networks.parts)
         if not networks.parts and not self.complete:
             return
-        source = networks if networks.parts else self.only("objects", "occupancy", "imagery", "topology")
-        inner = self.made("tmap2", source, derived=not networks.parts)
+        source = networks if networks.parts else self.select_layers("objects", "occupancy", "imagery", "topology")
+        inner = self.write_map("tmap2", source, derived=not networks.parts)
         if inner is None:
             return
-        self.put(dict.fromkeys(inner.files, "topological/network.tmap2.yaml"), inner)
+        self.add_files(dict.fromkeys(inner.files, "topological/network.tmap2.yaml"), inner)
         self.paths["TMAP_FILE"] = "topological/network.tmap2.yaml"
-        if networks.parts and (drawn := self.made("kml", _picture_of(networks))) is not None:
-            self.put(dict.fromkeys(drawn.files, "topological/network.kml"), drawn, copy=True)
+        if networks.parts and (drawn := self.write_map("kml", _display_layers(networks))) is not None:
+            self.add_files(dict.fromkeys(drawn.files, "topological/network.kml"), drawn, copy=True)
 
     def world(self) -> None:
         """The stored worlds, each under its own name; else one of what is stored, where that is asked for."""
@@ -298,22 +300,22 @@ class _Writer:
             worlds = {"gazebo": {}}
         first: list[str] = []
         for name, values in worlds.items():
-            source = self.only("objects", "resources", "occupancy")
+            source = self.select_layers("objects", "resources", "occupancy")
             if own_parts:
                 world_parts = {k: p for k, p in source.parts.items() if k.name == "gazebo" and k.layer != "occupancy"}
                 source = self.with_parts(world_parts)
-            inner = self.made("gazebo", source, values, derived=not own_parts)
+            inner = self.write_map("gazebo", source, values, derived=not own_parts)
             if inner is None:
                 continue
             # What one world lacks of another one stands in that one's file here.
             others_ = {f"ask with world={other}" for other in worlds}
             inner = dataclasses.replace(inner, dropped=tuple(d for d in inner.dropped if d["why"] not in others_))
-            self.told.update(own_parts)
-            self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name == "gazebo")
+            self.reported.update(own_parts)
+            self.reported.update(k for k in self.layers.parts if k.layer == "resources" and k.name == "gazebo")
             main, *companions = inner.files
             path = f"world/{_world_name(name)}"
             paths = {n: f"world/custom_models/{n.removeprefix('models/')}" for n in companions}
-            first.append(self.put({main: path, **paths}, inner))
+            first.append(self.add_files({main: path, **paths}, inner))
             if companions:
                 self.paths["GAZEBO_CUSTOM_MODELS"] = "world/custom_models/"
         if first:
@@ -327,19 +329,21 @@ class _Writer:
         for key, part in own_parts.items():
             nodes = tuple({**p, "kind": "node"} for p in part.properties)
             network = Features(part.ids, part.geometry, nodes, part.local, part.document)
-            inner = self.made("tmap2", self.with_parts({PartKey("topology", key.level, NETWORK): network}))
+            inner = self.write_map("tmap2", self.with_parts({PartKey("topology", key.level, NETWORK): network}))
             if inner is None:
                 continue
-            self.told.add(key)
+            self.reported.add(key)
             path = "world/poi.tmap2.yaml" if key.level == GROUND else f"world/poi_{_plain(key.level)}.tmap2.yaml"
-            self.paths.setdefault("POI_FILE", self.put(dict.fromkeys(inner.files, path), inner))
+            self.paths.setdefault("POI_FILE", self.add_files(dict.fromkeys(inner.files, path), inner))
 
     def objects(self) -> None:
         """Objects by the format they came from; zones, GeoJSON's and those of no format in one GeoJSON file."""
-        remaining: dict[PartKey, Part] = {k: p for k, p in self.only("zones").parts.items() if isinstance(p, Features)}
+        remaining: dict[PartKey, Part] = {
+            k: p for k, p in self.select_layers("zones").parts.items() if isinstance(p, Features)
+        }
         families: dict[str, dict[PartKey, Part]] = {}
         for key, part in self.layers.vector("objects").items():
-            if len(part) and key not in self.told:
+            if len(part) and key not in self.reported:
                 families.setdefault(key.name, {})[key] = part
         for family, parts in families.items():
             inner = self.family(family, parts) if family != "geojson" else None
@@ -349,18 +353,18 @@ class _Writer:
             main, *companions = inner.files
             names = {n: f"world/{_plain(family)}/{n}" for n in inner.files}
             if not companions:
-                end = _ending(main)
+                end = _file_ending(main)
                 plain = end in (f".{family}", ".kmz")
                 names[main] = f"world/objects{end}" if plain else f"world/objects_{_plain(family)}{end}"
-            self.put(names, inner)
-            self.told.update(parts)
+            self.add_files(names, inner)
+            self.reported.update(parts)
             further = {family, "kmz"} if main.endswith(".kmz") else {family}
-            self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name in further)
+            self.reported.update(k for k in self.layers.parts if k.layer == "resources" and k.name in further)
         if remaining:
-            inner = self.made("geojson", self.with_parts(remaining))
+            inner = self.write_map("geojson", self.with_parts(remaining))
             if inner is not None:
-                self.put(dict.fromkeys(inner.files, "world/objects.geojson"), inner)
-                self.told.update(remaining)
+                self.add_files(dict.fromkeys(inner.files, "world/objects.geojson"), inner)
+                self.reported.update(remaining)
 
     def family(self, name: str, parts: Mapping[PartKey, Part]) -> NestedMap | None:
         """A map of the format that these objects came from; None where they cannot be all of it."""
@@ -373,21 +377,21 @@ class _Writer:
         except FleetMapError:
             pass
         try:
-            networks = self.only("topology").parts
+            networks = self.select_layers("topology").parts
             return self.make(name, self.with_parts({**parts, **resources, **networks}), {}, False)
         except FleetMapError:
             return None
 
-    def left_over(self) -> None:
+    def report_unwritten(self) -> None:
         """Tell what no file of the package holds."""
         for key, part in sorted(self.layers.parts.items()):
-            if key in self.told or is_empty(part) or key.name == NAME:
+            if key in self.reported or is_empty(part) or key.name == NAME:
                 continue
             count = len(part) if isinstance(part, Features) else 1
             if count:
                 part_name = f"{key.layer} {key.level}/{key.name}"
                 self.context.drop(part_name, count, "no format that could hold it is there, or its map cannot be made")
-        levels = {k.level for k in self.told if k.layer in ("occupancy", "voxels", "imagery")} - {GROUND}
+        levels = {k.level for k in self.reported if k.layer in ("occupancy", "voxels", "imagery")} - {GROUND}
         self.context.drop("levels of grids and pictures", len(levels), "the template's folders know one level")
         if self.layers.levels != (Level(),):
             more = sum(level != Level() for level in self.layers.levels)
@@ -398,7 +402,7 @@ class _Writer:
         stems: dict[PartKey, str] = {}
         for k in sorted(all_keys):
             name = _plain(k.name if k.level == GROUND else f"{k.name}_{k.level}")
-            stems[k] = _distinct(name, "", {other.casefold() for other in stems.values()})
+            stems[k] = _unique_names(name, "", {other.casefold() for other in stems.values()})
         return stems[key]
 
     # --- the scripts ---
@@ -410,9 +414,11 @@ class _Writer:
             stored = part.document.get(NAME) if key.name == NAME else None
             values = stored.get("variables") if isinstance(stored, Mapping) else None
             all_variables |= values if isinstance(values, Mapping) else {}
-        out, file_names, reasons = _shell.handed_on(all_variables)
+        out, file_names, reasons = _shell.exported_variables(all_variables)
         self.context.drop(
-            "variables that name files", len(file_names), f"they name those of the package now: {some(file_names)}"
+            "variables that name files",
+            len(file_names),
+            f"they name those of the package now: {shorten_list(file_names)}",
         )
         for reason in reasons:
             self.context.drop("variables", 1, reason)
@@ -451,13 +457,13 @@ class _Writer:
         return f'export {name}="$CONFIG_DIR/{path}"'
 
 
-def _picture_of(layers: Layers) -> Layers:
+def _display_layers(layers: Layers) -> Layers:
     """The same for people to look at: without what only its own format knows, which stands in that format's file."""
     parts: dict[PartKey, Part] = {}
     for key, part in layers.parts.items():
         if isinstance(part, Features):
             order = sorted(range(len(part)), key=part.ids.__getitem__)
-            features = part.take(order)
+            features = part.select(order)
             plain = tuple({n: v for n, v in p.items() if not isinstance(v, Mapping)} for p in features.properties)
             document = {n: v for n, v in part.document.items() if n == "attribution"}
             parts[key] = Features(features.ids, features.geometry, plain, features.local, document)
@@ -470,7 +476,7 @@ def _plain(name: str) -> str:
     return plain or "unnamed"
 
 
-def _distinct(stem: str, end: str, taken: Container[str]) -> str:
+def _unique_names(stem: str, end: str, taken: Container[str]) -> str:
     """``stem`` with its ending, with the first number from 2 on where that is taken. taken: case-folded."""
     path, number = f"{stem}{end}", 2
     while path.casefold() in taken:
@@ -484,7 +490,7 @@ def _world_name(name: str) -> str:
     return stem if stem.endswith((".world", ".world.xml", ".sdf")) else f"{stem}.world.xml"
 
 
-def _ending(name: str) -> str:
+def _file_ending(name: str) -> str:
     """``.tif``, ``.pgw``, ``.png.aux.xml``: all behind the first point."""
     base = name.rpartition("/")[2]
     return base[base.index(".") :] if "." in base else ""
@@ -496,16 +502,16 @@ register(
         title="environment_template package (all maps of a place)",
         files=(MAIN,),
         media_types=("application/zip",),
-        carries=frozenset(LAYERS),
+        layers=frozenset(LAYERS),
         detect=detect,
         read=read,
         write=write,
-        needs=LayerRequirements(tuple(frozenset({layer}) for layer in HELD)),
+        needs=LayerRequirements(tuple(frozenset({layer}) for layer in STORED_LAYERS)),
         write_options=WriteOptions,
         family=NAME,
-        rank=70,
+        priority=70,
         version=3,
         extensions=(".zip",),
-        holds=True,
+        is_container=True,
     )
 )

@@ -25,21 +25,21 @@ from app.formats import Files, Format, LayerRequirements, ReadContext, WriteCont
 from app.formats._fields import COORDINATE, WIDTH, record
 from app.formats._network import (
     Array,
-    checked_name,
+    check_name,
+    duplicates,
+    get_source_properties,
     identifier,
     is_name,
-    joined,
-    known_document,
-    natural,
+    merge_networks,
+    natural_sort_key,
     node_points,
     number,
-    own,
-    refuse,
-    some,
-    without_repeats,
+    raise_unreadable,
+    shorten_list,
+    source_document,
 )
 from app.formats._text import METRES, numbers
-from app.formats._undirected import NODE_CANONICAL, Line, edges, lines, warn_lonely
+from app.formats._undirected import NODE_CANONICAL, Line, edges, lines, warn_isolated
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.frame import MAX_METRES
 from app.model.layers import NETWORK, Layers, PartKey
@@ -70,18 +70,20 @@ def read(files: Files, context: ReadContext) -> Layers:
         reason = f"an FFR network is a mapping with a list of {POINTS}"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where=POINTS)])
     names, xyz, high, rests = _points(top[POINTS])
-    if repeats := without_repeats(names):
-        context.warn(f"{len(repeats)} names stand twice or more: {some(repeats)}")
+    if repeats := duplicates(names):
+        context.warn(f"{len(repeats)} names stand twice or more: {shorten_list(repeats)}")
     index_by_spot: dict[tuple[float, float], int] = {}
     crowded = []
     for k, (x, y) in enumerate(xyz[:, :2].tolist()):
         if index_by_spot.setdefault(_spot(x, y), k) != k:
             crowded.append(names[k])
     if crowded:
-        context.warn(f"{len(crowded)} points stand where another one does: {some(crowded)}; lines go to the first")
+        context.warn(
+            f"{len(crowded)} points stand where another one does: {shorten_list(crowded)}; lines go to the first"
+        )
     file_lines, dangling = _lines(top.get(LINES), index_by_spot, context)
     _fields.check(top, SHAPE, context)
-    warn_lonely(len(names), (k for line in file_lines for k in (line.a, line.b)), names, context)
+    warn_isolated(len(names), (k for line in file_lines for k in (line.a, line.b)), names, context)
     ids = unique_ids(map(identifier, names))
     properties: list[Properties] = []
     for i, name, extra_members, is_high in zip(ids, names, rests, high, strict=True):
@@ -110,11 +112,11 @@ def _points(points: Sequence[Any]) -> tuple[list[str], Array, list[bool], list[d
     for k, point in enumerate(points):
         location = f"{POINTS}[{k}]"
         if not isinstance(point, dict):
-            refuse("a point is a mapping with name, x and y", location)
+            raise_unreadable("a point is a mapping with name, x and y", location)
         name = point.get("name")
         if isinstance(name, bool) or not isinstance(name, (int, float, str)):
-            refuse("a point must have a name", f"{location}.name")
-        names.append(checked_name(name if isinstance(name, str) else _yaml.text(name), f"{location}.name"))
+            raise_unreadable("a point must have a name", f"{location}.name")
+        names.append(check_name(name if isinstance(name, str) else _yaml.text(name), f"{location}.name"))
         rows.append((*_xy(point, location), number(point.get("z", 0.0), f"{location}.z")))
         high.append("z" in point)
         rests.append({key: value for key, value in point.items() if key not in ("name", *AXES)})
@@ -123,10 +125,10 @@ def _points(points: Sequence[Any]) -> tuple[list[str], Array, list[bool], list[d
 
 def _xy(point: Any, location: str) -> tuple[float, float]:
     if not isinstance(point, dict):
-        refuse("must be a mapping with x and y", location)
+        raise_unreadable("must be a mapping with x and y", location)
     x, y = (number(point.get(axis), f"{location}.{axis}") for axis in "xy")
     if max(abs(x), abs(y)) > MAX_METRES:
-        refuse(f"coordinates must lie within ±{MAX_METRES:g} m", location)
+        raise_unreadable(f"coordinates must lie within ±{MAX_METRES:g} m", location)
     return x, y
 
 
@@ -135,12 +137,12 @@ def _lines(
 ) -> tuple[list[Line], list[dict[str, Any]]]:
     """(lines between points; those that end at none, as they stand)."""
     if entries is not None and not isinstance(entries, list):
-        refuse("must be a list", LINES)
+        raise_unreadable("must be a list", LINES)
     file_lines, dangling = [], []
     for k, line in enumerate(entries or ()):
         location = f"{LINES}[{k}]"
         if not isinstance(line, dict):
-            refuse("a line is a mapping with start and end", location)
+            raise_unreadable("a line is a mapping with start and end", location)
         ends = [_xy(line.get(end), f"{location}.{end}") for end in ("start", "end")]
         spots = [index_by_spot.get(_spot(*end)) for end in ends]
         if spots[0] is None or spots[1] is None:
@@ -166,11 +168,11 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
     Edges of both directions between two nodes are one line. MissingDatum for wgs84 items without a datum.
     """
-    net = joined(layers, context)
-    order = sorted(range(len(net.nodes)), key=lambda k: natural(net.nodes[k].id))
+    net = merge_networks(layers, context)
+    order = sorted(range(len(net.nodes)), key=lambda k: natural_sort_key(net.nodes[k].id))
     if len(set(net.levels)) > 1:
         context.drop("levels of nodes", len(net.nodes), "all networks are joined into one")
-    document = known_document(layers, NAME)
+    document = source_document(layers, NAME)
     xy = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
     xy_texts = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
     at = list(zip(xy_texts[::2], xy_texts[1::2], strict=True))
@@ -185,7 +187,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     dropped_count = unnamed = 0
     for k in order:
         node = net.nodes[k]
-        p, its = node.properties, own(node.properties, NAME)
+        p, its = node.properties, get_source_properties(node.properties, NAME)
         name = its.get("name")
         name = name if isinstance(name, str) and is_name(name) else node.id
         more = its.get("more")
@@ -201,7 +203,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     ranks = {k: rank for rank, k in enumerate(order)}
     line_texts = []
     for line in sorted(lines(net, context, NAME), key=lambda one: (ranks[one.a], ranks[one.b])):
-        ends = (_end("start", line.said, at[line.a]), _end("end", line.said, at[line.b]))
+        ends = (_parse_end("start", line.said, at[line.a]), _parse_end("end", line.said, at[line.b]))
         extra_members = {key: value for key, value in line.said.items() if key not in ("start", "end")}
         line_texts.append(f"- {ends[0]}  {ends[1]}{_yaml.mapping(extra_members, 2) if extra_members else ''}")
     dangling = document.get("dangling")
@@ -211,7 +213,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     return {FILE: "".join(out).encode()}
 
 
-def _end(end: str, members: Mapping[str, Any], at: tuple[str, str]) -> str:
+def _parse_end(end: str, members: Mapping[str, Any], at: tuple[str, str]) -> str:
     more = members.get(end)
     extra_members = {key: value for key, value in more.items() if key not in "xy"} if isinstance(more, dict) else {}
     return f"{end}:\n    x: {at[0]}\n    y: {at[1]}\n{_yaml.mapping(extra_members, 4) if extra_members else ''}"
@@ -234,15 +236,15 @@ register(
         title="FFR network (environment_common)",
         files=(FILE,),
         media_types=("application/yaml",),
-        carries=frozenset({"topology"}),
+        layers=frozenset({"topology"}),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         family=NAME,
-        rank=34,
+        priority=34,
         extensions=(".ffr.yaml", ".yaml", ".yml"),
-        bends="nodes",
+        keeps_bends="nodes",
         version=2,
     )
 )

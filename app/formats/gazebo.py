@@ -46,7 +46,7 @@ from app.formats import (
     register,
 )
 from app.formats._sdf_elements import KNOWN
-from app.formats._select import the_one
+from app.formats._select import select_part
 from app.formats._text import DEGREES, number
 from app.model import masks, solids, worlds
 from app.model.features import Feature, Features, features, unique_ids
@@ -94,7 +94,7 @@ class WriteOptions(_sdf_bodies.BodyDefaults):
 def detect(name: str, data: bytes) -> bool:
     """A root element ``<sdf>`` with a world, model or light, or a list of the generator's."""
     if _sdf.is_sdf(data):
-        return _sdf.holds(data, b"world", b"model", b"light")
+        return _sdf.contains_element(data, b"world", b"model", b"light")
     return _sdf_lists.detect(name, data)
 
 
@@ -103,9 +103,9 @@ def sort(files: Files, mains: Sequence[str]) -> dict[str, list[str]]:
     includes it. With each come the model folders and files that it needs, also through other models."""
     library = _sdf.Library(files)
     lists = [n for n in mains if not _sdf.is_sdf(files[n])]
-    worlds = [n for n in mains if _sdf.is_sdf(files[n]) and _sdf.holds(files[n], b"world")]
-    out = {name: list(_sdf.needed(library, name)) for name in worlds}
-    parts = {name: _sdf_lists.needed(library, name) for name in lists}
+    worlds = [n for n in mains if _sdf.is_sdf(files[n]) and _sdf.contains_element(files[n], b"world")]
+    out = {name: list(_sdf.required_files(library, name)) for name in worlds}
+    parts = {name: _sdf_lists.required_files(library, name) for name in lists}
     inner = {other for name, companions in parts.items() for other in companions if other != name}
     for name in lists:
         if name not in inner or not set(lists) - inner:
@@ -123,7 +123,7 @@ def _lone_models(library: _sdf.Library, models: Sequence[str]) -> dict[str, list
         config = f"{folder}/model.config" if folder else "model.config"
         if config not in library.files or library.model_file(folder) in (name, None):
             mains.append(name)
-    out = {name: [*_sdf.needed(library, name), *_own_folder(library, name)] for name in mains}
+    out = {name: [*_sdf.required_files(library, name), *_model_files(library, name)] for name in mains}
     inner = {other for name, companions in out.items() for other in companions if other != name}
     free = {name: companions for name, companions in out.items() if name not in inner}
     # Models that include each other all the way round: one of them tells what is wrong.
@@ -138,14 +138,14 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not _sdf.is_sdf(files[main]) and _sdf_lists.detect(main, files[main]):
         return _read_list(library, main, context)
     root = _sdf.parse(files[main], context.limits)
-    _xml.warn_of_active_content(files[main], context, has_scripts=True)
-    _xml.warn_of_unknown(files[main], root, KNOWN, context, free={"plugin"})
-    _sdf.warn_of_values(root, context)
-    version = _sdf.version_of(root.get("version"))
+    _xml.report_active_content(files[main], context, has_scripts=True)
+    _xml.report_unknown_elements(files[main], root, KNOWN, context, free={"plugin"})
+    _sdf.report_suspicious_values(root, context)
+    version = _sdf.parse_version(root.get("version"))
     if version is None or not (1, 4) <= version <= _sdf.NEWEST:
         version_text = root.get("version")
         context.warn(f"SDFormat version {version_text!r} is not one of 1.4 to 1.11: read as 1.7", line=root.sourceline)
-    served = _sdf.needed(library, main)
+    served = _sdf.required_files(library, main)
     reader = _Reader(
         _sdf.ModelFlattener(library, served, context), main, {served[n]: files[n] for n in served}, context
     )
@@ -157,13 +157,13 @@ def read(files: Files, context: ReadContext) -> Layers:
         alone = etree.Element("world")
         alone.extend(list(_sdf.iter_models(root)))
         if not len(alone):
-            raise _sdf.wrong("there is no world, model or light in it", root)
+            raise _sdf.unreadable_error("there is no world, model or light in it", root)
         reader.world(alone, _key(main), root.get("version", ""), alone=True)
     reader.unfolder.report()
     return reader.layers()
 
 
-def _own_folder(library: _sdf.Library, main: str) -> list[str]:
+def _model_files(library: _sdf.Library, main: str) -> list[str]:
     """What lies in a lone model's own folder."""
     folder = main.rpartition("/")[0]
     if not folder or (main.rpartition("/")[2] != "model.sdf" and f"{folder}/model.config" not in library.files):
@@ -205,11 +205,11 @@ class _Reader:
         elements = []
         frames = _sdf.WorldFrames(self.unfolder, self.main)
         for element in world.iterchildren("frame"):
-            frames.add(element.get("name", ""), _sdf.pose_of(element), element.get("attached_to", ""), element)
+            frames.add(element.get("name", ""), _sdf.parse_pose(element), element.get("attached_to", ""), element)
         for element in world.iterchildren(*OBJECTS):
             body = self._body(element)
             name = self._name(element, body)
-            element_pose = _sdf.pose_of(element)
+            element_pose = _sdf.parse_pose(element)
             body_pose = body.pose if body is not None and element.tag == "include" else None
             back = None if body is None else _sdf.placement(element, body)
             frames.add_model(name, element_pose or body_pose or _sdf.ZERO, body or _sdf.Body(), back, element)
@@ -227,12 +227,12 @@ class _Reader:
             source_properties: dict[str, Any] = {"world": key}
             if not (simple and (element_pose.plain if element_pose is not None else element.tag != "include")):
                 source_properties["pose"] = pose
-            if element.tag == "include" and not _sdf.text_of(element, "name"):
+            if element.tag == "include" and not _sdf.element_text(element, "name"):
                 source_properties["name"] = name
-            if name in moved and not _same_pose(moved[name], pose):
+            if name in moved and not _is_same_pose(moved[name], pose):
                 source_properties["state"] = moved[name]
             self._add(element, body, name, pose, source_properties, footprints)
-        self._tell_state(moved, key, {name for _, _, name, _, _, _ in elements})
+        self._report_state(moved, key, {name for _, _, name, _, _, _ in elements})
         remainder = etree.Element("world", dict(world.attrib))
         for child in world:
             if child.tag not in (*OBJECTS, "state") and isinstance(child.tag, str):
@@ -252,12 +252,12 @@ class _Reader:
 
     def _name(self, element: etree._Element, body: _sdf.Body | None) -> str:
         """What the object is called: an include without a name like its model."""
-        name = _sdf.text_of(element, "name") if element.tag == "include" else element.get("name", "")
+        name = _sdf.element_text(element, "name") if element.tag == "include" else element.get("name", "")
         if not name:
-            reference = _sdf.text_of(element, "uri").rstrip("/")
+            reference = _sdf.element_text(element, "uri").rstrip("/")
             name = (body.name if body is not None else "") or reference.rpartition("/")[2] or str(element.tag)
         if len(name) > 256 or not is_writable(name):
-            raise _sdf.wrong("a name must have at most 256 characters and no control characters", element)
+            raise _sdf.unreadable_error("a name must have at most 256 characters and no control characters", element)
         return name
 
     def _add(
@@ -273,7 +273,7 @@ class _Reader:
         shapes = _sdf.absent_model(element) if body is None else body.shapes() if body.kind == "model" else []
         if shapes:
             properties["shapes"] = shapes
-        shape, size = footprints.of(properties, name)
+        shape, size = footprints.footprint_and_size(properties, name)
         if size is not None:
             properties["size"] = size
         if "pose" not in source_properties:
@@ -292,7 +292,7 @@ class _Reader:
         out = {}
         for state in world.iterchildren("state"):
             for model in state.iterchildren("model", "light"):
-                pose = _sdf.pose_of(model)
+                pose = _sdf.parse_pose(model)
                 if pose is not None:
                     out[model.get("name", "")] = list(pose.values)
             if state.find("insertions") is not None:
@@ -300,26 +300,26 @@ class _Reader:
                 self.context.warn(reason, line=state.sourceline, where="state")
         return out
 
-    def _tell_state(self, moved: Mapping[str, list[float]], key: str, names: set[str]) -> None:
+    def _report_state(self, moved: Mapping[str, list[float]], key: str, names: set[str]) -> None:
         off = [p["name"] for _, _, p in self.rows if p.get(NAME, {}).get("world") == key and "state" in p[NAME]]
         if off:
             self.context.warn(
-                f"the saved <state> moves {len(off)} of {len(names)} objects ({_some(off)}); it is not kept, the poses "
-                "of the world itself are",
+                f"the saved <state> moves {len(off)} of {len(names)} objects ({_shorten(off)}); it is not kept, the "
+                "poses of the world itself are",
                 where="state",
             )
         strangers = sorted(set(moved) - names)
         if strangers:
             self.context.warn(
-                f"the <state> names {len(strangers)} that are not there: {_some(strangers)}", where="state"
+                f"the <state> names {len(strangers)} that are not there: {_shorten(strangers)}", where="state"
             )
 
     def _datum(self, element: etree._Element | None) -> Datum | None:
         """The datum that spherical coordinates mean; None where they tell no place on earth."""
         if element is None:
             return None
-        surface = _sdf.text_of(element, "surface_model") or "EARTH_WGS84"
-        axes = _sdf.text_of(element, "world_frame_orientation") or "ENU"
+        surface = _sdf.element_text(element, "surface_model") or "EARTH_WGS84"
+        axes = _sdf.element_text(element, "world_frame_orientation") or "ENU"
         if surface != "EARTH_WGS84" or axes != "ENU":
             self.context.warn(f"a world on {surface} with axes {axes} gives no datum", line=element.sourceline)
             return None
@@ -356,19 +356,19 @@ class Footprints:
     context: ReadContext
     _solid: solids.Solids | None = None
     _flat: solids.Solids | None = None
-    _known: dict[bytes, tuple[Any, list[float] | None]] = field(default_factory=dict)
-    _told: set[str] = field(default_factory=set)
+    _cache: dict[bytes, tuple[Any, list[float] | None]] = field(default_factory=dict)
+    _warned: set[str] = field(default_factory=set)
 
-    def of(self, properties: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
+    def footprint_and_size(self, properties: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
         """The footprint in local metres (a point where no solid is known) and the size in the object's own frame."""
         pose = properties["pose"]
         point = shapely.Point(pose[:2])
         if not properties.get("shapes"):
             return point, None
         key = orjson.dumps([properties["shapes"], *(pose[3:5] if any(pose[3:5]) else ())])
-        if key not in self._known:
-            self._known[key] = self._worked_out(properties, name)
-        area, size = self._known[key]
+        if key not in self._cache:
+            self._cache[key] = self._compute(properties, name)
+        area, size = self._cache[key]
         if area is None or shapely.is_empty(area):
             return point, size
         c, s = math.cos(pose[5]), math.sin(pose[5])
@@ -376,7 +376,7 @@ class Footprints:
         position = np.array(pose[:2])
         return shapely.transform(area, lambda at: np.round(at @ turn + position, 9) + 0.0), size
 
-    def _worked_out(self, properties: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
+    def _compute(self, properties: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
         if self._solid is None or self._flat is None:
             self._solid = solids.Solids(self.resources, planes=False, visuals=True)
             self._flat = solids.Solids(self.resources, planes=True, visuals=True)
@@ -388,7 +388,7 @@ class Footprints:
             area = self._flat.footprint(tilted) if shapely.is_empty(area) else area
             size = self._solid.size(alone) or self._flat.size(alone)
         except (Invalid, TooLarge) as error:
-            self._tell(error, name)
+            self._warn_once(error, name)
             return None, None
         return area, None if size is None else [round(float(v), 9) + 0.0 for v in size]
 
@@ -398,23 +398,23 @@ class Footprints:
             (self._flat or solids.Solids(self.resources)).shape(shape)
         except (Invalid, TooLarge) as error:
             if not _sdf.is_absent(shape):
-                self._tell(error, name)
+                self._warn_once(error, name)
             return False
         return True
 
-    def _tell(self, error: Invalid | TooLarge, name: str) -> None:
-        if error.detail not in self._told:
-            self._told.add(error.detail)
+    def _warn_once(self, error: Invalid | TooLarge, name: str) -> None:
+        if error.detail not in self._warned:
+            self._warned.add(error.detail)
             file = error.problems[0].file if error.problems else None
             self.context.warn(f"its solids are not known: {error.detail}"[:500], file=file, where=name[:80])
 
 
-def _some(names: Sequence[str]) -> str:
+def _shorten(names: Sequence[str]) -> str:
     """The first names of many."""
     return ", ".join(n[:60] for n in names[:12]) + (" …" if len(names) > 12 else "")
 
 
-def _same_pose(a: Sequence[float], b: Sequence[float]) -> bool:
+def _is_same_pose(a: Sequence[float], b: Sequence[float]) -> bool:
     return bool(np.abs(solids.matrix(a) - solids.matrix(b)).max() <= SAME_POSE)
 
 
@@ -426,7 +426,7 @@ def _read_list(library: _sdf.Library, main: str, context: ReadContext) -> Layers
     rows = []
     key = _key(main)
     for name, properties in listing.objects:
-        shape, size = footprints.of(properties, name)
+        shape, size = footprints.footprint_and_size(properties, name)
         source_properties = {**properties.get(NAME, {}), "world": key}
         rows.append((name, shape, {**properties, **({"size": size} if size else {}), NAME: source_properties}))
     ids = unique_ids(name for name, _, _ in rows)
@@ -457,7 +457,9 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> list[PartKey]:
             raise MissingLayer("there is nothing to build a world of: supply objects or an occupancy grid")
         return matches
     supply = "supply a map.yaml with its image, or objects"
-    return matches + the_one(grids, "occupancy", options.grid, options.level, noun="grid", option="grid", supply=supply)
+    return matches + select_part(
+        grids, "occupancy", options.grid, options.level, noun="grid", option="grid", supply=supply
+    )
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
@@ -516,7 +518,7 @@ class _Writer:
                     self.stored.append(_StoredWorld(name, entry, by_world[name]))
         self.stored.sort(key=lambda world: world.rank)
 
-    def _chosen(self) -> _StoredWorld | None:
+    def _select_world(self) -> _StoredWorld | None:
         world_name = self.options.world
         if world_name is not None:
             matches = [w for w in self.stored if world_name in (w.key, _sdf.stem(w.key))]
@@ -531,7 +533,7 @@ class _Writer:
 
     def files(self) -> dict[str, bytes]:
         """The world first."""
-        source_world = self._chosen()
+        source_world = self._select_world()
         for other in self.stored:
             if other is not source_world:
                 self.context.drop(
@@ -539,9 +541,9 @@ class _Writer:
                 )
         world = self._frame(source_world)
         for one in sorted(source_world.objects if source_world is not None else [], key=lambda o: _natural(o.id)):
-            self._put_back(one)
+            self._restore_object(one)
         bodies = _sdf_bodies.Bodies(self.context, self.resources, self.options)
-        self._make(bodies, [(self.options.level or GROUND, one) for one in self.loose])
+        self._make_models(bodies, [(self.options.level or GROUND, one) for one in self.loose])
         everything = self.options.content == "all" or (
             self.options.content == "auto" and not (source_world is not None and source_world.is_world)
         )
@@ -552,7 +554,7 @@ class _Writer:
                 placed = part.in_local(self.layers.frame)
                 for one, geometry in zip(part, placed, strict=True):
                     rows.append((key.level, Feature(one.id, geometry, one.properties, "local")))
-            self._make(bodies, rows)
+            self._make_models(bodies, rows)
         else:
             self.context.drop("objects of other formats", sum(len(p) for _, p in self.others), why)
         for key, grid in self.layers.grids().items():
@@ -593,7 +595,7 @@ class _Writer:
             "world", name=_sdf_bodies.valid(_sdf.stem(source_world.key) if source_world else self.context.title)
         )
 
-    def _put_back(self, one: Feature) -> None:
+    def _restore_object(self, one: Feature) -> None:
         """An object of the stored world as it was, under its present name and pose."""
         source_properties = one.properties.get(NAME, {})
         text = source_properties.get("sdf")
@@ -632,7 +634,7 @@ class _Writer:
                 element.insert(0, _sdf.pose_element(pose))
         self.made.append((name, element))
 
-    def _make(self, bodies: _sdf_bodies.Bodies, rows: Iterable[tuple[str, Feature]]) -> None:
+    def _make_models(self, bodies: _sdf_bodies.Bodies, rows: Iterable[tuple[str, Feature]]) -> None:
         """Static models of objects that no world has told of."""
         for level, one in sorted(rows, key=lambda row: _natural(row[1].id)):
             model = bodies.model(one, self.layers.elevation(level), self.taken)
@@ -644,7 +646,9 @@ class _Writer:
         if "ground_plane" not in self.taken and self.options.ground and not bodies.hilly:
             self.made.append(("ground_plane", bodies.ground()))
             self.context.fill("ground plane", bodies.ground_size, "no world tells of the ground", "ground")
-        lit = any(e.tag == "light" or _sdf.text_of(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.made)
+        lit = any(
+            e.tag == "light" or _sdf.element_text(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.made
+        )
         if not lit and self.options.sun:
             name = _sdf_bodies.free_name("sun", self.taken)
             self.made.append((name, _sdf_bodies.sun(name)))
@@ -670,7 +674,7 @@ class _Writer:
             world.remove(old_coordinates)
         coordinates = _sdf.child(world, "spherical_coordinates")
         _sdf.child(coordinates, "surface_model", "EARTH_WGS84")
-        if (_sdf.version_of(self._version(source_world)) or (1, 7)) >= (1, 6):
+        if (_sdf.parse_version(self._version(source_world)) or (1, 7)) >= (1, 6):
             _sdf.child(coordinates, "world_frame_orientation", "ENU")
         _sdf.child(coordinates, "latitude_deg", number(datum.latitude, DEGREES))
         _sdf.child(coordinates, "longitude_deg", number(datum.longitude, DEGREES))
@@ -690,7 +694,7 @@ class _Writer:
         self, world: etree._Element, source_world: _StoredWorld | None, bodies: _sdf_bodies.Bodies
     ) -> dict[str, bytes]:
         version = self._version(source_world)
-        if bodies.newest > (_sdf.version_of(version) or (1, 7)):
+        if bodies.newest > (_sdf.parse_version(version) or (1, 7)):
             needed_version = ".".join(map(str, bodies.newest))
             if self.options.version is None and not (source_world is not None and source_world.is_world):
                 version = needed_version
@@ -698,16 +702,16 @@ class _Writer:
                 self.context.warn(f"some shapes need SDFormat {needed_version}")
         root = etree.Element("sdf", version=version)
         root.append(world)
-        main = _sdf.printed(root)
+        main = _sdf.serialise(root)
         files = {MAIN: main}
         stored: dict[str, bytes] = {}
-        for part in self.layers.of("resources", self.options.level, NAME).values():
+        for part in self.layers.parts_of("resources", self.options.level, NAME).values():
             stored.update(part.files if isinstance(part, Resources) else {})
         if source_world is not None and len(self.stored) == 1:
             needed = dict(stored)
         else:
             library = _sdf.Library({**stored, MAIN: main})
-            needed = {n: stored[n] for n in _sdf.needed(library, MAIN)}
+            needed = {n: stored[n] for n in _sdf.required_files(library, MAIN)}
         needed |= bodies.files
         needed.pop(MAIN, None)
         return files | dict(sorted(needed.items()))
@@ -761,21 +765,21 @@ register(
         files=(MAIN,),
         media_types=("application/xml",),
         extensions=(".world", ".world.xml", ".sdf"),
-        carries=frozenset({"objects", "occupancy", "resources"}),
+        layers=frozenset({"objects", "occupancy", "resources"}),
         detect=detect,
         sort=sort,
         read=read,
         write=write,
         write_options=WriteOptions,
-        choose=choose,
+        select_parts=choose,
         needs=LayerRequirements(
             one_of=(frozenset({"objects"}), frozenset({"occupancy"})),
             anchor="local",
             also=frozenset({"resources", "occupancy"}),
         ),
         family=NAME,
-        titled=True,
-        rank=10,
+        has_title=True,
+        priority=10,
         version=2,
     )
 )

@@ -43,7 +43,7 @@ LOCAL_3D = "http://www.opengis.net/def/crs/OGC/0/Engineering3D"
 """OGC's names for a local engineering frame: what ``coordRefSys`` says of metres in the environment's frame."""
 
 CONFORMS = "http://www.opengis.net/spec/json-fg-1/1.0/conf/core"
-OWN = "fleet_map"
+OWN_MEMBER = "fleet_map"
 
 GEOMETRIES = ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon", "GeometryCollection")
 WORDS = frozenset({"layer", "level", "part", "more"})
@@ -88,7 +88,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     return _Reader(data, top, context).layers()
 
 
-def _marked(p: Any) -> bool:
+def _has_own_members(p: Any) -> bool:
     """Whether these properties carry our own words."""
     return (
         isinstance(p, dict)
@@ -100,7 +100,7 @@ def _marked(p: Any) -> bool:
     )
 
 
-def _refuse(reason: str, line: int | None = None, location: str | None = None) -> NoReturn:
+def _raise_unreadable(reason: str, line: int | None = None, location: str | None = None) -> NoReturn:
     raise UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, line=line, where=location)])
 
 
@@ -121,11 +121,11 @@ class _Reader:
         self.data = data
         self.context = context
         if not isinstance(top, dict):
-            _refuse("GeoJSON is one object with a type", 1)
+            _raise_unreadable("GeoJSON is one object with a type", 1)
         self.top = top
         self.root = str(top.get("type"))
         self.rows = self._rows()
-        self.marks = [_marked(row.get("properties")) for row in self.rows]
+        self.marks = [_has_own_members(row.get("properties")) for row in self.rows]
         if len(self.rows) > context.limits.features:
             raise TooLarge(f"{context.main} has {len(self.rows)} features; the limit is {context.limits.features}")
         self.local = self._is_local(top.get("coordRefSys"))
@@ -135,10 +135,10 @@ class _Reader:
         if self.root == "FeatureCollection":
             rows = self.top.get("features")
             if not isinstance(rows, list):
-                _refuse("a FeatureCollection needs an array called features", 1)
+                _raise_unreadable("a FeatureCollection needs an array called features", 1)
             for k, row in enumerate(rows):
                 if not isinstance(row, dict) or row.get("type") != "Feature":
-                    _refuse(
+                    _raise_unreadable(
                         "every member of features must be an object of type Feature", self.line(k), f"features[{k}]"
                     )
             return rows
@@ -146,7 +146,9 @@ class _Reader:
             return [self.top]
         if self.root in GEOMETRIES:
             return [{"type": "Feature", "geometry": self.top, "properties": None}]
-        _refuse(f"{self.root[:40]!r} is no GeoJSON type: FeatureCollection, Feature or a geometry is needed", 1)
+        _raise_unreadable(
+            f"{self.root[:40]!r} is no GeoJSON type: FeatureCollection, Feature or a geometry is needed", 1
+        )
 
     def line(self, k: int) -> int | None:
         """The line where feature k begins, as far as the text tells: features seldom hold features."""
@@ -170,7 +172,7 @@ class _Reader:
         name = properties.get("name") if isinstance(properties, dict) else None
         name = name if isinstance(name, str) else orjson.dumps(crs).decode()
         if not _EARTH.match(name) or "UTM" in name.upper():
-            _refuse(
+            _raise_unreadable(
                 f"its coordinates are in {name[:80]}, but GeoJSON means degrees (WGS 84 longitude, latitude): export "
                 "it again in EPSG:4326 (a Nav2 route graph is the format nav2_route)",
                 1,
@@ -179,7 +181,7 @@ class _Reader:
 
     # --- features ---
 
-    def warn_of_members(self) -> None:
+    def report_missing_members(self) -> None:
         """Report features without the members that every feature has, and a CRS of places that is not known."""
         for member in ("geometry", "properties"):
             lacking = [
@@ -203,14 +205,16 @@ class _Reader:
             self.context.warn("is no box [west, south, east, north] in degrees; it is kept", where="bbox")
 
     def layers(self) -> Layers:
-        self.warn_of_members()
-        extension = self.top.get(OWN)
+        self.report_missing_members()
+        extension = self.top.get(OWN_MEMBER)
         extension = extension if isinstance(extension, dict) else {}
         network = self._network()
         keys = [self._key(k, network) for k in range(len(self.rows))]
-        raw = [self._geometry_of(k, row) for k, row in enumerate(self.rows)]
+        raw = [self._read_geometry(k, row) for k, row in enumerate(self.rows)]
         local = np.array([is_local for is_local, _ in raw], bool)
-        shapes, odd = _geometries([g for _, g in raw], lambda k, reason: _refuse(reason, self.line(k), self.name(k)))
+        shapes, odd = _geometries(
+            [g for _, g in raw], lambda k, reason: _raise_unreadable(reason, self.line(k), self.name(k))
+        )
         self._check_places(shapes, local)
         groups: dict[PartKey, list[int]] = {}
         for k, key in enumerate(keys):
@@ -223,7 +227,7 @@ class _Reader:
             document = documents.get(key, {})
             if key == home:
                 document = {**document, **self._document()}
-            file_ids = [self._wanted_id(k, self.rows[k]) for k in places]
+            file_ids = [self._requested_id(k, self.rows[k]) for k in places]
             ids = unique_ids(file_ids)
             repeats = [a for a, b in zip(ids, file_ids, strict=True) if a != b]
             if repeats:
@@ -285,7 +289,7 @@ class _Reader:
             )
         return not stubs
 
-    def _geometry_of(self, k: int, row: dict[str, Any]) -> tuple[bool, Any]:
+    def _read_geometry(self, k: int, row: dict[str, Any]) -> tuple[bool, Any]:
         """(whether it is in metres, the GeoJSON geometry or None)."""
         place = row.get("place")
         if "crs" in row:
@@ -304,7 +308,7 @@ class _Reader:
         if geometry is None and self.local and place is None and "place" in row:
             return True, None
         if geometry is not None and not isinstance(geometry, dict):
-            _refuse("a geometry must be an object or null", self.line(k), self.name(k))
+            _raise_unreadable("a geometry must be an object or null", self.line(k), self.name(k))
         return False, geometry
 
     def _check_places(self, shapes: NDArray[np.object_], local: NDArray[np.bool_]) -> None:
@@ -320,9 +324,9 @@ class _Reader:
                 else f"({x:g}, {y:g}) is no longitude, latitude in degrees: metres belong into JSON-FG's place, with "
                 f"coordRefSys {LOCAL_2D}, or the file must be exported in EPSG:4326"
             )
-            _refuse(reason, self.line(k), self.name(k))
+            _raise_unreadable(reason, self.line(k), self.name(k))
 
-    def _wanted_id(self, k: int, row: dict[str, Any]) -> str:
+    def _requested_id(self, k: int, row: dict[str, Any]) -> str:
         raw_id = row.get("id")
         if raw_id is None and isinstance(row.get("properties"), dict):
             raw_id = row["properties"].get("name")
@@ -335,7 +339,7 @@ class _Reader:
         row = self.rows[k]
         file_properties = row.get("properties")
         if file_properties is not None and not isinstance(file_properties, dict):
-            _refuse("properties must be an object or null", self.line(k), self.name(k))
+            _raise_unreadable("properties must be an object or null", self.line(k), self.name(k))
         out: dict[str, Any] = dict(file_properties or {})
         if not foreign:
             if not self.marks[k]:
@@ -364,7 +368,7 @@ class _Reader:
             del members["place"]
             members.pop("coordRefSys", None)
         if self.root != "FeatureCollection":
-            members = {k: v for k, v in members.items() if k != OWN}
+            members = {k: v for k, v in members.items() if k != OWN_MEMBER}
         if members:
             source_properties["members"] = members
         if odd is not None:
@@ -374,7 +378,7 @@ class _Reader:
         return out
 
     def _document(self) -> dict[str, Any]:
-        handled = {"type", "features", OWN} if self.root == "FeatureCollection" else set(self.top)
+        handled = {"type", "features", OWN_MEMBER} if self.root == "FeatureCollection" else set(self.top)
         document: dict[str, Any] = {"type": self.root if self.root in ("FeatureCollection", "Feature") else "Geometry"}
         members = {k: v for k, v in self.top.items() if k not in handled}
         if self.top.get("coordRefSys") is not None and self.local:
@@ -535,7 +539,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     out = _Writer(layers)
     pictures: tuple[Layer, ...] = ("occupancy", "voxels", "imagery")
     for layer in pictures:
-        context.drop(layer, len(layers.of(layer)), "GeoJSON holds features, no cells or pixels")
+        context.drop(layer, len(layers.parts_of(layer)), "GeoJSON holds features, no cells or pixels")
     context.drop("resources", len(layers.resources()), "GeoJSON is one text without further files")
     return {"map.geojson": out.data(context)}
 
@@ -578,7 +582,7 @@ class _Writer:
         root = original.get("type")
         if root in ("Feature", "Geometry") and len(rows) == 1 and not self.metres and extension.keys() <= {"datum"}:
             if root == "Feature":
-                return _dump({**rows[0], OWN: extension} if extension else rows[0])
+                return _dump({**rows[0], OWN_MEMBER: extension} if extension else rows[0])
             if rows[0]["geometry"] is not None:
                 context.drop("datum", len(extension), "a geometry alone has no place for it")
                 return _dump(rows[0]["geometry"])
@@ -587,7 +591,7 @@ class _Writer:
         if context.attribution and not top.keys() & {"attribution", "license", "copyright"}:
             top["attribution"] = "; ".join(context.attribution)
         if extension:
-            top[OWN] = extension
+            top[OWN_MEMBER] = extension
         top.pop("type", None)
         top.pop("features", None)
         return _dump({"type": "FeatureCollection", **top, "features": rows})
@@ -647,7 +651,7 @@ class _Writer:
         if not properties and "properties" in source_properties and source_properties["properties"] is None:
             properties = None
         odd = source_properties.get("geometry")
-        if isinstance(odd, dict) and _same_shape(odd, shape):
+        if isinstance(odd, dict) and _is_same_shape(odd, shape):
             if place is ...:
                 geometry = odd
             else:
@@ -661,7 +665,7 @@ class _Writer:
             row.update({k: v for k, v in members.items() if k not in row})
 
 
-def _same_shape(odd: dict[str, Any], shape: Any) -> bool:
+def _is_same_shape(odd: dict[str, Any], shape: Any) -> bool:
     """Whether an uploaded geometry still is what the item looks like."""
     try:
         return bool(shapely.equals_identical(_GeometryParser().shape(odd), shape))
@@ -744,15 +748,15 @@ register(
         title="GeoJSON",
         files=("map.geojson",),
         media_types=("application/geo+json",),
-        carries=frozenset(VECTOR_LAYERS),
+        layers=frozenset(VECTOR_LAYERS),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
         family=FAMILY,
         marks_blocked=True,
-        drawing=True,
-        rank=5,
+        is_drawing=True,
+        priority=5,
         extensions=(".geojson", ".json"),
     )
 )

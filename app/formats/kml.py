@@ -59,7 +59,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """The drawings as they were uploaded, with everything else beside them in our own words."""
-    files = sum(len(p.files) for k, p in layers.of("resources", name="kmz").items() if hasattr(p, "files"))
+    files = sum(len(p.files) for k, p in layers.parts_of("resources", name="kmz").items() if hasattr(p, "files"))
     context.drop("resources", files, "images and further files of a drawing travel in KMZ only")
     pictures = isinstance(context.options, WriteOptions) and context.options.pictures
     written = write_kml(layers, context, with_pictures=pictures, taken=frozenset())
@@ -72,7 +72,7 @@ register(
         title="KML",
         files=(MAIN,),
         media_types=("application/vnd.google-earth.kml+xml",),
-        carries=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery"}),
+        layers=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery"}),
         detect=detect,
         read=read,
         check=_kml_rules.check,
@@ -80,13 +80,13 @@ register(
         needs=NEEDS,
         family=FAMILY,
         marks_blocked=True,
-        drawing=True,
+        is_drawing=True,
         outlines=True,
-        titled=True,
+        has_title=True,
         version=2,
         write_options=WriteOptions,
         companions=companions,
-        rank=10,
+        priority=10,
         extensions=(".kml",),
     )
 )

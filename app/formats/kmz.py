@@ -15,7 +15,7 @@ from app.formats import _archive as archive
 from app.formats._kml import FAMILY, read_kml
 from app.formats._kml_writing import NEEDS, write_kml
 from app.model.layers import Layers, Part, PartKey, Resources
-from app.model.names import bad_name
+from app.model.names import name_problem
 
 MAIN = "map.kmz"
 DOCUMENT = "doc.kml"
@@ -27,17 +27,17 @@ def detect(name: str, data: bytes) -> bool:
     lower = name.lower()
     if lower.endswith(".kmz"):
         return True
-    return archive.is_archive(data) and not lower.endswith(".zip") and _first_name(data).endswith(b".kml")
+    return archive.is_archive(data) and not lower.endswith(".zip") and _first_entry_name(data).endswith(b".kml")
 
 
-def _first_name(data: bytes) -> bytes:
+def _first_entry_name(data: bytes) -> bytes:
     return data[30 : 30 + int.from_bytes(data[26:28], "little")].lower()
 
 
 def read(files: Files, context: ReadContext) -> Layers:
     """The layers of the main document, and all other entries as resources."""
     entries = archive.unpack(files[context.main], context.limits)
-    main = first_kml(entries)
+    main = main_document_name(entries)
     companions = {name: body for name, body in entries.items() if name != main}
     layers, used = read_kml(entries[main], context, companions, main)
     resources = {name: body for name, body in companions.items() if name not in used}
@@ -47,7 +47,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     return Layers(parts, layers.datum, layers.levels)
 
 
-def first_kml(entries: Files) -> str:
+def main_document_name(entries: Files) -> str:
     """The name of the main document. Raises UnreadableFile where there is none."""
     main = next((name for name in entries if name.lower().endswith(".kml")), None)
     if main is None:
@@ -60,13 +60,13 @@ def first_kml(entries: Files) -> str:
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """One archive: the main document first, then pictures and the entries that were uploaded, by name."""
     extra_files: dict[str, bytes] = {}
-    for part in layers.of("resources", name=RESOURCES).values():
+    for part in layers.parts_of("resources", name=RESOURCES).values():
         if isinstance(part, Resources):
             for name, body in part.files.items():
                 if extra_files.setdefault(name, body) != body:
                     context.drop("resources", 1, f"two levels bring another file called {name}")
     written = write_kml(layers, context, with_pictures=True, taken=frozenset(extra_files))
-    main = written.entry if written.entry and not bad_name(written.entry) else DOCUMENT
+    main = written.entry if written.entry and not name_problem(written.entry) else DOCUMENT
     stem, n = main.removesuffix(".kml"), 2
     while main in extra_files or main in written.pictures:
         main, n = f"{stem}-{n}.kml", n + 1
@@ -79,7 +79,7 @@ register(
         title="KMZ (KML with its images)",
         files=(MAIN,),
         media_types=("application/vnd.google-earth.kmz",),
-        carries=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery", "resources"}),
+        layers=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery", "resources"}),
         detect=detect,
         read=read,
         check=_kml_rules.check_archive,
@@ -87,10 +87,10 @@ register(
         needs=replace(NEEDS, one_of=(*NEEDS.one_of, frozenset({"imagery"}))),
         family=FAMILY,
         marks_blocked=True,
-        drawing=True,
-        titled=True,
+        is_drawing=True,
+        has_title=True,
         version=2,
-        rank=11,
+        priority=11,
         extensions=(".kmz",),
     )
 )

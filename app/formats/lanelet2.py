@@ -56,9 +56,9 @@ from app.formats import (
     register,
 )
 from app.formats._lanes import Arm, Array, Border
-from app.formats._network import AMONG_PARTS, Edge, MergedNetwork, joined, own
+from app.formats._network import CROSS_PART_PROPERTIES, Edge, MergedNetwork, get_source_properties, merge_networks
 from app.formats._osm import INT64, Data, Tags, Way, parse
-from app.formats._osm_text import NOTHING, as_texts, attribute_text, element_id, integers
+from app.formats._osm_text import NO_ATTRIBUTES, as_texts, attribute_text, element_id, integers
 from app.formats._text import number
 from app.model.features import NO_GEOMETRY, Features, Properties, SharedKeyDicts, from_columns, unique_ids
 from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Anchor, Datum
@@ -109,8 +109,8 @@ SAME_PLACE = {"wgs84": 1e-9, "local": 1e-4}
 UNITS = {"m/s": 1.0, "mps": 1.0, "mph": 0.44704, "m/h": 0.44704, "kmh": 1 / 3.6, "km/h": 1 / 3.6, "kph": 1 / 3.6}
 """Metres per second; without a unit kilometres an hour are meant (Lanelet2: Attribute)."""
 
-CANONICAL_EDGE = frozenset({"kind", "name", "source", "target", "speed_limit", "width", NAME}) | AMONG_PARTS
-CANONICAL_NODE = frozenset({"kind", "name", NAME}) | AMONG_PARTS
+CANONICAL_EDGE = frozenset({"kind", "name", "source", "target", "speed_limit", "width", NAME}) | CROSS_PART_PROPERTIES
+CANONICAL_NODE = frozenset({"kind", "name", NAME}) | CROSS_PART_PROPERTIES
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,13 +176,19 @@ def network(lanes: Sequence[Lane], places: PointTable, document: Properties) -> 
     if lanes:
         xy = places.metres()
         left, right = (_lanes.runs([[places.row[r] for r in side] for side in sides]) for sides in _bounds(lanes))
-        left, right = _lanes.aligned(left, right, xy)
+        left, right = _lanes.align_bounds(left, right, xy)
         lines, widths = _middles(lanes, left, right, places, xy)
         node_ids = {row: i for i, row in places.row.items()}
-        begins = [(node_ids[a], node_ids[b]) for a, b in zip(left.begin.tolist(), right.begin.tolist(), strict=True)]
-        ends = [(node_ids[a], node_ids[b]) for a, b in zip(left.end.tolist(), right.end.tolist(), strict=True)]
+        begins = [
+            (node_ids[a], node_ids[b])
+            for a, b in zip(left.first_points.tolist(), right.first_points.tolist(), strict=True)
+        ]
+        ends = [
+            (node_ids[a], node_ids[b])
+            for a, b in zip(left.last_points.tolist(), right.last_points.tolist(), strict=True)
+        ]
         for lane, a, b in zip(lanes, begins, ends, strict=True):
-            both = two_way(lane.tags)
+            both = is_two_way(lane.tags)
             rows.append((lane, a, b, both))
             for pair in (a, b):
                 marks.add(pair, both)
@@ -209,7 +215,7 @@ def network(lanes: Sequence[Lane], places: PointTable, document: Properties) -> 
             edge_properties["name"] = title
         if widths[k] is not None:
             edge_properties["width"] = widths[k]
-        if (speed := speed_of(lane.tags.get("speed_limit"))) is not None:
+        if (speed := parse_speed(lane.tags.get("speed_limit"))) is not None:
             edge_properties["speed_limit"] = speed
         edge_properties[NAME] = compact({"lanelet": lane.id, "tags": lane.tags})
         edge_properties = compact(edge_properties)
@@ -247,7 +253,7 @@ def _middles(
     points = np.round(points, 12 if places.anchor == "wgs84" else 9)
     deep = np.zeros(len(lanes), bool)
     for side in (left, right):
-        np.logical_or.at(deep, side.owner, high[side.at])
+        np.logical_or.at(deep, side.owner, high[side.indices])
     flat = np.asarray(shapely.linestrings(points[:, :2], indices=owner), object).reshape(len(lanes))
     lines = flat
     if deep.any():
@@ -259,7 +265,8 @@ def _middles(
             coordinates = values[rows] if high[rows].any() else places.xyz[rows, :2]
             out[k] = shapely.LineString(coordinates)
     sides = [
-        np.asarray(shapely.linestrings(xy[s.at], indices=s.owner), object).reshape(len(lanes)) for s in (left, right)
+        np.asarray(shapely.linestrings(xy[s.indices], indices=s.owner), object).reshape(len(lanes))
+        for s in (left, right)
     ]
     apart = shapely.distance(*sides).tolist()
     widths = []
@@ -296,7 +303,7 @@ class _JoinedEnds:
         return list(self.parent)
 
 
-def two_way(tags: Mapping[str, str]) -> bool:
+def is_two_way(tags: Mapping[str, str]) -> bool:
     """Whether a lanelet may be used both ways (Lanelet2: LaneletAndAreaTagging, "Direction")."""
     one_way = _truth(tags.get("one_way"))
     if one_way is not None:
@@ -322,7 +329,7 @@ MAX_SPEED = 150.0
 """Metres per second; no vehicle's limit is higher."""
 
 
-def speed_of(text: str | None) -> float | None:
+def parse_speed(text: str | None) -> float | None:
     """Metres per second, or None for what is no speed."""
     match = _SPEED.fullmatch(text or "")
     if match is None:
@@ -345,11 +352,11 @@ def _positive(text: Any) -> float | None:
     return value if value > 0 else None
 
 
-def _is_gone(attributes: Mapping[str, Any]) -> bool:
+def _is_deleted(attributes: Mapping[str, Any]) -> bool:
     return attributes.get("action") == "delete" or attributes.get("visible") == "false"
 
 
-def lanes_of(
+def read_lanes(
     relations: Iterable[tuple[int, Sequence[Sequence[Any]], Mapping[str, str], Mapping[str, str]]],
     ways: Mapping[int, tuple[Sequence[int], Mapping[str, str]]],
     located: Mapping[int, Any],
@@ -359,12 +366,12 @@ def lanes_of(
     for i, members, tags, attributes in relations:
         if tags.get("type") != "lanelet":
             continue
-        if _is_gone(attributes):
+        if _is_deleted(attributes):
             broken.append((i, "it is marked as deleted"))
             continue
         sides: dict[str, list[list[int]]] = {"left": [], "right": [], "centerline": []}
         for kind, ref, role in members:
-            if kind == "way" and role in sides and ref in ways and not _is_gone(ways[ref][1]):
+            if kind == "way" and role in sides and ref in ways and not _is_deleted(ways[ref][1]):
                 sides[role].append([r for r in ways[ref][0] if r in located])
         if any(len(sides[s]) != 1 or len(sides[s][0]) < 2 for s in ("left", "right")):
             broken.append((i, "it needs one left and one right bound of two and more points each"))
@@ -411,12 +418,12 @@ def read(files: Files, context: ReadContext) -> Layers:
         document["elements"] = data.elements
     for relation in data.relations:
         limit = relation.tags.get("speed_limit")
-        speed = None if limit is None else speed_of(limit)
+        speed = None if limit is None else parse_speed(limit)
         if limit is not None and (speed is None or speed > MAX_SPEED):
             reason = f"the speed limit {limit[:40]!r} is no speed from 0 to {MAX_SPEED:g} m/s"
             context.warn(reason, where=f"relation {relation.id}")
     projector = next((n for n in files if n != context.main), None)
-    local = _has_only_metres(data)
+    local = _is_metric_only(data)
     if projector is not None:
         document["projector"] = _projector_text(files[projector], projector)
         local = _projector_type(files[projector], projector, context) == "local" or local
@@ -431,7 +438,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     return Layers(parts)
 
 
-def _has_only_metres(data: Data) -> bool:
+def _is_metric_only(data: Data) -> bool:
     """Whether no point stands on earth and some say their metres: Autoware's maps without a projection."""
     metres = any(LOCAL[0] in tags for tags in data.tags.values())
     return metres and bool(np.isnan(data.lonlat[:, 0]).all())
@@ -500,7 +507,7 @@ class _Reader:
     def network(self) -> Features:
         relations = ((r.id, r.members, r.tags, r.attributes) for r in self.relations.values())
         ways = {i: (way.refs, way.attributes) for i, way in self.ways.items()}
-        lanes, broken = lanes_of(relations, ways, self.located)
+        lanes, broken = read_lanes(relations, ways, self.located)
         for i, reason in broken:
             self.context.warn(f"the lanelet is no part of the network: {reason}", where=f"relation {i}")
         if not lanes:
@@ -526,21 +533,21 @@ class _Reader:
         for i, k in self.row.items():
             tags = data.tags.get(k, {})
             special = i not in bent or i in members or i not in self.located or not tags.keys() <= PLAIN_TAGS
-            if special or k in data.node_children or _is_gone(data.attributes(k)):
+            if special or k in data.node_children or _is_deleted(data.attributes(k)):
                 lone.append(k)
         ids = [f"n{data.ids[k]}" for k in lone]
         geometry: list[Any] = [self.point(k) for k in lone]
         properties: list[Properties] = []
         for k in lone:
             tags = data.tags.get(k, {})
-            source_members = self.asked(k)
+            source_members = self.read_point(k)
             if children := data.node_children.get(k):
                 source_members["children"] = children
             properties.append(self.compact(_properties(source_members, tags, "point")))
         special_ids = {data.ids[k] for k in lone}
         deep = ~np.isnan(self.xyz[:, 2])
         for way in self.ways.values():
-            source_members = self.way(way, special_ids)
+            source_members = self.way_properties(way, special_ids)
             ids.append(f"w{way.id}")
             geometry.append(self.line(way, deep))
             properties.append(self.compact(_properties(source_members, way.tags, "line")))
@@ -571,13 +578,13 @@ class _Reader:
         at = np.where(np.isnan(at), 0.0, at) if deep[rows].any() else at[:, :2]
         return shapely.LineString(at) if len(rows) > 1 else shapely.Point(*at[0])
 
-    def way(self, way: Way, special: set[int]) -> dict[str, Any]:
+    def way_properties(self, way: Way, special: set[int]) -> dict[str, Any]:
         source_members: dict[str, Any] = {"refs": way.refs, "tags": way.tags}
         if way.attributes:
             source_members["attributes"] = way.attributes
         if missing := [k for k, r in enumerate(way.refs) if r not in self.located]:
             source_members["missing"] = missing
-        if not way.refs and not _is_gone(way.attributes):
+        if not way.refs and not _is_deleted(way.attributes):
             self.context.warn("the way has no nodes", where=f"way {way.id}")
         bends = [None if r in special or r not in self.row else self.bend(self.row[r]) for r in way.refs]
         mere = [b for b in bends if b is not None]
@@ -591,10 +598,10 @@ class _Reader:
         """What is known of a point beside its place; one value for all ways that bend there."""
         cached = self.known.get(k)
         if cached is None:
-            cached = self.known[k] = self.asked(k)
+            cached = self.known[k] = self.read_point(k)
         return cached
 
-    def asked(self, k: int) -> dict[str, Any]:
+    def read_point(self, k: int) -> dict[str, Any]:
         tags = self.data.tags.get(k)
         attributes = self.data.attributes(k)
         at = None
@@ -690,16 +697,16 @@ class _Writer:
         ]
         self.projector = next((s for d in self.documents if isinstance(s := d.get("projector"), str)), None)
         self.metric = any(part.local.any() for part in own_parts)
-        rows = [own(p, NAME) for part in own_parts for p in part.properties]
+        rows = [get_source_properties(p, NAME) for part in own_parts for p in part.properties]
         self.taken = {k[1] for part in own_parts for i in part.ids if (k := element_id(i))}
         self.taken.update(chain.from_iterable(integers(source_members.get("refs")) or () for source_members in rows))
         self.counter = 0
         # In a map whose metres are another frame's, new points say only where on earth they are.
         self.say_metres = self.metric or not any(
-            LOCAL[0] in as_texts(t) for source_members in rows for t in _all_tags(source_members)
+            LOCAL[0] in as_texts(t) for source_members in rows for t in _iterate_tags(source_members)
         )
 
-    def fresh(self) -> int:
+    def next_id(self) -> int:
         """A new id; points, ways and relations share one row of numbers."""
         self.counter += 1
         while self.counter in self.taken:
@@ -722,7 +729,7 @@ class _Writer:
         geometry = part.in_wgs84(self.layers.frame) if mixed else part.geometry
         local = bool(part.local.all())
         rows = [
-            (identity[0], identity[1], shape, own(p, NAME))
+            (identity[0], identity[1], shape, get_source_properties(p, NAME))
             for i, shape, p in zip(part.ids, geometry, part.properties, strict=True)
             if (identity := element_id(i)) and NAME in p
         ]
@@ -733,7 +740,7 @@ class _Writer:
         drawn_anew = [
             (i, shape, source_members)
             for kind, i, shape, source_members in rows
-            if kind == "w" and not self.way(level, i, shape, source_members, local)
+            if kind == "w" and not self.write_way(level, i, shape, source_members, local)
         ]
         for i, shape, source_members in drawn_anew:  # once the points of all others are there to be met
             refs = integers(source_members.get("refs")) or []
@@ -745,17 +752,17 @@ class _Writer:
             )
         relations = [(i, source_members) for kind, i, _, source_members in rows if kind == "r"]
         for i, _ in relations:
-            level.relations[i] = self.fresh() if i in self.relations else i
-            self.relations[level.relations[i]] = ([], NOTHING, NOTHING)
+            level.relations[i] = self.next_id() if i in self.relations else i
+            self.relations[level.relations[i]] = ([], NO_ATTRIBUTES, NO_ATTRIBUTES)
         lane_tags = self.lanelets(level, part, local, relations, networks)
         for i, source_members in relations:
-            self.relation(level, i, source_members, lane_tags.get(i, (NOTHING, False)))
+            self.relation(level, i, source_members, lane_tags.get(i, (NO_ATTRIBUTES, False)))
 
     def point(
         self, level: _Level, i: int, shape: Any, source_members: Mapping[str, Any], local: bool, nodes: set[str] | None
     ) -> None:
         xyz = _xyz(shape)
-        new = self.fresh() if i in self.points else i
+        new = self.next_id() if i in self.points else i
         tags = as_texts(source_members.get("tags"))
         if nodes is not None and NODE in tags and tags[NODE] not in nodes:
             tags = {k: v for k, v in tags.items() if k != NODE}
@@ -765,11 +772,11 @@ class _Writer:
         level.nodes[i] = new
         self.unknown("node", new, source_members)
 
-    def way(self, level: _Level, i: int, shape: Any, source_members: Mapping[str, Any], local: bool) -> bool:
+    def write_way(self, level: _Level, i: int, shape: Any, source_members: Mapping[str, Any], local: bool) -> bool:
         """Write a way; False where its geometry no longer has the points that it came with."""
         refs = integers(source_members.get("refs"))
         at = _course(shape)
-        new = level.ways[i] = self.fresh() if i in self.ways else i
+        new = level.ways[i] = self.next_id() if i in self.ways else i
         self.unknown("way", new, source_members)
         tags, attributes = as_texts(source_members.get("tags")), as_texts(source_members.get("attributes"))
         missing = set(integers(source_members.get("missing")) or ())
@@ -784,17 +791,17 @@ class _Writer:
             if k not in missing:
                 point = self.points.get(name)
                 bend: Mapping[str, Any] = row if isinstance(row := rows[k], Mapping) else {}
-                if point is None or (ref not in level.nodes and not _same(point.xyz, at[j])):
+                if point is None or (ref not in level.nodes and not _is_same_place(point.xyz, at[j])):
                     # Two ways that no longer agree where their common point is keep their course each.
                     if point is not None:
-                        name = self.fresh()
+                        name = self.next_id()
                     tags_, attributes_ = as_texts(bend.get("tags")), as_texts(bend.get("attributes"))
                     position = _pair(bend.get("at"))
                     self.points[name] = _Point(at[j], local, tags_, attributes_, position, vertex=True)
                     if point is None:
                         level.nodes[ref] = name
-                elif point.vertex and not _same(point.xyz, at[j]):
-                    name = self.fresh()
+                elif point.vertex and not _is_same_place(point.xyz, at[j]):
+                    name = self.next_id()
                     self.points[name] = _Point(at[j], local, vertex=True)
                 j += 1
             out.append(name)
@@ -808,7 +815,7 @@ class _Writer:
         out = []
         for position in at:
             if position[:2] not in point_names:
-                point_names[position[:2]] = new = self.fresh()
+                point_names[position[:2]] = new = self.next_id()
                 self.points[new] = _Point(position, local, vertex=True)
             out.append(point_names[position[:2]])
         return out
@@ -837,7 +844,7 @@ class _Writer:
         labels: dict[str, str] = {}
         sizes = shapely.get_num_coordinates(part.geometry).tolist()
         for i, size, p in zip(part.ids, sizes, part.properties, strict=True):
-            identity, source_members = element_id(i), own(p, NAME)
+            identity, source_members = element_id(i), get_source_properties(p, NAME)
             refs: list[int] = []
             if identity and identity[0] == "n" and size:
                 refs = [identity[1]]
@@ -866,20 +873,22 @@ class _Writer:
             )
             for i, source_members in relations
         )
-        lanes, broken = lanes_of(rows, ways, row)
+        lanes, broken = read_lanes(rows, ways, row)
         table = PointTable(row, np.array(xyz, np.float64).reshape(-1, 3), "local" if local else "wgs84", names, labels)
         drawn = network(lanes, table, {})
-        out = self.compared(lanes, drawn, networks)
+        out = self.compare_lanelets(lanes, drawn, networks)
         # A lanelet with a redrawn bound is written as it is drawn now; its edges stay with it.
         redrawn = {i for i, _ in broken}
         for key, net in networks.items():
             own_edges = (
-                k for k, p in zip(net.ids, net.properties, strict=True) if own(p, NAME).get("lanelet") in redrawn
+                k
+                for k, p in zip(net.ids, net.properties, strict=True)
+                if get_source_properties(p, NAME).get("lanelet") in redrawn
             )
             self.explained.setdefault(key, set()).update(own_edges)
         return out
 
-    def compared(
+    def compare_lanelets(
         self, lanes: Sequence[Lane], drawn: Features, networks: Mapping[PartKey, Features]
     ) -> dict[int, tuple[Mapping[str, str], bool] | None]:
         """Lanelets as the networks have them now. drawn: the network that the lanelets make by themselves."""
@@ -915,13 +924,13 @@ class _Writer:
                 out[lane.id] = None
                 self.lost["lanelets whose edges are no longer in the network"] += 1
                 continue
-            tags = self.edited(lane, drawn.properties[matches[0]], net_properties[drawn.ids[matches[0]]])
+            tags = self.edited_tags(lane, drawn.properties[matches[0]], net_properties[drawn.ids[matches[0]]])
             if len(matches) < len(edges):
                 tags = {**{k: v for k, v in tags.items() if not k.startswith("one_way:")}, "one_way": "yes"}
             out[lane.id] = (tags, matches[0] != edges[0])
         return out
 
-    def edited(self, lane: Lane, drawn: Properties, now: Properties) -> dict[str, str]:
+    def edited_tags(self, lane: Lane, drawn: Properties, now: Properties) -> dict[str, str]:
         """The lanelet's tags with what the network says otherwise."""
         tags = dict(lane.tags)
         if now.get("speed_limit") != drawn.get("speed_limit"):
@@ -966,7 +975,7 @@ class _Writer:
             explained_ids = self.explained.get(key, set())
             keep = [k for k, i in enumerate(part.ids) if i not in explained_ids]
             if any(part.properties[k].get("kind") == "edge" for k in keep) or not explained_ids:
-                parts[key] = part.take(keep)
+                parts[key] = part.select(keep)
         if not parts:
             return
         if self.layers.frame is None and not self.metric:
@@ -974,13 +983,13 @@ class _Writer:
                 "lanelet2 says where on earth a network lies, and the environment has no datum: set one with PATCH "
                 '/api/v1/environments/{env} {"datum": {"latitude": …, "longitude": …}} or upload a datum.yaml'
             )
-        net = joined(Layers(parts, self.layers.datum, self.layers.levels), self.context)
-        new = self.new_lanelets(net)
+        net = merge_networks(Layers(parts, self.layers.datum, self.layers.levels), self.context)
+        new = self.make_lanelets(net)
         centres = self.node_points(net, {n for lane in new for n in (lane.edge.source, lane.edge.target)})
         self.bounds(net, new, centres)
-        self.tell(net, new)
+        self.report_new_lanelets(net, new)
 
-    def tell(self, net: MergedNetwork, new: Sequence[_NewLanelet]) -> None:
+    def report_new_lanelets(self, net: MergedNetwork, new: Sequence[_NewLanelet]) -> None:
         """What new lanelets were given, and what they could not take."""
         if new:
             why = "the edges of the network say no more"
@@ -997,7 +1006,7 @@ class _Writer:
         if len(set(net.levels)) > 1:
             self.context.drop("levels of nodes", len(net.nodes), "Lanelet2 knows no levels: all networks are joined")
 
-    def new_lanelets(self, net: MergedNetwork) -> list[_NewLanelet]:
+    def make_lanelets(self, net: MergedNetwork) -> list[_NewLanelet]:
         """One for each edge, one for both where an edge has a like one on the way back."""
         waiting: dict[tuple[int, int], list[Edge]] = {}
         for edge in net.edges:
@@ -1012,14 +1021,14 @@ class _Writer:
             if edge.source == edge.target:
                 loops += 1
                 continue
-            middle = _middle_of(edge, net)
+            middle = _middle_line(edge, net)
             if middle is None:
                 without += 1
                 continue
             back = None
             for other in waiting.get((edge.target, edge.source), ()):
-                if id(other) not in done and _same_road(edge, other):
-                    course = _middle_of(other, net)
+                if id(other) not in done and _is_same_road(edge, other):
+                    course = _middle_line(other, net)
                     if (
                         course is not None
                         and course.shape == middle.shape
@@ -1039,12 +1048,14 @@ class _Writer:
         as they came need none unless a new lanelet begins there."""
         out = {}
         for k, node in enumerate(net.nodes):
-            source_members = own(node.properties, NAME)
+            source_members = get_source_properties(node.properties, NAME)
             stored = source_members.get("point")
             level = self.levels.get(node.level, _Level())
             if type(stored) is int and stored in level.nodes and self.points[level.nodes[stored]].tags.get(NODE):
                 new = level.nodes[stored]
-                if not _same(self.points[new].xyz, self.placed(node.x, node.y, node.z, self.points[new].local)):
+                if not _is_same_place(
+                    self.points[new].xyz, self.to_anchor(node.x, node.y, node.z, self.points[new].local)
+                ):
                     new = -1
             elif k not in used and isinstance(source_members.get("points"), list):
                 continue
@@ -1055,11 +1066,11 @@ class _Writer:
                 name = node.properties.get("name")
                 if isinstance(name, str) and name != node.id:
                     tags["name"] = name
-                new = self.new_point(node.x, node.y, node.z or 0.0 if node.z is not None else math.nan, tags)
+                new = self.add_point(node.x, node.y, node.z or 0.0 if node.z is not None else math.nan, tags)
             out[k] = new
         return out
 
-    def placed(self, x: float, y: float, z: float | None, local: bool) -> tuple[float, float, float]:
+    def to_anchor(self, x: float, y: float, z: float | None, local: bool) -> tuple[float, float, float]:
         """A place in metres in the coordinates that a point is anchored in."""
         high = math.nan if z is None else z
         if local or self.layers.frame is None:
@@ -1067,8 +1078,8 @@ class _Writer:
         lon, lat = np.round(self.layers.frame.to_wgs84(np.array([[x, y]]))[0], 12).tolist()
         return lon, lat, high
 
-    def new_point(self, x: float, y: float, z: float, tags: Mapping[str, str] = NOTHING) -> int:
-        new = self.fresh()
+    def add_point(self, x: float, y: float, z: float, tags: Mapping[str, str] = NO_ATTRIBUTES) -> int:
+        new = self.next_id()
         point_tags = dict(tags)
         if self.say_metres:
             point_tags |= {LOCAL[0]: number(x), LOCAL[1]: number(y)}
@@ -1093,14 +1104,14 @@ class _Writer:
         joins: dict[tuple[int, bool], tuple[int, bool]] = {}
         for node, node_arms in sorted(arms.items()):
             at = net.nodes[node]
-            stored = self.stored_border(net, node)
+            stored = self.read_border(net, node)
             border = stored[0] if stored else _lanes.border((at.x, at.y), node_arms)
             if border is None:
                 continue
             borders[node] = border
             if stored:
                 shared[node] = list(stored[1])
-            joins |= {(arm.lane, arm.far): (node, border.along(arm)) for arm in node_arms if border.shared_by(arm)}
+            joins |= {(arm.lane, arm.far): (node, border.along(arm)) for arm in node_arms if border.is_shared_by(arm)}
         narrow = 0
         for k, lane in enumerate(new):
             left, right, squeezed = self.sides(k, lane, joins, borders)
@@ -1112,46 +1123,48 @@ class _Writer:
                     join = joins.get((k, n > 0)) if n in (0, len(points) - 1) else None
                     z = float(lane.middle[n, 2])
                     if join is None:
-                        names.append(self.new_point(x, y, z))
+                        names.append(self.add_point(x, y, z))
                         continue
                     node, straight = join
                     if node not in shared:
                         border = borders[node]
-                        shared[node] = [self.new_point(*p, z) for p in (border.left, border.right)]
+                        shared[node] = [self.add_point(*p, z) for p in (border.left, border.right)]
                     names.append(shared[node][side if straight else 1 - side])
                 sides.append(names)
             self.emit(net, lane, sides, centres)
         if narrow:
             self.context.warn(f"{narrow} lanes are narrower than their edges say, so that their bounds do not cross")
-        possible = sum(map(_lanes.ways, arms.values()))
+        possible = sum(map(_lanes.count_ways, arms.values()))
         connection_count = 0
         for node, node_arms in arms.items():
-            across = [_lanes.across(arm, borders[node]) if (arm.lane, arm.far) in joins else 0.0 for arm in node_arms]
-            connection_count += _lanes.through(node_arms, across)
+            across = [
+                _lanes.crossing_cosine(arm, borders[node]) if (arm.lane, arm.far) in joins else 0.0 for arm in node_arms
+            ]
+            connection_count += _lanes.count_through(node_arms, across)
         if breaks := possible - connection_count:
             self.context.warn(
                 f"{breaks} of {possible} ways from one lane into the next are no connection in Lanelet2's sense: their "
                 "turns are too sharp for bounds to be shared"
             )
 
-    def stored_border(self, net: MergedNetwork, node: int) -> tuple[Border, tuple[int, int]] | None:
+    def read_border(self, net: MergedNetwork, node: int) -> tuple[Border, tuple[int, int]] | None:
         """The two points of a node of stored lanelets, in metres, where it is still there."""
         at = net.nodes[node]
-        pair = integers(own(at.properties, NAME).get("points"))
+        pair = integers(get_source_properties(at.properties, NAME).get("points"))
         level = self.levels.get(at.level)
         if pair is None or len(pair) != 2 or level is None or any(at.id in moved for moved in self.moved.values()):
             return None
         names = [level.nodes.get(i, i) for i in pair]
         if pair[0] == pair[1] or any(n not in self.points for n in names):
             return None
-        left, right = (self.in_metres(self.points[n]) for n in names)
+        left, right = (self.point_in_metres(self.points[n]) for n in names)
         if left is None or right is None:
             return None
         x, y = left[0] - right[0], left[1] - right[1]
         length = math.hypot(x, y)
         return (Border((y / length, -x / length), left, right), (names[0], names[1])) if length > 1e-6 else None
 
-    def in_metres(self, point: _Point) -> tuple[float, float] | None:
+    def point_in_metres(self, point: _Point) -> tuple[float, float] | None:
         if point.local:
             return point.xyz[:2]
         if self.layers.frame is None or math.isnan(point.xyz[0]):
@@ -1167,9 +1180,9 @@ class _Writer:
         if not shapely.LineString(lane.middle[:, :2]).is_simple:  # it crosses itself, however narrow it is
             for far in (False, True):
                 joins.pop((k, far), None)
-            return *_lanes.beside(lane.middle[:, :2], half), False
+            return *_lanes.offset_bounds(lane.middle[:, :2], half), False
         for attempt in range(8):
-            left, right = _lanes.beside(lane.middle[:, :2], half)
+            left, right = _lanes.offset_bounds(lane.middle[:, :2], half)
             for far_ends in ((False, True), (True,), (False,), ()):
                 a, b = left.copy(), right.copy()
                 for far in far_ends:
@@ -1185,24 +1198,24 @@ class _Writer:
             half /= 2.0
         for far in (False, True):
             joins.pop((k, far), None)
-        return *_lanes.beside(lane.middle[:, :2], half), True
+        return *_lanes.offset_bounds(lane.middle[:, :2], half), True
 
     def emit(
         self, net: MergedNetwork, lane: _NewLanelet, sides: Sequence[list[int]], centres: Mapping[int, int]
     ) -> None:
         edge = lane.edge
         middle = [centres[edge.source]]
-        middle += [self.new_point(x, y, z) for x, y, z in lane.middle[1:-1].tolist()]
+        middle += [self.add_point(x, y, z) for x, y, z in lane.middle[1:-1].tolist()]
         middle.append(centres[edge.target])
         members = []
         for role, refs in (("left", sides[0]), ("right", sides[1]), ("centerline", middle)):
-            new = self.fresh()
+            new = self.next_id()
             kind = "virtual" if role == "centerline" else self.options.bounds
-            self.ways[new] = (refs, {"type": kind}, NOTHING)
+            self.ways[new] = (refs, {"type": kind}, NO_ATTRIBUTES)
             members.append(("way", new, role))
-        source_tags = own(edge.properties, NAME).get("tags")
+        source_tags = get_source_properties(edge.properties, NAME).get("tags")
         tags = {"type": "lanelet", "subtype": self.subtype(edge), "location": self.options.location}
-        stated = as_texts(source_tags) if isinstance(source_tags, Mapping) else NOTHING
+        stated = as_texts(source_tags) if isinstance(source_tags, Mapping) else NO_ATTRIBUTES
         tags |= {k: v for k, v in stated.items() if k != "one_way" and not k.startswith(("one_way:", "fleetmap:"))}
         tags["one_way"] = "yes" if lane.back is None else "no"
         for key in ("name", "speed_limit", "width"):
@@ -1217,12 +1230,12 @@ class _Writer:
         tags |= {EDGE: edge.id, SOURCE: net.nodes[edge.source].id, TARGET: net.nodes[edge.target].id}
         if lane.back is not None:
             tags[BACK] = lane.back.id
-        self.relations[self.fresh()] = (members, tags, NOTHING)
+        self.relations[self.next_id()] = (members, tags, NO_ATTRIBUTES)
 
     def subtype(self, edge: Edge) -> str:
         """What its source calls it, in Lanelet2's words."""
-        source_subtype = as_texts(own(edge.properties, NAME).get("tags")).get("subtype")
-        highway = as_texts(own(edge.properties, "osm").get("tags")).get("highway")
+        source_subtype = as_texts(get_source_properties(edge.properties, NAME).get("tags")).get("subtype")
+        highway = as_texts(get_source_properties(edge.properties, "osm").get("tags")).get("highway")
         if source_subtype:
             return source_subtype
         return SUBTYPES.get(highway, "road") if highway else self.options.subtype
@@ -1230,14 +1243,14 @@ class _Writer:
     # --- XML ---
 
     def text(self) -> bytes:
-        nodes = self.placed_nodes()
+        nodes = self.nodes_in_degrees()
         for item, times in sorted(self.lost.items()):
             self.context.drop(item, times, "a Lanelet2 map has no place for them")
         if self.layers.datum is not None:
             self.context.drop("datum", 1, "a Lanelet2 map stands on earth and has no local frame of its own")
         return _osm_text.document(self.head(), nodes, self.ways, self.relations, self.children)
 
-    def placed_nodes(self) -> dict[int, _osm_text.Node]:
+    def nodes_in_degrees(self) -> dict[int, _osm_text.Node]:
         """All points in degrees with their tags."""
         todo = [i for i, p in self.points.items() if p.local and not (self.metric or math.isnan(p.xyz[0]))]
         degrees: dict[int, tuple[float, float]] = {}
@@ -1285,7 +1298,7 @@ class _Writer:
         return lines
 
 
-def _all_tags(source_members: Mapping[str, Any]) -> Iterable[Any]:
+def _iterate_tags(source_members: Mapping[str, Any]) -> Iterable[Any]:
     """The tags of a stored point or of a way's bends."""
     bends = source_members.get("vertices")
     rows = bends if isinstance(bends, list) else [bends]
@@ -1304,7 +1317,7 @@ def _course(shape: Any) -> list[tuple[float, float, float]]:
     return [(x, y, z) for x, y, z in shapely.get_coordinates(shape, include_z=True).tolist()]
 
 
-def _same(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
+def _is_same_place(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
     """The same place; a line without elevations says nothing of them."""
     high = math.isnan(a[2]) or math.isnan(b[2]) or a[2] == b[2]
     return a[0] == b[0] and a[1] == b[1] and high
@@ -1337,13 +1350,13 @@ def _kmh(speed: float) -> str:
     return _osm_text.plain(repr(round(speed * 3.6, 9) + 0.0)).removesuffix(".0")
 
 
-def _same_road(a: Edge, b: Edge) -> bool:
+def _is_same_road(a: Edge, b: Edge) -> bool:
     """Whether two edges, there and back, can be one lanelet."""
     keys = ("speed_limit", "width", "name")
     return all(a.properties.get(w) == b.properties.get(w) for w in keys) and a.level == b.level
 
 
-def _middle_of(edge: Edge, net: MergedNetwork) -> Array | None:
+def _middle_line(edge: Edge, net: MergedNetwork) -> Array | None:
     """[k, 3] from node to node, metres, no point twice in a row; z NaN in two dimensions; None without a length."""
     a, b = net.nodes[edge.source], net.nodes[edge.target]
     inner = np.empty((0, 3))
@@ -1373,7 +1386,7 @@ register(
         title="Lanelet2 (also Autoware's)",
         files=(MAIN,),
         media_types=("application/vnd.openstreetmap.data+xml",),
-        carries=frozenset({"topology", "objects"}),
+        layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
         write=write,
@@ -1383,9 +1396,9 @@ register(
         companions=companions,
         write_options=WriteOptions,
         family=NAME,
-        rank=36,
+        priority=36,
         version=2,
         extensions=(".osm",),
-        choose=choose,
+        select_parts=choose,
     )
 )

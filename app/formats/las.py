@@ -47,12 +47,14 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     kind = options.kind or (source.form if source.form in ENDINGS else "las")
     name = _points.file_name(options.name, kind)
     if source.data is not None:
-        return {name: source.data if kind == source.form else _las.again(source.data, kind == "laz")}
+        return {name: source.data if kind == source.form else _las.recompress(source.data, kind == "laz")}
     cloud = source.cloud()
     if source.form not in ENDINGS:
         if cloud.height > 1:
             context.drop("rows and columns of the cloud", 1, "LAS points are one list: ask for pcd")
-        context.drop("viewpoint", int(cloud.viewpoint != _points.UNTURNED), "LAS has no place for it: ask for pcd")
+        context.drop(
+            "viewpoint", int(cloud.viewpoint != _points.IDENTITY_VIEWPOINT), "LAS has no place for it: ask for pcd"
+        )
         for noun, count in cloud.further.items():
             context.drop(noun, count, "LAS has points only")
     return {name: _las.pack(_points.plain(cloud), context, kind == "laz")}
@@ -63,7 +65,7 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     return _points.choose(keys, options.name, options.level)
 
 
-def by_file(name: str) -> dict[str, str]:
+def options_from_filename(name: str) -> dict[str, str]:
     """``map.laz`` asks for compression; ``lab.las`` for the voxel map ``lab``, too."""
     stem, _, end = name.rpartition(".")
     if not stem or end not in ENDINGS:
@@ -77,7 +79,7 @@ register(
         title="LAS and LAZ point cloud",
         files=("map.las", "map.laz"),
         media_types=("application/vnd.las", "application/vnd.laszip"),
-        carries=frozenset({"voxels", "resources"}),
+        layers=frozenset({"voxels", "resources"}),
         detect=_las.detect,
         read=read,
         write=write,
@@ -85,8 +87,8 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".las", ".laz"),
-        choose=choose,
-        by_file=by_file,
+        select_parts=choose,
+        options_from_filename=options_from_filename,
         parts=_points.PARTS,
     )
 )

@@ -41,27 +41,27 @@ from app.formats import (
 )
 from app.formats._fields import ANGLE, COORDINATE, NOT_NEGATIVE, SPEED, Number, OneOf, record
 from app.formats._network import (
-    AMONG_PARTS,
+    CROSS_PART_PROPERTIES,
     SAME_ANGLE,
     Array,
     Edge,
     Node,
-    checked_name,
+    check_name,
     count,
+    duplicates,
     edge_lines,
+    get_source_properties,
     identifier,
     is_flat,
     is_name,
-    joined,
-    natural,
+    merge_networks,
+    natural_sort_key,
     node_points,
     number,
-    own,
     quaternion,
-    refuse,
-    said_yaw,
-    some,
-    without_repeats,
+    raise_unreadable,
+    shorten_list,
+    yaw_or_source,
 )
 from app.formats._text import METRES
 from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, unique_ids
@@ -74,7 +74,7 @@ VERSION = "1.0.0"
 EPOCH = "1970-01-01T00:00:00.00Z"
 """Where a source tells no time: the same network must give the same bytes."""
 
-ORDER = _json.ranks(
+ORDER = _json.rank_keys(
     "metaInformation projectIdentification lifId creator exportTimestamp lifVersion origins originId layoutId "
     "layoutName layoutVersion layoutLevelId layoutDescription layouts nodes edges stations nodeId nodeName "
     "nodeDescription mapId nodePosition edgeId edgeName edgeDescription startNodeId endNodeId stationId "
@@ -135,9 +135,9 @@ SHAPE = record(
 )
 """What a file of version 1 holds. Source: VDMA LIF 1.0.0, section 8."""
 
-CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | AMONG_PARTS
-CANONICAL_EDGE = frozenset({"kind", "name", "source", "target", "speed_limit", NAME}) | AMONG_PARTS
-CANONICAL_STATION = frozenset({"kind", "name", NAME}) | AMONG_PARTS
+CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | CROSS_PART_PROPERTIES
+CANONICAL_EDGE = frozenset({"kind", "name", "source", "target", "speed_limit", NAME}) | CROSS_PART_PROPERTIES
+CANONICAL_STATION = frozenset({"kind", "name", NAME}) | CROSS_PART_PROPERTIES
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,16 +148,16 @@ class Dialect:
     edge: str
     type: str
 
-    def type_of(self, name: str) -> dict[str, Any]:
+    def vehicle_type_member(self, name: str) -> dict[str, Any]:
         """The member that names a type of vehicle."""
         if self.type == "mobileRobotTypes":
             return {self.type: [{"manufacturer": name, "seriesName": name}]}
         return {self.type: name}
 
 
-FIRST = Dialect("vehicleTypeNodeProperties", "vehicleTypeEdgeProperties", "vehicleTypeId")
-SECOND = Dialect("mobileRobotTypeNodeProperties", "mobileRobotTypeEdgeProperties", "mobileRobotTypeId")
-THIRD = Dialect(SECOND.node, SECOND.edge, "mobileRobotTypes")
+LIF_1 = Dialect("vehicleTypeNodeProperties", "vehicleTypeEdgeProperties", "vehicleTypeId")
+LIF_2 = Dialect("mobileRobotTypeNodeProperties", "mobileRobotTypeEdgeProperties", "mobileRobotTypeId")
+LIF_3 = Dialect(LIF_2.node, LIF_2.edge, "mobileRobotTypes")
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +258,7 @@ class _Reader:
         for k, origin in enumerate(origins):
             location = f"origins[{k}]"
             if not isinstance(origin, dict):
-                refuse("must be an object", location)
+                raise_unreadable("must be an object", location)
             first = len(self.heads)
             for j, row in enumerate(self._list(origin, "layouts", location)):
                 yield row, f"{location}.layouts[{j}]"
@@ -268,37 +268,39 @@ class _Reader:
     def _list(self, of: Mapping[str, Any], key: str, location: str) -> list[Any]:
         value = of.get(key)
         if not isinstance(value, (list, type(None))):
-            refuse("must be an array", f"{location}.{key}".lstrip("."))
+            raise_unreadable("must be an array", f"{location}.{key}".lstrip("."))
         return value or []
 
     def layout(self, row: Any, location: str) -> None:
         """Take in a layout's items."""
         if not isinstance(row, dict):
-            refuse("must be an object", location)
+            raise_unreadable("must be an object", location)
         layout_id = row.get("layoutId")
         if not isinstance(layout_id, str) or not is_name(layout_id):
-            refuse("a layout needs an id, a text", f"{location}.layoutId")
+            raise_unreadable("a layout needs an id, a text", f"{location}.layoutId")
         if any(head["layoutId"] == layout_id for head in self.heads):
-            refuse(f"the layout {layout_id!r} stands twice: give layouts different ids", f"{location}.layoutId")
+            raise_unreadable(
+                f"the layout {layout_id!r} stands twice: give layouts different ids", f"{location}.layoutId"
+            )
         self.heads.append({w: v for w, v in row.items() if w not in LISTS})
         level = row.get("layoutLevelId")
         if level is None or level == "":
             level = self.context.level
         elif not isinstance(level, str):
-            refuse("must be a text", f"{location}.layoutLevelId")
-        level = checked_name(level, f"{location}.layoutLevelId")
+            raise_unreadable("must be a text", f"{location}.layoutLevelId")
+        level = check_name(level, f"{location}.layoutLevelId")
         for kind, items in self.found.items():
             for at, item in enumerate(self._list(row, f"{kind}s", location)):
                 spot = f"{location}.{kind}s[{at}]"
                 if not isinstance(item, dict):
-                    refuse("must be an object", spot)
+                    raise_unreadable("must be an object", spot)
                 name = item.get(f"{kind}Id")
                 if isinstance(name, (int, float)) and not isinstance(name, bool):
                     self.context.warn(f"{name!r} is no text; it is served as one", where=f"{spot}.{kind}Id")
                     name = str(name)
                 if not isinstance(name, str):
-                    refuse("needs an id, a text", f"{spot}.{kind}Id")
-                items.append(_Item(item, spot, checked_name(name, f"{spot}.{kind}Id"), layout_id, at, level))
+                    raise_unreadable("needs an id, a text", f"{spot}.{kind}Id")
+                items.append(_Item(item, spot, check_name(name, f"{spot}.{kind}Id"), layout_id, at, level))
 
     def layers(self) -> Layers:
         nodes, edges, stations = self.found["node"], self.found["edge"], self.found["station"]
@@ -307,8 +309,10 @@ class _Reader:
             for item, i in zip(items, unique_ids((identifier(item.name) for item in items), taken), strict=True):
                 item.id = i
                 taken.add(i)
-            if repeats := without_repeats([item.name for item in items]):
-                self.context.warn(f"{len(repeats)} {kind} share an id: {some(repeats)}; references mean the first one")
+            if repeats := duplicates([item.name for item in items]):
+                self.context.warn(
+                    f"{len(repeats)} {kind} share an id: {shorten_list(repeats)}; references mean the first one"
+                )
         for item, i in zip(stations, unique_ids(identifier(s.name) for s in stations), strict=True):
             item.id = i
         index_by_name = {item.name: k for k, item in reversed(list(enumerate(nodes)))}
@@ -340,10 +344,10 @@ class _Reader:
         """x, y in metres, and 0."""
         location = f"{location}.{kind}Position"
         if not isinstance(value, dict) or "x" not in value or "y" not in value:
-            refuse("must be an object with x and y", location)
+            raise_unreadable("must be an object with x and y", location)
         return number(value["x"], f"{location}.x"), number(value["y"], f"{location}.y"), 0.0
 
-    def mine(self, item: _Item, kind: str, *keys: str) -> dict[str, Any]:
+    def source_members(self, item: _Item, kind: str, *keys: str) -> dict[str, Any]:
         """What only this format knows of an item; ``keys`` members are canonical."""
         position = item.said.get(f"{kind}Position")
         extra_members = {w: v for w, v in item.said.items() if w not in (f"{kind}Id", *keys)}
@@ -358,17 +362,17 @@ class _Reader:
         out["item"] = extra_members
         return out
 
-    def named(self, item: _Item, kind: str) -> dict[str, Any]:
+    def name_members(self, item: _Item, kind: str) -> dict[str, Any]:
         name = item.said.get(f"{kind}Name")
         return {"name": name} if isinstance(name, str) and is_name(name) else {}
 
     def node(self, item: _Item) -> dict[str, Any]:
-        source_properties = self.mine(item, "node")
-        out: dict[str, Any] = {"kind": "node", "name": item.name, **self.named(item, "node")}
+        source_properties = self.source_members(item, "node")
+        out: dict[str, Any] = {"kind": "node", "name": item.name, **self.name_members(item, "node")}
         entries = _entries(source_properties["item"], "node")
         if not entries:
             self.doubts["nodes name no type of vehicle, so that none may use them"] += 1
-        theta = _shared(entries, "theta")
+        theta = _common_number(entries, "theta")
         if theta is not None and abs(theta) <= math.pi + SAME_ANGLE:
             out["orientation"] = quaternion(float(theta))
         far = sum(_is_number(e.get("theta")) and abs(e["theta"]) > math.pi + SAME_ANGLE for e in entries)
@@ -406,7 +410,9 @@ class _Reader:
             return
         unknown = [i for i in node_ids if i not in index_by_name]
         if unknown:
-            self.context.warn(f"the station is reached at {some(unknown)}, which is no node", where=station.where)
+            self.context.warn(
+                f"the station is reached at {shorten_list(unknown)}, which is no node", where=station.where
+            )
 
     def network(
         self, content: _Level, xyz: Array, nodes: Sequence[_Item], properties: Sequence[dict[str, Any]]
@@ -416,12 +422,12 @@ class _Reader:
         lines = edge_lines(xyz, sources, targets)
         rows: list[Properties] = [properties[k] for k in content.nodes]
         for j, (edge, a, b) in enumerate(content.edges):
-            source_properties = self.mine(edge, "edge", "startNodeId", "endNodeId")
+            source_properties = self.source_members(edge, "edge", "startNodeId", "endNodeId")
             entries = _entries(source_properties["item"], "edge")
             if not entries:
                 self.doubts["edges name no type of vehicle, so that none may use them"] += 1
-            out = {"kind": "edge", "source": nodes[a].id, "target": nodes[b].id, **self.named(edge, "edge")}
-            speed = _shared(entries, "maxSpeed")
+            out = {"kind": "edge", "source": nodes[a].id, "target": nodes[b].id, **self.name_members(edge, "edge")}
+            speed = _common_number(entries, "maxSpeed")
             if speed is not None and speed >= 0:
                 out["speed_limit"] = speed
                 source_properties["item"] = _without(source_properties["item"], "edge", "maxSpeed")
@@ -443,10 +449,12 @@ class _Reader:
             geometry[k] = (
                 NO_GEOMETRY if position is None else shapely.Point(self.position(position, item.where, "station")[:2])
             )
-            source_properties = self.mine(item, "station")
+            source_properties = self.source_members(item, "station")
             if position is None and "stationPosition" in source_properties["item"]:
                 del source_properties["item"]["stationPosition"]
-            rows.append({"kind": "station", "name": item.name, **self.named(item, "station"), NAME: source_properties})
+            rows.append(
+                {"kind": "station", "name": item.name, **self.name_members(item, "station"), NAME: source_properties}
+            )
         return from_columns([item.id for item in items], geometry, rows, "local", {NAME: {}})
 
 
@@ -454,20 +462,20 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _word(item: Mapping[str, Any], kind: str) -> str | None:
+def _vehicle_properties_key(item: Mapping[str, Any], kind: str) -> str | None:
     """The member that holds what types of vehicle have of their own."""
-    keys = (getattr(FIRST, kind), getattr(SECOND, kind))
+    keys = (getattr(LIF_1, kind), getattr(LIF_2, kind))
     return next((w for w in keys if isinstance(item.get(w), list)), None)
 
 
 def _entries(item: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
     """What types of vehicle have of their own at an item; nothing where an entry is no object."""
-    key = _word(item, kind)
+    key = _vehicle_properties_key(item, kind)
     entries = item[key] if key else []
     return entries if all(isinstance(e, dict) for e in entries) else []
 
 
-def _shared(entries: Sequence[Mapping[str, Any]], key: str) -> Any:
+def _common_number(entries: Sequence[Mapping[str, Any]], key: str) -> Any:
     """The number that all entries have in common, else None."""
     values = [e.get(key) for e in entries]
     same = values and all(_is_number(v) and v == values[0] and type(v) is type(values[0]) for v in values)
@@ -476,7 +484,7 @@ def _shared(entries: Sequence[Mapping[str, Any]], key: str) -> Any:
 
 def _without(item: Mapping[str, Any], kind: str, key: str) -> dict[str, Any]:
     """The item, its entries without a word."""
-    list_word = _word(item, kind)
+    list_word = _vehicle_properties_key(item, kind)
     if list_word is None:
         return dict(item)
     return {**item, list_word: [{w: v for w, v in e.items() if w != key} for e in item[list_word]]}
@@ -529,12 +537,12 @@ class _Writer:
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.layers, self.context = layers, context
         self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-        self.net = joined(layers, context)
+        self.net = merge_networks(layers, context)
         if not self.net.nodes:
             raise CannotConvert("the network has no node, and a layout needs one: supply a network with nodes")
         self.filled: Counter[str] = Counter()
         self.lost: Counter[str] = Counter()
-        documents = [own(part.document, NAME) for part in layers.vector("topology").values()]
+        documents = [get_source_properties(part.document, NAME) for part in layers.vector("topology").values()]
         self.documents = [d for d in documents if d]
         self.layouts: dict[str, _Layout] = {}
         self.origins: list[dict[str, Any]] = []
@@ -549,21 +557,21 @@ class _Writer:
         """The one that the source's items speak."""
         property_sets = [n.properties for n in self.net.nodes] + [e.properties for e in self.net.edges]
         for p in property_sets:
-            source_members = own(own(p, NAME), "item")
+            source_members = get_source_properties(get_source_properties(p, NAME), "item")
             for kind in ("node", "edge"):
                 for entry in _entries(source_members, kind):
-                    spoken = next((d for d in (FIRST, SECOND, THIRD) if d.type in entry), None)
+                    spoken = next((d for d in (LIF_1, LIF_2, LIF_3) if d.type in entry), None)
                     if spoken is not None:
                         return spoken
-        return FIRST
+        return LIF_1
 
     def data(self) -> bytes:
         """The whole text."""
         names = self._names(self.net.nodes)
         for node, name in zip(self.net.nodes, names, strict=True):
-            self._put("nodes", node.properties, node.level, name, self._node(node, name))
+            self._add_to_layout("nodes", node.properties, node.level, name, self._node(node, name))
         for edge, name in zip(self.net.edges, self._names(self.net.edges), strict=True):
-            self._put("edges", edge.properties, edge.level, name, self._edge(edge, name, names))
+            self._add_to_layout("edges", edge.properties, edge.level, name, self._edge(edge, name, names))
         self._stations()
         self._dangling()
         out = self._top()
@@ -575,14 +583,14 @@ class _Writer:
         if free_layouts or not inside:
             out["layouts"] = free_layouts
         self._report()
-        return orjson.dumps(_json.ordered(out, ORDER), option=orjson.OPT_INDENT_2) + b"\n"
+        return orjson.dumps(_json.sort_keys(out, ORDER), option=orjson.OPT_INDENT_2) + b"\n"
 
     def _top(self) -> dict[str, Any]:
         top: dict[str, Any] = {}
         for document in reversed(self.documents):
-            top |= own(document, "top")
+            top |= get_source_properties(document, "top")
         top = {w: v for w, v in top.items() if w not in ("layouts", "origins")}
-        meta = dict(own(top, "metaInformation"))
+        meta = dict(get_source_properties(top, "metaInformation"))
         if "lifId" not in meta and "projectIdentification" not in meta:
             meta["projectIdentification"] = self.options.project or self.context.title
             project = meta["projectIdentification"]
@@ -600,7 +608,7 @@ class _Writer:
         placed: set[str] = set()
         for document in self.documents:
             for origin in _objects(document.get("origins")):
-                head = {w: v for w, v in own(origin, "head").items() if w != "layouts"}
+                head = {w: v for w, v in get_source_properties(origin, "head").items() if w != "layouts"}
                 if any(head == other for other, _ in origins):
                     continue
                 ids = origin.get("layouts")
@@ -620,9 +628,9 @@ class _Writer:
                 out[section] = [item for _, item in sorted(items, key=lambda t: t[0])]
         return out
 
-    def _put(self, section: str, p: Properties, level: str, name: str, item: dict[str, Any]) -> None:
+    def _add_to_layout(self, section: str, p: Properties, level: str, name: str, item: dict[str, Any]) -> None:
         """Put an item into its layout: the one its source says, the first of its level, or a new one."""
-        source_members = own(p, NAME)
+        source_members = get_source_properties(p, NAME)
         layout_id, at = source_members.get("layout"), source_members.get("at")
         if not isinstance(layout_id, str) or layout_id not in self.layouts:
             of_level = (i for i, v in self.layouts.items() if v.head.get("layoutLevelId", GROUND) == level)
@@ -638,23 +646,25 @@ class _Writer:
             self.layouts[layout_id] = _Layout(head)
             self.filled["layouts"] += 1
         has_index = isinstance(at, int) and not isinstance(at, bool)
-        key = (not has_index, at if isinstance(at, int) else 0, natural(name))
+        key = (not has_index, at if isinstance(at, int) else 0, natural_sort_key(name))
         self.layouts[layout_id].items[section].append((key, item))
 
     def _names(self, items: Sequence[Node | Edge]) -> list[str]:
         """The ids of the file: those of the sources, where they are distinct."""
         names = []
         for item in items:
-            source_id = own(item.properties, NAME).get("id")
+            source_id = get_source_properties(item.properties, NAME).get("id")
             names.append(source_id if isinstance(source_id, str) and is_name(source_id) else item.id)
         out = unique_ids(names)
         if repeats := [a for a, b in zip(names, out, strict=True) if a != b]:
-            self.context.warn(f"{len(repeats)} ids stood for several items and got a number: {some(repeats)}")
+            self.context.warn(f"{len(repeats)} ids stood for several items and got a number: {shorten_list(repeats)}")
         return out
 
     def _base(self, p: Properties, kind: str, name: str) -> dict[str, Any]:
         """The members of an item's source, with its id and its name."""
-        item = {w: v for w, v in own(own(p, NAME), "item").items() if w != f"{kind}Id"}
+        item = {
+            w: v for w, v in get_source_properties(get_source_properties(p, NAME), "item").items() if w != f"{kind}Id"
+        }
         out: dict[str, Any] = {f"{kind}Id": name, **item}
         title = p.get("name")
         if isinstance(title, str) and title not in ("", name):
@@ -668,13 +678,13 @@ class _Writer:
 
         An item of a LIF file without entries stays so: no vehicle may use it.
         """
-        key = _word(out, kind)
+        key = _vehicle_properties_key(out, kind)
         entries = [dict(e) for e in _entries(out, kind)]
         if key is None:
             if NAME in p:
                 return []
             key = str(getattr(self.dialect, kind))
-            entries = [{**self.dialect.type_of(self.options.vehicle_type), **template}]
+            entries = [{**self.dialect.vehicle_type_member(self.options.vehicle_type), **template}]
             self.filled[f"{kind}s"] += 1
         elif len(entries) != count(out[key]):
             return []
@@ -684,12 +694,12 @@ class _Writer:
     def _node(self, node: Node, name: str) -> dict[str, Any]:
         p = node.properties
         out = self._base(p, "node", name)
-        out["nodePosition"] = {**own(out, "nodePosition"), "x": _metres(node.x), "y": _metres(node.y)}
+        out["nodePosition"] = {**get_source_properties(out, "nodePosition"), "x": _metres(node.x), "y": _metres(node.y)}
         entries = self._vehicles(p, out, "node", {})
         if p.get("orientation") is not None:
             self.lost["tilts of nodes"] += not is_flat(p["orientation"])
             for entry in entries:
-                theta = said_yaw(entry.get("theta"), p["orientation"])
+                theta = yaw_or_source(entry.get("theta"), p["orientation"])
                 if theta is not None:
                     entry["theta"] = theta
         self.lost["altitudes of nodes"] += bool(node.z)
@@ -701,7 +711,7 @@ class _Writer:
         out = self._base(p, "edge", name)
         out |= {"startNodeId": names[edge.source], "endNodeId": names[edge.target]}
         defaults: dict[str, Any] = {"orientationType": self.options.orientation_type}
-        if self.dialect == FIRST:
+        if self.dialect == LIF_1:
             turn = {"vehicleOrientation": self.options.vehicle_orientation}
             defaults = {**turn, **defaults, "rotationAllowed": self.options.rotation_allowed}
         entries = self._vehicles(p, out, "edge", defaults)
@@ -724,29 +734,29 @@ class _Writer:
                 if p.get("kind") != "station":
                     self.lost["objects that are no stations"] += 1
                     continue
-                source_id = own(p, NAME).get("id")
+                source_id = get_source_properties(p, NAME).get("id")
                 name = source_id if isinstance(source_id, str) and is_name(source_id) else i
                 out = self._base(p, "station", name)
                 if not shape.is_empty:
                     at = shapely.centroid(shape)
                     position = {"x": _metres(at.x), "y": _metres(at.y)}
-                    out["stationPosition"] = {**own(out, "stationPosition"), **position}
+                    out["stationPosition"] = {**get_source_properties(out, "stationPosition"), **position}
                 if not isinstance(out.get("interactionNodeIds"), list):
                     out["interactionNodeIds"] = []
                     self.filled["stations"] += 1
                 self.lost["attributes of stations"] += bool(p.keys() - CANONICAL_STATION)
-                self._put("stations", p, key.level, name, out)
+                self._add_to_layout("stations", p, key.level, name, out)
 
     def _dangling(self) -> None:
         """Edges to nowhere, of the nodes that know them and of the files as a whole, each once."""
-        lists = [own(node.properties, NAME).get("dangling") for node in self.net.nodes]
+        lists = [get_source_properties(node.properties, NAME).get("dangling") for node in self.net.nodes]
         lists += [document.get("dangling") for document in self.documents]
         seen = set()
         for edge in (e for entries in lists for e in _objects(entries)):
-            item, key = own(edge, "item"), orjson.dumps(edge, option=orjson.OPT_SORT_KEYS).decode()
+            item, key = get_source_properties(edge, "item"), orjson.dumps(edge, option=orjson.OPT_SORT_KEYS).decode()
             if isinstance(item.get("edgeId"), str) and key not in seen:
                 seen.add(key)
-                self._put("edges", {NAME: edge}, GROUND, item["edgeId"], item)
+                self._add_to_layout("edges", {NAME: edge}, GROUND, item["edgeId"], item)
 
     def _report(self) -> None:
         context = self.context
@@ -757,7 +767,7 @@ class _Writer:
                 context.fill(f"{kind}: type of vehicle", self.options.vehicle_type, reason, "vehicle_type")
         if self.filled["edges"]:
             option_names = {"orientationType": "orientation_type"}
-            if self.dialect == FIRST:
+            if self.dialect == LIF_1:
                 option_names |= {"vehicleOrientation": "vehicle_orientation", "rotationAllowed": "rotation_allowed"}
             for key, option in option_names.items():
                 reason = f"{self.filled['edges']} edges do not say it"
@@ -817,18 +827,18 @@ register(
         title="Layout Interchange Format (VDMA LIF)",
         files=("layout.lif.json",),
         media_types=("application/json",),
-        carries=frozenset({"topology", "objects"}),
+        layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
         check=_lif_rules.check,
-        lacks=lacks,
+        missing_content=lacks,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,
         family=NAME,
-        titled=True,
-        rank=37,
+        has_title=True,
+        priority=37,
         extensions=(".lif.json", ".lif", ".json"),
-        choose=choose,
+        select_parts=choose,
     )
 )

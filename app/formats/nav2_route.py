@@ -43,21 +43,21 @@ from app.formats import (
 )
 from app.formats._fields import NOT_NEGATIVE, SPEED, Number, OneOf, record
 from app.formats._network import (
-    AMONG_PARTS,
+    CROSS_PART_PROPERTIES,
     Array,
     Edge,
     MergedNetwork,
     Node,
     count,
+    duplicates,
     edge_lines,
-    joined,
-    known_document,
+    get_source_properties,
+    merge_networks,
     node_points,
     number,
-    own,
-    refuse,
-    some,
-    without_repeats,
+    raise_unreadable,
+    shorten_list,
+    source_document,
 )
 from app.formats._text import METRES
 from app.model.features import Properties, from_columns, unique_ids
@@ -76,7 +76,7 @@ FLOATS = frozenset({"speed_limit", "abs_speed_limit", "penalty", "abs_time_taken
 
 TEXTS: Mapping[str, str] = {"name": "name", "action": "action"}
 NUMBERS: Mapping[str, str] = {"abs_speed_limit": "speed_limit", "width": "width"}
-LIFTED: Mapping[str, str] = {**TEXTS, **NUMBERS}
+CANONICAL_METADATA: Mapping[str, str] = {**TEXTS, **NUMBERS}
 """Metadata word -> the canonical word, for values that are texts and numbers."""
 
 TRIGGERS = ("NODE", "ON_ENTER", "ON_EXIT")
@@ -115,7 +115,7 @@ SHAPE = record(is_open=True, type=OneOf(("FeatureCollection",)), features=[_FEAT
 CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
 """What Nav2's own graphs say, so that QGIS shows their metres; the route server does not look at it."""
 
-CANONICAL_NODE = frozenset({"kind", "name", "action", "speed_limit", "width", NAME}) | AMONG_PARTS
+CANONICAL_NODE = frozenset({"kind", "name", "action", "speed_limit", "width", NAME}) | CROSS_PART_PROPERTIES
 CANONICAL_EDGE = CANONICAL_NODE | {"source", "target"}
 
 
@@ -146,12 +146,12 @@ class _Reader:
         self.edges: list[int] = []
         self.ignored: list[Any] = []
         self.dangling: list[dict[str, Any]] = []
-        self.whole: Counter[str] = Counter()
+        self.is_complete: Counter[str] = Counter()
         for k, row in enumerate(rows):
             location = f"features[{k}]"
             geometry = row.get("geometry") if isinstance(row, dict) else None
             if not isinstance(row, dict) or not isinstance(geometry, (dict, type(None))):
-                refuse("must be a GeoJSON feature with a geometry", location)
+                raise_unreadable("must be a GeoJSON feature with a geometry", location)
             kind = geometry.get("type") if geometry else None
             if kind == "Point":
                 self.nodes.append(k)
@@ -166,11 +166,11 @@ class _Reader:
             raise UnreadableFile(reason, [Problem(reason, where="features")])
 
     def layers(self) -> Layers:
-        numbers = [self.id_of(k) for k in self.nodes]
+        numbers = [self.read_id(k) for k in self.nodes]
         ids = unique_ids(map(str, numbers))
-        if repeats := without_repeats(list(map(str, numbers))):
+        if repeats := duplicates(list(map(str, numbers))):
             self.context.warn(
-                f"{len(repeats)} nodes share an id: {some(repeats)}; edges go to the last one, as in Nav2"
+                f"{len(repeats)} nodes share an id: {shorten_list(repeats)}; edges go to the last one, as in Nav2"
             )
         index_by_number = {n: k for k, n in enumerate(numbers)}
         xyz: Array = np.array([self.position(k) for k in self.nodes], np.float64).reshape(-1, 3)
@@ -179,19 +179,19 @@ class _Reader:
         ]
         indices, numbers, sources, targets = self.ends(index_by_number, properties)
         edges = unique_ids(map(str, numbers), set(ids))
-        if repeats := without_repeats(list(map(str, numbers))):
+        if repeats := duplicates(list(map(str, numbers))):
             self.context.warn(
-                f"{len(repeats)} edges share an id: {some(repeats)}; later ones are served with a new one"
+                f"{len(repeats)} edges share an id: {shorten_list(repeats)}; later ones are served with a new one"
             )
         lines = edge_lines(xyz, sources, targets)
         for j, (k, n) in enumerate(zip(indices, numbers, strict=True)):
             p = {"kind": "edge", "source": ids[sources[j]], "target": ids[targets[j]], **self.canonical(k, n)}
             lines[j] = self.shape(k, lines[j], p[NAME])
             properties.append(p)
-        if self.whole["integers"]:
+        if self.is_complete["integers"]:
             self.context.warn(
-                f"{self.whole['integers']} metadata values ({', '.join(sorted(FLOATS))}) are integers, at which Nav2 "
-                "throws; they are served as floats"
+                f"{self.is_complete['integers']} metadata values ({', '.join(sorted(FLOATS))}) are integers, at which "
+                "Nav2 throws; they are served as floats"
             )
         document: dict[str, Any] = {"members": {w: v for w, v in self.top.items() if w not in ("type", "features")}}
         credit = [self.top[w] for w in ("attribution", "license", "copyright") if isinstance(self.top.get(w), str)]
@@ -202,21 +202,23 @@ class _Reader:
         part = from_columns([*ids, *edges], geometry, properties, "local", collection_document)
         return Layers({PartKey("topology", self.context.level, NETWORK): part})
 
-    def said(self, k: int) -> dict[str, Any]:
+    def properties_of(self, k: int) -> dict[str, Any]:
         """The properties of a feature."""
         properties = self.rows[k].get("properties")
         if not isinstance(properties, dict):
-            refuse("needs properties with an id", f"features[{k}]")
+            raise_unreadable("needs properties with an id", f"features[{k}]")
         return properties
 
-    def id_of(self, k: int, key: str = "id") -> int:
+    def read_id(self, k: int, key: str = "id") -> int:
         """A node's or edge's number."""
-        value = self.said(k).get(key)
+        value = self.properties_of(k).get(key)
         if isinstance(value, float) and value.is_integer():
             value = int(value)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
             shown = "is missing" if value is None else f"is {str(value)[:40]!r}"
-            refuse(f"{shown}; it must be a whole number from 0 to {MAX_ID}", f"features[{k}].properties.{key}")
+            raise_unreadable(
+                f"{shown}; it must be a whole number from 0 to {MAX_ID}", f"features[{k}].properties.{key}"
+            )
         return value
 
     def position(self, k: int) -> tuple[float, float, float]:
@@ -224,9 +226,9 @@ class _Reader:
         location = f"features[{k}].geometry.coordinates"
         at = self.rows[k]["geometry"].get("coordinates")
         if not isinstance(at, list) or len(at) < 2:
-            refuse("a node needs two coordinates [x, y]", location)
+            raise_unreadable("a node needs two coordinates [x, y]", location)
         x, y, z = (number(v, location) for v in [*at[:3], 0.0][:3])
-        frame = self.said(k).get("frame", FRAME)
+        frame = self.properties_of(k).get("frame", FRAME)
         if frame != FRAME:
             self.context.warn(f"its frame is {str(frame)[:60]!r}: its coordinates are taken as local", where=location)
         return x, y, z
@@ -237,7 +239,7 @@ class _Reader:
         """(features of edges between nodes, their numbers, the places of their ends); others are kept with a node."""
         indices, numbers, sources, targets = [], [], [], []
         for k in self.edges:
-            n, start, end = self.id_of(k), self.id_of(k, "startid"), self.id_of(k, "endid")
+            n, start, end = self.read_id(k), self.read_id(k, "startid"), self.read_id(k, "endid")
             a, b = index_by_number.get(start), index_by_number.get(end)
             if a is None or b is None:
                 missing = start if a is None else end
@@ -246,7 +248,9 @@ class _Reader:
                     "kept, but not served",
                     where=f"features[{k}]",
                 )
-                edge_properties = {w: v for w, v in self.said(k).items() if w not in ("id", "startid", "endid")}
+                edge_properties = {
+                    w: v for w, v in self.properties_of(k).items() if w not in ("id", "startid", "endid")
+                }
                 edge = {"id": n, "from": start, "to": end, "properties": edge_properties}
                 home = next((j for j in (a, b) if j is not None), None)
                 if home is None:
@@ -265,18 +269,18 @@ class _Reader:
     def canonical(self, k: int, n: int) -> dict[str, Any]:
         """The properties of an item that come from its feature."""
         row = self.rows[k]
-        extra_members = {w: v for w, v in self.said(k).items() if w not in ("id", "startid", "endid")}
+        extra_members = {w: v for w, v in self.properties_of(k).items() if w not in ("id", "startid", "endid")}
         out: dict[str, Any] = {}
         metadata = extra_members.get("metadata")
         if isinstance(metadata, dict):
-            self.whole["integers"] += _integers(metadata)
-            out = {LIFTED[w]: v for w, v in metadata.items() if _fits(w, v) and (w, v) != ("name", str(n))}
-            left = {w: v for w, v in metadata.items() if LIFTED.get(w) not in out}
+            self.is_complete["integers"] += _integers(metadata)
+            out = {CANONICAL_METADATA[w]: v for w, v in metadata.items() if _fits(w, v) and (w, v) != ("name", str(n))}
+            left = {w: v for w, v in metadata.items() if CANONICAL_METADATA.get(w) not in out}
             extra_members["metadata"] = left
             if not left and metadata:
                 del extra_members["metadata"]
-        self.whole["integers"] += _integers(extra_members.get("operations"))
-        for reason in _doubts(extra_members):
+        self.is_complete["integers"] += _integers(extra_members.get("operations"))
+        for reason in _loader_problems(extra_members):
             self.context.warn(reason, where=f"features[{k}].properties")
         source_properties: dict[str, Any] = {"id": n}
         if extra_members:
@@ -345,17 +349,17 @@ def _floats(value: Any) -> Any:
     return {w: float(v) if _is_integer(w, v) else _floats(v) for w, v in value.items()}
 
 
-def _doubts(properties: Mapping[str, Any]) -> Iterator[str]:
+def _loader_problems(properties: Mapping[str, Any]) -> Iterator[str]:
     """What the route server's loader would throw at in a feature's properties."""
     metadata, operations = properties.get("metadata"), properties.get("operations")
     if "metadata" in properties:
-        yield from _metadata_doubts(metadata, "metadata")
+        yield from _metadata_problems(metadata, "metadata")
     if isinstance(operations, (dict, list)):
         for name, one in operations.items() if isinstance(operations, dict) else enumerate(operations):
             if not isinstance(one, dict) or not isinstance(one.get("type"), str) or one.get("trigger") not in TRIGGERS:
                 yield f"the operation {str(name)[:60]!r} needs a type and a trigger, one of {', '.join(TRIGGERS)}"
             elif "metadata" in one:
-                yield from _metadata_doubts(one["metadata"], f"the metadata of the operation {str(name)[:60]!r}")
+                yield from _metadata_problems(one["metadata"], f"the metadata of the operation {str(name)[:60]!r}")
     elif "operations" in properties:
         yield "operations must be an object of operations"
     cost = properties.get("cost", 0.0)
@@ -367,13 +371,13 @@ def _doubts(properties: Mapping[str, Any]) -> Iterator[str]:
         yield f"frame must be a text, got {str(properties['frame'])[:40]!r}"
 
 
-def _metadata_doubts(value: Any, location: str) -> Iterator[str]:
+def _metadata_problems(value: Any, location: str) -> Iterator[str]:
     if not isinstance(value, dict):
         yield f"{location} must be an object"
         return
     for key, inner in value.items():
         if isinstance(inner, dict):
-            yield from _metadata_doubts(inner, f"{location}.{key[:60]}")
+            yield from _metadata_problems(inner, f"{location}.{key[:60]}")
         elif any(v is None or isinstance(v, (dict, list)) for v in (inner if isinstance(inner, list) else [inner])):
             yield f"{location}.{key[:60]}: Nav2 reads numbers, texts, booleans and lists of these only"
 
@@ -391,20 +395,20 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     return {"graph.geojson": _Writer(layers, context).data()}
 
 
-ORDER = _json.ranks(
+ORDER = _json.rank_keys(
     "type name id startid endid frame trigger cost overridable metadata operations properties geometry coordinates"
 )
 
 
 def _dump(value: Any) -> bytes:
-    return orjson.dumps(_json.ordered(value, ORDER))
+    return orjson.dumps(_json.sort_keys(value, ORDER))
 
 
 class _Writer:
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.context = context
-        self.document = known_document(layers, NAME)
-        self.net: MergedNetwork = joined(layers, context)
+        self.document = source_document(layers, NAME)
+        self.net: MergedNetwork = merge_networks(layers, context)
         if not self.net.nodes or not self.net.edges:
             noun = "no node" if not self.net.nodes else "no edge between its nodes"
             raise CannotConvert(f"the network has {noun}; the route server needs both: supply a network with edges")
@@ -416,11 +420,11 @@ class _Writer:
     def _numbers(self) -> tuple[list[int], list[int]]:
         """The numbers of nodes and edges, apart from each other where there are enough."""
         net, context = self.net, self.context
-        nodes, edges = _own_numbers(net.nodes), _own_numbers(net.edges)
+        nodes, edges = _stored_numbers(net.nodes), _stored_numbers(net.edges)
         own_nodes, own_edges = set(nodes.values()), set(edges.values())
         apart = len(net.nodes) + len(net.edges) <= MAX_USED_ID // 2
-        nodes = _numbered(net.nodes, nodes, own_nodes | own_edges if apart else own_nodes)
-        edges = _numbered(net.edges, edges, {*own_edges, *nodes.values()} if apart else own_edges)
+        nodes = _assign_numbers(net.nodes, nodes, own_nodes | own_edges if apart else own_nodes)
+        edges = _assign_numbers(net.edges, edges, {*own_edges, *nodes.values()} if apart else own_edges)
         duplicate_count = sum(_claim(n) not in (None, nodes[k]) for k, n in enumerate(net.nodes))
         duplicate_count += sum(_claim(e) not in (None, edges[k]) for k, e in enumerate(net.edges))
         if duplicate_count:
@@ -464,7 +468,7 @@ class _Writer:
     def _feature(self, item: Node | Edge, n: int, geometry: dict[str, Any], ends: dict[str, int]) -> bytes:
         """One line of the file."""
         p = item.properties
-        source_members = own(p, NAME)
+        source_members = get_source_properties(p, NAME)
         extra_properties = source_members.get("properties")
         properties: dict[str, Any] = {"id": n, **ends}
         if NAME not in p and not ends:
@@ -479,7 +483,7 @@ class _Writer:
         for key in ("metadata", "operations"):
             if key in properties:
                 properties[key] = _floats(properties[key])
-        for reason in _doubts(properties):
+        for reason in _loader_problems(properties):
             self.context.warn(reason, where=str(n))
         self.lost["attributes"] += bool(p.keys() - (CANONICAL_EDGE if ends else CANONICAL_NODE))
         self.lost["dangling"] += count(source_members.get("dangling"))
@@ -492,7 +496,7 @@ class _Writer:
     def _metadata(self, p: Properties, number: str) -> dict[str, Any]:
         """The canonical words among the metadata."""
         out: dict[str, Any] = {}
-        for key, canonical in LIFTED.items():
+        for key, canonical in CANONICAL_METADATA.items():
             value: Any = p.get(canonical)
             if _fits(key, value):
                 out[key] = float(value) if key in NUMBERS else value
@@ -503,7 +507,7 @@ class _Writer:
         return out
 
     def _shape(self, edge: Edge) -> dict[str, Any]:
-        source_members = own(edge.properties, NAME)
+        source_members = get_source_properties(edge.properties, NAME)
         kind = "LineString" if source_members.get("line") is True else "MultiLineString"
         odd = source_members.get("geometry")
         if isinstance(odd, dict):
@@ -532,7 +536,7 @@ class _Writer:
 
 def _claim(item: Node | Edge) -> int | None:
     """The number that an item has from its source."""
-    source_id = own(item.properties, NAME).get("id")
+    source_id = get_source_properties(item.properties, NAME).get("id")
     return (
         source_id
         if isinstance(source_id, int) and not isinstance(source_id, bool) and 0 <= source_id <= MAX_ID
@@ -540,7 +544,7 @@ def _claim(item: Node | Edge) -> int | None:
     )
 
 
-def _own_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
+def _stored_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
     """Place -> number of the items that have one; of several with the same, the one whose id still says it."""
     claims: dict[int, list[int]] = defaultdict(list)
     for k, item in enumerate(items):
@@ -550,7 +554,7 @@ def _own_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
     return {min(rivals, key=lambda k: (items[k].id != str(n), items[k].id)): n for n, rivals in claims.items()}
 
 
-def _numbered(items: Sequence[Node | Edge], claims: Mapping[int, int], taken: set[int]) -> dict[int, int]:
+def _assign_numbers(items: Sequence[Node | Edge], claims: Mapping[int, int], taken: set[int]) -> dict[int, int]:
     """Place -> number of all items; ``taken`` grows. Ids that are numbers come before those that one is made from."""
     out = dict(claims)
     remaining = sorted((k for k in range(len(items)) if k not in out), key=lambda k: items[k].id)
@@ -599,7 +603,7 @@ register(
         title="Route graph (Nav2 route server)",
         files=("graph.geojson",),
         media_types=("application/geo+json",),
-        carries=frozenset({"topology"}),
+        layers=frozenset({"topology"}),
         detect=detect,
         read=read,
         write=write,
@@ -607,11 +611,11 @@ register(
         write_options=WriteOptions,
         family=NAME,
         check=_nav2_route_rules.check,
-        lacks=lacks,
-        titled=True,
-        rank=36,
+        missing_content=lacks,
+        has_title=True,
+        priority=36,
         extensions=(".geojson", ".json"),
-        bends="foreign",
+        keeps_bends="foreign",
         version=2,
     )
 )

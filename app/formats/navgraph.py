@@ -40,29 +40,29 @@ from app.formats import (
 )
 from app.formats._fields import ANGLE, COORDINATE, Number, Record, record
 from app.formats._network import (
-    AMONG_PARTS,
+    CROSS_PART_PROPERTIES,
     Array,
     Edge,
     MergedNetwork,
     Node,
-    checked_name,
+    check_name,
     count,
+    duplicates,
     edge_lines,
+    get_source_properties,
     identifier,
     is_flat,
     is_name,
-    joined,
-    known_document,
-    natural,
+    merge_networks,
+    natural_sort_key,
     node_points,
     number,
-    only_2d,
-    own,
     quaternion,
-    refuse,
-    said_yaw,
-    some,
-    without_repeats,
+    raise_unreadable,
+    report_3d_loss,
+    shorten_list,
+    source_document,
+    yaw_or_source,
 )
 from app.formats._text import METRES, numbers
 from app.model.features import Properties, from_columns, unique_ids
@@ -80,11 +80,11 @@ KNOWN_TAGS = MODES | {DIRECTED, "bidir"}
 
 _WORD = re.compile(r"[A-Za-z0-9_-]{1,64}\Z")
 
-NAMED = frozenset({"graph-name", "root"})
+NAME_KEYS = frozenset({"graph-name", "root"})
 TOP_KEYS = frozenset({"nodes", "connections", "default-properties"})
 NODE_KEYS = frozenset({"name", "pos", "properties"})
-CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | AMONG_PARTS
-CANONICAL_EDGE = frozenset({"kind", "source", "target", NAME}) | AMONG_PARTS
+CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | CROSS_PART_PROPERTIES
+CANONICAL_EDGE = frozenset({"kind", "source", "target", NAME}) | CROSS_PART_PROPERTIES
 
 _TOLERANCE = Number(0.0, 1e4)
 _PROPERTIES = [
@@ -126,9 +126,10 @@ def read(files: Files, context: ReadContext) -> Layers:
     _fields.check(top, SHAPE, context)
     names = [node.name for node in nodes]
     ids = unique_ids(map(identifier, names))
-    if repeats := without_repeats(names):
+    if repeats := duplicates(names):
         context.warn(
-            f"{len(repeats)} names stand twice or more: {some(repeats)}; Fawkes refuses that; the first is meant"
+            f"{len(repeats)} names stand twice or more: {shorten_list(repeats)}; Fawkes refuses that; the first is "
+            "meant"
         )
     index_by_name = {name: k for k, name in reversed(list(enumerate(names)))}
     rows, dangling = _connections(top.get("connections"), index_by_name, context)
@@ -158,16 +159,16 @@ class _ParsedNode:
         location = f"nodes[{k}]"
         self.tag, entry = _untag(item, location, context)
         if not isinstance(entry, dict):
-            refuse("a node must be a mapping with a name and a pos", location)
+            raise_unreadable("a node must be a mapping with a name and a pos", location)
         if "name" not in entry:
-            refuse("a node must have a name", location)
-        self.name = checked_name(_name(entry["name"], f"{location}.name"), f"{location}.name")
+            raise_unreadable("a node must have a name", location)
+        self.name = check_name(_name(entry["name"], f"{location}.name"), f"{location}.name")
         self.where = self.name
         if self.tag not in (None, UNCONNECTED):
             context.warn(f"Fawkes does not know the tag !{self.tag} of a node", where=self.where)
         at = entry.get("pos")
         if not isinstance(at, list) or len(at) != 2:
-            refuse("pos must be [x, y]", f"{self.where}.pos")
+            raise_unreadable("pos must be [x, y]", f"{self.where}.pos")
         self.at = tuple(number(_plain(v, f"{self.where}.pos"), f"{self.where}.pos") for v in at)
         properties = entry.get("properties")
         self.properties, self.words = _properties(properties, f"{self.where}.properties", context)
@@ -199,7 +200,7 @@ def _untag(item: Any, location: str, context: ReadContext) -> tuple[str | None, 
         return None, item
     tag = item.tag.removeprefix(PREFIX) if item.tag.startswith(PREFIX) else item.tag[1:]
     if not _WORD.match(tag):
-        refuse(f"{item.tag[:80]!r} cannot be a tag: letters, digits, - and _ can", location)
+        raise_unreadable(f"{item.tag[:80]!r} cannot be a tag: letters, digits, - and _ can", location)
     if not item.tag.startswith(PREFIX):
         context.warn(f"the tag !{tag} needs the line '%TAG ! {PREFIX}' for Fawkes to know it", where=location)
     return tag, item.value
@@ -208,7 +209,7 @@ def _untag(item: Any, location: str, context: ReadContext) -> tuple[str | None, 
 def _name(value: Any, location: str) -> str:
     """A scalar as the text that it is for Fawkes."""
     if not isinstance(value, str):
-        refuse("must be a text", location)
+        raise_unreadable("must be a text", location)
     return str.__str__(value)
 
 
@@ -218,9 +219,9 @@ def _plain(value: Any, location: str) -> Any:
         try:
             return _yaml.scalar(str.__str__(value))
         except ValueError as error:
-            refuse(str(error), location)
+            raise_unreadable(str(error), location)
     if isinstance(value, _yaml.Tagged):
-        refuse(f"the tag {value.tag[:80]} has no meaning here", location)
+        raise_unreadable(f"the tag {value.tag[:80]} has no meaning here", location)
     if isinstance(value, dict):
         return {key: _plain(v, location) for key, v in value.items()}
     if isinstance(value, list):
@@ -236,7 +237,7 @@ def _properties(listing: Any, location: str, context: ReadContext) -> tuple[dict
         context.warn("must be a list of one-key mappings for Fawkes; a list is served", where=location)
         listing = [listing]
     if not isinstance(listing, list):
-        refuse("must be a list of words and one-key mappings", location)
+        raise_unreadable("must be a list of words and one-key mappings", location)
     out: dict[str, Any] = {}
     flags: set[str] = set()
     for item in listing:
@@ -246,7 +247,7 @@ def _properties(listing: Any, location: str, context: ReadContext) -> tuple[dict
         elif isinstance(item, dict):
             pairs = [(key, _plain(value, f"{location}.{key}")) for key, value in item.items()]
         else:
-            refuse("must be a list of words and one-key mappings", location)
+            raise_unreadable("must be a list of words and one-key mappings", location)
         for key, value in pairs:
             if key in out:
                 context.warn("stands twice; the last value counts", where=f"{location}.{key}")
@@ -270,13 +271,13 @@ def _connections(
     if entries is None or entries == "":
         return [], {}
     if not isinstance(entries, list):
-        refuse("must be a list of pairs", "connections")
+        raise_unreadable("must be a list of pairs", "connections")
     items = []
     for k, item in enumerate(entries):
         location = f"connections[{k}]"
         tag, pair = _untag(item, location, context)
         if not isinstance(pair, list) or len(pair) != 2:
-            refuse("a connection is a pair of names: [from, to]", location)
+            raise_unreadable("a connection is a pair of names: [from, to]", location)
         items.append((tag, _name(pair[0], location), _name(pair[1], location), location))
         if tag is not None and tag not in KNOWN_TAGS:
             context.warn(f"Fawkes does not know the tag !{tag} of a connection", where=location)
@@ -309,7 +310,7 @@ def _connections(
 def _document(top: Mapping[str, Any], names: set[str], context: ReadContext) -> dict[str, Any]:
     """What the file says as a whole."""
     extra_members = {
-        key: str.__str__(value) if value and isinstance(value, str) and key in NAMED else _plain(value, key)
+        key: str.__str__(value) if value and isinstance(value, str) and key in NAME_KEYS else _plain(value, key)
         for key, value in top.items()
         if key not in TOP_KEYS
     }
@@ -359,20 +360,22 @@ class _Connection:
 class _Writer:
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.context = context
-        self.document = known_document(layers, NAME)
-        self.net: MergedNetwork = joined(layers, context)
-        self.names = [self._name_of(node) for node in self.net.nodes]
+        self.document = source_document(layers, NAME)
+        self.net: MergedNetwork = merge_networks(layers, context)
+        self.names = [self._node_name(node) for node in self.net.nodes]
         self.lost: Counter[str] = Counter()
 
-    def _name_of(self, node: Node) -> str:
-        source_name = own(node.properties, NAME).get("name")
+    def _node_name(self, node: Node) -> str:
+        source_name = get_source_properties(node.properties, NAME).get("name")
         return source_name if isinstance(source_name, str) and is_name(source_name) else node.id
 
     def file(self) -> str:
         """The whole text."""
-        if repeats := without_repeats(self.names):
-            self.context.warn(f"{len(repeats)} names stand twice or more, which Fawkes refuses: {some(repeats)}")
-        connections = self._tagged(list(self._connections()))
+        if repeats := duplicates(self.names):
+            self.context.warn(
+                f"{len(repeats)} names stand twice or more, which Fawkes refuses: {shorten_list(repeats)}"
+            )
+        connections = self._with_tags(list(self._connections()))
         order = self._node_order(connections)
         out = [f"%YAML 1.2\n%TAG ! {PREFIX}\n---\n", self._head(), "nodes:" if order else "nodes: []"]
         xy = np.array([(self.net.nodes[k].x, self.net.nodes[k].y) for k in order], np.float64).reshape(-1, 2)
@@ -402,14 +405,14 @@ class _Writer:
             out.append(_yaml.mapping(top, 0))
         defaults = self.document.get("defaults")
         if isinstance(defaults, dict) and defaults:
-            out.append("default-properties:\n" + _listed(defaults, self.document.get("words"), 2))
+            out.append("default-properties:\n" + _list_text(defaults, self.document.get("words"), 2))
         return "".join(out)
 
     def _node(self, k: int, x: str, y: str, *, linked: bool) -> str:
         """The text of a node, with the line break before it."""
         node, name = self.net.nodes[k], self.names[k]
         p = node.properties
-        source_members = own(p, NAME)
+        source_members = get_source_properties(p, NAME)
         tag = _tag(source_members)
         if NAME not in p and not linked:
             tag = UNCONNECTED
@@ -419,7 +422,7 @@ class _Writer:
             self.context.warn("was !unconnected and is connected now: it is served without the tag", where=name)
         extra_properties = source_members.get("properties")
         properties = dict(extra_properties) if isinstance(extra_properties, dict) else {}
-        turned = said_yaw(properties.get("orientation"), p.get("orientation"))
+        turned = yaw_or_source(properties.get("orientation"), p.get("orientation"))
         if turned is not None:
             properties["orientation"] = turned
             self.lost["tilted"] += not is_flat(p["orientation"])
@@ -434,7 +437,7 @@ class _Writer:
         body = f"name: {_yaml.text(name)}\n    pos: [{x}, {y}]\n"
         text = f"\n  - !{tag}\n    {body}" if tag else f"\n  - {body}"
         if properties:
-            text += "    properties:\n" + _listed(properties, source_members.get("words"), 6)
+            text += "    properties:\n" + _list_text(properties, source_members.get("words"), 6)
         more = source_members.get("more")
         if isinstance(more, dict) and (more := {w: v for w, v in more.items() if w not in NODE_KEYS}):
             text += _yaml.mapping(more, 4)
@@ -443,7 +446,7 @@ class _Writer:
 
     def _connections(self) -> Iterator[_Connection]:
         """Edges as connections: both directions of a pair as one."""
-        edges = sorted(self.net.edges, key=lambda e: (NAME not in e.properties, natural(e.id)))
+        edges = sorted(self.net.edges, key=lambda e: (NAME not in e.properties, natural_sort_key(e.id)))
         waiting: dict[tuple[int, int, str | None], list[tuple[Edge, dict[str, Any]]]] = defaultdict(list)
         covered: set[tuple[int, int]] = set()
         for edge in edges:
@@ -453,7 +456,7 @@ class _Writer:
                 continue
             covered.add((edge.source, edge.target))
             self.lost["edge attributes"] += bool(edge.properties.keys() - CANONICAL_EDGE)
-            source_members = own(edge.properties, NAME)
+            source_members = get_source_properties(edge.properties, NAME)
             tag = _tag(source_members)
             order = source_members.get("order") if isinstance(source_members.get("order"), int) else None
             back = waiting[(edge.target, edge.source, tag)]
@@ -476,9 +479,9 @@ class _Writer:
         backward = (bool(its.get("backward")), bool(other.get("backward")))
         if backward[0] != backward[1]:
             return backward[1]
-        return natural(self.names[a.source]) < natural(self.names[b.source])
+        return natural_sort_key(self.names[a.source]) < natural_sort_key(self.names[b.source])
 
-    def _tagged(self, connections: list[_Connection]) -> list[_Connection]:
+    def _with_tags(self, connections: list[_Connection]) -> list[_Connection]:
         """The connections in the order that Fawkes shall add them, those of other formats tagged where they cross."""
         crossing = self._crossing(connections)
         out = []
@@ -496,7 +499,9 @@ class _Writer:
                 "where two of them cross each other"
             )
         names = self.names
-        out.sort(key=lambda t: (t[0], t[1], natural(names[t[2].a]), natural(names[t[2].b]), t[2].tag or ""))
+        out.sort(
+            key=lambda t: (t[0], t[1], natural_sort_key(names[t[2].a]), natural_sort_key(names[t[2].b]), t[2].tag or "")
+        )
         return [c for _, _, c in out]
 
     def _crossing(self, connections: Sequence[_Connection]) -> Sequence[bool]:
@@ -524,7 +529,7 @@ class _Writer:
     def _node_order(self, connections: Sequence[_Connection]) -> list[int]:
         """Places of the nodes in the file's order. Fawkes wants all of them to be reachable from the first one."""
         names, nodes = self.names, self.net.nodes
-        order = sorted(range(len(names)), key=lambda k: natural(names[k]))
+        order = sorted(range(len(names)), key=lambda k: natural_sort_key(names[k]))
         onward: dict[int, list[int]] = defaultdict(list)
         linked: set[int] = set()
         for c in connections:
@@ -532,7 +537,9 @@ class _Writer:
             if c.tag != DIRECTED:
                 onward[c.b].append(c.a)
             linked |= {c.a, c.b}
-        needed = [k for k in order if k in linked or _tag(own(nodes[k].properties, NAME)) != UNCONNECTED]
+        needed = [
+            k for k in order if k in linked or _tag(get_source_properties(nodes[k].properties, NAME)) != UNCONNECTED
+        ]
         needed = [k for k in needed if k in linked or NAME in nodes[k].properties]
         seen: set[int] = set()
         starts = [k for k in needed if _reach(k, onward, seen)]
@@ -552,7 +559,7 @@ class _Writer:
 
     def _report(self) -> None:
         context, counts = self.context, self.lost
-        only_2d(self.net, context, "Fawkes' nodes are two-dimensional")
+        report_3d_loss(self.net, context, "Fawkes' nodes are two-dimensional")
         if counts["unconnected"]:
             why = "Fawkes asks for the tag where no connection leads"
             context.fill("nodes: !unconnected", f"{counts['unconnected']} nodes", why)
@@ -592,7 +599,7 @@ def _reach(start: int, onward: Mapping[int, Sequence[int]], seen: set[int]) -> b
     return True
 
 
-def _listed(properties: Mapping[str, Any], flags: Any, column: int) -> str:
+def _list_text(properties: Mapping[str, Any], flags: Any, column: int) -> str:
     """A mapping as a list of one-key mappings, sorted, and bare words where the value still is true."""
     bare = frozenset(w for w in flags if isinstance(w, str)) if isinstance(flags, list) else frozenset()
     pad = " " * column
@@ -624,7 +631,7 @@ register(
         title="Navigation graph (Fawkes)",
         files=("navgraph.yaml",),
         media_types=("application/yaml",),
-        carries=frozenset({"topology"}),
+        layers=frozenset({"topology"}),
         detect=detect,
         read=read,
         check=_navgraph_rules.check,
@@ -632,10 +639,10 @@ register(
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,
         family=NAME,
-        titled=True,
-        rank=35,
+        has_title=True,
+        priority=35,
         extensions=(".yaml", ".yml"),
-        bends="nodes",
+        keeps_bends="nodes",
         version=2,
     )
 )

@@ -41,7 +41,7 @@ from app.formats import (
     _yaml,
     register,
 )
-from app.formats._select import file_stem, the_one
+from app.formats._select import file_stem, select_part
 from app.model.frame import MAX_METRES
 from app.model.grid import (
     FREE,
@@ -50,10 +50,10 @@ from app.model.grid import (
     UNKNOWN_GREY,
     Mode,
     OccupancyGrid,
-    as_seen,
     outline,
-    packed_cells,
+    pack_cells,
     unknown_grey,
+    unknown_grey_as_unknown,
     without_unknown_grey,
 )
 from app.model.layers import MAP, Layers, PartKey
@@ -75,7 +75,7 @@ REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_
 YAML_ENDS = (".yaml", ".yml")
 IMAGE_ENDS = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
 
-SAVED = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
+MAP_SAVER_PIXELS = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
 """The pixels that map_saver writes."""
 
 Table = NDArray[np.uint8]
@@ -163,7 +163,7 @@ def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
 
 
 def _is_image(name: str, data: bytes) -> bool:
-    return _image.kind_of(data) is not None or name.lower().endswith(IMAGE_ENDS)
+    return _image.detect_kind(data) is not None or name.lower().endswith(IMAGE_ENDS)
 
 
 def _find_image(reference: str, main: str, names: Iterable[str]) -> tuple[str | None, str]:
@@ -297,17 +297,17 @@ def _layers(
     )
     meaning = _masks.read(mask_file, files[mask_file], context) if mask_file else {}
     try:
-        if context.cells:
+        if context.decode_cells:
             shades = _image.read_grey(files[picture], context.limits)
             rule = _rule(
                 parameters["mode"], parameters["negate"], parameters["occupied_thresh"], parameters["free_thresh"]
             )
-            doubtful = _is_doubtful(rule, parameters["mode"], negate=parameters["negate"]) and not meaning
-            cells, grey = _cells(shades, rule, parameters["mode"], SAVED[UNKNOWN] if doubtful else None)
+            doubtful = _reads_unknown_as_free(rule, parameters["mode"], negate=parameters["negate"]) and not meaning
+            cells, grey = _cells(shades, rule, parameters["mode"], MAP_SAVER_PIXELS[UNKNOWN] if doubtful else None)
             if grey is not None:
-                meaning = {**meaning, UNKNOWN_GREY: packed_cells(grey)}
+                meaning = {**meaning, UNKNOWN_GREY: pack_cells(grey)}
         else:
-            width, height = _image.size_of(files[picture], context.limits)
+            width, height = _image.read_size(files[picture], context.limits)
             cells = outline(height, width)
     except BadUpload as error:
         raise type(error)(f"{picture}: {error.detail}", [Problem(error.detail, picture)]) from error
@@ -325,9 +325,9 @@ def _layers(
     return Layers({PartKey("occupancy", context.level, name): grid})
 
 
-def _is_doubtful(rule: Table, mode: Mode, *, negate: bool) -> bool:
+def _reads_unknown_as_free(rule: Table, mode: Mode, *, negate: bool) -> bool:
     """Whether the grey that map_saver writes for unknown is read as free."""
-    return mode == "trinary" and not negate and bool(rule[SAVED[UNKNOWN]] == FREE)
+    return mode == "trinary" and not negate and bool(rule[MAP_SAVER_PIXELS[UNKNOWN]] == FREE)
 
 
 def _cells(
@@ -339,7 +339,7 @@ def _cells(
     grey = None if shade is None else np.zeros(cells.shape, bool)
     table = rule.tobytes()
     for y, block, opaque in shades.strips():
-        values = _image.look_up(block, table)
+        values = _image.apply_table(block, table)
         if opaque is not None and mode != "raw":
             values = np.where(opaque, values, np.uint8(UNKNOWN))
         top = shades.height - y
@@ -396,9 +396,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     key = choose(sorted(layers.grids()), options)[0]
     grid = layers.grids()[key]
     if options.resolution is not None and options.resolution != grid.resolution:
-        grid = _with_mask(grid, partial(resampled, resolution=options.resolution))
+        grid = _with_mask(grid, partial(resample, resolution=options.resolution))
     if options.normalize:
-        grid = _with_mask(grid, normalized)
+        grid = _with_mask(grid, normalize)
     stem = file_stem(key.name)
     grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
     grid, pixels = _with_grey(grid, pixels)
@@ -413,10 +413,10 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named grid; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
     supply = "upload one (a YAML and its image)"
-    return the_one(keys, "occupancy", options.grid, options.level, noun="grid", option="grid", supply=supply)
+    return select_part(keys, "occupancy", options.grid, options.level, noun="grid", option="grid", supply=supply)
 
 
-def by_file(name: str) -> dict[str, str]:
+def options_from_filename(name: str) -> dict[str, str]:
     """``keepout.yaml``, ``keepout.pgm`` and ``keepout_filter_info.yaml`` are the grid ``keepout``; ``keepout.png`` asks
     for a PNG, too."""
     stem, _, end = name.rpartition(".")
@@ -434,15 +434,15 @@ def _encoding(
 
     In a PNG unknown may have no pixel of its own: it is transparent then.
     """
-    present = np.flatnonzero(_present(grid.cells))
+    present = np.flatnonzero(_present_file(grid.cells))
     if options.mode is not None:
         same_mode = options.mode == grid.mode
         grid = replace(grid, mode=options.mode)
         if options.mode == "trinary":
             if not same_mode and _pixels(grid, present) is None:
                 grid = replace(grid, occupied_thresh=0.65, free_thresh=0.196)
-            grid = _judged(grid, context)
-            present = np.flatnonzero(_present(grid.cells))
+            grid = _apply_thresholds(grid, context)
+            present = np.flatnonzero(_present_file(grid.cells))
         elif options.mode == "scale" and not same_mode and _pixels(grid, present[present != UNKNOWN]) is None:
             grid = replace(grid, occupied_thresh=1.0, free_thresh=0.0)
     pixels = _pixels(grid, present)
@@ -473,32 +473,32 @@ def _with_mask(grid: OccupancyGrid, change: Callable[[OccupancyGrid], OccupancyG
     out = without_unknown_grey(change(grid))
     if unknown_grey(grid) is None:
         return out
-    grey = (change(as_seen(grid)).cells == UNKNOWN) & (out.cells == FREE)
-    return replace(out, properties={**out.properties, UNKNOWN_GREY: packed_cells(grey)}) if grey.any() else out
+    grey = (change(unknown_grey_as_unknown(grid)).cells == UNKNOWN) & (out.cells == FREE)
+    return replace(out, properties={**out.properties, UNKNOWN_GREY: pack_cells(grey)}) if grey.any() else out
 
 
 def _with_grey(grid: OccupancyGrid, pixels: Table) -> tuple[OccupancyGrid, Table]:
     """Free cells that came with the grey of unknown ones get it back, by a value that no cell has."""
     rule = _rule(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
-    grey = unknown_grey(grid) if _is_doubtful(rule, grid.mode, negate=grid.negate) else None
+    grey = unknown_grey(grid) if _reads_unknown_as_free(rule, grid.mode, negate=grid.negate) else None
     if grey is None:
         return grid, pixels
-    present = _present(grid.cells)
+    present = _present_file(grid.cells)
     spare = next((v for v in range(FREE + 1, OCCUPIED) if not present[v]), None)
     if spare is None:
         return grid, pixels
     pixels = pixels.copy()
-    pixels[spare] = SAVED[UNKNOWN]
+    pixels[spare] = MAP_SAVER_PIXELS[UNKNOWN]
     return replace(grid, cells=np.where(grey, np.uint8(spare), grid.cells)), pixels
 
 
-def _present(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def _present_file(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Which of the 256 values occur."""
     seen = np.zeros(256, bool)
     rows = max(1, _image.STRIP // cells.shape[1])
     for y in range(0, len(cells), rows):
         block = cells[y : y + rows]
-        counts = {value: int(np.count_nonzero(block == value)) for value in SAVED}
+        counts = {value: int(np.count_nonzero(block == value)) for value in MAP_SAVER_PIXELS}
         for value, count in counts.items():
             seen[value] |= count > 0
         if sum(counts.values()) < block.size:
@@ -517,7 +517,7 @@ def _pixels(grid: OccupancyGrid, values: NDArray[np.intp]) -> Table | None:
         fit = np.flatnonzero(rule == value)
         if not len(fit):
             return None
-        pixel = SAVED.get(value, -1)
+        pixel = MAP_SAVER_PIXELS.get(value, -1)
         pixel = 255 - pixel if grid.negate and pixel >= 0 else pixel
         black, white = (int(fit[-1]), int(fit[0])) if grid.negate else (int(fit[0]), int(fit[-1]))
         if grid.mode == "raw":
@@ -529,7 +529,7 @@ def _pixels(grid: OccupancyGrid, values: NDArray[np.intp]) -> Table | None:
     return out
 
 
-def _judged(grid: OccupancyGrid, context: WriteContext) -> OccupancyGrid:
+def _apply_thresholds(grid: OccupancyGrid, context: WriteContext) -> OccupancyGrid:
     """Values between free and occupied put to the thresholds, as trinary knows three values only."""
     value = np.arange(256)
     table = np.where(value >= grid.occupied_thresh * OCCUPIED, OCCUPIED, UNKNOWN)
@@ -537,7 +537,7 @@ def _judged(grid: OccupancyGrid, context: WriteContext) -> OccupancyGrid:
     table[[FREE, OCCUPIED, UNKNOWN]] = FREE, OCCUPIED, UNKNOWN
     between = int(grid.cells.size) - sum(int(np.count_nonzero(grid.cells == v)) for v in (FREE, OCCUPIED, UNKNOWN))
     context.drop("cells between free and occupied", between, "mode=trinary knows free, occupied and unknown only")
-    return replace(grid, cells=_image.look_up(grid.cells, table.astype(np.uint8).tobytes())) if between else grid
+    return replace(grid, cells=_image.apply_table(grid.cells, table.astype(np.uint8).tobytes())) if between else grid
 
 
 def _yaml_text(grid: OccupancyGrid, picture: str) -> bytes:
@@ -610,7 +610,7 @@ def _picture(grid: OccupancyGrid, pixels: Table, kind: Literal["pgm", "png"]) ->
     if rule[pixels[UNKNOWN]] == UNKNOWN or not bool((grid.cells == UNKNOWN).any()):
         return _image.encode_png(grid.cells, flip=True, table=table)
     both = np.empty((grid.height, grid.width, 2), np.uint8)
-    both[..., 0] = _image.look_up(grid.cells, table)
+    both[..., 0] = _image.apply_table(grid.cells, table)
     both[..., 1] = 255
     both[..., 1][grid.cells == UNKNOWN] = 0
     return _image.encode_png(both, flip=True)
@@ -622,7 +622,7 @@ _OF_RANK = np.concatenate([[FREE, UNKNOWN], np.arange(1, OCCUPIED + 1), np.zeros
 """Free < unknown < any known value above free: the order in which one cell is made of several."""
 
 
-def resampled(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
+def resample(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
     """The same place in cells of another size, from the same corner.
 
     A coarser cell has the highest value that it covers, where unknown counts just above free: no obstacle gets lost,
@@ -637,7 +637,7 @@ def resampled(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
             for n, last in zip(shape, grid.cells.shape, strict=True)
         )
         return replace(grid, cells=grid.cells.take(rows, 0).take(columns, 1), resolution=resolution)
-    ranks = _image.look_up(grid.cells, _RANK.tobytes())
+    ranks = _image.apply_table(grid.cells, _RANK.tobytes())
     for axis in (0, 1):
         n, old = shape[axis], ranks.shape[axis]
         edges = np.arange(n + 1) * ratio
@@ -648,10 +648,10 @@ def resampled(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
         for step in range(1, int((ends - starts).max())):
             np.maximum(out, np.take(ranks, np.minimum(starts + step, ends - 1), axis), out=out)
         ranks = out
-    return replace(grid, cells=_image.look_up(ranks, _OF_RANK.tobytes()), resolution=resolution)
+    return replace(grid, cells=_image.apply_table(ranks, _OF_RANK.tobytes()), resolution=resolution)
 
 
-def normalized(grid: OccupancyGrid) -> OccupancyGrid:
+def normalize(grid: OccupancyGrid) -> OccupancyGrid:
     """The same place with yaw 0 and an origin that is a whole multiple of the resolution; unknown outside.
 
     A cell has the value of the old cell at its centre, or that of an occupied one whose centre it holds, whichever is
@@ -667,7 +667,7 @@ def normalized(grid: OccupancyGrid) -> OccupancyGrid:
     high = np.maximum(np.ceil(corners.max(axis=0) - 1e-6).astype(np.int64), low + 1)
     width, height = (int(v) for v in high - low)
     _check_count(width * height, "normalize")
-    source = _image.look_up(grid.cells, _RANK.tobytes())
+    source = _image.apply_table(grid.cells, _RANK.tobytes())
     ranks = np.empty((height, width), np.uint8)
     u = np.arange(width) + (float(low[0]) + 0.5 - steps[0])
     step = max(1, _image.STRIP // 8 // width)
@@ -686,7 +686,7 @@ def normalized(grid: OccupancyGrid) -> OccupancyGrid:
         at_y = np.floor(p * sin + q * cos + (steps[1] - float(low[1]))).astype(np.intp).clip(0, height - 1)
         np.maximum.at(ranks, (at_y, at_x), source[row + high_line, high_column])
     origin = (round(float(low[0]) * size, 9), round(float(low[1]) * size, 9), 0.0)
-    return replace(grid, cells=_image.look_up(ranks, _OF_RANK.tobytes()), origin=origin)
+    return replace(grid, cells=_image.apply_table(ranks, _OF_RANK.tobytes()), origin=origin)
 
 
 def _check_count(count: int, location: str) -> None:
@@ -702,7 +702,7 @@ register(
         title="Occupancy grid (Nav2, ROS map_server)",
         files=("map.yaml", "map.pgm"),
         media_types=("application/yaml", "image/x-portable-graymap"),
-        carries=frozenset({"occupancy"}),
+        layers=frozenset({"occupancy"}),
         detect=detect,
         read=read,
         write=write,
@@ -710,11 +710,11 @@ register(
         companions=companions,
         read_options=ReadOptions,
         write_options=WriteOptions,
-        choose=choose,
-        by_file=by_file,
+        select_parts=choose,
+        options_from_filename=options_from_filename,
         parts=Parts("occupancy", "grid", file_stem),
         check=_occupancy_grid_rules.check,
-        rank=40,
+        priority=40,
         version=4,
         extensions=(*YAML_ENDS, *IMAGE_ENDS),
     )

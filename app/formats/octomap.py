@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from app.errors import NotFound, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, WriteContext, _octomap_rules, register
-from app.formats._select import file_stem, the_one
+from app.formats._select import file_stem, select_part
 from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
-from app.model.voxels import DEPTH, LOG_ODDS, UNSET, VoxelMap, coarser, cut, parents_of, pruned
+from app.model.voxels import DEPTH, LOG_ODDS, UNSET, VoxelMap, coarser, cut, merge_to_parents, prune
 from app.parameters import parameter
 
 NAME = "octomap"
@@ -47,7 +47,7 @@ FULL_TYPES = (OCTREE, COLOR_OCTREE, "OcTreeStamped")
 """Trees whose ``.ot`` is read: OcTreeStamped keeps its times to itself and is stored like an OcTree."""
 
 HEADER_BYTES = 2**16
-WAITING = 7 * DEPTH
+MAX_PENDING_NODES = 7 * DEPTH
 """Nodes of a tree of this depth that can wait for their turn in a depth-first walk."""
 
 Kind = Literal["bt", "ot"]
@@ -105,7 +105,7 @@ class _Header:
     body: int
 
 
-def _wrong(reason: str, line: int | None = None, location: str | None = None) -> UnreadableFile:
+def _unreadable_error(reason: str, line: int | None = None, location: str | None = None) -> UnreadableFile:
     return UnreadableFile(reason, [Problem(reason, line=line, where=location)])
 
 
@@ -114,59 +114,59 @@ def _header(data: bytes, context: ReadContext) -> _Header:
         return _legacy_header(data, context)
     kind: Kind = "bt" if data.startswith(BINARY_FILE) else "ot"
     if kind == "ot" and not data.startswith(FULL_FILE):
-        raise _wrong(f"the first line must be {FULL_FILE.decode()!r} or {BINARY_FILE.decode()!r}", 1)
+        raise _unreadable_error(f"the first line must be {FULL_FILE.decode()!r} or {BINARY_FILE.decode()!r}", 1)
     entries: dict[str, tuple[str, int]] = {}
     comments: list[str] = []
     position, number = data.find(b"\n") + 1, 1
     while True:
         end = data.find(b"\n", position, HEADER_BYTES)
         if position == 0 or end < 0:
-            raise _wrong("the header does not end: the line 'data' is missing", number, "data")
+            raise _unreadable_error("the header does not end: the line 'data' is missing", number, "data")
         number += 1
         line, position = data[position:end].rstrip(b"\r"), end + 1
         tokens = line.split()
         while tokens:
             token = tokens.pop(0)
             if token == b"data":
-                return _stated(kind, entries, tuple(comments), position, context)
+                return _header_from_ids(kind, entries, tuple(comments), position, context)
             if token.startswith(b"#"):
-                comments.append(_decoded(line[line.index(b"#") :]))
+                comments.append(_decode_text(line[line.index(b"#") :]))
                 break
-            key = _decoded(token)
+            key = _decode_text(token)
             if key not in ("id", "res", "size") or not tokens:
                 context.warn(f"unknown word {key[:40]!r} in the header: left out", line=number, where=key[:40])
                 break
-            entries[key] = (_decoded(tokens.pop(0)), number)
+            entries[key] = (_decode_text(tokens.pop(0)), number)
 
 
-def _decoded(text: bytes) -> str:
+def _decode_text(text: bytes) -> str:
     try:
         return text.decode()
     except UnicodeDecodeError:
         return text.decode("latin-1")
 
 
-def _stated(
+def _header_from_ids(
     kind: Kind, entries: Mapping[str, tuple[str, int]], comments: tuple[str, ...], body: int, context: ReadContext
 ) -> _Header:
     for key in ("id", "size", "res"):
         if key not in entries:
-            raise _wrong(f"the header does not tell the tree's {key}", location=key)
+            raise _unreadable_error(f"the header does not tell the tree's {key}", location=key)
     name, line = entries["id"]
     if name == "1":
         context.warn("the id 1 is an old one: taken for OcTree", line=line, where="id")
         name = OCTREE
     if kind == "ot" and name not in FULL_TYPES:
         reason = f"an .ot of the type {name[:80]!r} cannot be read, only {', '.join(FULL_TYPES)}: save it as a .bt"
-        raise _wrong(reason, line, "id")
+        raise _unreadable_error(reason, line, "id")
     if not re.fullmatch(r"\w{1,80}", name, re.ASCII):
-        raise _wrong(f"the tree's type must be a word, got {name[:80]!r}", line, "id")
+        raise _unreadable_error(f"the tree's type must be a word, got {name[:80]!r}", line, "id")
     size, line = entries["size"]
     if not re.fullmatch(r"\d{1,12}", size, re.ASCII):
-        raise _wrong(f"size must be the number of nodes, got {size[:40]!r}", line, "size")
+        raise _unreadable_error(f"size must be the number of nodes, got {size[:40]!r}", line, "size")
     resolution, line = entries["res"]
     if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", resolution, re.ASCII):
-        raise _wrong(f"res must be a number of metres, got {resolution[:40]!r}", line, "res")
+        raise _unreadable_error(f"res must be a number of metres, got {resolution[:40]!r}", line, "res")
     _check_resolution(float(resolution), line)
     is_default = comments == COMMENTS
     user_comments = () if is_default else tuple(c for c in comments if is_writable(c.replace("\t", " ")))
@@ -177,12 +177,12 @@ def _stated(
 
 def _check_resolution(resolution: float, line: int | None = None) -> None:
     if not 1e-6 <= resolution <= 1e4:
-        raise _wrong(f"the resolution must be between 1e-6 and 1e4 metres, got {resolution!r}", line, "res")
+        raise _unreadable_error(f"the resolution must be between 1e-6 and 1e4 metres, got {resolution!r}", line, "res")
 
 
 def _legacy_header(data: bytes, context: ReadContext) -> _Header:
     if len(data) < LEGACY.size or data[:4] != b"\x03\0\0\0":
-        raise _wrong(f"the first line must be {FULL_FILE.decode()!r} or {BINARY_FILE.decode()!r}", 1)
+        raise _unreadable_error(f"the first line must be {FULL_FILE.decode()!r} or {BINARY_FILE.decode()!r}", 1)
     _, resolution, size = LEGACY.unpack_from(data)
     _check_resolution(resolution)
     context.warn("an OctoMap file of 2010 without a text header: served with today's")
@@ -224,20 +224,22 @@ def _read_binary(data: bytes, header: _Header) -> tuple[NDArray[np.uint8], NDArr
     """Depth, code and log-odds of the leaves of a stream of inner nodes."""
     body_size = len(data) - header.body
     if body_size % 2:
-        raise _wrong(f"the tree has {body_size} bytes, which is no whole number of 16 bit words", location="data")
+        raise _unreadable_error(
+            f"the tree has {body_size} bytes, which is no whole number of 16 bit words", location="data"
+        )
     if body_size // 2 > header.size:
-        raise _wrong(
+        raise _unreadable_error(
             f"the header says {header.size} nodes, the data has {body_size // 2} inner nodes alone", location="size"
         )
     masks: Words = np.frombuffer(data, "<u2", body_size // 2, header.body).astype(np.uint16, copy=False)
-    inner = _packed(masks & (masks >> np.uint16(1)))
-    leaves = _packed(masks ^ (masks >> np.uint16(1)))
+    inner = _pack_bits(masks & (masks >> np.uint16(1)))
+    leaves = _pack_bits(masks ^ (masks >> np.uint16(1)))
     count = int(np.bitwise_count(leaves).sum(dtype=np.int64))
     _check_size(len(masks) + count, header)
-    occupied = _packed((masks & ~(masks << np.uint16(1))) >> np.uint16(1))
-    at_depth = _by_depth(inner, DEPTH - 1)
+    occupied = _pack_bits((masks & ~(masks << np.uint16(1))) >> np.uint16(1))
+    at_depth = _split_by_depth(inner, DEPTH - 1)
     if len(masks) > 1 and bool((masks == 0).any()):
-        raise _wrong("an inner node has no children", location="data")
+        raise _unreadable_error("an inner node has no children", location="data")
     codes, depths, states = [], [], []
     code = np.zeros(1, np.uint64)
     for depth, rows in enumerate(at_depth):
@@ -253,7 +255,7 @@ def _read_binary(data: bytes, header: _Header) -> tuple[NDArray[np.uint8], NDArr
     return depth_[order], code[order], np.array(LOG_ODDS)[state[order]]
 
 
-def _packed(pairs: Words) -> Masks:
+def _pack_bits(pairs: Words) -> Masks:
     """The even ones of 16 bits, moved together: uint8 [n]."""
     x = pairs & np.uint16(0x5555)
     x = (x | x >> np.uint16(1)) & np.uint16(0x3333)
@@ -269,13 +271,13 @@ def _read_full(
     body_size = len(data) - header.body
     if body_size % record.itemsize:
         size = record.itemsize
-        raise _wrong(
+        raise _unreadable_error(
             f"the tree has {body_size} bytes; a node of {header.id} takes {size}, which does not go", location="data"
         )
     nodes = np.frombuffer(data, record, body_size // record.itemsize, header.body)
     _check_size(len(nodes), header)
     masks: Masks = np.ascontiguousarray(nodes["mask"])
-    at_depth = _by_depth(masks, DEPTH)
+    at_depth = _split_by_depth(masks, DEPTH)
     leaf = masks == 0
     code, depth = np.empty(len(nodes), np.uint64), np.empty(len(nodes), np.uint8)
     codes = np.zeros(1, np.uint64)
@@ -288,7 +290,7 @@ def _read_full(
     infinite = np.flatnonzero(~np.isfinite(nodes["odds"]))
     if len(infinite):
         at = int(infinite[0])
-        raise _wrong(f"the log-odds of node {at} are no finite number", location="data")
+        raise _unreadable_error(f"the log-odds of node {at} are no finite number", location="data")
     colour = np.ascontiguousarray(nodes["colour"][leaf]) if header.id == COLOR_OCTREE else None
     if len(nodes) == 1:  # the whole tree is one leaf: its eight octants
         colour = None if colour is None else np.repeat(colour, 8, axis=0)
@@ -304,7 +306,7 @@ def _record(tree: str) -> np.dtype[Any]:
 
 def _check_size(counted: int, header: _Header) -> None:
     if counted != header.size:
-        raise _wrong(f"the header says {header.size} nodes, the data has {counted}", location="size")
+        raise _unreadable_error(f"the header says {header.size} nodes, the data has {counted}", location="size")
 
 
 def _children(masks: Masks) -> tuple[Rows, NDArray[np.uint64]]:
@@ -313,7 +315,7 @@ def _children(masks: Masks) -> tuple[Rows, NDArray[np.uint64]]:
     return bits >> 3, (bits & 7).astype(np.uint64)
 
 
-def _by_depth(masks: Masks, deepest: int) -> list[Rows]:
+def _split_by_depth(masks: Masks, deepest: int) -> list[Rows]:
     """The nodes of a depth-first stream by depth: indexes, ascending, so the children of one depth in their order.
 
     masks: uint8 [n], a bit for each child that follows in the stream. Before node k, P[k] + 1 nodes wait for their turn
@@ -327,12 +329,12 @@ def _by_depth(masks: Masks, deepest: int) -> list[Rows]:
     waiting -= np.arange(1, n + 1)
     short = waiting < 0
     if not bool(short.any()):
-        raise _wrong("the data ends before the tree does", location="data")
+        raise _unreadable_error("the data ends before the tree does", location="data")
     end = int(np.argmax(short))
     if end != n - 1:
-        raise _wrong(f"the tree ends after {end + 1} nodes, but the data goes on", location="data")
-    if n > 1 and int(waiting.max()) > WAITING:
-        raise _wrong(f"the tree is deeper than {DEPTH} levels", location="data")
+        raise _unreadable_error(f"the tree ends after {end + 1} nodes, but the data goes on", location="data")
+    if n > 1 and int(waiting.max()) > MAX_PENDING_NODES:
+        raise _unreadable_error(f"the tree is deeper than {DEPTH} levels", location="data")
     before = np.zeros(n, np.int8)
     before[1:] = waiting[:-1]
     order = np.argsort(before, kind="stable")
@@ -348,7 +350,7 @@ def _by_depth(masks: Masks, deepest: int) -> list[Rows]:
         step -= np.bincount(np.concatenate(ends), minlength=n + 1)
     depth = np.cumsum(step[:n])
     if int(depth.max()) > deepest:
-        raise _wrong(f"the tree is deeper than {DEPTH} levels", location="data")
+        raise _unreadable_error(f"the tree is deeper than {DEPTH} levels", location="data")
     order = np.argsort(depth.astype(np.int8), kind="stable")
     return np.split(order, np.cumsum(np.bincount(depth))[:-1])
 
@@ -360,7 +362,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     Raises MissingLayer, NotFound, Ambiguous, or Invalid for an impossible box.
     """
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    key = choose(sorted(layers.of("voxels")), options)[0]
+    key = choose(sorted(layers.parts_of("voxels")), options)[0]
     voxels = layers.parts[key]
     if not isinstance(voxels, VoxelMap):
         raise AssertionError(f"{key} is no voxel map")
@@ -378,7 +380,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if kind == "bt":
         voxels = _likeliest(voxels, context)
     if kind == "bt" if options.prune is None else options.prune:
-        voxels = _pruned(voxels, options.depth or DEPTH, kind, context)
+        voxels = _prune(voxels, options.depth or DEPTH, kind, context)
     if kind == "ot" and tree not in FULL_TYPES:
         context.warn(f"a tree of the type {tree} is served as an {OCTREE}")
         tree = OCTREE
@@ -390,10 +392,10 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named voxel map; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
     supply = "upload one (an OctoMap file or a point cloud)"
-    return the_one(keys, "voxels", options.name, options.level, noun="voxel map", option="name", supply=supply)
+    return select_part(keys, "voxels", options.name, options.level, noun="voxel map", option="name", supply=supply)
 
 
-def by_file(name: str) -> dict[str, str]:
+def options_from_filename(name: str) -> dict[str, str]:
     """``map.ot`` asks for the full tree; ``lab.bt`` for the voxel map ``lab``, too."""
     stem, _, end = name.rpartition(".")
     if not stem or end not in ("bt", "ot"):
@@ -419,8 +421,8 @@ def _likeliest(voxels: VoxelMap, context: WriteContext) -> VoxelMap:
     return VoxelMap(voxels.resolution, voxels.depth, voxels.code, odds, None, True, voxels.properties)
 
 
-def _pruned(voxels: VoxelMap, deepest: int, kind: Kind, context: WriteContext) -> VoxelMap:
-    out = pruned(voxels, deepest)
+def _prune(voxels: VoxelMap, deepest: int, kind: Kind, context: WriteContext) -> VoxelMap:
+    out = prune(voxels, deepest)
     if kind == "ot" and voxels.colour is not None and out.colour is not None and len(out) < len(voxels):
         holder = np.searchsorted(out.place, voxels.place, side="right") - 1
         other = int(np.count_nonzero((voxels.colour != out.colour[holder]).any(axis=1)))
@@ -493,7 +495,7 @@ def _full(voxels: VoxelMap, coloured: bool) -> tuple[int, bytes]:
             code, odds = code[order], odds[order]
             colour = None if colour is None else colour[order]
         bit = np.left_shift(np.uint8(1), (code & np.uint64(7)).astype(np.uint8))
-        start, code, odds, colour = parents_of(code, odds, colour)
+        start, code, odds, colour = merge_to_parents(code, odds, colour)
         keys.append(_key(code, depth - 1))
         masks.append(np.bitwise_or.reduceat(bit, start))
         odds_of.append(odds)
@@ -531,7 +533,7 @@ register(
         title="OctoMap (.bt, .ot)",
         files=("map.bt", "map.ot"),
         media_types=("application/octet-stream", "application/octet-stream"),
-        carries=frozenset({"voxels"}),
+        layers=frozenset({"voxels"}),
         detect=detect,
         read=read,
         check=_octomap_rules.check,
@@ -539,8 +541,8 @@ register(
         needs=LayerRequirements((frozenset({"voxels"}),)),
         write_options=WriteOptions,
         extensions=(".bt", ".ot"),
-        choose=choose,
-        by_file=by_file,
+        select_parts=choose,
+        options_from_filename=options_from_filename,
         parts=Parts("voxels", "name", file_stem),
     )
 )

@@ -51,11 +51,32 @@ from app.formats import (
     register,
 )
 from app.formats._fields import ANGLE, ANY, COORDINATE, LENGTH, NOT_NEGATIVE, SPEED, Number, OneOf, Typed, record
-from app.formats._network import own
-from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, Storey, index, listing, mapping, number, refuse, value_of
-from app.formats._rmf_images import companions_of, images, stored
-from app.formats._text import DEGREES, METRES, encoded, numbers
-from app.model.features import Features, Properties, alike, features, from_columns, points, segments, unique_ids
+from app.formats._network import get_source_properties
+from app.formats._rmf import (
+    BUILDING,
+    NAV_GRAPH,
+    Array,
+    Flow,
+    Storey,
+    index,
+    listing,
+    mapping,
+    number,
+    parameter_value,
+    raise_unreadable,
+)
+from app.formats._rmf_images import companion_hook, find_stored_image, images
+from app.formats._text import DEGREES, METRES, encode_pieces, numbers
+from app.model.features import (
+    Features,
+    Properties,
+    features,
+    from_columns,
+    points,
+    segments,
+    shared_key_dict,
+    unique_ids,
+)
 from app.model.frame import GROUND, Level
 from app.model.geodesy import check_crs
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
@@ -93,7 +114,7 @@ DOOR_TEMPLATE: Mapping[str, Any] = {
     "type": [1, "hinged"],
 }
 
-SMALLEST = 1e-9
+MIN_SCALE = 1e-9
 """Metres per pixel, and pixels per metre: beyond it is a mistake."""
 
 MAX_FIDUCIALS = 200
@@ -142,7 +163,7 @@ _LAYER = record(
     "features filename visible",
     color=[Number(0.0, 1.0)],
     transform=record(
-        scale=Number(SMALLEST, 1 / SMALLEST, unit="metres per pixel"),
+        scale=Number(MIN_SCALE, 1 / MIN_SCALE, unit="metres per pixel"),
         translation_x=COORDINATE,
         translation_y=COORDINATE,
         yaw=ANGLE,
@@ -214,11 +235,11 @@ class Transform:
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return np.array([[c, -s], [s, c]])
 
-    def says(self) -> list[float]:
+    def as_list(self) -> list[float]:
         """The transform as a document keeps it."""
         return [self.scale, self.rotation, *self.shift]
 
-    def near(self, other: Transform) -> bool:
+    def is_close(self, other: Transform) -> bool:
         """Whether both bring a pixel to the same place, to a micrometre or so."""
         moved = max(abs(a - b) for a, b in zip(self.shift, other.shift, strict=True))
         turn = abs(math.remainder(self.rotation - other.rotation, 2 * math.pi))
@@ -244,12 +265,12 @@ def transforms(levels: Mapping[str, Scaling], reference: str, warn: Callable[[st
     if not scales:
         warn("no measurement tells the scale: a pixel is taken as a metre", f"levels.{reference}.measurements")
     scale = sum(scales) / len(scales) if scales else 1.0
-    if not SMALLEST <= scale <= 1 / SMALLEST:
-        refuse(f"gives {scale:g} metres per pixel, which is no scale", f"levels.{reference}.measurements")
+    if not MIN_SCALE <= scale <= 1 / MIN_SCALE:
+        raise_unreadable(f"gives {scale:g} metres per pixel, which is no scale", f"levels.{reference}.measurements")
     out = {reference: Transform(scale)}
     for name, level in levels.items():
         if name != reference:
-            transform = _by_fiducials(levels[reference].fiducials, level.fiducials, scale)
+            transform = _fit_fiducials(levels[reference].fiducials, level.fiducials, scale)
             if transform is None:
                 problem = "shares fewer than two fiducials with the reference level: a pixel is taken as a metre"
                 warn(problem, f"levels.{name}.fiducials")
@@ -257,7 +278,7 @@ def transforms(levels: Mapping[str, Scaling], reference: str, warn: Callable[[st
     return out
 
 
-def _by_fiducials(
+def _fit_fiducials(
     reference: Sequence[tuple[str, float, float]], other: Sequence[tuple[str, float, float]], scale: float
 ) -> Transform | None:
     """Circular mean of the turns, mean of the relative scales and of the shifts, over pairs of common fiducials."""
@@ -267,7 +288,7 @@ def _by_fiducials(
     pairs = ((x, y, *b) for name, x, y in reference for b in by_name.get(name, ()))
     common = np.array(list(islice(pairs, MAX_FIDUCIALS + 1)), np.float64).reshape(-1, 4)
     if len(common) > MAX_FIDUCIALS:
-        refuse(f"two levels have more than {MAX_FIDUCIALS} fiducials in common", "fiducials")
+        raise_unreadable(f"two levels have more than {MAX_FIDUCIALS} fiducials in common", "fiducials")
     first, second = np.triu_indices(len(common), 1)
     with np.errstate(all="ignore"):
         step = common[second] - common[first]
@@ -278,8 +299,8 @@ def _by_fiducials(
         step, relative = step[valid], float(np.mean(lengths[valid] / reference_lengths[valid]))
         turn = np.arctan2(step[:, 3], step[:, 2]) - np.arctan2(step[:, 1], step[:, 0])
         rotation = -math.atan2(float(np.sin(turn).sum()), float(np.cos(turn).sum()))
-    if not SMALLEST <= scale / relative <= 1 / SMALLEST:
-        refuse("two levels whose fiducials lie at no common scale", "fiducials")
+    if not MIN_SCALE <= scale / relative <= 1 / MIN_SCALE:
+        raise_unreadable("two levels whose fiducials lie at no common scale", "fiducials")
     turned = Transform(1.0 / relative, rotation).apply(common[:, 2:])
     shift = (common[:, :2] - turned).mean(axis=0) * scale
     return Transform(scale / relative, rotation, (float(shift[0]), float(shift[1])))
@@ -324,7 +345,7 @@ class _Level:
     ids: list[str] = field(default_factory=list)
     dangling: dict[str, list[Any]] = field(default_factory=dict)
 
-    def where(self, section: str, k: int) -> str:
+    def location_of(self, section: str, k: int) -> str:
         return f"levels.{self.name}.{section}[{k}]"
 
 
@@ -336,15 +357,15 @@ def read(files: Files, context: ReadContext) -> Layers:
     main = context.main or next(iter(files))
     top = _yaml.load(files[main], context.limits)
     if not isinstance(top, dict):
-        refuse("must be a mapping with levels", "")
+        raise_unreadable("must be a mapping with levels", "")
     _fields.check(top, SHAPE, context)
     _check_crs(top.get("parameters"))
     raw_value = mapping(top.get("levels"), "levels")
     if not raw_value:
-        refuse("a building needs at least one level", "levels")
+        raise_unreadable("a building needs at least one level", "levels")
     system = top.get("coordinate_system", IMAGE)
     if system not in SYSTEMS:
-        refuse(f"must be one of {', '.join(SYSTEMS)}, got {str(system)[:80]!r}", "coordinate_system")
+        raise_unreadable(f"must be one of {', '.join(SYSTEMS)}, got {str(system)[:80]!r}", "coordinate_system")
     levels = {name: _level(name, k, one) for k, (name, one) in enumerate(raw_value.items())}
     if context.level != GROUND:
         context.warn(f"its levels have names of their own: level={context.level} is not used", where="levels")
@@ -378,7 +399,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     named = [
         (f"levels.{level.name}.{key}.filename", raw_value)
         for level in levels.values()
-        for key, raw_value in _named(level.said)
+        for key, raw_value in _named_images(level.said)
     ]
     pictures = images(files, main, named, context)
     if pictures and context.wants("resources"):
@@ -389,12 +410,12 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 def _check_crs(parameters: Any) -> None:
     """Refuse a building whose coordinates are said to be of a CRS that does not exist."""
-    crs = value_of(parameters, "generate_crs") if isinstance(parameters, dict) else None
+    crs = parameter_value(parameters, "generate_crs") if isinstance(parameters, dict) else None
     if crs not in (None, ""):
         try:
             check_crs(str(crs))
         except Invalid as error:
-            refuse(error.detail, "parameters.generate_crs")
+            raise_unreadable(error.detail, "parameters.generate_crs")
 
 
 def _level(name: str, order: int, members: Any) -> _Level:
@@ -412,16 +433,16 @@ def _reference(top: Mapping[str, Any], levels: Mapping[str, _Level]) -> str:
         return next(iter(levels))
     name = raw_value if isinstance(raw_value, str) else _yaml.text(raw_value)
     if name not in levels:
-        refuse(f"names the level {name[:80]!r}, which is not there", "reference_level_name")
+        raise_unreadable(f"names the level {name[:80]!r}, which is not there", "reference_level_name")
     return name
 
 
 def _scaling(level: _Level) -> Scaling:
     measurements = []
     for k, row in enumerate(listing(level.said.get("measurements"), f"levels.{level.name}.measurements")):
-        i, j, parameters, _ = _edge(row, level.where("measurements", k))
+        i, j, parameters, _ = _edge(row, level.location_of("measurements", k))
         if 0 <= i < len(level.raw) and 0 <= j < len(level.raw):
-            metres = number(value_of(parameters, "distance"), f"{level.where('measurements', k)}.distance")
+            metres = number(parameter_value(parameters, "distance"), f"{level.location_of('measurements', k)}.distance")
             measurements.append((math.dist(level.raw[i], level.raw[j]), metres))
     rows = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
     at = _rmf.places(rows, f"levels.{level.name}.fiducials")
@@ -432,7 +453,7 @@ def _scaling(level: _Level) -> Scaling:
 def _edge(row: Any, location: str) -> tuple[int, int, dict[str, Any], list[Any]]:
     """(start, end, parameters, what stands behind them) of a row ``[i, j, {…}]``."""
     if not isinstance(row, list) or len(row) < 2:
-        refuse("must be a list [vertex, vertex, {parameters}]", location)
+        raise_unreadable("must be a list [vertex, vertex, {parameters}]", location)
     parameters = mapping(row[2] if len(row) > 2 else None, f"{location}[2]")
     return index(row[0], f"{location}[0]"), index(row[1], f"{location}[1]"), parameters, row[3:]
 
@@ -446,7 +467,7 @@ def _node_ids(level: _Level, taken: set[str]) -> list[str]:
     for k, row in enumerate(level.rows):
         name = row[3] if len(row) > 3 else ""
         if isinstance(name, (list, dict)):
-            refuse("the name of a vertex must be a text", f"{level.where('vertices', k)}[3]")
+            raise_unreadable("the name of a vertex must be a text", f"{level.location_of('vertices', k)}[3]")
         names.append(_rmf.short(_text(name)) or f"{_rmf.short(level.name, 200)}/{k}")
     return unique_ids(names, taken)
 
@@ -463,7 +484,7 @@ class _Reader:
         extra_members = {key: value for key, value in level.said.items() if key not in LISTS}
         out: dict[str, Any] = {"building": building, "level": extra_members, "order": level.order}
         if self.system == IMAGE:
-            out["transform"] = level.transform.says()
+            out["transform"] = level.transform.as_list()
         if level.dangling:
             out["dangling"] = level.dangling
         return out
@@ -474,7 +495,11 @@ class _Reader:
         properties: list[Properties] = []
         heights = np.zeros(len(level.rows))
         names = Counter[str]()
-        named, nameless, index_template = alike("kind", "name", NAME), alike("kind", NAME), alike("index")
+        named, nameless, index_template = (
+            shared_key_dict("kind", "name", NAME),
+            shared_key_dict("kind", NAME),
+            shared_key_dict("index"),
+        )
         for k, row in enumerate(level.rows):
             node_properties = (named if len(row) > 3 and row[3] != "" else nameless).copy()
             node_properties["kind"] = "node"
@@ -486,9 +511,9 @@ class _Reader:
                 if not isinstance(row[3], str):
                     source_properties["name"] = row[3]
             if len(row) > 2 and row[2] != 0:
-                heights[k] = number(row[2], f"{level.where('vertices', k)}[2]")
+                heights[k] = number(row[2], f"{level.location_of('vertices', k)}[2]")
             if len(row) > 4 and row[4]:
-                source_properties["parameters"] = mapping(row[4], f"{level.where('vertices', k)}[4]")
+                source_properties["parameters"] = mapping(row[4], f"{level.location_of('vertices', k)}[4]")
             if len(row) > 5:
                 source_properties["more"] = row[5:]
             node_properties[NAME] = source_properties
@@ -518,9 +543,9 @@ class _Reader:
         sources: list[int] = []
         targets: list[int] = []
         out: list[Properties] = []
-        unlimited = alike("kind", "source", "target", NAME)
-        limited = alike("kind", "source", "target", NAME, "speed_limit")
-        forth, back = alike("index", "parameters"), alike("index", "parameters", "reverse")
+        unlimited = shared_key_dict("kind", "source", "target", NAME)
+        limited = shared_key_dict("kind", "source", "target", NAME, "speed_limit")
+        forth, back = shared_key_dict("index", "parameters"), shared_key_dict("index", "parameters", "reverse")
 
         def edge(i: int, j: int, source_properties: dict[str, Any], limit: float) -> None:
             sources.append(i)
@@ -542,14 +567,14 @@ class _Reader:
             source_properties["index"], source_properties["parameters"] = k, parameters
             if more:
                 source_properties["more"] = more
-            speed = value_of(parameters, "speed_limit", 0.0)
+            speed = parameter_value(parameters, "speed_limit", 0.0)
             limit = 0.0
             if isinstance(speed, (int, float)) and not isinstance(speed, bool) and speed > 0:
                 limit = float(speed)
-            graphless += value_of(parameters, "graph_idx") is None
+            graphless += parameter_value(parameters, "graph_idx") is None
             loops += i == j
             edge(i, j, source_properties, limit)
-            if value_of(parameters, "bidirectional") is True:
+            if parameter_value(parameters, "bidirectional") is True:
                 reverse = {**source_properties, "reverse": True} if more else back.copy()
                 reverse["index"], reverse["parameters"], reverse["reverse"] = k, parameters, True
                 edge(j, i, reverse, limit)
@@ -567,19 +592,19 @@ class _Reader:
         rows = list(listing(level.said.pop(section, None), f"levels.{level.name}.{section}"))
         for k in range(len(rows)):
             row, rows[k] = rows[k], None
-            i, j, parameters, more = _edge(row, level.where(section, k))
+            i, j, parameters, more = _edge(row, level.location_of(section, k))
             if 0 <= i < n and 0 <= j < n:
                 yield k, i, j, parameters, more
             else:
                 level.dangling.setdefault(section, []).append(row)
                 problem = f"joins the vertices {i} and {j}, but the level has {n}: it is kept in the level's document"
-                self.context.warn(problem, where=level.where(section, k))
+                self.context.warn(problem, where=level.location_of(section, k))
 
     def objects(self, level: _Level, lifts: list[tuple[str, Any, Properties]]) -> Features:
         """Everything but vertices and lanes."""
         rows: list[tuple[str, Any, Properties]] = []
         prefix = _rmf.short(level.name, 200)
-        template = alike("index", "parameters", "vertices")
+        template = shared_key_dict("index", "parameters", "vertices")
         for section, kind in LINES.items():
             for k, i, j, parameters, more in self._between(level, section):
                 source_properties = template.copy()
@@ -591,13 +616,13 @@ class _Reader:
                 if more:
                     source_properties["more"] = more
                 properties: dict[str, Any] = {"kind": kind, NAME: source_properties}
-                name = value_of(parameters, "name")
+                name = parameter_value(parameters, "name")
                 if isinstance(name, str) and name:
                     properties["name"] = name
                 rows.append((f"{prefix}/{kind}/{k}", shapely.LineString(level.at[[i, j]]), properties))
         for section, kind in RINGS.items():
             for k, one in enumerate(listing(level.said.pop(section, None), f"levels.{level.name}.{section}")):
-                location = level.where(section, k)
+                location = level.location_of(section, k)
                 properties = dict(mapping(one, location))
                 corners = listing(properties.pop("vertices", None), f"{location}.vertices")
                 ring = [index(v, f"{location}.vertices[{m}]") for m, v in enumerate(corners)]
@@ -610,7 +635,7 @@ class _Reader:
                 rows.append((f"{prefix}/{kind}/{k}", _ring(level.at[ring]), {"kind": kind, NAME: source_properties}))
         rows += self._models(level, prefix)
         marks = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
-        at = self._at(_rmf.places(marks, f"levels.{level.name}.fiducials"), level)
+        at = self._level_position(_rmf.places(marks, f"levels.{level.name}.fiducials"), level)
         for k, row in enumerate(marks):
             properties = {"kind": "fiducial", NAME: {"index": k, **({"more": row[3:]} if len(row) > 3 else {})}}
             if len(row) > 2:
@@ -618,18 +643,18 @@ class _Reader:
             rows.append((f"{prefix}/fiducial/{k}", shapely.Point(at[k]), properties))
         return features([*rows, *lifts], "wgs84" if self.degrees else "local")
 
-    def _at(self, raw: Array, level: _Level) -> Array:
+    def _level_position(self, raw: Array, level: _Level) -> Array:
         return _to_canonical(self.system, raw, level.transform)
 
     def _models(self, level: _Level, prefix: str) -> list[tuple[str, Any, Properties]]:
         listed = listing(level.said.get("models"), f"levels.{level.name}.models")
         raw = np.empty((len(listed), 2))
         for k, one in enumerate(listed):
-            location = level.where("models", k)
+            location = level.location_of("models", k)
             raw[k] = [number(mapping(one, location).get(axis), f"{location}.{axis}") for axis in "xy"]
         out: list[tuple[str, Any, Properties]] = []
-        for k, (one, (x, y)) in enumerate(zip(listed, self._at(raw, level).tolist(), strict=True)):
-            location = level.where("models", k)
+        for k, (one, (x, y)) in enumerate(zip(listed, self._level_position(raw, level).tolist(), strict=True)):
+            location = level.location_of("models", k)
             members = {key: value for key, value in one.items() if key not in ("x", "y")}
             z, yaw = number(members.get("z", 0.0), f"{location}.z"), number(members.get("yaw", 0.0), f"{location}.yaw")
             properties: dict[str, Any] = {"kind": "model"}
@@ -656,7 +681,7 @@ class _Reader:
             x, y = (number(members.pop(axis, None), f"{location}.{axis}") for axis in "xy")
             yaw = number(members.get("yaw", 0.0), f"{location}.yaw")
             width, depth = (number(members.pop(key, None), f"{location}.{key}") for key in ("width", "depth"))
-            at = self._at(np.array([[x, y]]), self.levels[floor])[0].tolist()
+            at = self._level_position(np.array([[x, y]]), self.levels[floor])[0].tolist()
             properties: dict[str, Any] = {"kind": "lift", "name": name, "size": [width, depth, _rmf.CABIN_HEIGHT]}
             if not self.degrees:
                 # The tools take a lift's yaw as it stands, on whatever floor plan it was drawn.
@@ -685,7 +710,7 @@ _FILENAME = re.compile(
 )
 
 
-def _named(members: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+def _named_images(members: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     """(place, file name) of the images that a level's document names."""
     drawing = members.get("drawing")
     if isinstance(drawing, dict) and isinstance(drawing.get("filename"), str):
@@ -712,7 +737,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if not storeys:
         raise MissingLayer("openrmf needs a network: upload a building.yaml, tmap2 or OSM file")
     resources: dict[str, bytes] = {}
-    for part in layers.of("resources", name=NAME).values():
+    for part in layers.parts_of("resources", name=NAME).values():
         resources.update(part.files if isinstance(part, Resources) else {})
     buildings: list[dict[str, Any]] = []
     for storey in storeys:
@@ -737,7 +762,7 @@ Sections = dict[str, list[str]]
 """By name: a level's lists as they are written, in pieces of whole lines."""
 
 
-def _lines_of(rows: Iterable[str]) -> list[str]:
+def _section_lines(rows: Iterable[str]) -> list[str]:
     """Rows as lines of a section, thousands together: far fewer texts are held than there are rows."""
     left = iter(rows)
     pieces = iter(lambda: "".join(f"      - {row}\n" for row in islice(left, 4096)), "")
@@ -755,7 +780,7 @@ class _Vertices:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def at(self, position: tuple[str, str], hint: Any) -> int:
+    def find_or_add(self, position: tuple[str, str], hint: Any) -> int:
         """The vertex at this place (x and y as texts): the one it stood on, else any, else a new one."""
         start = f"[{position[0]}, {position[1]}, "
         old_row = self._old.get(hint) if isinstance(hint, int) else None
@@ -786,7 +811,7 @@ class _Writer:
     ) -> None:
         self.layers, self.context, self.storeys, self.system = layers, context, storeys, system
         self.options = context.options if isinstance(context.options, _rmf.WriteOptions) else _rmf.WriteOptions()
-        self.robots = _rmf.Robots(self.options, _nodes_of(storeys))
+        self.robots = _rmf.Robots(self.options, _iterate_nodes(storeys))
         self.building = dict(building)
         self.resources = resources
         self.why = why
@@ -794,8 +819,8 @@ class _Writer:
         self.degrees = system in DEGREE_SYSTEMS
         self.decimals = DEGREES if self.degrees else METRES
         self.flow = Flow()
-        self.lost: Counter[str] = Counter()
-        self.made: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.created_ids: Counter[str] = Counter()
         self.used: dict[str, bytes] = {}
         self.scaling: dict[str, Scaling] = {}
         self.transforms = {s.name: self._transform(s) for s in storeys}
@@ -821,7 +846,7 @@ class _Writer:
         text.append(_yaml.mapping(after, 0) if after else "")
         self._report()
         levels.clear()
-        return {FILE: encoded(text), **dict(sorted(self.used.items()))}
+        return {FILE: encode_pieces(text), **dict(sorted(self.used.items()))}
 
     def _top(self) -> dict[str, Any]:
         top = {key: value for key, value in self.building.items() if key not in ("levels", "lifts")}
@@ -847,20 +872,23 @@ class _Writer:
                         return graphs[graph]["building_name"]
         return None
 
-    def _served(self, lift: str) -> dict[str, list[str]]:
+    def _served_levels(self, lift: str) -> dict[str, list[str]]:
         """The levels with a node that a navigation graph puts into this lift, without doors."""
         return {
             storey.name: []
             for storey in self.storeys
             for part in storey.networks
-            if any(mapping(own(p, NAV_GRAPH).get("parameters"), "").get("lift") == lift for p in part.properties)
+            if any(
+                mapping(get_source_properties(p, NAV_GRAPH).get("parameters"), "").get("lift") == lift
+                for p in part.properties
+            )
         }
 
     def _check(self) -> None:
         """Whether a reader of this file places the levels where they are."""
         level_transforms = transforms(self.scaling, self.reference, lambda problem, location: None)
         for name, transform in self.transforms.items():
-            if not transform.near(level_transforms[name]):
+            if not transform.is_close(level_transforms[name]):
                 raise _RewriteError(f"measurements and fiducials no longer place level {name} where it is")
 
     # places
@@ -869,7 +897,7 @@ class _Writer:
         """The file's x and y of all coordinates of these items, and the item each belongs to."""
         geometry = part.geometry[indices]
         if (part.local[indices] == self.degrees).any():
-            subset, frame = part.take(indices), self.layers.frame
+            subset, frame = part.select(indices), self.layers.frame
             geometry = subset.in_wgs84(frame) if self.degrees else subset.in_local(frame)
         at, owner = shapely.get_coordinates(geometry, return_index=True)
         return _to_file(self.system, at, self.transforms[storey]), owner
@@ -891,15 +919,15 @@ class _Writer:
         members = dict(mapping(storey.document.get("level"), "level"))
         if self.converted:
             dropped_keys = sorted(key for key in members if key in IN_PIXELS and members[key])
-            self.lost["what levels say in pixels of their drawing"] += len(dropped_keys)
+            self.dropped["what levels say in pixels of their drawing"] += len(dropped_keys)
             members = {key: value for key, value in members.items() if key not in IN_PIXELS}
         members["elevation"] = self._elevation(storey)
         self._drawings(members, storey.name)
         vertices, ids = self._nodes(storey)
-        sections: Sections = {"lanes": _lines_of(self._lanes(storey, ids))}
+        sections: Sections = {"lanes": _section_lines(self._lanes(storey, ids))}
         self._objects(storey, vertices, sections)
         self._dangling(storey, vertices, sections)
-        sections["vertices"] = _lines_of(vertices.rows)
+        sections["vertices"] = _section_lines(vertices.rows)
         out = [f"  {_yaml.text(storey.name)}:\n"]
         for key in sorted({*members, *(k for k, rows in sections.items() if rows)}):
             if key in sections:
@@ -911,8 +939,8 @@ class _Writer:
 
     def _drawings(self, members: dict[str, Any], level: str) -> None:
         """Take along the images that the level names, under names that stay below the building's folder."""
-        for key, image in list(_named(members)):
-            name = stored(image, self.resources)
+        for key, image in list(_named_images(members)):
+            name = find_stored_image(image, self.resources)
             if name is None:
                 if image:
                     problem = f"the image {image[:200]!r} was not in the upload: it is named and not served"
@@ -933,17 +961,19 @@ class _Writer:
         for part in storey.networks:
             point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
             node: NDArray[np.bool_] = np.array([p.get("kind") == "node" for p in part.properties], bool)
-            self.lost["nodes without a point"] += int((node & ~point).sum())
+            self.dropped["nodes without a point"] += int((node & ~point).sum())
             indices = np.flatnonzero(node & point)
             raw, _ = self._coordinates(part, indices, storey.name)
             z = shapely.get_z(part.geometry[indices])
             for k, position, high in zip(indices.tolist(), self._texts(raw), z.tolist(), strict=True):
                 p = part.properties[k]
-                at = own(p, NAME).get("index")
+                at = get_source_properties(p, NAME).get("index")
                 has_index = isinstance(at, int)
                 key = (not has_index, at if isinstance(at, int) else 0, len(part.ids[k]), part.ids[k])
                 height = 0.0 if math.isnan(high) else high - elevation
-                row = self._vertex(part.ids[k], p, position, height, self.robots.at(storey.name, part.ids[k]))
+                row = self._vertex(
+                    part.ids[k], p, position, height, self.robots.vertex_properties(storey.name, part.ids[k])
+                )
                 nodes.append((key, row))
         nodes.sort(key=lambda item: item[0])
         ids: dict[str, int] = {}
@@ -955,7 +985,7 @@ class _Writer:
         return _Vertices([row for _, row in nodes], old), ids
 
     def _vertex(self, i: str, p: Properties, position: tuple[str, str], z: float, further: Mapping[str, Any]) -> str:
-        source_members = own(p, NAME)
+        source_members = get_source_properties(p, NAME)
         title = p.get("name")
         parameters = source_members.get("parameters")
         if NAME in p:
@@ -966,14 +996,16 @@ class _Writer:
             )
         else:
             name = title if isinstance(title, str) and (title or NAV_GRAPH in p) else "" if NAV_GRAPH in p else i
-            graph = mapping(own(p, NAV_GRAPH).get("parameters"), "parameters")
-            parameters = {key: _rmf.typed(value) for key, value in graph.items() if key not in ("name", "lift")}
-            self.lost["nodes' attributes of other formats"] += any(
+            graph = mapping(get_source_properties(p, NAV_GRAPH).get("parameters"), "parameters")
+            parameters = {
+                key: _rmf.typed_parameter(value) for key, value in graph.items() if key not in ("name", "lift")
+            }
+            self.dropped["nodes' attributes of other formats"] += any(
                 isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
             )
         if further:
-            parameters = {**(parameters or {}), **{key: _rmf.typed(value) for key, value in further.items()}}
-        self.lost["nodes' orientations"] += p.get("orientation") is not None
+            parameters = {**(parameters or {}), **{key: _rmf.typed_parameter(value) for key, value in further.items()}}
+        self.dropped["nodes' orientations"] += p.get("orientation") is not None
         row = f"[{position[0]}, {position[1]}, {_yaml.text(round(z, METRES) + 0.0)}, {_yaml.text(name)}"
         if parameters or source_members.get("more"):
             row += f", {self.flow(parameters or {})}"
@@ -992,29 +1024,29 @@ class _Writer:
                     first = partner.pop()
                     first.both = True
                     continue
-                waiting.setdefault(lane.says(), []).append(lane)
+                waiting.setdefault(lane.parameters_key(), []).append(lane)
                 out.append(lane)
             for lane in out:
                 yield lane.row(self.flow)
 
     def _edges(self, storey: Storey, ids: Mapping[str, int]) -> Iterator[_Lane]:
         """The level's edges, in the order of the lanes that they were."""
-        for _, p in _in_order(storey.networks):
+        for _, p in _sort_by_lane(storey.networks):
             source, target = ids.get(str(p.get("source"))), ids.get(str(p.get("target")))
             if p.get("kind") != "edge" or source is None or target is None:
-                self.lost["edges without two nodes on their level"] += 1
+                self.dropped["edges without two nodes on their level"] += 1
                 continue
-            self.lost["edges' actions"] += p.get("action") is not None
-            self.lost["edges' widths"] += p.get("width") is not None
-            source_members = own(p, NAME)
+            self.dropped["edges' actions"] += p.get("action") is not None
+            self.dropped["edges' widths"] += p.get("width") is not None
+            source_members = get_source_properties(p, NAME)
             if NAME not in p:
-                self.made["lanes"] += NAV_GRAPH not in p
+                self.created_ids["lanes"] += NAV_GRAPH not in p
                 source_members = {"parameters": _lane_parameters(p, self.options)}
-                self.lost["edges' attributes of other formats"] += any(
+                self.dropped["edges' attributes of other formats"] += any(
                     isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
                 )
             limit = _rmf.limit(p) or (self.options.speed_limit if NAME not in p and NAV_GRAPH not in p else 0.0)
-            yield _Lane.of(limit, source_members, source, target, self.flow)
+            yield _Lane.from_edge(limit, source_members, source, target, self.flow)
 
     def _dangling(self, storey: Storey, vertices: _Vertices, sections: Sections) -> None:
         """Rows to vertices that did not exist come back where they still do not."""
@@ -1022,11 +1054,11 @@ class _Writer:
             for row in rows:
                 ends = row["vertices"] if isinstance(row, dict) else row[:2]
                 if section in RINGS or not all(0 <= v < len(vertices) for v in ends):
-                    sections.setdefault(section, []).extend(_lines_of([self.flow(row)]))
+                    sections.setdefault(section, []).extend(_section_lines([self.flow(row)]))
                     problem = f"{section} with vertices that do not exist: rmf_building_map_tools will refuse the file"
                     self.context.warn(problem, where=f"levels.{storey.name}.{section}")
                 else:
-                    self.lost[f"{section} to vertices that did not exist"] += 1
+                    self.dropped[f"{section} to vertices that did not exist"] += 1
 
     # objects
 
@@ -1050,9 +1082,9 @@ class _Writer:
                     continue
                 if kind in LINES.values() and len(at) >= 2:
                     row, parameters = self._line(p, vertices, [at[0], at[-1]])
-                    self.lost["bends of walls, doors and measurements"] += int(len(at) > 2)
+                    self.dropped["bends of walls, doors and measurements"] += int(len(at) > 2)
                     if kind == "measurement":
-                        metres = value_of(parameters, "distance", 0.0)
+                        metres = parameter_value(parameters, "distance", 0.0)
                         length = math.dist(coordinates[0], coordinates[-1])
                         scaling.measurements.append((length, float(metres)))
                     rows_by_section.setdefault(sections_of[str(kind)], []).append((key, row))
@@ -1063,33 +1095,33 @@ class _Writer:
                     rows_by_section.setdefault("models", []).append((key, self._model(p, at[0], storey)))
                 elif kind == "fiducial" and len(at) == 1:
                     name = str(p.get("name") or "")
-                    more = own(p, NAME).get("more") or []
+                    more = get_source_properties(p, NAME).get("more") or []
                     row = f"[{at[0][0]}, {at[0][1]}, {_yaml.text(name)}{''.join(', ' + self.flow(v) for v in more)}]"
                     rows_by_section.setdefault("fiducials", []).append((key, row))
                     scaling.fiducials.append((name, float(at[0][0]), -float(at[0][1])))
                 else:
-                    self.lost["objects that are no part of a building"] += 1
+                    self.dropped["objects that are no part of a building"] += 1
         for section, rows_of in rows_by_section.items():
-            sections[section] = _lines_of(row for _, row in sorted(rows_of, key=lambda item: item[0]))
+            sections[section] = _section_lines(row for _, row in sorted(rows_of, key=lambda item: item[0]))
         self.scaling[storey.name] = scaling
 
     def _line(self, p: Properties, vertices: _Vertices, ends: list[tuple[str, str]]) -> tuple[str, dict[str, Any]]:
-        source_members = own(p, NAME)
+        source_members = get_source_properties(p, NAME)
         hints = source_members.get("vertices")
         hints = hints if isinstance(hints, list) and len(hints) == 2 else [None, None]
-        i, j = (vertices.at(position, hint) for position, hint in zip(ends, hints, strict=True))
+        i, j = (vertices.find_or_add(position, hint) for position, hint in zip(ends, hints, strict=True))
         parameters = dict(mapping(source_members.get("parameters"), "parameters"))
         if p.get("kind") == "door" and "parameters" not in source_members:
             parameters = dict(DOOR_TEMPLATE)
-            self.made["doors"] += 1
+            self.created_ids["doors"] += 1
         name = p.get("name")
-        if isinstance(name, str) and name and value_of(parameters, "name") != name:
+        if isinstance(name, str) and name and parameter_value(parameters, "name") != name:
             parameters["name"] = [1, name]
         more = "".join(f", {self.flow(v)}" for v in source_members.get("more") or ())
         return f"[{i}, {j}, {self.flow(parameters)}{more}]", parameters
 
     def _rings(self, p: Properties, geometry: Any, vertices: _Vertices, texts: list[tuple[str, str]]) -> Iterable[str]:
-        source_members = own(p, NAME)
+        source_members = get_source_properties(p, NAME)
         members = {key: value for key, value in source_members.items() if key not in ("index", "vertices")}
         members.setdefault("parameters", {})
         source_hints = source_members.get("vertices")
@@ -1101,23 +1133,23 @@ class _Writer:
             ring = texts[done : done + count]
             done += count
             if piece.geom_type == "Polygon":
-                self.lost["holes in floors"] += len(piece.interiors)
+                self.dropped["holes in floors"] += len(piece.interiors)
                 ring = ring[: len(piece.exterior.coords)]
                 if len(ring) != len(hints):  # a polygon repeats its first corner, a floor need not
                     ring = ring[:-1]
             corner_hints = hints if len(hints) == len(ring) else [None] * len(ring)
-            corners = [vertices.at(position, hint) for position, hint in zip(ring, corner_hints, strict=True)]
+            corners = [vertices.find_or_add(position, hint) for position, hint in zip(ring, corner_hints, strict=True)]
             yield self.flow({**members, "vertices": corners})
 
     def _model(self, p: Properties, position: tuple[str, str], storey: Storey) -> str:
-        members = dict(mapping(own(p, NAME).get("says"), "says"))
-        pose = _rmf.pose_of(p)
+        members = dict(mapping(get_source_properties(p, NAME).get("says"), "says"))
+        pose = _rmf.object_pose(p)
         if pose is not None and not self.degrees:
             z = round(pose[2] - float(self._elevation(storey)), METRES) + 0.0
             if z or "z" not in members:
                 members["z"] = z
             members["yaw"] = round(pose[5] - self.transforms[storey.name].rotation, DEGREES) + 0.0
-            self.lost["models' roll and pitch"] += bool(pose[3] or pose[4])
+            self.dropped["models' roll and pitch"] += bool(pose[3] or pose[4])
         members.setdefault("yaw", 0.0)
         if isinstance(p.get("name"), str):
             members["name"] = p["name"]
@@ -1133,23 +1165,23 @@ class _Writer:
                     if p.get("kind") != "lift":
                         continue
                     if int(shapely.get_type_id(part.geometry[k])) != 0 or part.geometry[k].is_empty:
-                        self.lost["lifts without a point"] += 1
+                        self.dropped["lifts without a point"] += 1
                         continue
-                    members = dict(mapping(own(p, NAME).get("says"), "says"))
+                    members = dict(mapping(get_source_properties(p, NAME).get("says"), "says"))
                     floor = _text(members.get("reference_floor_name"))
                     floor = floor if floor in self.transforms else self.reference
                     raw, _ = self._coordinates(part, np.array([k]), floor)
                     (x, y) = self._texts(raw)[0]
                     members["x"], members["y"] = float(x), float(y)
-                    size = _rmf.size_of(p) or (1.0, 1.0)
+                    size = _rmf.object_size(p) or (1.0, 1.0)
                     members["width"], members["depth"] = size
-                    pose = _rmf.pose_of(p)
+                    pose = _rmf.object_pose(p)
                     if pose is not None and not self.degrees:
                         members["yaw"] = round(pose[5], DEGREES) + 0.0
                     members.setdefault("yaw", 0.0)
                     if NAME not in p:
-                        self.made["lifts"] += 1
-                        served = self._served(str(p.get("name")))
+                        self.created_ids["lifts"] += 1
+                        served = self._served_levels(str(p.get("name")))
                         members |= {"doors": {}, "level_doors": served, "reference_floor_name": floor, "plugins": True}
                     lifts.append((_place(part.ids[k], p), str(p.get("name") or part.ids[k]), members))
         lifts.sort(key=lambda item: item[0])
@@ -1164,22 +1196,22 @@ class _Writer:
         if self.why:
             text = "cartesian_meters is written instead of the source's coordinates"
             self.context.warn(f"{self.why}: {text}", file=FILE, where="coordinate_system")
-        for text, count in sorted(self.lost.items()):
+        for text, count in sorted(self.dropped.items()):
             self.context.drop(text, count, "a building in these coordinates has no place for it")
-        if self.made["lanes"]:
-            why = f"{self.made['lanes']} edges come from another format"
+        if self.created_ids["lanes"]:
+            why = f"{self.created_ids['lanes']} edges come from another format"
             self.context.fill("lanes: graph_idx", self.options.graph, why, "graph")
             limited = f"{why}, where they have none"
             self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
             self.context.fill("lanes: orientation", LANE_TEMPLATE["orientation"][1], why)
         self.robots.report(self.context)
-        if self.made["doors"]:
+        if self.created_ids["doors"]:
             parameters = {key: value[1] for key, value in DOOR_TEMPLATE.items()}
             self.context.fill(
-                "doors: parameters", parameters, f"{self.made['doors']} doors come from a navigation graph"
+                "doors: parameters", parameters, f"{self.created_ids['doors']} doors come from a navigation graph"
             )
-        if self.made["lifts"]:
-            why = f"{self.made['lifts']} lifts come from a navigation graph"
+        if self.created_ids["lifts"]:
+            why = f"{self.created_ids['lifts']} lifts come from a navigation graph"
             self.context.fill(
                 "lifts: doors, level_doors, reference floor",
                 "none, on the levels of its vertices, the first level",
@@ -1189,12 +1221,12 @@ class _Writer:
 
 def _place(i: str, p: Properties) -> tuple[bool, int, str]:
     """The order of items in their list: as in the file, then by id."""
-    at = own(p, NAME).get("index", own(p, NAV_GRAPH).get("index"))
+    at = get_source_properties(p, NAME).get("index", get_source_properties(p, NAV_GRAPH).get("index"))
     has_index = isinstance(at, int)
     return (not has_index, at if isinstance(at, int) else 0, i)
 
 
-def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
+def _sort_by_lane(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
     """(id, properties) of what is no node: by the lane it was and its direction, then the others by id."""
 
     def each() -> Iterator[tuple[str, Properties]]:
@@ -1205,7 +1237,7 @@ def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
 
     def key(item: tuple[str, Properties]) -> tuple[bool, int, bool, int, str]:
         i, p = item
-        source_members = own(p, NAME)
+        source_members = get_source_properties(p, NAME)
         was = source_members.get("index")
         has_index = isinstance(was, int)
         return (not has_index, was if isinstance(was, int) else 0, source_members.get("reverse") is True, len(i), i)
@@ -1214,7 +1246,7 @@ def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
     return each() if all(a <= b for a, b in pairwise(map(key, each()))) else sorted(each(), key=key)
 
 
-def _nodes_of(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Properties]]:
+def _iterate_nodes(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Properties]]:
     for storey in storeys:
         for part in storey.networks:
             for i, p in zip(part.ids, part.properties, strict=True):
@@ -1227,7 +1259,7 @@ def _lane_parameters(p: Properties, options: _rmf.WriteOptions) -> dict[str, Any
     out = {key: list(value) for key, value in LANE_TEMPLATE.items()}
     if NAV_GRAPH not in p:
         out["graph_idx"] = [2, options.graph]
-    graph = own(p, NAV_GRAPH)
+    graph = get_source_properties(p, NAV_GRAPH)
     graph_parameters = mapping(graph.get("parameters"), "parameters")
     if isinstance(graph.get("graph"), int):
         out["graph_idx"] = [2, graph["graph"]]
@@ -1235,7 +1267,7 @@ def _lane_parameters(p: Properties, options: _rmf.WriteOptions) -> dict[str, Any
         if key == "orientation_constraint":
             out["orientation"] = [1, value]
         elif key not in ("door_name", "speed_limit", "is_bidirectional", "dock_name", "undock_name"):
-            out[key] = _rmf.typed(value)
+            out[key] = _rmf.typed_parameter(value)
     return out
 
 
@@ -1254,12 +1286,12 @@ class _Lane:
     both: bool = False
 
     @classmethod
-    def of(cls, limit: float, source_members: Mapping[str, Any], source: int, target: int, flow: Flow) -> _Lane:
+    def from_edge(cls, limit: float, source_members: Mapping[str, Any], source: int, target: int, flow: Flow) -> _Lane:
         """The edge with this speed limit (0: none); rest: what is known of its lane."""
         was = source_members.get("index") if isinstance(source_members.get("index"), int) else None
         reverse = source_members.get("reverse") is True
         parameters = mapping(source_members.get("parameters"), "parameters")
-        speed = value_of(parameters, "speed_limit", 0.0)
+        speed = parameter_value(parameters, "speed_limit", 0.0)
         if (speed if isinstance(speed, (int, float)) and speed > 0 else 0.0) != limit:
             parameters = {**parameters, "speed_limit": [3, limit]}
         signature = str(was)
@@ -1269,25 +1301,25 @@ class _Lane:
         return cls(source, target, was, reverse, limit, parameters, more if isinstance(more, list) else (), signature)
 
     def _orientation(self) -> Any:
-        return str(value_of(self.parameters, "orientation", ""))
+        return str(parameter_value(self.parameters, "orientation", ""))
 
-    def says(self) -> Any:
+    def parameters_key(self) -> Any:
         """Equal for edges that could be one."""
         direction = self._orientation() if self.was is None else self.reverse
         return (self.source, self.target, self.limit, self.signature, direction)
 
     def partner(self) -> Any:
         """What the edge back says, if both are one two-way lane."""
-        direction = _rmf.turned(self._orientation()) if self.was is None else not self.reverse
+        direction = _rmf.reverse_orientation(self._orientation()) if self.was is None else not self.reverse
         return (self.target, self.source, self.limit, self.signature, direction)
 
     def row(self, flow: Flow) -> str:
         """The lane's row."""
         parameters = self.parameters
-        if self.both or value_of(parameters, "bidirectional") is True or self.was is None:
+        if self.both or parameter_value(parameters, "bidirectional") is True or self.was is None:
             parameters = {**parameters, "bidirectional": [4, self.both]}
         if self.reverse and "orientation" in parameters:
-            parameters = {**parameters, "orientation": [1, _rmf.turned(self._orientation())]}
+            parameters = {**parameters, "orientation": [1, _rmf.reverse_orientation(self._orientation())]}
         more = "".join(f", {flow(v)}" for v in self.more)
         return f"[{self.source}, {self.target}, {flow(parameters)}{more}]"
 
@@ -1330,20 +1362,20 @@ register(
         title="Building (Open-RMF traffic editor)",
         files=(FILE,),
         media_types=("application/yaml",),
-        carries=frozenset({"topology", "objects", "resources"}),
+        layers=frozenset({"topology", "objects", "resources"}),
         detect=detect,
         read=read,
         check=_openrmf_rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
-        companions=companions_of(_FILENAME),
+        companions=companion_hook(_FILENAME),
         family=NAME,
-        titled=True,
-        rank=40,
+        has_title=True,
+        priority=40,
         write_options=_rmf.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),
-        choose=choose,
-        bends="nodes",
+        select_parts=choose,
+        keeps_bends="nodes",
         version=2,
     )
 )

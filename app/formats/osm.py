@@ -59,13 +59,13 @@ from app.formats import (
     register,
 )
 from app.formats._osm import INT64, Data, Tags, Way, is_pbf, parse, unpack
-from app.formats._osm_text import NOTHING, Node, as_texts, attribute_text, element_id, integers, plain
+from app.formats._osm_text import NO_ATTRIBUTES, Node, as_texts, attribute_text, element_id, integers, plain
 from app.formats._text import DEGREES, numbers
 from app.model import osm_tags
-from app.model.features import NO_GEOMETRY, Features, Properties, alike, from_columns, points, segments
+from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, points, segments, shared_key_dict
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
-from app.model.osm_areas import areas_of
+from app.model.osm_areas import multipolygon_areas
 
 FAMILY = "osm"
 GENERATOR = "Fleet Map Server"
@@ -146,7 +146,7 @@ def direction(tags: Mapping[str, Any]) -> Direction:
     return "forward" if implied else "both"
 
 
-def deleted(attributes: Mapping[str, Any]) -> bool:
+def is_deleted(attributes: Mapping[str, Any]) -> bool:
     """Whether an element is only there to say that it is gone."""
     return attributes.get("action") == "delete" or attributes.get("visible") == "false"
 
@@ -161,7 +161,7 @@ KINDS: Mapping[str, Mapping[Any, str]] = {
 """By a main tag's key and value, the kind where the key itself tells too little."""
 
 
-def kind_of(tags: Mapping[str, Any], otherwise: str) -> str:
+def object_kind(tags: Mapping[str, Any], otherwise: str) -> str:
     """The key of the main tag, or what its value says more plainly."""
     main_key = next((key for key in MAIN_TAGS if key in tags and tags[key] != "no"), None)
     if main_key is None:
@@ -180,7 +180,7 @@ _EDGE_TAGS = frozenset({"maxspeed", "maxspeed:forward", "maxspeed:backward", "wi
 _EDGE_TAGS |= {"surface", "access"}
 
 
-def object_words(tags: Mapping[str, Any]) -> dict[str, Any]:
+def object_properties(tags: Mapping[str, Any]) -> dict[str, Any]:
     """The canonical words that an object's tags say, but for its kind. A highway's measures are its edges'."""
     out: dict[str, Any] = {}
     if name := tags.get("name"):
@@ -191,7 +191,7 @@ def object_words(tags: Mapping[str, Any]) -> dict[str, Any]:
     return out | {key: value for key, value in values.items() if value is not None}
 
 
-def edge_words(tags: Mapping[str, Any], heading: Literal["forward", "backward"]) -> dict[str, Any]:
+def edge_properties(tags: Mapping[str, Any], heading: Literal["forward", "backward"]) -> dict[str, Any]:
     """The canonical words that a highway's tags say of its edges in one direction."""
     out: dict[str, Any] = {}
     if not _EDGE_TAGS.isdisjoint(tags):
@@ -296,7 +296,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     Raises UnreadableFile, with a line where there is one, for what is no OSM file and for places that are not on earth.
     """
     topology, objects = context.wants("topology"), context.wants("objects")
-    _xml.warn_of_active_content(files[context.main][:PROLOG_BYTES], context, has_scripts=True)
+    _xml.report_active_content(files[context.main][:PROLOG_BYTES], context, has_scripts=True)
     data = parse(files[context.main], context.limits, highways_only=not objects)
     for problem, line, location in data.problems:
         context.warn(problem, line=line, where=location)
@@ -337,7 +337,7 @@ def _document(data: Data) -> dict[str, Any]:
     document: dict[str, Any] = {"osm": source_document}
     boxes = [box for box in map(_box, data.bounds) if box is not None]
     if boxes:
-        document["bounds"] = list(_around(boxes))
+        document["bounds"] = list(_bounding_box(boxes))
     texts = [data.root[k] for k in ("copyright", "attribution", "license") if data.root.get(k)]
     texts += [row[2] for row in data.elements if row[0] == "note" and row[2]]
     if texts:
@@ -367,7 +367,7 @@ def _warn_of_values(data: Data, context: ReadContext) -> None:
     occurrences: dict[tuple[str, str], list[Any]] = {}
     tagged = chain(((f"way {w.id}", w.tags) for w in data.ways), ((k, tags) for k, tags in data.tags.items()))
     for place, tags in tagged:
-        for key in osm_tags.READ & tags.keys():
+        for key in osm_tags.NUMERIC_KEYS & tags.keys():
             if key not in _OF_WAYS or "highway" in tags:
                 occurrences.setdefault((key, tags[key]), [place, 0])[1] += 1
     for (key, value), (place, count) in occurrences.items():
@@ -407,10 +407,10 @@ class _Network:
         for way in self.ways:
             if "highway" not in way.tags:
                 continue
-            if deleted(way.attributes):
+            if is_deleted(way.attributes):
                 context.warn("the way is marked as deleted, so it is no part of the network", where=f"way {way.id}")
                 continue
-            self._doubts(way, context)
+            self._report_doubts(way, context)
             present = [r for r in way.refs if r in self.placed]
             absent = set(way.refs) - set(present) if len(present) < len(way.refs) else set()
             used.update(dict.fromkeys(present))
@@ -423,7 +423,7 @@ class _Network:
                 f"highways use {len(absent_ids)} nodes that have no place in the file ({examples}); gaps are left there"
             )
 
-    def _doubts(self, way: Way, context: ReadContext) -> None:
+    def _report_doubts(self, way: Way, context: ReadContext) -> None:
         location = f"way {way.id}"
         if not is_loop(way.refs, way.tags) and any(a == b for a, b in pairwise(way.refs)):
             context.warn("the way goes from a node to itself; that segment is no edge", where=location)
@@ -435,11 +435,11 @@ class _Network:
         data = self.data
         indices = sorted(self.place[i] for i in self.used)
         ids = [f"n{data.ids[k]}" for k in indices]
-        pattern, plain_edge = alike("kind", "osm"), alike("kind", "source", "target", "osm")
+        pattern, plain_edge = shared_key_dict("kind", "osm"), shared_key_dict("kind", "source", "target", "osm")
         properties: list[Properties] = []
         for k in indices:
             node = pattern.copy()
-            node["kind"], node["osm"] = "node", _of_node(data, k)
+            node["kind"], node["osm"] = "node", _node_properties(data, k)
             properties.append(node)
         name_of = dict(zip((data.ids[k] for k in indices), ids, strict=True))
         source: list[int] = []
@@ -449,7 +449,7 @@ class _Network:
             ids += edges.ids
             source += edges.source
             target += edges.target
-            forth, back = edge_words(way.tags, "forward"), edge_words(way.tags, "backward")
+            forth, back = edge_properties(way.tags, "forward"), edge_properties(way.tags, "backward")
             refs = way.refs
             for k, a, b in zip(edges.segment, edges.source, edges.target, strict=True):
                 attributes = forth if forth == back or refs[k] == a else back
@@ -487,10 +487,10 @@ def _warn_twice(noun: str, ids: list[int], context: ReadContext) -> None:
         seen.add(identity)
 
 
-_ATTRIBUTES_ONLY = alike("attributes")
+_ATTRIBUTES_ONLY = shared_key_dict("attributes")
 
 
-def _of_node(data: Data, k: int) -> dict[str, Any]:
+def _node_properties(data: Data, k: int) -> dict[str, Any]:
     tags, attributes = data.tags.get(k), data.attributes(k)
     source_properties: dict[str, Any]
     if attributes and not tags:
@@ -508,7 +508,7 @@ def _of_node(data: Data, k: int) -> dict[str, Any]:
 def _properties(source_properties: dict[str, Any], tags: Tags, otherwise: str) -> Properties:
     if not tags:
         return {"kind": otherwise, "osm": source_properties}
-    return {"kind": kind_of(tags, otherwise), **object_words(tags), "osm": source_properties}
+    return {"kind": object_kind(tags, otherwise), **object_properties(tags), "osm": source_properties}
 
 
 def _objects(data: Data, network: _Network, context: ReadContext, document: Properties) -> Features:
@@ -525,13 +525,13 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
         if identity in network.used:
             continue
         lone = identity not in bent or k in data.tags or identity in members or identity not in network.placed
-        if lone or k in data.node_children or deleted(data.attributes(k)):
+        if lone or k in data.node_children or is_deleted(data.attributes(k)):
             nodes.append(k)
             if identity not in network.placed:
                 context.warn("the node has no place", where=f"node {identity}")
     features = {data.ids[k] for k in nodes} | network.used.keys()
     ids = [f"n{data.ids[k]}" for k in nodes]
-    properties = [_properties(_of_node(data, k), data.tags.get(k, {}), "point") for k in nodes]
+    properties = [_properties(_node_properties(data, k), data.tags.get(k, {}), "point") for k in nodes]
     geometry = np.empty(len(nodes), object)
     at = data.lonlat[nodes] if nodes else np.empty((0, 2))
     has_position = ~np.isnan(at[:, 0])
@@ -562,7 +562,7 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
     if dangling:
         context.warn(f"ways refer {dangling} times to nodes that have no place in the file; the references are kept")
     ids += [f"w{way.id}" for way in network.ways]
-    shapes = _way_geometry(network.ways, lonlat, absent)
+    shapes = _way_geometries(network.ways, lonlat, absent)
     for relation in relations.values():
         source_properties = {"members": [list(m) for m in relation.members], "tags": relation.tags}
         if relation.attributes:
@@ -573,7 +573,7 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
     ids += [f"r{i}" for i in relations]
     nothing = np.full(len(relations), NO_GEOMETRY, object)
     part = from_columns(ids, np.concatenate([geometry, shapes, nothing]), properties, "wgs84", document)
-    areas = areas_of(part, range(len(ids) - len(relations), len(ids)))
+    areas = multipolygon_areas(part, range(len(ids) - len(relations), len(ids)))
     if open_ := [part.ids[k][1:] for k, area in areas.items() if area is None]:
         examples = ", ".join(open_[:5]) + (" …" if len(open_) > 5 else "")
         context.warn(
@@ -595,7 +595,7 @@ def _vertices(data: Data, refs: list[int], index: list[int], features: set[int])
     return first if all(row is first or row == first for row in entries) else rows
 
 
-def _way_geometry(ways: list[Way], lonlat: NDArray[np.float64], absent: NDArray[np.bool_]) -> NDArray[np.object_]:
+def _way_geometries(ways: list[Way], lonlat: NDArray[np.float64], absent: NDArray[np.bool_]) -> NDArray[np.object_]:
     """For each way the line, area, point or nothing that its nodes with a place make."""
     owner = np.repeat(np.arange(len(ways)), [len(way.refs) for way in ways])[~absent]
     lonlat = lonlat[~absent]
@@ -620,10 +620,10 @@ def _way_geometry(ways: list[Way], lonlat: NDArray[np.float64], absent: NDArray[
 
 # --- writing -----------------------------------------------------------------------------------------------------
 
-MOST_NODES = 2000
+MAX_WAY_NODES = 2000
 """Nodes a way may have (OSM API 0.6)."""
 
-NOWHERE = (float("nan"), float("nan"))
+NO_POSITION = (float("nan"), float("nan"))
 
 
 @dataclass(slots=True)
@@ -672,7 +672,7 @@ class _Writer:
         self.lost: dict[str, int] = {}
         self.children: dict[tuple[str, int], Any] = {}
 
-    def fresh(self, kind: str) -> int:
+    def next_id(self, kind: str) -> int:
         new = self.next[kind]
         self.next[kind] = new - 1
         return new
@@ -703,7 +703,7 @@ class _Writer:
                 ):
                     number, source_properties = element_id(i), properties.get("osm")
                     if layer == "objects" and key.name == FAMILY and number and isinstance(source_properties, Mapping):
-                        current = _told(source_properties, properties, i)
+                        current = _object_tags(source_properties, properties, i)
                         own_items.append((number[0], number[1], geometry, current, properties))
                     elif i in drawn and shapely.get_type_id(geometry) in (0, 1, 2, 5):
                         # The network made from this drawing is written; the line would lie on it a second time.
@@ -714,17 +714,17 @@ class _Writer:
             if kind == "n":
                 self.node(level, osm_id, geometry, source_properties)
         for kind, osm_id, geometry, source_properties, properties in own_items:
-            if kind == "w" and not self.way(level, osm_id, geometry, source_properties):
+            if kind == "w" and not self.write_way(level, osm_id, geometry, source_properties):
                 new_items.append((f"w{osm_id}", geometry, properties, False))
         for kind, osm_id, _, _, _ in own_items:
             if kind == "r":
-                level.relations[osm_id] = self.fresh("relation") if osm_id in self.relations else osm_id
-                self.relations[level.relations[osm_id]] = ([], NOTHING, NOTHING)
+                level.relations[osm_id] = self.next_id("relation") if osm_id in self.relations else osm_id
+                self.relations[level.relations[osm_id]] = ([], NO_ATTRIBUTES, NO_ATTRIBUTES)
         for kind, osm_id, _, source_properties, _ in own_items:
             if kind == "r":
                 self.relation(level, osm_id, source_properties)
         for part in topology:
-            self.new_ways(part, level)
+            self.add_ways(part, level)
         for i, geometry, properties, zone in new_items:
             self.other(level, i, geometry, properties, zone)
 
@@ -732,7 +732,7 @@ class _Writer:
         level.has_network = True
         is_node = np.array([p.get("kind") != "edge" for p in part.properties], bool)
         indices = np.flatnonzero(is_node)
-        at = part.take(indices).in_wgs84(self.layers.frame) if len(indices) else np.empty(0, object)
+        at = part.select(indices).in_wgs84(self.layers.frame) if len(indices) else np.empty(0, object)
         has_point = (shapely.get_type_id(at) == 0) & ~shapely.is_empty(at)
         places = np.full((len(at), 2), np.nan)
         places[has_point] = shapely.get_coordinates(at[has_point])
@@ -746,9 +746,9 @@ class _Writer:
                 and number[0] == "n"
                 and (isinstance(source_properties, Mapping) or number[1] in self.referenced)
             )
-            new = number[1] if is_own and number is not None else self.fresh("node")
+            new = number[1] if is_own and number is not None else self.next_id("node")
             if new in self.nodes and (self.nodes[new].lon, self.nodes[new].lat) != (x, y):
-                new = self.fresh("node")
+                new = self.next_id("node")
             if isinstance(source_properties, Mapping):
                 tags, attributes = (
                     as_texts(source_properties.get("tags")),
@@ -758,7 +758,7 @@ class _Writer:
             else:
                 # A street node that went through another format is called by its id there: that is no name.
                 nameless = is_own and properties.get("name", i) == i
-                tags, attributes = NOTHING if nameless else self.tags(i, properties, ("name",)), NOTHING
+                tags, attributes = NO_ATTRIBUTES if nameless else self.tags(i, properties, ("name",)), NO_ATTRIBUTES
             if geometry.has_z and geometry.geom_type == "Point" and not geometry.is_empty and "ele" not in tags:
                 tags = {**tags, "ele": repr(float(geometry.z))}
             self.nodes[new] = Node(x, y, tags, attributes)
@@ -779,17 +779,17 @@ class _Writer:
     def node(self, level: _Level, number: int, geometry: Any, source_properties: Mapping[str, Any]) -> None:
         if number in level.moved:
             return
-        x, y = (geometry.x, geometry.y) if geometry.geom_type == "Point" and not geometry.is_empty else NOWHERE
+        x, y = (geometry.x, geometry.y) if geometry.geom_type == "Point" and not geometry.is_empty else NO_POSITION
         new = number
         if number in self.nodes and (self.nodes[number].lon, self.nodes[number].lat) != (x, y):
-            new = self.fresh("node")
+            new = self.next_id("node")
         self.nodes[new] = Node(
             x, y, as_texts(source_properties.get("tags")), as_texts(source_properties.get("attributes"))
         )
         level.moved[number] = new
         self.unknown("node", new, source_properties)
 
-    def way(self, level: _Level, number: int, geometry: Any, source_properties: Mapping[str, Any]) -> bool:
+    def write_way(self, level: _Level, number: int, geometry: Any, source_properties: Mapping[str, Any]) -> bool:
         """Write an OSM way; False where its properties or its geometry are no longer those of one."""
         refs = integers(source_properties.get("refs"))
         at = _course(geometry)
@@ -797,17 +797,17 @@ class _Writer:
             return False
         tags, attributes = as_texts(source_properties.get("tags")), as_texts(source_properties.get("attributes"))
         missing = set(integers(source_properties.get("missing")) or ())
-        first = self.fresh("way") if number in self.ways else number
-        if level.has_network and "highway" in tags and not deleted(attributes):
+        first = self.next_id("way") if number in self.ways else number
+        if level.has_network and "highway" in tags and not is_deleted(attributes):
             runs = self.runs(level, number, refs, tags, {refs[k] for k in missing if 0 <= k < len(refs)})
         else:
             runs = [(0, len(refs), tags)]
         written: list[int] = []
         for begin, end, run_tags in runs:
-            new = self.fresh("way") if written else first
+            new = self.next_id("way") if written else first
             complete = end - begin == len(refs)
             nodes = self.bend(level, refs, at, missing, source_properties.get("vertices"), range(begin, end))
-            self.ways[new] = (nodes, run_tags, attributes if complete or not written else NOTHING)
+            self.ways[new] = (nodes, run_tags, attributes if complete or not written else NO_ATTRIBUTES)
             written.append(new)
         if written:
             self.unknown("way", written[0], source_properties)
@@ -839,13 +839,16 @@ class _Writer:
                 own_tags = tags if edge[2] is None else edge[2]
                 values = cache.get((id(own_tags), heading))
                 if values is None:
-                    values = cache[id(own_tags), heading] = edge_words(as_texts(own_tags), heading)
+                    values = cache[id(own_tags), heading] = edge_properties(as_texts(own_tags), heading)
                 new = {w: v for w in _EDGE_WORDS if _differs(v := edge[3].get(w), values.get(w))}
                 if new:
                     edited.setdefault(k, {})[heading] = new
         for k, changes in edited.items():
             headings, other = headings_by_segment[k]
-            headings_by_segment[k] = (headings, _edited(tags if other is None else as_texts(other), changes, headings))
+            headings_by_segment[k] = (
+                headings,
+                _way_tags(tags if other is None else as_texts(other), changes, headings),
+            )
         if all(
             k in headings_by_segment and len(headings_by_segment[k][0]) == n and headings_by_segment[k][1] is None
             for k, n in edge_counts.items()
@@ -899,10 +902,12 @@ class _Writer:
             node = self.nodes.get(new)
             if position is not None:
                 if node is None:
-                    self.nodes[new] = Node(position[0], position[1], NOTHING, as_texts(attributes[k]), vertex=True)
+                    self.nodes[new] = Node(
+                        position[0], position[1], NO_ATTRIBUTES, as_texts(attributes[k]), vertex=True
+                    )
                 elif node.vertex and (node.lon != position[0] or node.lat != position[1]):
                     # Two ways no longer agree where their common node is: each keeps its course.
-                    new = self.fresh("node")
+                    new = self.next_id("node")
                     self.nodes[new] = Node(position[0], position[1], vertex=True)
             out.append(new)
         return out
@@ -917,7 +922,7 @@ class _Writer:
         out = []
         for x, y in at.tolist():
             if (x, y) not in node_ids:
-                node_ids[x, y] = new = self.fresh("node")
+                node_ids[x, y] = new = self.next_id("node")
                 self.nodes[new] = Node(x, y, vertex=True)
             out.append(node_ids[x, y])
         return out
@@ -944,7 +949,7 @@ class _Writer:
         tags, attributes = as_texts(source_properties.get("tags")), as_texts(source_properties.get("attributes"))
         self.relations[level.relations[number]] = (members, tags, attributes)
 
-    def new_ways(self, part: Features, level: _Level) -> None:
+    def add_ways(self, part: Features, level: _Level) -> None:
         """Edges that no way explains, joined to lines where they follow each other and say the same."""
         left = [
             k
@@ -953,7 +958,7 @@ class _Writer:
         ]
         if not left:
             return
-        features = part.take(left)
+        features = part.select(left)
         pairs: dict[tuple[int, int], list[int]] = {}
         signs: list[tuple[Any, ...]] = []
         for k, (i, p) in enumerate(zip(features.ids, features.properties, strict=True)):
@@ -980,10 +985,14 @@ class _Writer:
                 nodes = [a, *self.inner(course[k] if course is not None else None), b]
                 sign = (*signs[k], twin)
                 if nodes == [a, a]:  # by itself: within a line it would be a node that stands twice
-                    self.ways[self.fresh("way")] = (nodes, {**dict(signs[k][1]), "oneway": "yes", LOOP: "yes"}, NOTHING)
-                elif sign == state and line[-1] == a and len(line) + len(nodes) <= MOST_NODES:
+                    self.ways[self.next_id("way")] = (
+                        nodes,
+                        {**dict(signs[k][1]), "oneway": "yes", LOOP: "yes"},
+                        NO_ATTRIBUTES,
+                    )
+                elif sign == state and line[-1] == a and len(line) + len(nodes) <= MAX_WAY_NODES:
                     line += nodes[1:]
-                elif sign == state and twin and line[-1] == b and len(line) + len(nodes) <= MOST_NODES:
+                elif sign == state and twin and line[-1] == b and len(line) + len(nodes) <= MAX_WAY_NODES:
                     line += nodes[-2::-1]
                 else:
                     line, state = nodes, sign
@@ -992,7 +1001,7 @@ class _Writer:
                         tags["oneway"] = "yes"
                     elif direction(tags) != "both":
                         tags["oneway"] = "no"
-                    self.ways[self.fresh("way")] = (line, tags, NOTHING)
+                    self.ways[self.next_id("way")] = (line, tags, NO_ATTRIBUTES)
 
     def inner(self, geometry: Any) -> list[int]:
         """New nodes for what an edge bends over between its ends."""
@@ -1000,7 +1009,7 @@ class _Writer:
             return []
         out = []
         for x, y in shapely.get_coordinates(geometry)[1:-1].tolist():
-            out.append(self.fresh("node"))
+            out.append(self.next_id("node"))
             self.nodes[out[-1]] = Node(x, y, vertex=True)
         return out
 
@@ -1009,11 +1018,11 @@ class _Writer:
         if isinstance(source_properties, Mapping) and isinstance(source_properties.get("tags"), Mapping):
             own_tags = {k: v for k, v in as_texts(source_properties["tags"]).items() if k != "oneway"}
             limits = {own_tags.pop(k, None) for k in ("maxspeed:forward", "maxspeed:backward")} - {None}
-            values = edge_words(own_tags, "forward")
+            values = edge_properties(own_tags, "forward")
             new = {w: v for w in _EDGE_WORDS if _differs(v := p.get(w), values.get(w))}
             if limits and "speed_limit" not in new and "maxspeed" not in own_tags:
                 new["speed_limit"] = min((v for v in map(osm_tags.speed, limits) if v), default=None)
-            return dict(_edited(own_tags, {"forward": {w: v for w, v in new.items() if v}}, {"forward"}))
+            return dict(_way_tags(own_tags, {"forward": {w: v for w, v in new.items() if v}}, {"forward"}))
         tags = {"highway": "path"}
         for member, key in (("name", "name"), ("action", "action"), ("width", "width")):
             value = p.get(member)
@@ -1066,34 +1075,34 @@ class _Writer:
         for part in parts:
             if part.geom_type == "Point":
                 x, y = part.x, part.y
-                self.nodes[self.fresh("node")] = Node(x, y, tags)
+                self.nodes[self.next_id("node")] = Node(x, y, tags)
             elif part.geom_type == "Polygon" and not single:
-                rings.append((self.line(part.exterior, NOTHING), "outer"))
-                rings += [(self.line(r, NOTHING), "inner") for r in part.interiors]
+                rings.append((self.line(part.exterior, NO_ATTRIBUTES), "outer"))
+                rings += [(self.line(r, NO_ATTRIBUTES), "inner") for r in part.interiors]
             elif part.geom_type == "Polygon":
                 self.line(part.exterior, {**tags, "area": "yes"})
             else:
                 self.line(part, tags)
         if rings:
             members = [("way", number, role) for number, role in rings]
-            self.relations[self.fresh("relation")] = (members, {**tags, "type": "multipolygon"}, NOTHING)
+            self.relations[self.next_id("relation")] = (members, {**tags, "type": "multipolygon"}, NO_ATTRIBUTES)
 
     def line(self, geometry: Any, tags: Mapping[str, str]) -> int:
         """A way along a line or ring, with nodes of its own. A line too long for one way goes on in further ones."""
         at = shapely.get_coordinates(geometry).tolist()
         nodes = []
         for x, y in at[:-1]:
-            nodes.append(self.fresh("node"))
+            nodes.append(self.next_id("node"))
             self.nodes[nodes[-1]] = Node(x, y, vertex=True)
         if at[0] == at[-1] and len(at) > 2:
             nodes.append(nodes[0])
         else:
-            nodes.append(self.fresh("node"))
+            nodes.append(self.next_id("node"))
             self.nodes[nodes[-1]] = Node(at[-1][0], at[-1][1], vertex=True)
-        first = self.fresh("way")
-        self.ways[first] = (nodes[:MOST_NODES], tags, NOTHING)
-        for begin in range(MOST_NODES - 1, len(nodes) - 1, MOST_NODES - 1):
-            self.ways[self.fresh("way")] = (nodes[begin : begin + MOST_NODES], tags, NOTHING)
+        first = self.next_id("way")
+        self.ways[first] = (nodes[:MAX_WAY_NODES], tags, NO_ATTRIBUTES)
+        for begin in range(MAX_WAY_NODES - 1, len(nodes) - 1, MAX_WAY_NODES - 1):
+            self.ways[self.next_id("way")] = (nodes[begin : begin + MAX_WAY_NODES], tags, NO_ATTRIBUTES)
         return first
 
     # --- XML ---
@@ -1136,12 +1145,12 @@ class _Writer:
 _EDGE_WORDS = ("speed_limit", "width", "surface", "access")
 
 
-def _told(source_properties: Mapping[str, Any], p: Properties, i: str) -> Mapping[str, Any]:
+def _object_tags(source_properties: Mapping[str, Any], p: Properties, i: str) -> Mapping[str, Any]:
     """An object's own words with the tags that its name and measures say now. A highway's are its edges'."""
     tags = as_texts(source_properties.get("tags"))
     if "highway" in tags:
         return source_properties
-    values = object_words(tags)
+    values = object_properties(tags)
     new = {w: v for w in _SPOKEN if _differs(v := p.get(w), values.get(w)) and v != i}
     if not new:
         return source_properties
@@ -1149,7 +1158,9 @@ def _told(source_properties: Mapping[str, Any], p: Properties, i: str) -> Mappin
     return {**source_properties, "tags": {**tags, **new_tags}}
 
 
-def _edited(tags: Mapping[str, str], changes: Mapping[str, Mapping[str, Any]], headings: Set[str]) -> Mapping[str, str]:
+def _way_tags(
+    tags: Mapping[str, str], changes: Mapping[str, Mapping[str, Any]], headings: Set[str]
+) -> Mapping[str, str]:
     """A highway's tags with the words that its edges say now. changes: by direction; ways: those that are there."""
     out = dict(tags)
     limits = {heading: new["speed_limit"] for heading, new in changes.items() if "speed_limit" in new}
@@ -1191,13 +1202,13 @@ def _bounds(
 ) -> Sequence[Mapping[str, str]]:
     """The attributes of ``<bounds>``: those that were read, while they are still the box around these boxes, else of
     that one box. What they say besides (their origin) stays with them."""
-    extent = _around(boxes)
+    extent = _bounding_box(boxes)
     try:
         old_boxes = [box for one in source_bounds if (box := _box(one)) is not None]
     except (UnreadableFile, ValueError):  # edits can put anything there
         old_boxes = []
-    if len(old_boxes) != len(source_bounds) or not old_boxes or _around(old_boxes) != extent:
-        old_boxes, source_bounds = [extent], source_bounds if len(source_bounds) == 1 else [NOTHING]
+    if len(old_boxes) != len(source_bounds) or not old_boxes or _bounding_box(old_boxes) != extent:
+        old_boxes, source_bounds = [extent], source_bounds if len(source_bounds) == 1 else [NO_ATTRIBUTES]
     names = ("minlat", "minlon", "maxlat", "maxlon")
     out = []
     for one, (w, s, e, n) in zip(source_bounds, old_boxes, strict=True):
@@ -1207,7 +1218,7 @@ def _bounds(
     return out
 
 
-def _around(boxes: Sequence[Sequence[float]]) -> tuple[float, float, float, float]:
+def _bounding_box(boxes: Sequence[Sequence[float]]) -> tuple[float, float, float, float]:
     west, south, east, north = zip(*boxes, strict=True)
     return min(west), min(south), max(east), max(north)
 
@@ -1228,14 +1239,14 @@ register(
         title="OpenStreetMap",
         files=("map.osm",),
         media_types=("application/vnd.openstreetmap.data+xml",),
-        carries=CARRIES,
+        layers=CARRIES,
         detect=detect,
         read=read,
         check=_osm_rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
         family=FAMILY,
-        rank=20,
+        priority=20,
         version=3,
         extensions=(".osm", "osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
     )

@@ -44,7 +44,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         return {name: source.data}
     cloud = source.cloud()
     if source.form != NAME:
-        cloud = replace(cloud, columns=_pcd.for_pcl(_points.plain(cloud)), comments=())
+        cloud = replace(cloud, columns=_pcd.add_padding(_points.plain(cloud)), comments=())
         for noun, count in cloud.further.items():
             context.drop(noun, count, "a PCD has points only")
     return {name: _pcd.pack(cloud, options.data or "binary")}
@@ -61,7 +61,7 @@ register(
         title="PCD point cloud",
         files=("map.pcd",),
         media_types=("application/octet-stream",),
-        carries=frozenset({"voxels", "resources"}),
+        layers=frozenset({"voxels", "resources"}),
         detect=_pcd.detect,
         read=read,
         write=write,
@@ -69,8 +69,8 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".pcd",),
-        choose=choose,
-        by_file=_points.by_file((NAME,)),
+        select_parts=choose,
+        options_from_filename=_points.options_from_filename((NAME,)),
         parts=_points.PARTS,
     )
 )

@@ -46,7 +46,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if source.form != NAME:
         if cloud.height > 1:
             context.drop("rows and columns of the cloud", 1, "a PLY's vertices are one list: ask for pcd")
-        context.drop("viewpoint", int(cloud.viewpoint != _points.UNTURNED), "PLY has no place for it: ask for pcd")
+        context.drop(
+            "viewpoint", int(cloud.viewpoint != _points.IDENTITY_VIEWPOINT), "PLY has no place for it: ask for pcd"
+        )
         cloud = replace(cloud, columns=_points.plain(cloud), comments=())
     for noun, count in cloud.further.items():
         context.drop(noun, count, "written again, a PLY has vertices only: leave out data= and frame= to keep it")
@@ -64,7 +66,7 @@ register(
         title="PLY point cloud",
         files=("map.ply",),
         media_types=("application/octet-stream",),
-        carries=frozenset({"voxels", "resources"}),
+        layers=frozenset({"voxels", "resources"}),
         detect=_ply.detect,
         read=read,
         write=write,
@@ -72,8 +74,8 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".ply",),
-        choose=choose,
-        by_file=_points.by_file((NAME,)),
+        select_parts=choose,
+        options_from_filename=_points.options_from_filename((NAME,)),
         parts=_points.PARTS,
     )
 )

@@ -44,21 +44,21 @@ from app.formats._fields import NOT_NEGATIVE, Number, record
 from app.formats._network import (
     Array,
     MergedNetwork,
-    checked_name,
+    check_name,
+    duplicates,
+    get_source_properties,
     identifier,
     is_name,
-    joined,
-    known_document,
-    natural,
+    merge_networks,
+    natural_sort_key,
     node_points,
     number,
-    only_2d,
-    own,
-    refuse,
-    some,
-    without_repeats,
+    raise_unreadable,
+    report_3d_loss,
+    shorten_list,
+    source_document,
 )
-from app.formats._undirected import NODE_CANONICAL, Line, canonical, edges, lines, warn_lonely
+from app.formats._undirected import NODE_CANONICAL, Line, canonical, edges, lines, warn_isolated
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.frame import GROUND, MAX_METRES
 from app.model.grid import OccupancyGrid
@@ -77,7 +77,7 @@ SHAPE = record(
 )
 """What a roadmap holds."""
 
-WHOLE = 1e-4
+MAX_ROUNDING_PIXELS = 1e-4
 """A pixel this near to a whole one is that one: metres are kept to a nanometre."""
 
 RESOLUTION = 0.05
@@ -146,8 +146,8 @@ def read(files: Files, context: ReadContext) -> Layers:
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
     picture = _picture(top.get(PICTURE), files, main, context)
     names, pixels, rests = _nodes(top["nodes"])
-    if repeats := without_repeats(names):
-        context.warn(f"{len(repeats)} ids stand twice or more: {some(repeats)}; edges to them go to the first")
+    if repeats := duplicates(names):
+        context.warn(f"{len(repeats)} ids stand twice or more: {shorten_list(repeats)}; edges to them go to the first")
     if len(pixels) and (pixels.min() < -0.5 or pixels[:, 1].max() > picture.height - 0.5):
         context.warn(f"some nodes lie outside the map's picture ({picture.height} rows)")
     _fields.check(top, SHAPE, context)
@@ -155,9 +155,9 @@ def read(files: Files, context: ReadContext) -> Layers:
     ids = unique_ids(map(identifier, names))
     xyz = np.concatenate([picture.metres(pixels), np.zeros((len(names), 1))], axis=1)
     if len(xyz) and np.abs(xyz).max() > MAX_METRES:
-        refuse(f"nodes must lie within ±{MAX_METRES:g} m", "nodes")
+        raise_unreadable(f"nodes must lie within ±{MAX_METRES:g} m", "nodes")
     file_lines, dangling = _edges(top.get("edges"), index_by_name, context)
-    warn_lonely(len(names), (k for line in file_lines for k in (line.a, line.b)), names, context)
+    warn_isolated(len(names), (k for line in file_lines for k in (line.a, line.b)), names, context)
     properties: list[Properties] = []
     for i, name, extra_members in zip(ids, names, rests, strict=True):
         canonical_members = canonical(("name",), extra_members)
@@ -183,16 +183,16 @@ def _picture(members: Any, files: Files, main: str, context: ReadContext) -> _Pi
         _check_origin(options.origin, main)
         return _Picture(options.resolution, options.origin, options.height)
     if members is not None:
-        return _picture_said(members)
-    for name in looks_at(main, list(files)):
+        return _parse_picture(members)
+    for name in related_files(main, list(files)):
         if not name.lower().endswith((".yaml", ".yml")):
             continue
         try:
             beside = _yaml.load(files[name], context.limits)
             base = re.split(r"[/\\]", str(beside["image"]))[-1]
             image = files[f"{name.rpartition('/')[0]}/{base}".lstrip("/")]
-            rows = _image.size_of(image, context.limits)[1]
-            return _picture_said({**beside, "height": rows})
+            rows = _image.read_size(image, context.limits)[1]
+            return _parse_picture({**beside, "height": rows})
         except (*BAD_INPUT, FleetMapError):  # the map's own reader says what is wrong with it
             continue
     reason = (
@@ -202,21 +202,21 @@ def _picture(members: Any, files: Files, main: str, context: ReadContext) -> _Pi
     raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
 
 
-def _picture_said(members: Any) -> _Picture:
+def _parse_picture(members: Any) -> _Picture:
     """A mapping's resolution, origin and height, checked."""
     if not isinstance(members, dict):
-        refuse("must be a mapping with resolution, origin and height", PICTURE)
+        raise_unreadable("must be a mapping with resolution, origin and height", PICTURE)
     origin, height = members.get("origin"), members.get("height")
     if not isinstance(origin, list) or len(origin) != 3:
-        refuse("must be [x, y, yaw]", f"{PICTURE}.origin")
+        raise_unreadable("must be [x, y, yaw]", f"{PICTURE}.origin")
     if isinstance(height, bool) or not isinstance(height, int) or not 1 <= height <= 2**31:
-        refuse("must be a whole number above 0", f"{PICTURE}.height")
+        raise_unreadable("must be a whole number above 0", f"{PICTURE}.height")
     resolution = number(members.get("resolution"), f"{PICTURE}.resolution")
     if not 1e-6 <= resolution <= 1e4:
-        refuse("must be between 1e-6 and 1e4 metres", f"{PICTURE}.resolution")
+        raise_unreadable("must be between 1e-6 and 1e4 metres", f"{PICTURE}.resolution")
     x, y, yaw = (number(v, f"{PICTURE}.origin") for v in origin)
     if max(map(abs, (x, y, yaw))) > MAX_METRES:
-        refuse(f"must lie within ±{MAX_METRES:g}", f"{PICTURE}.origin")
+        raise_unreadable(f"must lie within ±{MAX_METRES:g}", f"{PICTURE}.origin")
     return _Picture(resolution, (x, y, yaw), height)
 
 
@@ -226,7 +226,7 @@ def _check_origin(origin: Sequence[float], file: str) -> None:
         raise UnreadableFile(f"{file}: {reason}", [Problem(reason, file, where="origin")])
 
 
-def looks_at(main: str, names: Sequence[str]) -> Iterable[str]:
+def related_files(main: str, names: Sequence[str]) -> Iterable[str]:
     """Maps of the upload that the pixels may belong to, the likeliest first, and the pictures beside them."""
     folder = main.rpartition("/")[0]
     root = folder.rpartition("/")[0] if folder.rpartition("/")[2] == "topological" else None
@@ -249,22 +249,22 @@ def _nodes(entries: Sequence[Any]) -> tuple[list[str], Array, list[dict[str, Any
     for k, node in enumerate(entries):
         location = f"nodes[{k}]"
         if not isinstance(node, dict):
-            refuse("a node is a mapping with id, x and y", location)
+            raise_unreadable("a node is a mapping with id, x and y", location)
         extra_members = {key: value for key, value in node.items() if key not in ("id", "x", "y")}
         names.append(_id(node.get("id"), f"{location}.id"))
         if not isinstance(node["id"], int):
             extra_members["id"] = node["id"]
         rows.append((number(node.get("x"), f"{location}.x"), number(node.get("y"), f"{location}.y")))
         if max(map(abs, rows[-1])) > 1e12:
-            refuse("a pixel this far away is of no picture", location)
+            raise_unreadable("a pixel this far away is of no picture", location)
         rests.append(extra_members)
     return names, np.array(rows, np.float64).reshape(-1, 2), rests
 
 
 def _id(value: Any, location: str) -> str:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        refuse("an id is a number or a text", location)
-    return checked_name(value if isinstance(value, str) else _yaml.text(value), location)
+        raise_unreadable("an id is a number or a text", location)
+    return check_name(value if isinstance(value, str) else _yaml.text(value), location)
 
 
 def _edges(
@@ -272,12 +272,12 @@ def _edges(
 ) -> tuple[list[Line], list[dict[str, Any]]]:
     """(edges between nodes; those to nowhere as they stand)."""
     if entries is not None and not isinstance(entries, list):
-        refuse("must be a list", "edges")
+        raise_unreadable("must be a list", "edges")
     file_lines, dangling = [], []
     for k, edge in enumerate(entries or ()):
         location = f"edges[{k}]"
         if not isinstance(edge, dict):
-            refuse("an edge is a mapping with from and to", location)
+            raise_unreadable("an edge is a mapping with from and to", location)
         ends = [_id(edge.get(end), f"{location}.{end}") for end in ("from", "to")]
         absent = [end for end in ends if end not in index_by_name]
         if absent:
@@ -311,20 +311,22 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     Nodes of other formats are moved to the centres of their pixels, and numbered where their ids are no whole numbers
     (the id becomes the ``name``). MissingDatum for wgs84 items without a datum.
     """
-    net = joined(layers, context)
-    only_2d(net, context, "pixels have no altitude and no level")
-    net = _sorted(net)
-    document = known_document(layers, NAME)
+    net = merge_networks(layers, context)
+    report_3d_loss(net, context, "pixels have no altitude and no level")
+    net = _sort_nodes(net)
+    document = source_document(layers, NAME)
     xy = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
-    picture = _picture_of(layers, document, xy, context)
+    picture = _select_picture(layers, document, xy, context)
     exact = picture.pixels(xy)
     near = np.round(exact)
     own_nodes = np.array([NAME in n.properties for n in net.nodes], bool)
-    is_integer = np.asarray((np.abs(exact - near) <= WHOLE).all(axis=1), bool)
+    is_integer = np.asarray((np.abs(exact - near) <= MAX_ROUNDING_PIXELS).all(axis=1), bool)
     moved = int((~is_integer & ~own_nodes).sum())
     context.drop("places of nodes within their pixels", moved, f"pixels of {picture.resolution:g} m are whole numbers")
     # The pixel that holds the place, its left and lower edge included; a roadmap's own broken pixels stay broken.
-    inside = np.stack([np.floor(exact[:, 0] + 0.5 + WHOLE), np.ceil(exact[:, 1] - 0.5 - WHOLE)], axis=1)
+    inside = np.stack(
+        [np.floor(exact[:, 0] + 0.5 + MAX_ROUNDING_PIXELS), np.ceil(exact[:, 1] - 0.5 - MAX_ROUNDING_PIXELS)], axis=1
+    )
     pixels = np.where(is_integer[:, None], near, np.where(own_nodes[:, None], np.round(exact, 6), inside))
     ids = _ids(net)
     top = document.get("top")
@@ -334,7 +336,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     dropped_count = renamed = 0
     for k, (node, i) in enumerate(zip(net.nodes, ids, strict=True)):
         p = node.properties
-        more = own(p, NAME).get("more")
+        more = get_source_properties(p, NAME).get("more")
         members = {key: v for key, v in more.items() if key not in ("id", "x", "y")} if isinstance(more, dict) else {}
         called = p.get("name")
         if isinstance(called, str) and called:
@@ -382,9 +384,9 @@ def _plain(value: float) -> float:
     return int(value) if float(value).is_integer() else value
 
 
-def _sorted(net: MergedNetwork) -> MergedNetwork:
+def _sort_nodes(net: MergedNetwork) -> MergedNetwork:
     """The same with nodes in the order of their ids."""
-    order = sorted(range(len(net.nodes)), key=lambda k: natural(net.nodes[k].id))
+    order = sorted(range(len(net.nodes)), key=lambda k: natural_sort_key(net.nodes[k].id))
     new_index = {old: new for new, old in enumerate(order)}
     moved = [
         type(e)(e.id, new_index[e.source], new_index[e.target], e.properties, e.geometry, e.level) for e in net.edges
@@ -399,7 +401,7 @@ def _ids(net: MergedNetwork) -> list[Any]:
     """The ids as the file says them: whole numbers and a roadmap's own texts; the others get free numbers."""
     out: list[Any] = []
     for node in net.nodes:
-        source_id = own(node.properties, NAME).get("id")
+        source_id = get_source_properties(node.properties, NAME).get("id")
         keep = isinstance(source_id, (int, float)) or (isinstance(source_id, str) and is_name(source_id))
         if keep and not isinstance(source_id, bool):
             out.append(source_id)
@@ -418,7 +420,7 @@ def _ids(net: MergedNetwork) -> list[Any]:
     return out
 
 
-def _picture_of(layers: Layers, document: Mapping[str, Any], xy: Array, context: WriteContext) -> _Picture:
+def _select_picture(layers: Layers, document: Mapping[str, Any], xy: Array, context: WriteContext) -> _Picture:
     """The picture whose pixels are written."""
     grids = layers.grids()
     keys = choose(sorted(grids), None)
@@ -428,7 +430,7 @@ def _picture_of(layers: Layers, document: Mapping[str, Any], xy: Array, context:
     source_picture = document.get("picture")
     if isinstance(source_picture, dict):
         with contextlib.suppress(UnreadableFile):  # a document may be edited
-            return _picture_said(source_picture)
+            return _parse_picture(source_picture)
     low = np.floor(xy.min(axis=0) - MARGIN) if len(xy) else np.zeros(2)
     high = np.ceil(xy.max(axis=0) + MARGIN) if len(xy) else np.ones(2)
     size = context.options.pixel_size if isinstance(context.options, WriteOptions) else RESOLUTION
@@ -468,20 +470,20 @@ register(
         title="Probabilistic roadmap (environment_common)",
         files=(FILE,),
         media_types=("application/yaml",),
-        carries=frozenset({"topology", "occupancy"}),
+        layers=frozenset({"topology", "occupancy"}),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"occupancy"})),
-        looks_at=looks_at,
+        related_files=related_files,
         read_options=ReadOptions,
         write_options=WriteOptions,
         family=NAME,
-        rank=3,
+        priority=3,
         extensions=(".yaml", ".yml"),
-        choose=choose,
+        select_parts=choose,
         outlines=True,
-        bends="nodes",
+        keeps_bends="nodes",
         version=2,
     )
 )

@@ -44,7 +44,7 @@ from app.formats import (
     register,
 )
 from app.formats._fields import ANGLE, ANY, COORDINATE, SPEED, WIDTH, Number, OneOf, record
-from app.formats._network import own
+from app.formats._network import get_source_properties
 from app.formats._rmf import (
     BUILDING,
     CABIN_HEIGHT,
@@ -56,8 +56,8 @@ from app.formats._rmf import (
     listing,
     mapping,
     number,
-    refuse,
-    value_of,
+    parameter_value,
+    raise_unreadable,
 )
 from app.formats._text import METRES, numbers
 from app.model.features import (
@@ -81,10 +81,10 @@ PARALLEL = 0.01
 """rmf_building_map_tools takes a lane and a door for parallel where the determinant of their directions is smaller, in
 the units of the building's file."""
 
-SHARED = 4096
+MAX_CACHED_PARAMETERS = 4096
 """Different parameters of lanes, of which equal ones are kept once."""
 
-ROWS = 10_000
+LINES_PER_WRITE = 10_000
 """Lines that are turned into bytes at once."""
 
 _VERTEX = record(
@@ -144,7 +144,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         _collect(lifts, mapping(top.get("lifts"), "lifts"), graph, context, "lifts")
     top = members = {}
     if not levels:
-        refuse("a navigation graph needs at least one level", "levels")
+        raise_unreadable("a navigation graph needs at least one level", "levels")
     if context.level != GROUND:
         context.warn(f"its levels have names of their own: level={context.level} is not used", where="levels")
     for name, (members, inside, k) in doors.items():
@@ -176,7 +176,7 @@ def _graphs(files: Files, context: ReadContext) -> dict[int, dict[str, Any]]:
         context.main = name
         top = _yaml.load(files[name], context.limits)
         if not isinstance(top, dict):
-            refuse("must be a mapping with levels", "")
+            raise_unreadable("must be a mapping with levels", "")
         stem = _stem(name)
         graph_number = int(stem) if stem.isdecimal() and stem.isascii() and len(stem) < 5 else None
         graph = (
@@ -215,7 +215,7 @@ def _level(level: _Level, graph: int, members: Mapping[str, Any], location: str,
     for k, row in enumerate(listing(members.get("lanes"), f"{location}.lanes")):
         at = f"{location}.lanes[{k}]"
         if not isinstance(row, list) or len(row) < 2:
-            refuse("must be a list [vertex, vertex, {…}]", at)
+            raise_unreadable("must be a list [vertex, vertex, {…}]", at)
         i, j = index(row[0], f"{at}[0]"), index(row[1], f"{at}[1]")
         parameters = mapping(row[2] if len(row) > 2 else None, f"{at}[2]")
         if not (0 <= i < len(rows) and 0 <= j < len(rows)):
@@ -224,7 +224,7 @@ def _level(level: _Level, graph: int, members: Mapping[str, Any], location: str,
             context.warn(problem, where=at)
             continue
         more = {"more": row[3:]} if len(row) > 3 else {}
-        if len(shared) < SHARED:
+        if len(shared) < MAX_CACHED_PARAMETERS:
             parameters = shared.setdefault(orjson.dumps(parameters).decode(), parameters)
         extra_members = {"graph": graph, "index": k, "parameters": parameters, **more}
         level.edges.append((places[i], places[j], compact(extra_members)))
@@ -261,7 +261,7 @@ def _door(levels: Mapping[str, _Level], name: str, members: Any, source_properti
     one = dict(mapping(members, location))
     ends = listing(one.pop("endpoints", None), f"{location}.endpoints")
     if len(ends) != 2:
-        refuse("must be two points", f"{location}.endpoints")
+        raise_unreadable("must be two points", f"{location}.endpoints")
     at = _rmf.places(ends, f"{location}.endpoints")
     level = one.pop("map", None)
     if level not in levels:
@@ -277,7 +277,7 @@ def _lift(levels: Mapping[str, _Level], name: str, members: Any, source_properti
     position = listing(one.pop("position", None), f"{location}.position")
     dims = listing(one.pop("dims", None), f"{location}.dims")
     if len(position) < 2 or len(dims) != 2:
-        refuse("needs position [x, y, yaw] and dims [width, depth]", location)
+        raise_unreadable("needs position [x, y, yaw] and dims [width, depth]", location)
     x, y, yaw = (number(v, f"{location}.position") for v in [*position, 0.0][:3])
     size = [*(number(v, f"{location}.dims") for v in dims), CABIN_HEIGHT]
     level = next(iter(levels))
@@ -364,7 +364,7 @@ class _Edge:
     @property
     def order(self) -> tuple[bool, int, bool, int, str]:
         """Its place among the lanes of its file; edges that come from none follow by id."""
-        source_members = own(self.p, NAME) or own(self.p, BUILDING)
+        source_members = get_source_properties(self.p, NAME) or get_source_properties(self.p, BUILDING)
         was = source_members.get("index")
         has_index = isinstance(was, int)
         return (
@@ -431,7 +431,7 @@ class _Writer:
                 "rmf_nav_graph needs lanes, and no node has an edge: supply a network (building.yaml, tmap2, OSM …)"
             )
         out = {f"{graph}.yaml": self._graph(graph) for graph in graphs}
-        self._count_left_out()
+        self._count_dropped()
         if self.new_lanes:
             why = f"{self.new_lanes} edges come from another format"
             self.context.fill("lanes: graph", self.options.graph, why, "graph")
@@ -449,7 +449,7 @@ class _Writer:
             )
         return out
 
-    def _count_left_out(self) -> None:
+    def _count_dropped(self) -> None:
         for storey in self.storeys:
             used = np.array([NAME in p for p in storey.nodes], bool)
             for edges in storey.edges.values():
@@ -468,7 +468,7 @@ class _Writer:
         for key, part in self.layers.vector("objects").items():
             if key.name not in (BUILDING, NAME):
                 continue
-            subset = part.of_kind(kind)
+            subset = part.select_kinds(kind)
             geometry = subset.in_local(self.layers.frame)
             rows = list(zip(subset.ids, subset.properties, geometry, strict=True))
             rows.sort(key=lambda row: (_place(row[1]), row[0]))
@@ -484,7 +484,7 @@ class _Writer:
                 self.lost["doors without two ends, or of a name that another one has"] += 1
                 continue
             names.add(name)
-            source_members = own(p, NAME)
+            source_members = get_source_properties(p, NAME)
             inside = source_members.get("graphs") if isinstance(source_members.get("graphs"), list) else None
             out.append(_Door(name, level, _rmf.ends(g), inside, mapping(source_members.get("says"), "says")))
         return out
@@ -498,21 +498,21 @@ class _Writer:
                 self.lost["lifts without a point, or of a name that another one has"] += 1
                 continue
             names.add(name)
-            lift_members = mapping(own(p, BUILDING).get("says"), "says")
-            pose, size = _rmf.pose_of(p), _rmf.size_of(p) or (1.0, 1.0)
+            lift_members = mapping(get_source_properties(p, BUILDING).get("says"), "says")
+            pose, size = _rmf.object_pose(p), _rmf.object_size(p) or (1.0, 1.0)
             yaw = pose[5] if pose else lift_members.get("yaw", 0.0)
             yaw = float(yaw) if isinstance(yaw, (int, float)) else 0.0
-            source_members = own(p, NAME)
+            source_members = get_source_properties(p, NAME)
             inside = source_members.get("graphs") if isinstance(source_members.get("graphs"), list) else None
             position = (float(g.x), float(g.y), yaw)
             says = mapping(source_members.get("says"), "says")
-            served = self._served(lift_members)
+            served = self._served_levels(lift_members)
             lift = _Lift(name, position, size, _shaft(position, size), served, inside, says)
             lifts.append((_place(p), name, lift))
         lifts.sort(key=lambda row: row[:2])
         return [lift for _, _, lift in lifts]
 
-    def _served(self, lift_members: Mapping[str, Any]) -> frozenset[str]:
+    def _served_levels(self, lift_members: Mapping[str, Any]) -> frozenset[str]:
         """The levels between a lift's lowest and highest floor; none where it has no door on any."""
         if not lift_members.get("level_doors"):
             return frozenset()
@@ -539,7 +539,7 @@ class _Writer:
                 indices = [k for k, p in enumerate(part.properties) if p.get("kind") == "node" and point[k]]
                 ids += [part.ids[k] for k in indices]
                 nodes += [part.properties[k] for k in indices]
-                at.append(shapely.get_coordinates(part.take(indices).in_local(self.layers.frame)))
+                at.append(shapely.get_coordinates(part.select(indices).in_local(self.layers.frame)))
             places = {i: k for k, i in reversed(list(enumerate(ids)))}
             edges = self._edges(networks, places)
             document = mapping(documents.get(NAME), NAME)
@@ -572,7 +572,7 @@ class _Writer:
                 if p.get("kind") == "node":
                     continue
                 source, target = places.get(str(p.get("source"))), places.get(str(p.get("target")))
-                graph = self.options.graph if NAME not in p and BUILDING not in p else _graph_of(p)
+                graph = self.options.graph if NAME not in p and BUILDING not in p else _edge_graph(p)
                 if p.get("kind") != "edge" or source is None or target is None:
                     self.lost["edges without two nodes on their level"] += 1
                 elif graph is None:
@@ -585,7 +585,7 @@ class _Writer:
                     out.setdefault(graph, []).append(_Edge(i, source, target, p))
         for edges in out.values():
             edges.sort(key=lambda e: e.order)
-            for e, paired in zip(edges, _paired(edges, len(places)), strict=True):
+            for e, paired in zip(edges, _find_pairs(edges, len(places)), strict=True):
                 e.paired = paired
         return out
 
@@ -601,16 +601,16 @@ class _Writer:
                 self.context.fill("building_name", default, "no source names the building", "building")
         if self.building.get("coordinate_system") == "cartesian_meters":
             parameters = self.building.get("parameters")
-            top.setdefault("offset", [value_of(parameters, key, 0) for key in ("offset_x", "offset_y")])
-            if value_of(parameters, "generate_crs") is not None:
-                top.setdefault("crs_name", value_of(parameters, "generate_crs"))
+            top.setdefault("offset", [parameter_value(parameters, key, 0) for key in ("offset_x", "offset_y")])
+            if parameter_value(parameters, "generate_crs") is not None:
+                top.setdefault("crs_name", parameter_value(parameters, "generate_crs"))
         doors = {
-            d.name: {"endpoints": _rounded(d.ends), "map": d.level, **d.says}
+            d.name: {"endpoints": _round(d.ends), "map": d.level, **d.says}
             for d in self.doors
             if d.graphs is None or graph in d.graphs
         }
         lifts = {
-            lift.name: {"dims": list(lift.dims), "position": _rounded(np.array(lift.position)), **lift.says}
+            lift.name: {"dims": list(lift.dims), "position": _round(np.array(lift.position)), **lift.says}
             for lift in self.lifts
             if lift.graphs is None or graph in lift.graphs
         }
@@ -621,7 +621,7 @@ class _Writer:
         names: Counter[str] = Counter()
         for storey in self.storeys:
             rows = self._level(storey, graph, names)
-            while batch := list(islice(rows, ROWS)):
+            while batch := list(islice(rows, LINES_PER_WRITE)):
                 out.write("".join(batch).encode())
         out.write(_yaml.mapping(after, 0).encode())
         twice = sorted(name for name, count in names.items() if count > 1)
@@ -634,7 +634,7 @@ class _Writer:
     def _level(self, storey: _LevelWriter, graph: int, names: Counter[str]) -> Iterator[str]:
         """The lines of a level in a graph; names: how often vertices have each."""
         edges = storey.edges.get(graph, [])
-        graphs = [own(p, NAME).get("graphs") for p in storey.nodes]
+        graphs = [get_source_properties(p, NAME).get("graphs") for p in storey.nodes]
         listed = [members.get(str(graph)) if isinstance(members, dict) else None for members in graphs]
         order = sorted((k for k, at in enumerate(listed) if isinstance(at, int)), key=lambda k: (listed[k], k))
         order = list(dict.fromkeys([*order, *(k for e in edges for k in (e.source, e.target))]))
@@ -648,21 +648,21 @@ class _Writer:
     def _vertices(self, storey: _LevelWriter, order: Sequence[int], names: Counter[str]) -> Iterator[str]:
         texts = list(map(_yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
         for n, k in enumerate(order):
-            options = {**self._vertex(storey, k), **self.robots.at(storey.name, storey.ids[k])}
+            options = {**self._vertex(storey, k), **self.robots.vertex_properties(storey.name, storey.ids[k])}
             if options.get("name"):
                 names[str(options["name"])] += 1
-            more = "".join(f", {self.flow(v)}" for v in own(storey.nodes[k], NAME).get("more") or ())
+            more = "".join(f", {self.flow(v)}" for v in get_source_properties(storey.nodes[k], NAME).get("more") or ())
             yield f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(options)}{more}]\n"
 
     def _lanes(
         self, storey: _LevelWriter, graph: int, edges: Sequence[_Edge], new_index: Mapping[int, int]
     ) -> Iterator[str]:
-        crossed = self._crossed(storey, edges)
+        crossed = self._crossed_doors(storey, edges)
         blocked = {(e.source, e.target) for e in edges if e.p.get("blocked") is True}
         for n, e in enumerate(edges):
-            if own(e.p, NAME).get("reverse") is True and e.paired:
+            if get_source_properties(e.p, NAME).get("reverse") is True and e.paired:
                 continue  # it is told by the lane that says is_bidirectional
-            more = "".join(f", {self.flow(v)}" for v in own(e.p, NAME).get("more") or ())
+            more = "".join(f", {self.flow(v)}" for v in get_source_properties(e.p, NAME).get("more") or ())
             options = self._lane(storey, e, crossed[n])
             if e.p.get("blocked") is True or (
                 options.get("is_bidirectional") is True and (e.target, e.source) in blocked
@@ -680,15 +680,15 @@ class _Writer:
     def _vertex(self, storey: _LevelWriter, k: int) -> dict[str, Any]:
         p = storey.nodes[k]
         if NAME in p:
-            options = dict(mapping(own(p, NAME).get("parameters"), "parameters"))
+            options = dict(mapping(get_source_properties(p, NAME).get("parameters"), "parameters"))
             name = p.get("name")
             if isinstance(name, str) or "name" not in options:
                 options["name"] = name or ""
             return options
         if BUILDING in p:
-            parameters = mapping(own(p, BUILDING).get("parameters"), "parameters")
+            parameters = mapping(get_source_properties(p, BUILDING).get("parameters"), "parameters")
             options = {"name": p.get("name") or ""}
-            options |= {key: value_of(parameters, key, value) for key, value in parameters.items()}
+            options |= {key: parameter_value(parameters, key, value) for key, value in parameters.items()}
         else:
             self.lost["nodes' orientations"] += p.get("orientation") is not None
             self.lost["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
@@ -700,7 +700,7 @@ class _Writer:
     def _lane(self, storey: _LevelWriter, e: _Edge, door: str | None) -> dict[str, Any]:
         limit = _rmf.limit(e.p)
         if NAME in e.p:
-            options = dict(mapping(own(e.p, NAME).get("parameters"), "parameters"))
+            options = dict(mapping(get_source_properties(e.p, NAME).get("parameters"), "parameters"))
             if _limit(options) != limit:
                 options["speed_limit"] = limit
             if options.get("is_bidirectional") is True and not e.paired:
@@ -714,24 +714,24 @@ class _Writer:
             options["door_name"] = door
         if limit:
             options["speed_limit"] = limit
-        source_members = own(e.p, BUILDING)
+        source_members = get_source_properties(e.p, BUILDING)
         parameters = source_members.get("parameters")
-        orientation = value_of(parameters, "orientation")
+        orientation = parameter_value(parameters, "orientation")
         if orientation:
-            turned = _rmf.turned(orientation) if orientation in ("forward", "backward") else ""
+            turned = _rmf.reverse_orientation(orientation) if orientation in ("forward", "backward") else ""
             options["orientation_constraint"] = turned if source_members.get("reverse") is True else orientation
         for key in LANE_WORDS:
-            if value_of(parameters, key):
-                options[key] = value_of(parameters, key)
+            if parameter_value(parameters, key):
+                options[key] = parameter_value(parameters, key)
         for dock_key, k in (("dock_name", e.target), ("undock_name", e.source)):
-            dock = value_of(own(storey.nodes[k], BUILDING).get("parameters"), "dock_name")
+            dock = parameter_value(get_source_properties(storey.nodes[k], BUILDING).get("parameters"), "dock_name")
             if dock:
                 options[dock_key] = dock
         if not e.paired:
             options["is_bidirectional"] = False
         return options
 
-    def _crossed(self, storey: _LevelWriter, edges: Sequence[_Edge]) -> list[str | None]:
+    def _crossed_doors(self, storey: _LevelWriter, edges: Sequence[_Edge]) -> list[str | None]:
         """The door that each edge leads through; of several the last."""
         out: list[str | None] = [None] * len(edges)
         doors = [d for d in self.doors if d.level == storey.name]
@@ -757,11 +757,11 @@ def _section(key: str, rows: Iterator[str]) -> Iterator[str]:
         yield from rows
 
 
-def _paired(edges: Sequence[_Edge], nodes: int) -> list[bool]:
+def _find_pairs(edges: Sequence[_Edge], nodes: int) -> list[bool]:
     """Whether each edge's lane has an edge the other way round. nodes: no number of a node is as high."""
     ends = np.array([(e.source, e.target) for e in edges], np.int64).reshape(-1, 2)
     lanes: dict[int | None, int] = {}
-    lane = np.array([lanes.setdefault(_lane_of(e.p), len(lanes)) for e in edges], np.int64)
+    lane = np.array([lanes.setdefault(_lane_number(e.p), len(lanes)) for e in edges], np.int64)
     forth, back = ends[:, 0] * nodes + ends[:, 1], ends[:, 1] * nodes + ends[:, 0]
     pair_index = np.unique(np.concatenate([forth, back]), return_inverse=True)[1]
     key = pair_index.reshape(2, -1) * len(lanes) + lane
@@ -793,24 +793,24 @@ def _shaft(position: tuple[float, float, float], dims: tuple[float, float]) -> A
 
 
 def _place(p: Properties) -> int:
-    at = (own(p, BUILDING) or own(p, NAME)).get("index")
+    at = (get_source_properties(p, BUILDING) or get_source_properties(p, NAME)).get("index")
     return at if isinstance(at, int) else 2**62
 
 
-def _graph_of(p: Properties) -> int | None:
+def _edge_graph(p: Properties) -> int | None:
     """The graph of an edge; None for a lane of a building that is in none."""
     if NAME in p:
-        graph = own(p, NAME).get("graph")
+        graph = get_source_properties(p, NAME).get("graph")
         return graph if isinstance(graph, int) and graph >= 0 else 0
-    graph = value_of(own(p, BUILDING).get("parameters"), "graph_idx", 0)
+    graph = parameter_value(get_source_properties(p, BUILDING).get("parameters"), "graph_idx", 0)
     if isinstance(graph, bool) or not isinstance(graph, int):
         return 0
     return graph if 0 <= graph < MAX_GRAPHS else None
 
 
-def _lane_of(p: Properties) -> int | None:
+def _lane_number(p: Properties) -> int | None:
     """The number of the lane in its file: what two edges of one two-way lane have in common."""
-    source_members = own(p, NAME) if NAME in p else own(p, BUILDING)
+    source_members = get_source_properties(p, NAME) if NAME in p else get_source_properties(p, BUILDING)
     if NAME in p:
         parameters = source_members.get("parameters")
         if not isinstance(parameters, dict) or parameters.get("is_bidirectional") is not True:
@@ -819,7 +819,7 @@ def _lane_of(p: Properties) -> int | None:
     return index if isinstance(index, int) else None
 
 
-def _rounded(values: Array) -> Any:
+def _round(values: Array) -> Any:
     return (np.round(values, METRES) + 0.0).tolist()
 
 
@@ -857,21 +857,21 @@ register(
         title="Navigation graphs (Open-RMF)",
         files=("0.yaml",),
         media_types=("application/yaml",),
-        carries=frozenset({"topology", "objects"}),
+        layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
         check=_rmf_nav_graph_rules.check,
-        lacks=lacks,
+        missing_content=lacks,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
         family=NAME,
-        titled=True,
-        rank=30,
+        has_title=True,
+        priority=30,
         write_options=_rmf.WriteOptions,
         extensions=(".yaml", ".yml"),
-        choose=choose,
-        joined=True,
-        bends="nodes",
+        select_parts=choose,
+        one_map_per_folder=True,
+        keeps_bends="nodes",
         version=2,
     )
 )

@@ -39,14 +39,14 @@ from app.formats import (
     register,
 )
 from app.formats._network import number
-from app.formats._rmf import BUILDING, NAV_GRAPH, Array, mapping, refuse
-from app.formats._rmf_images import companions_of, images
+from app.formats._rmf import BUILDING, NAV_GRAPH, Array, mapping, raise_unreadable
+from app.formats._rmf_images import companion_hook, images
 from app.formats._rmf_site import (
     NAME,
     UNNAMED,
     Cabin,
-    by_id,
     elements,
+    members_by_id,
     place,
     reference,
     references,
@@ -90,7 +90,7 @@ class _Level:
     cabins: set[str] = field(default_factory=set)
 
     @property
-    def where(self) -> str:
+    def location(self) -> str:
         return f"levels.{self.id}"
 
 
@@ -112,7 +112,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     data = files[main]
     top = _ron.load(data, context.limits) if _is_ron(main, data) else _json.load(data, context.limits)
     if not isinstance(top, dict):
-        refuse("must be a site: a mapping with format_version and levels", "")
+        raise_unreadable("must be a site: a mapping with format_version and levels", "")
     reader = _Reader(top, context)
     parts = reader.parts()
     pictures = images(files, main, list(reader.drawings()), context)
@@ -133,7 +133,7 @@ class _Reader:
 
     def __init__(self, top: dict[str, Any], context: ReadContext) -> None:
         self.top, self.context = top, context
-        self.strange: Counter[str] = Counter()
+        self.unknown_members: Counter[str] = Counter()
         self._version()
         self.site_anchors = self._anchors(top.get("anchors"), "anchors")
         self.levels = self._levels()
@@ -162,10 +162,10 @@ class _Reader:
         for i, scenario in elements(top.get("scenarios"), "scenarios"):
             mapping(scenario.get("instances"), f"scenarios.{i}.instances")
         self.dangling: dict[str, dict[str, Any]] = {}
-        self.placed = self._placed()
+        self.placed = self._models_by_level()
         for section in ("", "properties", "navigation"):
-            self._look(mapping(top.get(section), section) if section else top, section)
-        self._look(guided, "navigation.guided")
+            self._count_unknown_members(mapping(top.get(section), section) if section else top, section)
+        self._count_unknown_members(guided, "navigation.guided")
 
     # what stands where
 
@@ -173,33 +173,33 @@ class _Reader:
         version = self.top.get("format_version")
         match = _VERSION.fullmatch(version) if isinstance(version, str) else None
         if match is None:
-            refuse(f'must be a text "major.minor", is {str(version)[:40]!r}', "format_version")
+            raise_unreadable(f'must be a text "major.minor", is {str(version)[:40]!r}', "format_version")
         if int(match[1]) > 0:
-            refuse(
+            raise_unreadable(
                 f"version {version} is not supported, only 0.x: save the site with a release that writes 0.x",
                 "format_version",
             )
 
-    def _look(self, element: Mapping[str, Any], section: str) -> None:
+    def _count_unknown_members(self, element: Mapping[str, Any], section: str) -> None:
         """Count members that no release has."""
         for member in unknown(element, section):
-            self.strange[f"{section}: {member[:60]}" if section else member[:60]] += 1
+            self.unknown_members[f"{section}: {member[:60]}" if section else member[:60]] += 1
 
     def _anchors(self, anchors: Any, location: str) -> dict[str, list[float]]:
-        return {key: place(raw, "General", f"{location}.{key}") for key, raw in by_id(anchors, location)}
+        return {key: place(raw, "General", f"{location}.{key}") for key, raw in members_by_id(anchors, location)}
 
     def _levels(self) -> dict[str, _Level]:
         listed = elements(self.top.get("levels"), "levels")
         if not listed:
-            refuse("a site needs at least one level", "levels")
+            raise_unreadable("a site needs at least one level", "levels")
         if self.context.level != GROUND:
             problem = f"its levels have names of their own: level={self.context.level} is not used"
             self.context.warn(problem, where="levels")
         properties = [mapping(level.get("properties"), f"levels.{i}.properties") for i, level in listed]
         level_names = []
         for (i, level), p in zip(listed, properties, strict=True):
-            self._look(level, "levels")
-            self._look(p, "levels.properties")
+            self._count_unknown_members(level, "levels")
+            self._count_unknown_members(p, "levels.properties")
             level_names.append(_rmf.short(text(p.get("name"), f"levels.{i}.properties.name")) or f"level {i}")
         names = unique_ids(level_names)
         if twice := sorted({a for a, b in zip(level_names, names, strict=True) if a != b}):
@@ -237,21 +237,21 @@ class _Reader:
 
     def _lift(self, i: str, lift: dict[str, Any]) -> _Lift:
         location = f"lifts.{i}"
-        self._look(lift, "lifts")
+        self._count_unknown_members(lift, "lifts")
         properties = mapping(lift.get("properties"), f"{location}.properties")
         ends = references(properties.get("reference_anchors"), f"{location}.properties.reference_anchors", 2)
         at = []
         for anchor in ends:
             raw = mapping(self.top.get("anchors"), "anchors").get(anchor)
             if raw is None:
-                refuse(f"there is no anchor {anchor} of the site", f"{location}.properties.reference_anchors")
+                raise_unreadable(f"there is no anchor {anchor} of the site", f"{location}.properties.reference_anchors")
             at.append(place(raw, "Lift", f"anchors.{anchor}"))
         name = _rmf.short(text(properties.get("name"), f"{location}.properties.name")) or f"lift {i}"
         visits: list[str] = []
         for key, door in elements(lift.get("cabin_doors"), f"{location}.cabin_doors"):
             visits += references(door.get("visits", []), f"{location}.cabin_doors.{key}.visits")
         served = [level for level in self.levels if level in visits]
-        cabin = _rmf_site.cabin_of(properties, at[0], at[1], f"{location}.properties")
+        cabin = _rmf_site.parse_cabin(properties, at[0], at[1], f"{location}.properties")
         return _Lift(i, name, lift, cabin, served)
 
     # the parts
@@ -293,7 +293,7 @@ class _Reader:
         return out
 
     def _warn_unknown(self) -> None:
-        for member, count in sorted(self.strange.items()):
+        for member, count in sorted(self.unknown_members.items()):
             times = f" ({count} times)" if count > 1 else ""
             self.context.warn(f"unknown member {member!r}{times}: it is kept for the way back and not understood")
 
@@ -302,8 +302,8 @@ class _Reader:
         members = {key: value for key, value in level.said.items() if key not in _LISTS}
         members["id"] = level.id
         drawings: dict[str, Any] = {}
-        for i, drawing in elements(level.said.get("drawings"), f"{level.where}.drawings"):
-            location = f"{level.where}.drawings.{i}"
+        for i, drawing in elements(level.said.get("drawings"), f"{level.location}.drawings"):
+            location = f"{level.location}.drawings.{i}"
             drawings[i] = {k: v for k, v in drawing.items() if k not in ("anchors", "fiducials", "measurements")}
             drawings[i]["transform"] = self._transform(drawing, location)
             used: set[str] = set()
@@ -315,7 +315,7 @@ class _Reader:
             }
         forms = {
             anchor: raw
-            for anchor, raw in mapping(level.said.get("anchors"), f"{level.where}.anchors").items()
+            for anchor, raw in mapping(level.said.get("anchors"), f"{level.location}.anchors").items()
             if anchor not in level.nodes and "Translate2D" not in raw
         }
         return {"level": members, "drawings": drawings, "forms": forms, "order": level.order}
@@ -327,7 +327,7 @@ class _Reader:
         self._name_nodes(locations, taken)
         rows: dict[str, list[tuple[str, Any, Properties]]] = {i: [] for i in self.levels}
         docks = self._edges(rows, taken)
-        robots = self._robots_at()
+        robots = self._robots_by_anchor()
         out = {}
         for i, level in self.levels.items():
             ids, properties = list(level.nodes.values()), []
@@ -361,7 +361,7 @@ class _Reader:
         """The locations by anchor."""
         out: dict[str, list[tuple[str, dict[str, Any]]]] = {}
         for i, element in self.locations:
-            self._look(element, "locations")
+            self._count_unknown_members(element, "locations")
             anchor = reference(element.get("anchor"), f"navigation.guided.locations.{i}.anchor")
             out.setdefault(anchor, []).append((i, element))
         return out
@@ -371,7 +371,7 @@ class _Reader:
         owners = {anchor: level for level in self.levels.values() for anchor in level.anchors}
         moved: set[str] = set(locations)
         for i, element in self.lanes:
-            self._look(element, "lanes")
+            self._count_unknown_members(element, "lanes")
             ends = references(element.get("anchors"), f"navigation.guided.lanes.{i}.anchors", 2)
             moved.update(ends)
             for end, other in (ends, ends[::-1]):
@@ -399,9 +399,9 @@ class _Reader:
             i: element for anchor, listed in locations.items() if anchor not in self.homes for i, element in listed
         }
         if dangling:
-            self._keep("locations", dangling)
+            self._keep_document("locations", dangling)
 
-    def _keep(self, section: str, items: dict[str, Any]) -> None:
+    def _keep_document(self, section: str, items: dict[str, Any]) -> None:
         self.dangling.setdefault(section, {}).update(items)
         problem = f"{len(items)} stand on no anchor of a level or a lift's cabin: they are kept for the way back only"
         self.context.warn(problem, where=f"navigation.guided.{section}")
@@ -460,7 +460,7 @@ class _Reader:
         for i, element in self.lanes:
             location = f"navigation.guided.lanes.{i}"
             ends = references(element.get("anchors"), f"{location}.anchors", 2)
-            homes = self._level_of(ends)
+            homes = self._levels_of_ends(ends)
             if homes is None:
                 dangling[i] = element
                 continue
@@ -469,19 +469,19 @@ class _Reader:
             if target is not level or xyz[:, 2].any():
                 xyz[:, 2] += [home.elevation for home in homes]
             line = xyz if target is not level or xyz[:, 2].any() else xyz[:, :2]
-            graph, graphs = _rmf_site.graphs_of(element.get("graphs"), self.graphs, f"{location}.graphs")
+            graph, graphs = _rmf_site.parse_graphs(element.get("graphs"), self.graphs, f"{location}.graphs")
             several += graphs > 1
             for both, motion, backward in self._motions(element, location):
                 mirrored = both and backward
                 a, b = (1, 0) if backward else (0, 1)
                 source, end = homes[a].nodes[ends[a]], homes[b].nodes[ends[b]]
                 counts[level.id] += not mirrored
-                orientation, limit = motion_words(motion, location)
+                orientation, limit = motion_properties(motion, location)
                 mutex = self._mutex(element, location)
                 parameters: dict[str, Any] = {
                     "bidirectional": [4, both],
                     "graph_idx": [2, graph],
-                    "orientation": [1, _rmf.turned(orientation) if mirrored else orientation],
+                    "orientation": [1, _rmf.reverse_orientation(orientation) if mirrored else orientation],
                     **({} if mutex is None else {"mutex": [1, mutex]}),
                     **({"speed_limit": [3, limit]} if limit else {}),
                 }
@@ -502,7 +502,7 @@ class _Reader:
         for name, (home, _, geometry, edge) in zip(names, edges, strict=True):
             rows[home].append((name, geometry, edge))
         if dangling:
-            self._keep("lanes", dangling)
+            self._keep_document("lanes", dangling)
         if several:
             problem = f"{several} lanes are of several graphs; a building and navigation graphs have them in the first"
             self.context.warn(problem, where="navigation.guided.lanes")
@@ -513,15 +513,15 @@ class _Reader:
         forward = mapping(element.get("forward"), f"{location}.forward")
         name, content = variant(element.get("reverse", "Same"), f"{location}.reverse")
         if name not in ("Same", "Disable", "Different"):
-            refuse(f"must be Same, Disable or Different, is {name[:40]!r}", f"{location}.reverse")
+            raise_unreadable(f"must be Same, Disable or Different, is {name[:40]!r}", f"{location}.reverse")
         back = forward if name == "Same" else mapping(content, f"{location}.reverse")
-        forth_words, back_words = (motion_words(motion, location) for motion in (forward, back))
-        both = name != "Disable" and back_words == (_rmf.turned(forth_words[0]), forth_words[1])
+        forth_words, back_words = (motion_properties(motion, location) for motion in (forward, back))
+        both = name != "Disable" and back_words == (_rmf.reverse_orientation(forth_words[0]), forth_words[1])
         yield both, forward, False
         if name != "Disable":
             yield both, back, True
 
-    def _level_of(self, ends: Sequence[str]) -> tuple[_Level, _Level] | None:
+    def _levels_of_ends(self, ends: Sequence[str]) -> tuple[_Level, _Level] | None:
         """The levels of a lane's start and end."""
         first, second = (self.homes.get(end, []) for end in ends)
         both = next((level for level in first if ends[1] in level.nodes), None)
@@ -534,8 +534,8 @@ class _Reader:
     def _items(self, level: _Level, section: str) -> list[tuple[str, tuple[list[str], dict[str, Any]]]]:
         """(id, (anchors, what else it says)) of walls, doors and floors."""
         out = []
-        for i, element in elements(level.said.get(section), f"{level.where}.{section}"):
-            location = f"{level.where}.{section}.{i}.anchors"
+        for i, element in elements(level.said.get(section), f"{level.location}.{section}"):
+            location = f"{level.location}.{section}.{i}.anchors"
             out.append((i, (references(element.get("anchors"), location, None if section == "floors" else 2), element)))
         return out
 
@@ -553,17 +553,19 @@ class _Reader:
             ("floors", "floor", "Floor"),
         ):
             for k, (i, (anchors, element)) in enumerate(self._items(level, section)):
-                self._look(element, section)
+                self._count_unknown_members(element, section)
                 raws = [self._raw_anchor(level, a) for a in anchors]
                 if any(raw is None for raw in raws):
-                    refuse("stands on anchors that neither its level nor the site has", f"{level.where}.{section}.{i}")
+                    raise_unreadable(
+                        "stands on anchors that neither its level nor the site has", f"{level.location}.{section}.{i}"
+                    )
                 at = np.array([place(raw, category, "anchors")[:2] for raw in raws]).reshape(-1, 2)
-                location = f"{level.where}.{section}.{i}"
+                location = f"{level.location}.{section}.{i}"
                 p = self._solid(kind, k, element, location)
                 members = {key: value for key, value in element.items() if key not in ("anchors", "name")}
                 p[NAME] = {"id": int(i), "anchors": [int(a) for a in anchors], "says": members}
                 rows.append((self._id(level, kind, i), shapely.LineString(at) if kind != "floor" else _ring(at), p))
-        return [*rows, *self._drawn(level), *self._models(level)]
+        return [*rows, *self._read_drawn(level), *self._models(level)]
 
     def _id(self, level: _Level, kind: str, i: str) -> str:
         return f"{_rmf.short(level.name, 200)}/{kind}/{i}"
@@ -591,17 +593,17 @@ class _Reader:
     def drawings(self) -> Iterable[tuple[str, str]]:
         """(place, file) of the images that are named on this machine."""
         for level in self.levels.values():
-            for i, drawing in elements(level.said.get("drawings"), f"{level.where}.drawings"):
-                location = f"{level.where}.drawings.{i}.properties.source"
+            for i, drawing in elements(level.said.get("drawings"), f"{level.location}.drawings"):
+                location = f"{level.location}.drawings.{i}.properties.source"
                 kind, name = _rmf_site.asset(mapping(drawing.get("properties"), location).get("source"), location)
                 if name and kind in ("Local", "Remote"):
                     yield location, name
 
     def _primary(self, level: _Level) -> str | None:
         """The drawing that a building would have."""
-        listed = dict(elements(level.said.get("drawings"), f"{level.where}.drawings"))
-        rankings = mapping(level.said.get("rankings"), f"{level.where}.rankings").get("drawings") or []
-        ranked = references(rankings, f"{level.where}.rankings.drawings")
+        listed = dict(elements(level.said.get("drawings"), f"{level.location}.drawings"))
+        rankings = mapping(level.said.get("rankings"), f"{level.location}.rankings").get("drawings") or []
+        ranked = references(rankings, f"{level.location}.rankings.drawings")
         return next((i for i in ranked if i in listed), next(iter(listed), None))
 
     def _transform(self, drawing: Mapping[str, Any], location: str) -> list[float]:
@@ -612,7 +614,7 @@ class _Reader:
         p = mapping(drawing.get("properties"), f"{location}.properties")
         pixels = number(p.get("pixels_per_meter", 100.0), f"{location}.properties.pixels_per_meter")
         if not 1e-6 <= pixels <= 1e9:
-            refuse("must be between 1e-6 and 1e9", f"{location}.properties.pixels_per_meter")
+            raise_unreadable("must be between 1e-6 and 1e9", f"{location}.properties.pixels_per_meter")
         x, y, _, _, _, yaw = _rmf_site.pose(p.get("pose"), f"{location}.properties.pose")
         anchors = self._anchors(drawing.get("anchors"), f"{location}.anchors")
         scales = []
@@ -624,28 +626,28 @@ class _Reader:
                     number(m["distance"], f"{location}.measurements.{k}.distance") / length if length else 0.0
                 )
         mean = sum(scales) / len(scales) if scales else 0.0
-        scale = mean if abs(mean * pixels - 1.0) < _rmf_site.SINGLE else 1.0 / pixels
+        scale = mean if abs(mean * pixels - 1.0) < _rmf_site.SINGLE_PRECISION else 1.0 / pixels
         return [scale, yaw, x, y]
 
-    def _drawn(self, level: _Level) -> list[tuple[str, Any, Properties]]:
+    def _read_drawn(self, level: _Level) -> list[tuple[str, Any, Properties]]:
         """The measurements and fiducials of a level's drawings, in metres."""
         rows: list[tuple[str, Any, Properties]] = []
         counts: Counter[str] = Counter()
-        for i, drawing in elements(level.said.get("drawings"), f"{level.where}.drawings"):
-            location = f"{level.where}.drawings.{i}"
-            self._look(drawing, "drawings")
+        for i, drawing in elements(level.said.get("drawings"), f"{level.location}.drawings"):
+            location = f"{level.location}.drawings.{i}"
+            self._count_unknown_members(drawing, "drawings")
             transform = self._transform(drawing, location)
             anchors = self._anchors(drawing.get("anchors"), f"{location}.anchors")
-            at = {key: moved(transform, place_) for key, place_ in anchors.items()}
+            at = {key: pixels_to_metres(transform, place_) for key, place_ in anchors.items()}
 
             def places(ids: Sequence[str], path: str, at: Mapping[str, Array] = at) -> list[Array]:
                 if any(a not in at for a in ids):
-                    refuse("stands on anchors that its drawing does not have", path)
+                    raise_unreadable("stands on anchors that its drawing does not have", path)
                 return [at[a] for a in ids]
 
             for section, kind in (("measurements", "measurement"), ("fiducials", "fiducial")):
                 for key, one in elements(drawing.get(section), f"{location}.{section}"):
-                    self._look(one, section)
+                    self._count_unknown_members(one, section)
                     item_location = f"{location}.{section}.{key}"
                     p: dict[str, Any] = {"kind": kind, BUILDING: {"index": counts[kind]}}
                     counts[kind] += 1
@@ -677,10 +679,10 @@ class _Reader:
             key = element.get("description")
             description_id = None if key is None else reference(key, f"model_instances.{i}.description")
             out.append((i, element, self.descriptions.get(description_id or "", {})))
-        older = elements(level.said.get("models"), f"{level.where}.models")
+        older = elements(level.said.get("models"), f"{level.location}.models")
         return out + [(i, element, element) for i, element in older]
 
-    def _placed(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
+    def _models_by_level(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
         """The models by the level that they stand on."""
         out: dict[str, list[tuple[str, dict[str, Any]]]] = {}
         for i, element in elements(self.top.get("model_instances"), "model_instances"):
@@ -690,7 +692,7 @@ class _Reader:
             out.setdefault(parent, []).append((i, element))
         return out
 
-    def _robots_at(self) -> dict[tuple[str, str], dict[str, Any]]:
+    def _robots_by_anchor(self) -> dict[tuple[str, str], dict[str, Any]]:
         """The robots that start at a location, by level and anchor."""
         out: dict[tuple[str, str], dict[str, Any]] = {}
         for level in self.levels.values():
@@ -719,7 +721,7 @@ class _Reader:
             if int(i) in self.placed_robots:
                 continue
             location = f"model_instances.{i}"
-            self._look(element, "model_instances")
+            self._count_unknown_members(element, "model_instances")
             x, y, z, *turn = _rmf_site.pose(element.get("pose"), f"{location}.pose")
             name = text(element.get("name"), f"{location}.name")
             p: dict[str, Any] = {
@@ -800,7 +802,7 @@ class _Reader:
             if primary is None:
                 continue
             members = mapping(level.said["drawings"], "drawings")[primary]
-            location = f"{level.where}.drawings.{primary}"
+            location = f"{level.location}.drawings.{primary}"
             _, file = _rmf_site.asset(mapping(members.get("properties"), location).get("source"), location)
             drawings[i] = self._transform(members, location), file
         drawn = len(drawings) == len(self.levels)
@@ -819,18 +821,18 @@ class _Reader:
         return out
 
 
-def motion_words(motion: Mapping[str, Any], location: str) -> tuple[str, float]:
+def motion_properties(motion: Mapping[str, Any], location: str) -> tuple[str, float]:
     """(orientation in a building's words, speed limit or 0) of a motion along a lane."""
     name, content = variant(motion.get("orientation_constraint") or "None", f"{location}.orientation_constraint")
     if name in ("RelativeYaw", "AbsoluteYaw"):
         _rmf_site.angle(content, f"{location}.orientation_constraint")
     elif name not in _ORIENTATIONS and name != "None":
-        refuse(f"unknown orientation constraint {name[:40]!r}", location)
+        raise_unreadable(f"unknown orientation constraint {name[:40]!r}", location)
     limit = motion.get("speed_limit")
     return _ORIENTATIONS.get(name, ""), 0.0 if limit is None else max(0.0, number(limit, f"{location}.speed_limit"))
 
 
-def moved(transform: Sequence[float], at: Sequence[float]) -> Array:
+def pixels_to_metres(transform: Sequence[float], at: Sequence[float]) -> Array:
     """Metres of a drawing's pixel (y up)."""
     scale, turn, x, y = transform
     c, s = scale * math.cos(turn), scale * math.sin(turn)
@@ -871,7 +873,7 @@ def detect(name: str, data: bytes) -> bool:
     return low.endswith(".ron") and bool(_RON_SITE.search(data) and _OF_SITE.search(data))
 
 
-def by_file(name: str) -> dict[str, str]:
+def options_from_filename(name: str) -> dict[str, str]:
     """``map.site.ron`` asks for RON."""
     return {"encoding": "ron" if name.endswith(".ron") else "json"} if name.endswith((".ron", ".json")) else {}
 
@@ -893,20 +895,20 @@ register(
         title="Site (Open-RMF site editor)",
         files=(FILE, FILE_RON),
         media_types=("application/json", "text/plain"),
-        carries=frozenset({"topology", "objects", "resources"}),
+        layers=frozenset({"topology", "objects", "resources"}),
         detect=detect,
         read=read,
         check=_rmf_site_rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
-        companions=companions_of(re.compile(rb'\b(?:Local|Remote)"?\s*[:(]\s*"([^"\n]{1,500})"')),
+        companions=companion_hook(re.compile(rb'\b(?:Local|Remote)"?\s*[:(]\s*"([^"\n]{1,500})"')),
         family=BUILDING,
-        rank=45,
+        priority=45,
         write_options=WriteOptions,
         extensions=(".site.json", ".site.ron", ".json", ".ron"),
-        choose=choose,
-        by_file=by_file,
-        titled=True,
-        bends="nodes",
+        select_parts=choose,
+        options_from_filename=options_from_filename,
+        has_title=True,
+        keeps_bends="nodes",
     )
 )

@@ -37,13 +37,13 @@ from app.formats import (
     _xml,
     register,
 )
-from app.formats._select import file_stem, the_one
+from app.formats._select import file_stem, select_part
 from app.formats._text import DEGREES, METRES
 from app.model.frame import MAX_METRES, is_writable
 from app.model.geodesy import WGS84
-from app.model.imagery import LOCAL, USUAL_COLOURS, Affine, GeoImage, displayed, placed
+from app.model.imagery import DEFAULT_COLOURS, LOCAL, Affine, GeoImage, display_pixels, pixel_positions
 from app.model.layers import Layers, PartKey
-from app.model.resampling import resampled
+from app.model.resampling import resample
 from app.parameters import parameter
 
 NAME = "satellite"
@@ -69,7 +69,7 @@ MAX_SIDECAR = 2**20
 DEGREE_PIXEL = 2e-4
 """Degrees. Pixels that would be larger on earth (20 m) are no degrees: a plan in metres has 0.001 to 1 a pixel."""
 
-SUPPLY = (
+HOW_TO_SUPPLY = (
     "a picture does not say where it lies: add a world file (.pgw, .jgw, .tfw), or the option corners=lat,lon,… of two "
     "opposite or all four corners, or, for a floor plan, metres_per_pixel with origin and yaw"
 )
@@ -126,7 +126,7 @@ class WriteOptions:
 # --- telling ------------------------------------------------------------------------------------------------------
 def detect(name: str, data: bytes) -> bool:
     """A GeoTIFF, or a world file. A picture alone may be of anything."""
-    end = _world_end(name)
+    end = _world_file_ending(name)
     if end is None:
         return _raster.is_georeferenced(data)
     if len(data) > MAX_WORLD or b"\0" in data:
@@ -136,20 +136,20 @@ def detect(name: str, data: bytes) -> bool:
 
 def yields(name: str) -> bool:
     """A world file only speaks for its picture."""
-    return _world_end(name) is not None
+    return _world_file_ending(name) is not None
 
 
 def lacking(name: str, data: bytes) -> str:
     """What to add to a picture that does not say where it lies."""
     del name
-    return SUPPLY if _is_picture(data) and not _raster.is_georeferenced(data) else ""
+    return HOW_TO_SUPPLY if _is_picture(data) and not _raster.is_georeferenced(data) else ""
 
 
 def _is_picture(data: bytes) -> bool:
-    return _image.kind_of(data) in ("png", "jpeg", "bmp") or _raster.is_tiff(data)
+    return _image.detect_kind(data) in ("png", "jpeg", "bmp") or _raster.is_tiff(data)
 
 
-def _world_end(name: str) -> str | None:
+def _world_file_ending(name: str) -> str | None:
     end = name.rpartition("/")[2].lower().rpartition(".")
     return "." + end[2] if end[1] and "." + end[2] in WORLD_ENDS else None
 
@@ -157,10 +157,10 @@ def _world_end(name: str) -> str | None:
 def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
     """Of a world file its picture, of a picture its world file; with the .prj and .aux.xml beside the two."""
     del data
-    by_lower = _by_lower(tuple(names))
+    by_lower = _by_lower_case(tuple(names))
     lower = main.lower()
     stem = lower.rpartition(".")[0]
-    end = _world_end(main)
+    end = _world_file_ending(main)
     if end is not None:
         picture = next((stem + e for e in WORLD_ENDS[end] if stem + e in by_lower), None)
         candidates = [picture] if picture else []
@@ -173,7 +173,7 @@ def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
 
 
 @lru_cache(maxsize=4)
-def _by_lower(names: tuple[str, ...]) -> dict[str, str]:
+def _by_lower_case(names: tuple[str, ...]) -> dict[str, str]:
     """Names by their small letters, the first of those that differ in nothing else; kept, since every picture of an
     upload asks for the same."""
     by_lower: dict[str, str] = {}
@@ -188,10 +188,10 @@ def read(files: Files, context: ReadContext) -> Layers:
     main = context.main or next(iter(files))
     options = context.options if isinstance(context.options, ReadOptions) else ReadOptions()
     _check_options(options)
-    world = next((n for n in files if _world_end(n) is not None), None)
-    image = main if _world_end(main) is None else next((n for n in files if _is_picture(files[n])), None)
+    world = next((n for n in files if _world_file_ending(n) is not None), None)
+    image = main if _world_file_ending(main) is None else next((n for n in files if _is_picture(files[n])), None)
     if image is None:
-        stem, end = main.rpartition(".")[0], WORLD_ENDS[_world_end(main) or ".wld"]
+        stem, end = main.rpartition(".")[0], WORLD_ENDS[_world_file_ending(main) or ".wld"]
         reason = f"the picture of this world file is not in the upload: add {stem.rpartition('/')[2]}{end[0]} beside it"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)])
     if not _is_picture(files[image]):
@@ -200,7 +200,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not context.wants("imagery"):
         return Layers()
     try:
-        raster = _decoded(files[image], context.limits)
+        raster = _decode(files[image], context.limits)
     except (UnreadableFile, TooLarge) as error:
         raise type(error)(f"{image}: {error.detail}", [Problem(error.detail, image)]) from error
     for doubt in raster.doubts:
@@ -219,7 +219,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     return Layers({PartKey("imagery", context.level, name): picture})
 
 
-def _decoded(data: bytes, limits: Limits) -> _raster.Raster:
+def _decode(data: bytes, limits: Limits) -> _raster.Raster:
     if _raster.is_tiff(data):
         return _raster.read_tiff(data, limits)
     pixels = _image.png_pixels(data, limits)
@@ -231,7 +231,7 @@ def _decoded(data: bytes, limits: Limits) -> _raster.Raster:
             clear = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA", "La", "RGBa")
             grey = image.mode in ("1", "L", "LA", "La")
             pixels = _pixels(image, ("LA" if clear else "L") if grey else ("RGBA" if clear else "RGB"), np.uint8)
-    bands = [{"colour": colour} for colour in USUAL_COLOURS[pixels.shape[2]]]
+    bands = [{"colour": colour} for colour in DEFAULT_COLOURS[pixels.shape[2]]]
     return _raster.Raster(pixels, None, None, {"bands": bands})
 
 
@@ -293,7 +293,7 @@ def _place(
             context.warn(
                 f"the option {option} is not used: {teller} says where the picture lies", file=image, where=option
             )
-        return file_transform, _crs_of(file_transform, raster, teller, options, context)
+        return file_transform, _find_crs(file_transform, raster, teller, options, context)
     if options.crs is not None and option:
         reason = (
             "corners are latitude and longitude" if option == "corners" else "metres_per_pixel is of the local frame"
@@ -305,10 +305,12 @@ def _place(
         m, (x, y) = options.metres_per_pixel, options.origin
         cos, sin = m * math.cos(options.yaw), m * math.sin(options.yaw)
         return (cos, sin, x - sin * height, sin, -cos, y + cos * height), LOCAL
-    raise UnreadableFile(f"{image}: {SUPPLY}", [Problem(SUPPLY, image)])
+    raise UnreadableFile(f"{image}: {HOW_TO_SUPPLY}", [Problem(HOW_TO_SUPPLY, image)])
 
 
-def _crs_of(transform: Affine, raster: _raster.Raster, teller: str, options: ReadOptions, context: ReadContext) -> str:
+def _find_crs(
+    transform: Affine, raster: _raster.Raster, teller: str, options: ReadOptions, context: ReadContext
+) -> str:
     option = options.crs
     if raster.crs is not None:
         if option is not None:
@@ -316,7 +318,7 @@ def _crs_of(transform: Affine, raster: _raster.Raster, teller: str, options: Rea
         return raster.crs
     if option is not None:
         return {"wgs84": WGS84, LOCAL: LOCAL}.get(option.lower(), option.upper())
-    if _like_degrees(transform, raster.pixels.shape[1], raster.pixels.shape[0]):
+    if _looks_like_degrees(transform, raster.pixels.shape[1], raster.pixels.shape[0]):
         context.warn(
             "it names no CRS: its numbers are taken for degrees (longitude, latitude on WGS 84); if they are not, say "
             "crs=EPSG:<number> or crs=local",
@@ -330,9 +332,9 @@ def _crs_of(transform: Affine, raster: _raster.Raster, teller: str, options: Rea
     return LOCAL
 
 
-def _like_degrees(transform: Affine, width: int, height: int) -> bool:
+def _looks_like_degrees(transform: Affine, width: int, height: int) -> bool:
     a, b, _, d, e, _ = transform
-    ends = placed(transform, np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height]))
+    ends = pixel_positions(transform, np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height]))
     small = max(math.hypot(a, d), math.hypot(b, e)) <= DEGREE_PIXEL
     return small and bool(np.abs(ends[:, 0]).max() <= 180.0 and np.abs(ends[:, 1]).max() <= 90.0)
 
@@ -366,7 +368,7 @@ def _from_corners(corners: Sequence[float], width: int, height: int, image: str,
     if max(longitude) - min(longitude) > 180.0:
         longitude = [v + 360.0 if v < 0.0 else v for v in longitude]
     ends = ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height))
-    fit = _raster.fitted([(u, v, x, y) for (u, v), x, y in zip(ends, longitude, latitude, strict=True)])
+    fit = _raster.fit_affine([(u, v, x, y) for (u, v), x, y in zip(ends, longitude, latitude, strict=True)])
     if fit is None or not math.isfinite(fit[1]):
         reason = "the corners lie on one line"
         raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where="corners")])
@@ -405,7 +407,7 @@ def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
 
 def _check_place(picture: GeoImage, image: str) -> None:
     """Refuse what lies nowhere: beyond the local frame, or where PROJ knows no place on earth."""
-    reason = _raster.lies_nowhere(picture)
+    reason = _raster.position_problem(picture)
     if reason is not None:
         local = picture.crs == LOCAL
         advice = "say crs=EPSG:<number>" if local else "say another with crs=EPSG:<number>, or crs=local"
@@ -418,14 +420,12 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``satellite.tif``, or ``satellite.png`` with its world file. Raises MissingLayer, NotFound, Ambiguous,
     MissingDatum, or Invalid for a grid that cannot be."""
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    pictures = {k: p for k, p in layers.of("imagery").items() if isinstance(p, GeoImage)}
+    pictures = {k: p for k, p in layers.parts_of("imagery").items() if isinstance(p, GeoImage)}
     key = choose(sorted(pictures), options)[0]
     picture = pictures[key]
     crs = {"source": picture.crs, "local": LOCAL, "wgs84": WGS84}[options.crs]
     if options.crs != "source" or options.resolution is not None:
-        new_picture = resampled(
-            picture, layers.frame, crs=crs, resolution=options.resolution, method=options.resampling
-        )
+        new_picture = resample(picture, layers.frame, crs=crs, resolution=options.resolution, method=options.resampling)
         if new_picture is not picture:
             picture = replace(new_picture, properties=_without_statistics(new_picture.properties))
     elif options.resampling is not None:
@@ -456,12 +456,12 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named picture; else ``satellite``, else the only one; on its level, else on the ground, else the only one."""
     supply = "upload one (a GeoTIFF, or a PNG with its world file)"
-    return the_one(
+    return select_part(
         keys, "imagery", options.picture, options.level, noun="picture", option="picture", supply=supply, default=NAME
     )
 
 
-def by_file(name: str) -> dict[str, str]:
+def options_from_filename(name: str) -> dict[str, str]:
     """``satellite.png`` and ``satellite.pgw`` ask for PNG; ``plan.tif`` for the picture ``plan``, too."""
     lower = name.lower()
     for end, kind in ((".png.aux.xml", "png"), (".png", "png"), (".pgw", "png"), (".tif", "tif")):
@@ -492,7 +492,7 @@ def _without_statistics(properties: Mapping[str, Any]) -> dict[str, Any]:
 
 def _write_png(picture: GeoImage, crs: str | None, stem: str, context: WriteContext) -> dict[str, bytes]:
     height, width, count = picture.pixels.shape
-    pixels = displayed(picture)
+    pixels = display_pixels(picture)
     if picture.pixels.dtype != np.uint8:
         why = f"PNG holds 8 bit here: {picture.pixels.dtype} was stretched to 0…255; file_type=tif keeps the values"
         context.drop("pixel values", height * width, why)
@@ -503,7 +503,7 @@ def _write_png(picture: GeoImage, crs: str | None, stem: str, context: WriteCont
     context.drop("tags", len(_tags(picture)), "they are the GeoTIFF's own; file_type=tif keeps them")
     a, b, c, d, e, f = picture.transform
     digits = METRES if crs is None or abs(a) + abs(e) > 0.1 else DEGREES
-    numbers = [*map(_exact, (a, d, b, e)), _rounded(c + a / 2 + b / 2, digits), _rounded(f + d / 2 + e / 2, digits)]
+    numbers = [*map(_exact, (a, d, b, e)), _round(c + a / 2 + b / 2, digits), _round(f + d / 2 + e / 2, digits)]
     out = {f"{stem}.png": _image.encode_png(pixels), f"{stem}.pgw": ("\n".join(numbers) + "\n").encode()}
     if crs is None:
         context.warn(
@@ -518,7 +518,7 @@ def _exact(value: float) -> str:
     return repr(float(value) + 0.0)
 
 
-def _rounded(value: float, digits: int) -> str:
+def _round(value: float, digits: int) -> str:
     """To a nanometre, or as far as 15 digits go: half a pixel forth and back leaves it the same."""
     return repr(float(f"{round(value, digits):.15g}") + 0.0)
 
@@ -527,7 +527,7 @@ def _aux_xml(crs: str) -> bytes:
     """GDAL's file for what a picture cannot say itself: QGIS and GDAL take the CRS from it."""
     from xml.sax.saxutils import escape
 
-    return f"<PAMDataset>\n  <SRS>{escape(_raster.wkt_of(crs))}</SRS>\n</PAMDataset>\n".encode()
+    return f"<PAMDataset>\n  <SRS>{escape(_raster.crs_to_wkt(crs))}</SRS>\n</PAMDataset>\n".encode()
 
 
 register(
@@ -536,7 +536,7 @@ register(
         title="Georeferenced picture (GeoTIFF, or PNG and JPEG with a world file)",
         files=("satellite.tif", "satellite.png", "satellite.pgw"),
         media_types=("image/tiff", "image/png", "text/plain"),
-        carries=frozenset({"imagery"}),
+        layers=frozenset({"imagery"}),
         detect=detect,
         read=read,
         write=write,
@@ -545,11 +545,11 @@ register(
         read_options=ReadOptions,
         write_options=WriteOptions,
         extensions=IMAGE_ENDS,
-        choose=choose,
-        by_file=by_file,
+        select_parts=choose,
+        options_from_filename=options_from_filename,
         parts=Parts("imagery", "picture", partial(file_stem, default=NAME), default=NAME),
-        yields=yields,
-        lacking=lacking,
-        completing=frozenset({"corners", "metres_per_pixel"}),
+        is_sidecar=yields,
+        missing_metadata=lacking,
+        completing_options=frozenset({"corners", "metres_per_pixel"}),
     )
 )

@@ -21,16 +21,16 @@ import shapely
 from app.errors import MissingDatum, TooLarge
 from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _text, register
 from app.formats._network import (
-    checked_name,
+    check_name,
+    duplicates,
+    get_source_properties,
     identifier,
-    joined,
-    known_document,
-    own,
+    merge_networks,
     quaternion,
-    refuse,
-    said_yaw,
-    some,
-    without_repeats,
+    raise_unreadable,
+    shorten_list,
+    source_document,
+    yaw_or_source,
 )
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.frame import MAX_METRES, Anchor
@@ -52,16 +52,18 @@ def read(files: Files, context: ReadContext) -> Layers:
     rows = _rows(data.decode("utf-8-sig"))
     header = [title.strip() for title in next(rows, ("", []))[1]]
     axes = _axes(header)
-    if axes is None or without_repeats(header):
-        refuse("the first row must name the columns, each once: name, and x and y or latitude and longitude", "line 1")
+    if axes is None or duplicates(header):
+        raise_unreadable(
+            "the first row must name the columns, each once: name, and x and y or latitude and longitude", "line 1"
+        )
     names: list[str] = []
     places: list[tuple[float, ...]] = []
     properties: list[Properties] = []
     for location, row in rows:
         if len(row) != len(header):
-            refuse(f"has {len(row)} values, the first row names {len(header)} columns", location)
+            raise_unreadable(f"has {len(row)} values, the first row names {len(header)} columns", location)
         cells = dict(zip(header, row, strict=True))
-        names.append(checked_name(cells.pop("name").strip(), f"{location}, name"))
+        names.append(check_name(cells.pop("name").strip(), f"{location}, name"))
         places.append(tuple(_number(cells.pop(axis), axis, location) for axis in axes))
         node: dict[str, object] = {"kind": "node", "name": names[-1]}
         source_members: dict[str, object] = {}
@@ -70,8 +72,8 @@ def read(files: Files, context: ReadContext) -> Layers:
             node["orientation"] = quaternion(angle)
         source_members |= {column: text for column, text in cells.items() if text}
         properties.append({**node, NAME: source_members})
-    if repeats := without_repeats(names):
-        context.warn(f"{len(repeats)} names stand twice or more and got a number: {some(repeats)}")
+    if repeats := duplicates(names):
+        context.warn(f"{len(repeats)} names stand twice or more and got a number: {shorten_list(repeats)}")
     xy = np.array(places, np.float64).reshape(-1, 2)
     points = np.asarray(shapely.points(xy if axes == METRES else xy[:, ::-1]), object).reshape(-1)
     anchor: Anchor = "local" if axes == METRES else "wgs84"
@@ -88,7 +90,7 @@ def _rows(text: str) -> Iterator[tuple[str, list[str]]]:
             if row:
                 yield f"line {rows.line_num}", row
     except csv.Error as error:
-        refuse(f"no CSV: {error}", f"line {rows.line_num}")
+        raise_unreadable(f"no CSV: {error}", f"line {rows.line_num}")
 
 
 def _axes(header: Sequence[str]) -> tuple[str, str] | None:
@@ -99,17 +101,17 @@ def _axes(header: Sequence[str]) -> tuple[str, str] | None:
 
 def _number(text: str, column: str, location: str) -> float:
     if not _DECIMAL.fullmatch(text):
-        refuse(f"must be a number, is {text[:60]!r}", f"{location}, {column}")
+        raise_unreadable(f"must be a number, is {text[:60]!r}", f"{location}, {column}")
     value = float(text)
     if not abs(value) <= LIMITS[column]:
-        refuse(f"must be within ±{LIMITS[column]:g}, is {text[:60]}", f"{location}, {column}")
+        raise_unreadable(f"must be within ±{LIMITS[column]:g}, is {text[:60]}", f"{location}, {column}")
     return value
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``waypoints.csv``: the nodes of all networks, by name. MissingDatum where degrees and metres meet without one."""
-    net = joined(layers, context)
-    columns = known_document(layers, NAME).get("columns")
+    net = merge_networks(layers, context)
+    columns = source_document(layers, NAME).get("columns")
     columns = columns if isinstance(columns, list) and _axes(list(map(str, columns))) else ["name", *METRES, "yaw"]
     axes = _axes(columns) or METRES
     context.drop("edges", len(net.edges), "a table of waypoints has none")
@@ -127,8 +129,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     table = csv.writer(out, lineterminator="\n")
     table.writerow(columns)
     for node, position in sorted(zip(net.nodes, places.tolist(), strict=True), key=lambda one: one[0].id):
-        p, source_members = node.properties, own(node.properties, NAME)
-        angle = said_yaw(source_members.get("yaw"), p.get("orientation"))
+        p, source_members = node.properties, get_source_properties(node.properties, NAME)
+        angle = yaw_or_source(source_members.get("yaw"), p.get("orientation"))
         cells = {key: str(value) for key, value in source_members.items()}
         cells |= dict(zip(axes, _text.numbers(position, decimals), strict=True))
         cells |= {"name": str(p.get("name") or node.id), "yaw": "" if angle is None else _text.number(angle, 12)}
@@ -153,7 +155,7 @@ register(
         title="Waypoints (CSV)",
         files=("waypoints.csv",),
         media_types=("text/csv",),
-        carries=frozenset({"topology"}),
+        layers=frozenset({"topology"}),
         detect=detect,
         read=read,
         write=write,

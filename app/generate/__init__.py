@@ -71,10 +71,10 @@ class Generator:
     @property
     def reads(self) -> frozenset[Layer]:
         """All layers that it looks at."""
-        return self.works_on | self.also
+        return self.editable_layers | self.also
 
     @property
-    def works_on(self) -> frozenset[Layer]:
+    def editable_layers(self) -> frozenset[Layer]:
         """Layers that it may replace; empty where it makes a whole site."""
         return self.needs | self.changes
 

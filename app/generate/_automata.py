@@ -16,10 +16,12 @@ I64 = NDArray[np.int64]
 STRIP = 2**18
 """Cells that are worked on at a time, so that they stay in the processor's cache."""
 
-ROUNDS = 6
+MAX_ROUNDS = 6
 
 
-def grown(alive: Bool, born: Collection[int], stays: Collection[int], iterations: int, *, outside: bool) -> Bool:
+def run_automaton(
+    alive: Bool, born: Collection[int], stays: Collection[int], iterations: int, *, outside: bool
+) -> Bool:
     """The cells after so many steps. born, stays: numbers of living neighbours (of eight) with which a dead cell comes
     alive, and a living one stays so. outside: whether what is beyond the border is alive. Ends early where nothing
     changes any more."""
@@ -48,7 +50,7 @@ def grown(alive: Bool, born: Collection[int], stays: Collection[int], iterations
     return now[1:-1, 1:-1].astype(bool)
 
 
-def joined(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: float) -> tuple[Bool, int, int]:
+def join_free_space(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: float) -> tuple[Bool, int, int]:
     """Occupied cells between which free space is one piece: (cells, how many were filled, how many passages were cut).
 
     rim: cells that stay occupied. radius: of a robot, in cells: places that hold it are joined by passages (cells wide)
@@ -59,7 +61,7 @@ def joined(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: f
     out = occupied.copy()
     passages = 0
     width = max(round(passage), 2 * int(np.ceil(radius)) + 1)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         label, sizes = _places(out, radius)
         large = np.flatnonzero(sizes >= max(smallest, 1.0))
         if len(large) <= 1:
@@ -67,7 +69,7 @@ def joined(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: f
         keep = np.zeros(len(sizes), bool)
         keep[large] = True
         cut = np.zeros(out.shape, np.uint8)
-        for a, b in _shortest(np.where(keep[label], label, 0)):
+        for a, b in _shortest_path(np.where(keep[label], label, 0)):
             cv2.line(cut, (a[1], a[0]), (b[1], b[0]), 1, thickness=width, lineType=cv2.LINE_4)
             cv2.line(cut, (a[1], a[0]), (b[1], b[0]), 1, lineType=cv2.LINE_4)
             passages += 1
@@ -103,7 +105,7 @@ def _places(occupied: Bool, radius: float) -> tuple[NDArray[np.int32], I64]:
     return np.asarray(label), sizes
 
 
-def _shortest(label: NDArray[np.int32]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+def _shortest_path(label: NDArray[np.int32]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Lines (row, column to row, column) that join all labelled pieces to one, the shortest first (Kruskal): between
     the nearest cells of pieces whose surroundings touch."""
     from scipy import ndimage

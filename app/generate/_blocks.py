@@ -41,15 +41,15 @@ import shapely
 
 from app.errors import CannotGenerate, Problem
 from app.generate import _expressions
-from app.generate._expressions import Expression, refuse
+from app.generate._expressions import Expression, raise_invalid
 
-MOST_SHAPES = 30_000
-DEEPEST = 48
-MOST_TEXT, MOST_RULES = 20_000, 200
-SMALLEST = 1.0
+MAX_SHAPES = 30_000
+MAX_DEPTH = 48
+MAX_TEXT_CHARACTERS, MAX_RULES = 20_000, 200
+MIN_AREA_M2 = 1.0
 """Square metres: smaller pieces are left as they are."""
 
-NEAR = 14.0
+MIN_CROSSING_METRES = 14.0
 """Metres: a street ends at a crossing that is nearer than this, or farther from it."""
 
 SHAPE_NAMES = frozenset({"area", "length", "width", "frontage", "deep"})
@@ -137,12 +137,12 @@ class _Shape:
 
 def parse(text: str, constants: Mapping[str, float]) -> Grammar:
     """The grammar that these rules describe. Invalid names the rule and what is wrong with it."""
-    if len(text) > MOST_TEXT:
-        refuse(f"the rules have {len(text)} characters; the limit is {MOST_TEXT}", "rules")
+    if len(text) > MAX_TEXT_CHARACTERS:
+        raise_invalid(f"the rules have {len(text)} characters; the limit is {MAX_TEXT_CHARACTERS}", "rules")
     statements = [s.strip() for line in text.splitlines() for s in line.partition("#")[0].split(";")]
     statements = [s for s in statements if s]
-    if not 0 < len(statements) <= MOST_RULES:
-        refuse(f"there are {len(statements)} rules; there must be 1 to {MOST_RULES}", "rules")
+    if not 0 < len(statements) <= MAX_RULES:
+        raise_invalid(f"there are {len(statements)} rules; there must be 1 to {MAX_RULES}", "rules")
     names = frozenset({*SHAPE_NAMES, *constants})
     rules: dict[str, list[Rule]] = {}
     for k, statement in enumerate(statements):
@@ -151,9 +151,11 @@ def parse(text: str, constants: Mapping[str, float]) -> Grammar:
         head, at, weight = head.partition("@")
         match = _RULE.fullmatch(head)
         if not arrow or match is None:
-            refuse(f"{statement[:60]!r} is no rule, such as lots : area > 600 @ 2 -> cut(0.5, 0) lots lots", location)
+            raise_invalid(
+                f"{statement[:60]!r} is no rule, such as lots : area > 600 @ 2 -> cut(0.5, 0) lots lots", location
+            )
         if match[2] is not None and not match[2].strip():
-            refuse("a condition is missing behind :", location)
+            raise_invalid("a condition is missing behind :", location)
         rule = _action(tail, names, location)
         rules.setdefault(match[1], []).append(
             Rule(
@@ -168,23 +170,25 @@ def parse(text: str, constants: Mapping[str, float]) -> Grammar:
         for rule_ in found_:
             for name in rule_.makes:
                 if name not in grammar.rules and name not in OPEN:
-                    refuse(f"no rule says what becomes of {name!r}", rule_.where)
+                    raise_invalid(f"no rule says what becomes of {name!r}", rule_.where)
     return grammar
 
 
 def _action(text: str, names: frozenset[str], location: str) -> tuple[str, tuple[Expression, ...], tuple[str, ...]]:
     match = _ACTION.fullmatch(text)
     if match is None:
-        refuse(f"{text.strip()[:60]!r} is no action with the shapes it makes, such as cut(0.5, 8) a b", location)
+        raise_invalid(f"{text.strip()[:60]!r} is no action with the shapes it makes, such as cut(0.5, 8) a b", location)
     name, inside, rest = match[1], match[2], tuple(match[3].split())
     if name not in ACTIONS:
         if inside is None and not rest:
             return "is", (), (name,)
-        refuse(f"there is no action {name!r}; there are {', '.join(ACTIONS)}, or a shape's name alone", location)
+        raise_invalid(f"there is no action {name!r}; there are {', '.join(ACTIONS)}, or a shape's name alone", location)
     values = tuple(_expressions.parse(one, names, location) for one in _split(inside or "()"))
     wants, makes = ACTIONS[name]
     if len(values) != wants or len(rest) != makes:
-        refuse(f"{name} takes {wants} values and makes {makes} shapes, got {len(values)} and {len(rest)}", location)
+        raise_invalid(
+            f"{name} takes {wants} values and makes {makes} shapes, got {len(values)} and {len(rest)}", location
+        )
     return name, values, rest
 
 
@@ -214,21 +218,21 @@ def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
     while waiting:
         shape = waiting.pop()
         shape_count += 1
-        if shape_count > MOST_SHAPES:
-            _stop(f"the rules make more than {MOST_SHAPES} shapes", "rules")
+        if shape_count > MAX_SHAPES:
+            _stop(f"the rules make more than {MAX_SHAPES} shapes", "rules")
         rules = grammar.rules.get(shape.name)
-        if rules is None or shape.land.area < SMALLEST:
-            _end(town, shape, shape.name if shape.name in OPEN else "garden")
+        if rules is None or shape.land.area < MIN_AREA_M2:
+            _finish_lot(town, shape, shape.name if shape.name in OPEN else "garden")
             continue
         names = _ShapeVariables(grammar.constants, shape)
-        rule = _chosen(rules, names, chance)
+        rule = _choose_rule(rules, names, chance)
         if rule is None:
-            _end(town, shape, "garden")
+            _finish_lot(town, shape, "garden")
             continue
-        if shape.deep >= DEEPEST:
-            _stop(f"the rules go more than {DEEPEST} deep: give {shape.name!r} an end", rule.where)
+        if shape.deep >= MAX_DEPTH:
+            _stop(f"the rules go more than {MAX_DEPTH} deep: give {shape.name!r} an end", rule.where)
         # The last one waits first, so that shapes are made from the first to the last.
-        waiting += reversed(_applied(town, shape, rule, [value(names, chance) for value in rule.values]))
+        waiting += reversed(_apply_rule(town, shape, rule, [value(names, chance) for value in rule.values]))
     return town
 
 
@@ -236,7 +240,7 @@ def _stop(problem: str, location: str) -> None:
     raise CannotGenerate(f"{location}: {problem}", [Problem(problem, where=location)])
 
 
-def _end(town: Town, shape: _Shape, use: str, storeys: int = 0) -> None:
+def _finish_lot(town: Town, shape: _Shape, use: str, storeys: int = 0) -> None:
     if shape.front is None and not shape.land.is_empty:
         town.blocks.append(shape.land)
     if shape.land.area > 0:
@@ -271,7 +275,7 @@ def _strip(land: Any) -> Any:
     return shapely.buffer(shapely.boundary(land), 0.01, cap_style="flat", join_style="mitre")
 
 
-def _chosen(rules: Sequence[Rule], names: Mapping[str, float], chance: np.random.Generator) -> Rule | None:
+def _choose_rule(rules: Sequence[Rule], names: Mapping[str, float], chance: np.random.Generator) -> Rule | None:
     holding = [r for r in rules if r.condition is None or r.condition(names, chance) != 0]
     if len(holding) < 2:
         return holding[0] if holding else None
@@ -286,7 +290,7 @@ def _chosen(rules: Sequence[Rule], names: Mapping[str, float], chance: np.random
     return holding[-1]
 
 
-def _applied(town: Town, shape: _Shape, rule: Rule, values: list[float]) -> list[_Shape]:
+def _apply_rule(town: Town, shape: _Shape, rule: Rule, values: list[float]) -> list[_Shape]:
     """The shapes that an action makes; buildings and open ground are done with."""
     deep = shape.deep + 1
     if rule.action == "is":
@@ -295,7 +299,7 @@ def _applied(town: Town, shape: _Shape, rule: Rule, values: list[float]) -> list
         storeys = math.floor(values[0] + 0.5)
         if not 1 <= storeys <= 100:
             _stop(f"a building has 1 to 100 storeys, got {values[0]:g}", rule.where)
-        _end(town, shape, rule.action, storeys)
+        _finish_lot(town, shape, rule.action, storeys)
         return []
     if rule.action == "inset":
         return _inset(town, shape, rule, values[0], deep)
@@ -320,7 +324,7 @@ def _inset(town: Town, shape: _Shape, rule: Rule, metres: float, deep: int) -> l
         front = _strip(shape.land)
     inner = _pieces(shapely.buffer(shape.land, -metres, join_style="mitre"))
     if not inner:
-        _end(town, _Shape(shape.name, shape.land, shape.land, front, deep), "garden")
+        _finish_lot(town, _Shape(shape.name, shape.land, shape.land, front, deep), "garden")
     return [_Shape(rule.makes[0], piece, piece, front, deep) for piece in inner]
 
 
@@ -344,7 +348,7 @@ def _cut(town: Town, shape: _Shape, rule: Rule, share: float, width: float, deep
     """In two halves, each of which may be several pieces."""
     (x, y), along, long, short = _box(shape.land)
     if width:
-        share = _aligned(town, shape.land, share, width)
+        share = _align_share(town, shape.land, share, width)
     reach = long + short + 1000.0
     middle = (x + along[0] * (share - 0.5) * long, y + along[1] * (share - 0.5) * long)
     across = (-along[1], along[0])
@@ -373,7 +377,7 @@ def _cut(town: Town, shape: _Shape, rule: Rule, share: float, width: float, deep
     return out
 
 
-def _aligned(town: Town, land: Any, share: float, width: float) -> float:
+def _align_share(town: Town, land: Any, share: float, width: float) -> float:
     """A share at which a street meets those that end nearby, or keeps away from them."""
     (x, y), along, long, short = _box(land)
     near = []
@@ -386,7 +390,7 @@ def _aligned(town: Town, land: Any, share: float, width: float) -> float:
         return share
     at = (share - 0.5) * long
     nearest = min(near, key=lambda u: (abs(u - at), u))
-    if abs(nearest - at) >= NEAR + width / 2:
+    if abs(nearest - at) >= MIN_CROSSING_METRES + width / 2:
         return share
     moved = nearest / long + 0.5
     return moved if 0.2 <= moved <= 0.8 else share
@@ -415,8 +419,8 @@ def _pieces(area: Any) -> list[Any]:
     """The polygons of an area in whole millimetres, from the left and from below; slivers and holes are left out."""
     out = []
     for part in shapely.get_parts(area):
-        if part.geom_type != "Polygon" or part.area < SMALLEST:
+        if part.geom_type != "Polygon" or part.area < MIN_AREA_M2:
             continue
         plain = shapely.make_valid(_mm(shapely.Polygon(part.exterior)))
-        out += [p for p in shapely.get_parts(plain) if p.geom_type == "Polygon" and p.area >= SMALLEST]
+        out += [p for p in shapely.get_parts(plain) if p.geom_type == "Polygon" and p.area >= MIN_AREA_M2]
     return sorted((shapely.normalize(p) for p in out), key=lambda p: p.bounds)

@@ -19,8 +19,8 @@ import shapely
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.generate import RandomSource
-from app.generate._site import SLACK, Site, SiteOptions, angle, mm, refused
-from app.generate._site_frame import SiteFrame, placed
+from app.generate._site import SLACK, Site, SiteOptions, angle, invalid_option_error, mm
+from app.generate._site_frame import SiteFrame, place_site
 from app.model.frame import GROUND, Level
 from app.model.layers import Layers
 
@@ -81,7 +81,7 @@ class Room:
         """Metres from the corridor's wall to the outer one."""
         return self.box[3] - self.box[1]
 
-    def at(self, along: float, inward: float) -> tuple[float, float]:
+    def position(self, along: float, inward: float) -> tuple[float, float]:
         """A place by metres from its left wall, and from the corridor's side."""
         v = self.box[1] + inward if self.side > 0 else self.box[3] - inward
         return self.box[0] + along, v
@@ -135,13 +135,13 @@ class Building:
         after: float,
         thickness: float,
     ) -> None:
-        a, b = self.place.at(*a), self.place.at(*b)
+        a, b = self.place.to_local(*a), self.place.to_local(*b)
         yaw = angle(math.atan2(b[1] - a[1], b[0] - a[0]))
         long, high = math.dist(a, b), self.measures.height
         size = [mm(long + before + after), mm(thickness), mm(min(high - 0.2, 3.0))]
         shape = {"type": "box", "size": size, "pose": [mm((after - before) / 2), 0.0, mm(size[2] / 2), 0.0, 0.0, 0.0]}
         line = shapely.LineString([a, b])
-        self.site.put(
+        self.site.add_object(
             f"{level}/wall/{self.number(level + 'wall')}",
             "wall",
             line,
@@ -161,8 +161,8 @@ class Building:
     ) -> None:
         """A door that stands open. along: the direction of its wall, radians in the drawing."""
         c, s = round(math.cos(along), 12), round(math.sin(along), 12)
-        ends = [self.place.at(middle[0] + k * c * width / 2, middle[1] + k * s * width / 2) for k in (-1, 1)]
-        x, y = self.place.at(*middle)
+        ends = [self.place.to_local(middle[0] + k * c * width / 2, middle[1] + k * s * width / 2) for k in (-1, 1)]
+        x, y = self.place.to_local(*middle)
         leaf = {
             "type": "box",
             "size": [mm(width), 0.04, DOOR_HEIGHT],
@@ -176,7 +176,7 @@ class Building:
             "type": [1, kind],
             "name": [1, name],
         }
-        self.site.put(
+        self.site.add_object(
             f"{level}/door/{name}",
             "door",
             shapely.LineString(ends),
@@ -191,11 +191,11 @@ class Building:
 
     def floor(self, level: str, area: Any, colour: str = "floor") -> None:
         """A slab whose top is the level's elevation."""
-        polygon = self.place.of(area)
+        polygon = self.place.geometry_to_local(area)
         x, y = (mm(v) for v in shapely.get_coordinates(shapely.centroid(polygon))[0])
         corners = shapely.get_coordinates(shapely.get_exterior_ring(polygon))[:-1] - np.array([x, y])
         ring = (np.round(corners, 3) + 0.0).tolist()
-        self.site.put(
+        self.site.add_object(
             f"{level}/floor/{self.number(level + 'floor')}",
             "floor",
             polygon,
@@ -209,7 +209,7 @@ class Building:
 
     def lift(self, name: str, levels: Sequence[str], middle: tuple[float, float]) -> None:
         """A lift that serves these levels, its doors towards larger u."""
-        x, y = self.place.at(*middle)
+        x, y = self.place.to_local(*middle)
         door = f"{name}_door"
         says = {
             "depth": CABIN,
@@ -231,7 +231,7 @@ class Building:
         }
         plate = {"type": "box", "size": [CABIN, CABIN, 0.02], "pose": [0.0, 0.0, 0.01, 0.0, 0.0, 0.0], "visual": True}
         # Its doors are on the side of its negative y, as the editor draws a new lift.
-        self.site.put(
+        self.site.add_object(
             f"{levels[0]}/lift/{name}",
             "lift",
             shapely.Point(x, y),
@@ -249,7 +249,9 @@ class Building:
     def furnish(self, room: Room, goal: tuple[float, float]) -> Furniture:
         """What may be put into a room whose node is at ``goal`` (metres along and inward)."""
         along = room.door - room.box[0]
-        path = shapely.LineString([room.at(along, -PARTITION), room.at(along, self.radius + 0.5), room.at(*goal)])
+        path = shapely.LineString(
+            [room.position(along, -PARTITION), room.position(along, self.radius + 0.5), room.position(*goal)]
+        )
         keep = self.radius + 3 * self.site.resolution + 0.1
         return Furniture(self, room, shapely.buffer(path, keep, cap_style="square"))
 
@@ -260,13 +262,13 @@ class Building:
         if inward < goal[1] + 0.3:
             return
         k = self.number("dock")
-        things.put("charger", goal[0], room.depth - 0.03 - depth / 2, (0.5, depth, 0.6), "charger", gap=0.0)
-        path = shapely.LineString([room.at(*goal), room.at(goal[0], inward)])
-        things.taken = shapely.union(things.taken, shapely.buffer(path, keep))
-        at = self.place.at(*room.at(goal[0], inward))
+        things.add_item("charger", goal[0], room.depth - 0.03 - depth / 2, (0.5, depth, 0.6), "charger", gap=0.0)
+        path = shapely.LineString([room.position(*goal), room.position(goal[0], inward)])
+        things.occupied = shapely.union(things.occupied, shapely.buffer(path, keep))
+        at = self.place.to_local(*room.position(goal[0], inward))
         words = {"openrmf": {"parameters": {"is_charger": [4, True], "is_parking_spot": [4, True]}}}
         yaw = self.place.yaw + room.side * math.pi / 2
-        self.site.way(room.name, self.site.node(f"dock_{k}", at, yaw=yaw, level=room.level, **words), speed=0.3)
+        self.site.add_edges(room.name, self.site.node(f"dock_{k}", at, yaw=yaw, level=room.level, **words), speed=0.3)
 
 
 @dataclass(slots=True)
@@ -275,13 +277,13 @@ class Furniture:
 
     building: Building
     room: Room
-    taken: Any
+    occupied: Any
 
     def fits(self, area: Any) -> bool:
         """Whether this area (drawn metres) is free and in the room."""
-        return bool(shapely.contains(shapely.box(*self.room.box), area)) and not shapely.intersects(self.taken, area)
+        return bool(shapely.contains(shapely.box(*self.room.box), area)) and not shapely.intersects(self.occupied, area)
 
-    def put(
+    def add_item(
         self,
         kind: str,
         along: float,
@@ -296,20 +298,20 @@ class Furniture:
 
         style: ``box``; ``desk``: a top on two side panels; ``table``: a top on a foot; ``bed``: on a lower frame.
         """
-        u, v = self.room.at(along, inward)
+        u, v = self.room.position(along, inward)
         x, y, z = size
         area = shapely.box(u - x / 2, v - y / 2, u + x / 2, v + y / 2)
         if not self.fits(area):
             return False
-        self.taken = shapely.union(self.taken, shapely.buffer(area, gap, join_style="mitre"))
+        self.occupied = shapely.union(self.occupied, shapely.buffer(area, gap, join_style="mitre"))
         site, place, level = self.building.site, self.building.place, self.room.level
-        polygon = place.of(area)
-        at = place.at(u, v)
-        site.put(
+        polygon = place.geometry_to_local(area)
+        at = place.to_local(u, v)
+        site.add_object(
             f"{level}/{kind}/{self.building.number(level + kind)}",
             kind,
             polygon,
-            shapes=_styled(style, x, y, z),
+            shapes=_style_shapes(style, x, y, z),
             pose=(*at, site.elevation(level), place.yaw),
             level=level,
             size=[mm(x), mm(y), mm(z)],
@@ -320,7 +322,7 @@ class Furniture:
         return True
 
 
-def _styled(style: str, x: float, y: float, z: float) -> list[dict[str, Any]]:
+def _style_shapes(style: str, x: float, y: float, z: float) -> list[dict[str, Any]]:
     def box(size: Sequence[float], pose: Sequence[float]) -> dict[str, Any]:
         return {"type": "box", "size": [mm(v) for v in size], "pose": [*(mm(v) for v in pose), 0.0, 0.0, 0.0]}
 
@@ -345,17 +347,21 @@ NodeOf = Callable[[Room], tuple[float, float]]
 def check(measures: Storeys, radius: float) -> None:
     """Measures that do not go together are told before any work."""
     if measures.least > measures.most:
-        raise refused("room_width", "the smaller width comes first")
+        raise invalid_option_error("room_width", "the smaller width comes first")
     if measures.least < measures.door + RASTER + 0.6:
-        raise refused("room_width", f"must be at least {measures.door + RASTER + 0.6:.2f} m, for a door to stand in it")
+        raise invalid_option_error(
+            "room_width", f"must be at least {measures.door + RASTER + 0.6:.2f} m, for a door to stand in it"
+        )
     if measures.length < measures.least + 1.0:
-        raise refused("length", f"must be at least {measures.least + 1.0:.2f} m, for one room")
+        raise invalid_option_error("length", f"must be at least {measures.least + 1.0:.2f} m, for one room")
     if 2 * (measures.length / measures.least) * measures.levels > MAX_ROOMS:
         raise CannotGenerate(f"the building would have more than {MAX_ROOMS} rooms: make it shorter, or rooms wider")
     if measures.depth < 2 * radius + 2.0:
-        raise refused("depth", f"rooms must be at least {2 * radius + 2.0:.2f} m deep, for a robot to turn")
+        raise invalid_option_error(
+            "depth", f"rooms must be at least {2 * radius + 2.0:.2f} m deep, for a robot to turn"
+        )
     if measures.height < LOWEST + 0.2:
-        raise refused("storey_height", f"must be at least {LOWEST + 0.2:g} m")
+        raise invalid_option_error("storey_height", f"must be at least {LOWEST + 0.2:g} m")
 
 
 def fits_robot(site: Site, measures: Storeys, radius: float) -> None:
@@ -367,17 +373,19 @@ def fits_robot(site: Site, measures: Storeys, radius: float) -> None:
     for parameter, width in widths.items():
         if width < need - 1e-9:
             label = {"robot_radius": "the lift's doors are", "corridor": "its entrance is"}.get(parameter, "it is")
-            raise refused(parameter, f"{label} {width:.3g} m wide; a robot of {radius:g} m needs {need:.2f} m here")
+            raise invalid_option_error(
+                parameter, f"{label} {width:.3g} m wide; a robot of {radius:g} m needs {need:.2f} m here"
+            )
 
 
-def names_of(levels: int) -> list[str]:
+def level_names(levels: int) -> list[str]:
     """The names of a building's levels: the ground, then L2, L3 …"""
     return [GROUND, *(f"L{k}" for k in range(2, levels + 1))]
 
 
-def levels_of(measures: Storeys) -> tuple[Level, ...]:
+def building_levels(measures: Storeys) -> tuple[Level, ...]:
     """The levels with their elevations."""
-    return tuple(Level(name, mm(k * measures.height)) for k, name in enumerate(names_of(measures.levels)))
+    return tuple(Level(name, mm(k * measures.height)) for k, name in enumerate(level_names(measures.levels)))
 
 
 def build(
@@ -395,10 +403,10 @@ def build(
     west = SHAFT if measures.lift else 0.0
     total, across = west + measures.length, 2 * measures.depth + measures.corridor
     narrow = min(measures.door, measures.corridor - ENTRANCE, *([LIFT_DOOR] if measures.lift else []))
-    place = placed(site, total + APRON, across, MARGIN, narrow / 2 - radius)
+    place = place_site(site, total + APRON, across, MARGIN, narrow / 2 - radius)
     fits_robot(site, measures, radius)
     building = Building(site, place, measures, radius)
-    names = names_of(measures.levels)
+    names = level_names(measures.levels)
     for k, level in enumerate(names):
         _storey(building, k, level, west, source.stream(f"storey/{k}"), kinds)
     if measures.lift:
@@ -407,7 +415,7 @@ def build(
         _network(building, k, level, west, node_of)
     if measures.lift:
         for low, high in itertools.pairwise(names):
-            site.way(f"lift_1_{low}", f"lift_1_{high}", action="lift")
+            site.add_edges(f"lift_1_{low}", f"lift_1_{high}", action="lift")
     return building
 
 
@@ -423,8 +431,8 @@ def _storey(building: Building, k: int, level: str, west: float, chance: np.rand
     building.floor(level, outline)
     if m.lift:
         cabin = shapely.box(west / 2 - 0.9, middle - 0.9, west / 2 + 0.9, middle + 0.9)
-        site.draw(building.place.of(cabin), "metal", level=level)
-    site.draw(building.place.of(shapely.box(west, low, east, high)), "concrete", level=level)
+        site.draw(building.place.geometry_to_local(cabin), "metal", level=level)
+    site.draw(building.place.geometry_to_local(shapely.box(west, low, east, high)), "concrete", level=level)
     if k == 0:
         apron = shapely.box(east, max(0.0, middle - 4.0), east + APRON, min(across, middle + 4.0))
         building.floor(level, apron, "paving")
@@ -471,7 +479,9 @@ def _widths(m: Storeys, chance: np.random.Generator) -> list[float]:
     """Widths of the rooms along one side, together the corridor's length, in steps of a decimetre."""
     min_count, max_count = math.ceil(m.length / m.most - 1e-9), math.floor(m.length / m.least + 1e-9)
     if max_count < 1 or min_count > max_count:
-        raise refused("room_width", f"no number of rooms from {m.least:g} to {m.most:g} m fills {m.length:g} m")
+        raise invalid_option_error(
+            "room_width", f"no number of rooms from {m.least:g} to {m.most:g} m fills {m.length:g} m"
+        )
     count = int(chance.integers(min_count, max_count + 1))
     spare = m.length - count * m.least
     shares = chance.random(count) + 0.2
@@ -513,25 +523,31 @@ def _network(building: Building, k: int, level: str, west: float, node_of: NodeO
         stops.add(last)
     name = {u: f"{level}_corridor_{n + 1}" for n, u in enumerate(sorted(stops))}
     for u in sorted(stops):
-        site.node(name[u], place.at(u, middle), yaw=place.yaw, level=level)
+        site.node(name[u], place.to_local(u, middle), yaw=place.yaw, level=level)
     for a, b in itertools.pairwise(sorted(stops)):
-        site.way(name[a], name[b], speed=1.0)
+        site.add_edges(name[a], name[b], speed=1.0)
     for room in rooms:
-        u, v = room.at(room.door - room.box[0], building.radius + 0.5)
+        u, v = room.position(room.door - room.box[0], building.radius + 0.5)
         facing = place.yaw + room.side * math.pi / 2
-        inner = site.node(f"{room.name}_door", place.at(u, v), yaw=facing, level=level)
-        site.way(name[room.door], inner, speed=0.5)
-        goal = room.at(*node_of(room))
-        site.node(room.name, place.at(*goal), yaw=facing, level=level)
-        site.way(inner, room.name, speed=0.5)
-        site.mark(f"{level}/room/{room.name}", "region", place.of(shapely.box(*room.box)), level=level, name=room.name)
+        inner = site.node(f"{room.name}_door", place.to_local(u, v), yaw=facing, level=level)
+        site.add_edges(name[room.door], inner, speed=0.5)
+        goal = room.position(*node_of(room))
+        site.node(room.name, place.to_local(*goal), yaw=facing, level=level)
+        site.add_edges(inner, room.name, speed=0.5)
+        site.mark(
+            f"{level}/room/{room.name}",
+            "region",
+            place.geometry_to_local(shapely.box(*room.box)),
+            level=level,
+            name=room.name,
+        )
     if m.lift:
-        at = place.at(west / 2, middle)
+        at = place.to_local(west / 2, middle)
         site.node(f"lift_1_{level}", at, yaw=place.yaw, level=level)
-        site.way(f"lift_1_{level}", name[first], speed=0.3)
+        site.add_edges(f"lift_1_{level}", name[first], speed=0.3)
     if k == 0:
-        site.node("entrance", place.at(east + APRON / 2, middle), yaw=place.yaw, level=level)
-        site.way(name[last], "entrance", speed=0.5)
+        site.node("entrance", place.to_local(east + APRON / 2, middle), yaw=place.yaw, level=level)
+        site.add_edges(name[last], "entrance", speed=0.5)
 
 
 def _along(a: tuple[float, float], b: tuple[float, float], length: float) -> tuple[float, float]:
@@ -544,15 +560,16 @@ def slow_zones(building: Building, speed: float = 0.5) -> None:
     m, site, place = building.measures, building.site, building.place
     west = SHAFT if m.lift else 0.0
     low, high = m.depth, m.depth + m.corridor
-    for level in names_of(m.levels):
+    for level in level_names(m.levels):
         if m.lift:
             site.zone(
-                f"{level}/speed/lift", "speed", place.of(shapely.box(west, low, west + 2.0, high)), level=level,
+                f"{level}/speed/lift", "speed", place.geometry_to_local(shapely.box(west, low, west + 2.0, high)),
+                level=level,
                 value=speed, name=f"before the lift, {level}",
             )  # fmt: skip
     east = west + m.length
     site.zone(
-        "ground/speed/entrance", "speed", place.of(shapely.box(east - 2.0, low, east + APRON, high)),
+        "ground/speed/entrance", "speed", place.geometry_to_local(shapely.box(east - 2.0, low, east + APRON, high)),
         value=speed, name="entrance",
     )  # fmt: skip
 
@@ -563,7 +580,7 @@ def goal(room: Room, radius: float) -> tuple[float, float]:
     return room.door - room.box[0], min(inward, room.depth - radius - 0.5)
 
 
-def raised(
+def build_site(
     given: Layers,
     options: SiteOptions,
     measures: Storeys,
@@ -576,13 +593,13 @@ def raised(
     """A whole building with its network. kinds: see ``build``. furnish: puts a room's things, None: it stays empty.
     charged: whether a room (of the level of that number) has a charger for robots."""
     check(measures, options.robot_radius)
-    site = Site(given, options, notes, levels=levels_of(measures))
+    site = Site(given, options, notes, levels=building_levels(measures))
 
     def node_of(room: Room) -> tuple[float, float]:
         return goal(room, options.robot_radius)
 
     building = build(site, measures, options.robot_radius, source, kinds, node_of)
-    for k, level in enumerate(names_of(measures.levels)):
+    for k, level in enumerate(level_names(measures.levels)):
         chance = source.stream(f"furniture/{k}")
         for room in (room for room in building.rooms if room.level == level):
             things = building.furnish(room, node_of(room))

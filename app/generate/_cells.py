@@ -19,7 +19,7 @@ from app.derive import DerivationNotes
 from app.derive.occupancy_to_topology import Parameters, network
 from app.errors import CannotConvert, CannotGenerate
 from app.generate import MAX_CELLS, MAX_OBJECTS
-from app.generate._site import Site, SiteOptions, refused
+from app.generate._site import Site, SiteOptions, invalid_option_error
 from app.model.features import Features
 from app.model.frame import GROUND
 from app.model.grid import OccupancyGrid
@@ -60,21 +60,21 @@ class GridFrame:
         return shapely.box(self.x, self.y, round(right, 3), round(top, 3))
 
 
-def placed(site: Site, width: float, depth: float, resolution: float, *, step: int = 1) -> GridFrame:
+def site_grid_frame(site: Site, width: float, depth: float, resolution: float, *, step: int = 1) -> GridFrame:
     """The grid of a site: around its fence where the environment has one, else width × depth metres from the origin.
 
     step: the sides are whole numbers of so many cells. Raises CannotGenerate before anything is made: for too many
     cells, or cells that are not whole millimetres, which is what coordinates are kept in.
     """
     if abs(resolution * 1000 - round(resolution * 1000)) > 1e-6:
-        raise refused("resolution", f"must be whole millimetres, got {resolution:g} m")
+        raise invalid_option_error("resolution", f"must be whole millimetres, got {resolution:g} m")
     size = resolution * step
     if width / size * (depth / size) * step * step > MAX_CELLS:
-        raise refused(
+        raise invalid_option_error(
             "width",
             f"{width:g} × {depth:g} m would be more than {MAX_CELLS} cells of {resolution:g} m: make it smaller",
         )
-    low_x, low_y, high_x, high_y = site.bounded(shapely.box(0.0, 0.0, width, depth)).bounds
+    low_x, low_y, high_x, high_y = site.set_fence(shapely.box(0.0, 0.0, width, depth)).bounds
     if not site.is_given:
         columns, rows = (max(1, round(v / size)) for v in (width, depth))
         frame = GridFrame(0.0, 0.0, resolution, columns * step, rows * step)
@@ -83,11 +83,13 @@ def placed(site: Site, width: float, depth: float, resolution: float, *, step: i
     x, y = (math.floor(v / resolution + 1e-6) for v in (low_x, low_y))
     columns, rows = (math.ceil((v - o * resolution) / size - 1e-6) for v, o in ((high_x, x), (high_y, y)))
     if columns * rows * step * step > MAX_CELLS:
-        raise refused("resolution", f"the fence would hold more than {MAX_CELLS} cells of {resolution:g} m")
+        raise invalid_option_error(
+            "resolution", f"the fence would hold more than {MAX_CELLS} cells of {resolution:g} m"
+        )
     return GridFrame(round(x * resolution, 3), round(y * resolution, 3), resolution, columns * step, rows * step)
 
 
-def stand(site: Site, place: GridFrame, occupied: Bool, seen: CellStyle) -> None:
+def add_objects(site: Site, place: GridFrame, occupied: Bool, seen: CellStyle) -> None:
     """Put an object for each piece of occupied cells (joined by their sides), which all look the same."""
     pieces = _pieces(occupied)
     if len(pieces) > MAX_OBJECTS:
@@ -117,23 +119,23 @@ def stand(site: Site, place: GridFrame, occupied: Bool, seen: CellStyle) -> None
             solid = {"type": "polyline", "points": points, "height": seen.height}
             words = {"height": seen.height}
         pose = (*at, floor, 0.0)
-        site.put(i, seen.kind, area, shapes=[solid], pose=pose, colour=seen.colour, **words)
+        site.add_object(i, seen.kind, area, shapes=[solid], pose=pose, colour=seen.colour, **words)
 
 
-def finished(site: Site, options: SiteOptions, notes: DerivationNotes, *, ground: str) -> Layers:
+def finish_site(site: Site, options: SiteOptions, notes: DerivationNotes, *, ground: str) -> Layers:
     """The site's layers with the network of its grid: the largest piece of what its robot can reach."""
     layers = site.finish(ground=ground)
     grid = layers.parts[PartKey("occupancy", GROUND, MAP)]
     if not isinstance(grid, OccupancyGrid):
         raise TypeError("a site has a grid")
-    topology = ways_of(grid, options.robot_radius, notes)
+    topology = free_space_network(grid, options.robot_radius, notes)
     parts: dict[PartKey, Part] = dict(layers.parts)
     if topology is not None:
         parts[PartKey("topology", GROUND, NETWORK)] = topology
     return Layers(dict(sorted(parts.items())), layers.datum, layers.levels)
 
 
-def ways_of(grid: OccupancyGrid, radius: float, notes: DerivationNotes) -> Features | None:
+def free_space_network(grid: OccupancyGrid, radius: float, notes: DerivationNotes) -> Features | None:
     """The network of a grid's free space, one piece of it; None, with a warning, where a robot finds no way."""
     network_notes = DerivationNotes()
     spacing = max(1.5, 25 * grid.resolution)
@@ -166,7 +168,7 @@ def _largest(network: Features, notes: DerivationNotes) -> Features:
     components, counts = np.unique(roots[nodes], return_counts=True)
     mask = roots == components[int(np.argmax(counts))]
     notes.drop("nodes", int(np.count_nonzero(nodes & ~mask)), "in places from which the robot finds no way to the rest")
-    return network.take(mask)
+    return network.select(mask)
 
 
 def _pieces(occupied: Bool) -> list[Any]:
@@ -197,7 +199,7 @@ def _mask(areas: list[Any], shape: tuple[int, int]) -> Bool:
     return np.asarray(features.rasterize([(area, 1) for area in areas], shape, dtype=np.uint8) > 0)
 
 
-LOOKS: Mapping[str, CellStyle] = {
+STYLES: Mapping[str, CellStyle] = {
     "wall": CellStyle("wall", 2.5, "wall"),
     "rack": CellStyle("rack", 2.0, "shelf"),
     "furniture": CellStyle("furniture", 0.8, "furniture"),

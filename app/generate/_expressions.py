@@ -30,13 +30,13 @@ import numpy as np
 
 from app.errors import CannotGenerate, Invalid, Problem
 
-DEEPEST = 32
+MAX_DEPTH = 32
 """Parentheses and operators within each other."""
 
-LONGEST = 400
+MAX_TOKENS = 400
 """Tokens of one expression."""
 
-LARGEST = 1e9
+MAX_NUMBER = 1e9
 """Numbers beyond it are a mistake, or a rule that explodes."""
 
 _TOKEN = re.compile(
@@ -62,8 +62,8 @@ class Expression:
             value = self.value(names, chance)
         except (ArithmeticError, ValueError) as error:
             self._stop(str(error))
-        if not abs(value) <= LARGEST:
-            self._stop(f"{value:g} is beyond ±{LARGEST:g}")
+        if not abs(value) <= MAX_NUMBER:
+            self._stop(f"{value:g} is beyond ±{MAX_NUMBER:g}")
         return value
 
     def _stop(self, reason: str) -> NoReturn:
@@ -71,7 +71,7 @@ class Expression:
         raise CannotGenerate(f"{self.where}: {problem}", [Problem(problem, where=self.where)])
 
 
-def refuse(problem: str, location: str) -> NoReturn:
+def raise_invalid(problem: str, location: str) -> NoReturn:
     """Raise Invalid that names the place in the rules."""
     raise Invalid(f"{location}: {problem}", [Problem(problem, where=location)])
 
@@ -81,7 +81,7 @@ def parse(text: str, names: frozenset[str] | set[str], location: str) -> Express
     parser = _Parser(_tokens(text, location), names, location)
     value = parser.either(0)
     if parser.peek():
-        refuse(f"{parser.peek()!r} stands where the expression {text.strip()!r} should end", location)
+        raise_invalid(f"{parser.peek()!r} stands where the expression {text.strip()!r} should end", location)
     return Expression(text, location, value)
 
 
@@ -92,13 +92,13 @@ def _tokens(text: str, location: str) -> list[str]:
     while at < end:
         match = _TOKEN.match(text, at)
         if match is None:
-            refuse(f"{text[at:].strip()[:20]!r} is no part of an expression", location)
+            raise_invalid(f"{text[at:].strip()[:20]!r} is no part of an expression", location)
         out.append(match.group().strip())
         at = match.end()
-        if len(out) > LONGEST:
-            refuse(f"an expression has at most {LONGEST} numbers, names and signs", location)
+        if len(out) > MAX_TOKENS:
+            raise_invalid(f"an expression has at most {MAX_TOKENS} numbers, names and signs", location)
     if not out:
-        refuse("an expression is missing", location)
+        raise_invalid("an expression is missing", location)
     return out
 
 
@@ -150,7 +150,7 @@ class _Parser:
         """The next token, or "" at the end."""
         return self.tokens[self.at] if self.at < len(self.tokens) else ""
 
-    def take(self) -> str:
+    def next_token(self) -> str:
         token = self.peek()
         self.at += 1
         return token
@@ -158,12 +158,12 @@ class _Parser:
     def _series(self, depth: int, signs: tuple[str, ...], inner: Callable[[int], Value]) -> Iterator[tuple[str, Value]]:
         yield "", inner(depth)
         while self.peek() in signs:
-            yield self.take(), inner(depth)
+            yield self.next_token(), inner(depth)
 
     def either(self, depth: int) -> Value:
         """Alternatives, the loosest binding."""
-        if depth > DEEPEST:
-            refuse(f"an expression is at most {DEEPEST} deep", self.where)
+        if depth > MAX_DEPTH:
+            raise_invalid(f"an expression is at most {MAX_DEPTH} deep", self.where)
         terms = [value for _, value in self._series(depth + 1, ("|",), self._both)]
         return terms[0] if len(terms) == 1 else lambda n, c: float(any(v(n, c) != 0 for v in terms))
 
@@ -174,9 +174,9 @@ class _Parser:
     def _not(self, depth: int) -> Value:
         if self.peek() != "!":
             return self._compared(depth)
-        self.take()
-        if depth > DEEPEST:
-            refuse(f"an expression is at most {DEEPEST} deep", self.where)
+        self.next_token()
+        if depth > MAX_DEPTH:
+            raise_invalid(f"an expression is at most {MAX_DEPTH} deep", self.where)
         inner = self._not(depth + 1)
         return lambda n, c: float(inner(n, c) == 0)
 
@@ -184,22 +184,22 @@ class _Parser:
         left = self._sum(depth)
         if self.peek() not in _COMPARED:
             return left
-        how = _COMPARED[self.take()]
+        how = _COMPARED[self.next_token()]
         right = self._sum(depth)
         return lambda n, c: float(how(left(n, c), right(n, c)))
 
     def _sum(self, depth: int) -> Value:
-        return _folded(list(self._series(depth, ("+", "-"), self._product)))
+        return _fold(list(self._series(depth, ("+", "-"), self._product)))
 
     def _product(self, depth: int) -> Value:
-        return _folded(list(self._series(depth, ("*", "/", "%"), self._signed)))
+        return _fold(list(self._series(depth, ("*", "/", "%"), self._signed)))
 
     def _signed(self, depth: int) -> Value:
         if self.peek() != "-":
             return self._power(depth)
-        self.take()
-        if depth > DEEPEST:
-            refuse(f"an expression is at most {DEEPEST} deep", self.where)
+        self.next_token()
+        if depth > MAX_DEPTH:
+            raise_invalid(f"an expression is at most {MAX_DEPTH} deep", self.where)
         inner = self._signed(depth + 1)
         return lambda n, c: -inner(n, c)
 
@@ -207,14 +207,14 @@ class _Parser:
         base = self._primary(depth)
         if self.peek() != "^":
             return base
-        self.take()
-        exponent = self.take()
+        self.next_token()
+        exponent = self.next_token()
         if not exponent.isdecimal() or int(exponent) > 16:
-            refuse(f"a power is a whole number from 0 to 16, got {exponent!r}", self.where)
+            raise_invalid(f"a power is a whole number from 0 to 16, got {exponent!r}", self.where)
         return lambda n, c: math.prod([base(n, c)] * int(exponent))
 
     def _primary(self, depth: int) -> Value:
-        token = self.take()
+        token = self.next_token()
         if token == "(":  # noqa: S105 - no secret
             inner = self.either(depth + 1)
             self._expect(")")
@@ -227,12 +227,12 @@ class _Parser:
         if token and (token[0].isalpha() or token[0] == "_"):
             if token not in self.names:
                 name_list = ", ".join(sorted(self.names)) or "none"
-                refuse(
+                raise_invalid(
                     f"nothing is called {token!r} here; there are: {name_list}; functions: {', '.join(_FUNCTIONS)}",
                     self.where,
                 )
             return lambda n, c: n[token]
-        refuse(
+        raise_invalid(
             f"a number, a name or ( is expected, got {token!r}" if token else "the expression ends too early",
             self.where,
         )
@@ -243,7 +243,7 @@ class _Parser:
         self._expect(")")
         minimum, maximum = _FUNCTIONS[name]
         if not minimum <= len(given) <= maximum:
-            refuse(
+            raise_invalid(
                 f"{name} takes {minimum if minimum == maximum else f'{minimum} or more'} values, got {len(given)}",
                 self.where,
             )
@@ -259,12 +259,14 @@ class _Parser:
         return lambda n, c: how([v(n, c) for v in given])
 
     def _expect(self, sign: str) -> None:
-        got = self.take()
+        got = self.next_token()
         if got != sign:
-            refuse(f"{sign!r} is expected, got {got!r}" if got else f"{sign!r} is missing at the end", self.where)
+            raise_invalid(
+                f"{sign!r} is expected, got {got!r}" if got else f"{sign!r} is missing at the end", self.where
+            )
 
 
-def _folded(parts: list[tuple[str, Value]]) -> Value:
+def _fold(parts: list[tuple[str, Value]]) -> Value:
     """A series of operations of one rank, from the left."""
     first = parts[0][1]
     if len(parts) == 1:

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.generate._site import MOST_NODES, SLACK, Site, SiteOptions, mm, rectangle, refused, rounded
+from app.generate._site import MAX_NODES, SLACK, Site, SiteOptions, invalid_option_error, mm, rectangle, round_geometry
 from app.parameters import parameter
 
-SHORTEST = 2.0
+MIN_AISLE_METRES = 2.0
 """Metres that an aisle has at least between its headlands."""
 
-MOST_ROWS = 500
+MAX_ROWS = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,26 +94,26 @@ class Field:
     rows: list[Row] = field(default_factory=list)
     aisles: list[Aisle] = field(default_factory=list)
 
-    def at(self, u: float, v: float) -> tuple[float, float]:
+    def to_local(self, u: float, v: float) -> tuple[float, float]:
         """A place in local metres."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return mm(self.origin[0] + c * u - s * v), mm(self.origin[1] + s * u + c * v)
 
     def area(self, low_u: float, low_v: float, high_u: float, high_v: float) -> Any:
         """A rectangle of the field, within the fence, in local metres."""
-        corners = [self.at(u, v) for u, v in ((low_u, low_v), (high_u, low_v), (high_u, high_v), (low_u, high_v))]
-        return rounded(shapely.intersection(shapely.Polygon(corners), self.site.fence))
+        corners = [self.to_local(u, v) for u, v in ((low_u, low_v), (high_u, low_v), (high_u, high_v), (low_u, high_v))]
+        return round_geometry(shapely.intersection(shapely.Polygon(corners), self.site.fence))
 
     def strip(self, row: Row, width: float) -> Any:
         """The ground of a row, in local metres."""
-        x, y = self.at((row.low + row.high) / 2, row.v)
+        x, y = self.to_local((row.low + row.high) / 2, row.v)
         return rectangle(x, y, self.yaw, row.length, width)
 
     def line(self, row: Row) -> Any:
         """A row's middle line, in local metres."""
-        return shapely.LineString([self.at(row.low, row.v), self.at(row.high, row.v)])
+        return shapely.LineString([self.to_local(row.low, row.v), self.to_local(row.high, row.v)])
 
-    def end_with(self, kind: str) -> None:
+    def trim_after(self, kind: str) -> None:
         """Leave away what comes after the last line of a kind."""
         last = max((k for k, row in enumerate(self.rows) if row.kind == kind), default=-1)
         self.rows = self.rows[: last + 1]
@@ -131,7 +131,7 @@ class Field:
         return shapely.buffer(shapely.transform(self.site.fence, turned), -margin, join_style="mitre")
 
 
-def numbered(rows: int) -> list[Line]:
+def number_rows(rows: int) -> list[Line]:
     """Rows 1, 2, 3 … and the aisles behind them."""
     return [Line("row", k, f"r{k}.5") for k in range(1, rows + 1)]
 
@@ -159,7 +159,7 @@ def open_field(
     across = (options.row_length or length) + 2 * options.headland
     depth = options.yard + options.headland * 1.5 + (count - 1) * spacing
     room = min(spacing, options.headland) / 2 - options.robot_radius - half
-    fence = site.bounded(shapely.box(-margin, -margin, across - margin, depth - margin), room=room)
+    fence = site.set_fence(shapely.box(-margin, -margin, across - margin, depth - margin), room=room)
     out = Field(site, options, 0.0, (-margin, -margin))
     if site.is_given:
         out.yaw, out.origin = _longest(fence)
@@ -168,8 +168,8 @@ def open_field(
     _check_room(site, options, spacing, half, word)
     _lay(out, lines, spacing, count_lost=row_count is None)
     nodes = 2 + 2 * options.docks + sum(len(stops(out, aisle)) for aisle in out.aisles[1:])
-    if nodes > MOST_NODES - 200:
-        raise refused("node_spacing", f"there would be {nodes} nodes; the limit is {MOST_NODES - 200}")
+    if nodes > MAX_NODES - 200:
+        raise invalid_option_error("node_spacing", f"there would be {nodes} nodes; the limit is {MAX_NODES - 200}")
     return out
 
 
@@ -187,14 +187,16 @@ def _check_room(site: Site, options: FieldOptions, spacing: float, half: float, 
     """Whether a robot comes through between two rows, and around their ends."""
     needed = options.robot_radius + half + SLACK * site.resolution
     if spacing / 2 < needed:
-        raise refused(
+        raise invalid_option_error(
             word,
             f"{spacing:.2f} m from row to row leave no way for a robot of {options.robot_radius:g} m radius between "
             f"rows that reach {half:.2f} m to the side: at least {2 * needed:.2f} m are needed with cells of "
             f"{site.resolution:g} m",
         )
     if options.headland / 2 < needed:
-        raise refused("headland", f"{options.headland:g} m are too few to turn: at least {2 * needed:.2f} m are needed")
+        raise invalid_option_error(
+            "headland", f"{options.headland:g} m are too few to turn: at least {2 * needed:.2f} m are needed"
+        )
 
 
 def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool) -> None:
@@ -204,25 +206,25 @@ def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool)
     inner = out.inner(turn)
     drive = out.inner(options.robot_radius + SLACK * site.resolution)
     if inner.is_empty:
-        raise refused("headland", f"the fence holds no field with a headland of {options.headland:g} m")
+        raise invalid_option_error("headland", f"the fence holds no field with a headland of {options.headland:g} m")
     v = max(options.yard, turn)
-    lane = _widest(inner, v, None)
-    if lane is None or lane[1] - lane[0] < options.headland + SHORTEST:
-        raise refused(
+    lane = _widest_row(inner, v, None)
+    if lane is None or lane[1] - lane[0] < options.headland + MIN_AISLE_METRES:
+        raise invalid_option_error(
             "yard",
-            f"the fence has no lane of {options.headland + SHORTEST:g} m behind a yard of {options.yard:g} m",
+            f"the fence has no lane of {options.headland + MIN_AISLE_METRES:g} m behind a yard of {options.yard:g} m",
         )
-    lane = _at_most(lane, options)
+    lane = _longest_aisle(lane, options)
     out.aisles.append(Aisle("Lane", v, *lane))
     v += turn
     left = 0
     for k, line in enumerate(lines):
         before = out.aisles[-1]
         last = k == len(lines) - 1
-        span = None if last else _widest(inner, v + spacing / 2, (before.low, before.high))
+        span = None if last else _widest_row(inner, v + spacing / 2, (before.low, before.high))
         if span is not None:
-            span = _at_most(span, options, (before.low, before.high))
-        if span is None or span[1] - span[0] < options.headland + SHORTEST:
+            span = _longest_aisle(span, options, (before.low, before.high))
+        if span is None or span[1] - span[0] < options.headland + MIN_AISLE_METRES:
             span = None
         after = None if span is None else Aisle(line.aisle, v + spacing / 2, *span)
         if after is not None:
@@ -239,7 +241,9 @@ def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool)
         out.aisles.append(after)
         v += spacing
     if not any(row.kind == "row" for row in out.rows):
-        raise refused("headland", "the fence holds no row: a smaller headland, yard or row_spacing is needed")
+        raise invalid_option_error(
+            "headland", "the fence holds no row: a smaller headland, yard or row_spacing is needed"
+        )
     site.notes.drop("rows", left, "the fence holds no more, or no way leads to them within it")
 
 
@@ -247,14 +251,14 @@ def _row(line: Line, v: float, before: Aisle, after: Aisle | None, inner: Any, t
     """The row between two aisles, a headland shorter than both."""
     low = before.low if after is None else max(before.low, after.low)
     high = before.high if after is None else min(before.high, after.high)
-    span = _widest(inner, v, (low, high))
+    span = _widest_row(inner, v, (low, high))
     if span is None:
         return None
     low, high = max(low, span[0]) + turn, min(high, span[1]) - turn
     return Row(line.number, v, low, high, line.kind) if high - low >= 1.0 else None
 
 
-def _widest(area: Any, v: float, before: tuple[float, float] | None) -> tuple[float, float] | None:
+def _widest_row(area: Any, v: float, before: tuple[float, float] | None) -> tuple[float, float] | None:
     """The longest piece of an area at a height v, or the one that has most in common with ``before``."""
     low, _, high, _ = area.bounds
     cut = shapely.intersection(area, shapely.LineString([(low - 1, v), (high + 1, v)]))
@@ -267,7 +271,7 @@ def _widest(area: Any, v: float, before: tuple[float, float] | None) -> tuple[fl
     return None if best is None else best[1]
 
 
-def _at_most(
+def _longest_aisle(
     reach: tuple[float, float], options: FieldOptions, before: tuple[float, float] | None = None
 ) -> tuple[float, float]:
     """An aisle for rows of the greatest length: from its beginning, or from where the one before begins."""
@@ -306,23 +310,25 @@ def network(
     site, lane = out.site, out.aisles[0]
     at_ends = (("LaneWest", lane.low), ("LaneEast", lane.high))
     for name, u in at_ends:
-        site.node(name, out.at(u, lane.v), yaw=out.yaw)
+        site.node(name, out.to_local(u, lane.v), yaw=out.yaw)
     listed = sorted([*((u, name) for name, u in on_lane.items()), *((u, name) for name, u in at_ends)])
     for (_, a), (_, b) in itertools.pairwise(listed):
-        site.way(a, b, speed=lane_speed)
+        site.add_edges(a, b, speed=lane_speed)
     ends, round_both = {"Lane": ("LaneWest", "LaneEast")}, True
     for number, aisle in enumerate(out.aisles[1:]):
         round_both = round_both and aisle.west and aisle.east
-        names = [site.node(f"{aisle.name}-{name}", out.at(u, aisle.v), yaw=out.yaw) for name, u in stops(out, aisle)]
+        names = [
+            site.node(f"{aisle.name}-{name}", out.to_local(u, aisle.v), yaw=out.yaw) for name, u in stops(out, aisle)
+        ]
         single = one_way and round_both
         for a, b in itertools.pairwise(names if number % 2 == 0 else names[::-1]):
-            site.way(a, b, action=along, speed=aisle_speed, both=not single)
+            site.add_edges(a, b, action=along, speed=aisle_speed, both=not single)
         ends[aisle.name] = (names[0], names[-1])
     for before, after in itertools.pairwise(out.aisles):
         for side, good in ((0, after.west), (1, after.east)):
             if good:
                 action = "move_base" if before is lane else change
-                site.way(ends[before.name][side], ends[after.name][side], action=action, speed=lane_speed)
+                site.add_edges(ends[before.name][side], ends[after.name][side], action=action, speed=lane_speed)
 
 
 def _pitch(options: FieldOptions) -> float:
@@ -330,7 +336,7 @@ def _pitch(options: FieldOptions) -> float:
     return mm(max(1.5, 2 * options.robot_radius + 0.6))
 
 
-def _at_lane(out: Field) -> dict[str, float]:
+def _lane_nodes(out: Field) -> dict[str, float]:
     """u of the yard's nodes on the lane."""
     lane, options = out.aisles[0], out.options
     pitch = _pitch(options)
@@ -344,41 +350,45 @@ def yard(out: Field) -> dict[str, float]:
     """The yard along the longest side: docks, a gate, a barn and a water tank, as far as there is room; its nodes on
     the lane, and their u."""
     site, options, lane = out.site, out.options, out.aisles[0]
-    positions = _at_lane(out)
+    positions = _lane_nodes(out)
     radius = options.robot_radius
     reach = lane.v - max(2.0, 2 * radius + 0.5)
     first, gate = positions["Yard1"], positions["YardGate"]
     if gate - 0.5 < lane.low or first + 0.5 > lane.high:
-        raise refused("docks", f"the lane of {lane.high - lane.low:.1f} m has no room for {options.docks} docks")
+        raise invalid_option_error(
+            "docks", f"the lane of {lane.high - lane.low:.1f} m has no room for {options.docks} docks"
+        )
     low_u, high_u = max(lane.low, gate - 2.0), min(lane.high, first + radius + 14.0)
     site.draw(out.area(low_u, 0.0, high_u, lane.v + 1.0), "gravel")
     free = shapely.buffer(site.fence, -0.3)
     for name, u in positions.items():
-        site.node(name, out.at(u, lane.v), yaw=out.yaw)
+        site.node(name, out.to_local(u, lane.v), yaw=out.yaw)
     for k in range(options.docks):
         u = positions[f"Yard{k + 1}"]
         dock = f"Dock{k + 1}"
         facing = out.yaw - math.pi / 2
         charging: dict[str, Any] = {"openrmf": {"parameters": {"is_charger": [4, True], "is_parking_spot": [4, True]}}}
-        site.node(dock, out.at(u, reach), yaw=facing, **charging)
-        site.way(f"Yard{k + 1}", dock, speed=0.5)
+        site.node(dock, out.to_local(u, reach), yaw=facing, **charging)
+        site.add_edges(f"Yard{k + 1}", dock, speed=0.5)
         behind = mm(reach - radius - 2 * SLACK * site.resolution - 0.25)
-        place = out.at(u, behind)
+        place = out.to_local(u, behind)
         open_to = lowest(out, u, min(radius + 0.3, options.headland / 2))
         if open_to is None or open_to > reach or not free.contains(rectangle(*place, out.yaw, 0.6, 0.4)):
-            raise refused("yard", f"{options.yard:g} m are too few for the docks of a robot of {radius:g} m radius")
+            raise invalid_option_error(
+                "yard", f"{options.yard:g} m are too few for the docks of a robot of {radius:g} m radius"
+            )
         site.box(
             f"charger{k + 1}", "machine", place, (0.6, 0.4, 0.9), yaw=out.yaw, colour="charger", name=f"Charger {k + 1}"
         )
     below = lowest(out, gate, min(radius + 0.5, options.headland / 2))
     if below is None or lane.v - below < 0.5:
-        raise refused("yard", f"{options.yard:g} m are too few for a gate")
-    site.node("Gate", out.at(gate, below), yaw=out.yaw + math.pi / 2)
-    site.way("YardGate", "Gate", speed=0.5)
+        raise invalid_option_error("yard", f"{options.yard:g} m are too few for a gate")
+    site.node("Gate", out.to_local(gate, below), yaw=out.yaw + math.pi / 2)
+    site.add_edges("YardGate", "Gate", speed=0.5)
     start = first + radius + 1.0
     depth = mm(min(5.0, lane.v - 2.5 - radius))
-    barn = out.at(start + 3.5, 0.5 + depth / 2)
-    tank = out.at(start + 9.0, 2.0)
+    barn = out.to_local(start + 3.5, 0.5 + depth / 2)
+    tank = out.to_local(start + 9.0, 2.0)
     if free.contains(rectangle(*barn, out.yaw, 7.0, depth)):
         site.box("barn", "building", barn, (7.0, depth, 4.0), yaw=out.yaw, colour="roof", name="Barn")
     else:
@@ -412,7 +422,9 @@ def ground(out: Field, *, field_colour: str, lane_colour: str = "path") -> None:
     for row in out.rows:
         site.draw(out.strip(Row(row.number, row.v, row.low - turn, row.high + turn, row.kind), 2 * turn), lane_colour)
     lane = out.aisles[0]
-    site.draw(shapely.LineString([out.at(lane.low, lane.v), out.at(lane.high, lane.v)]).buffer(1.2), lane_colour)
+    site.draw(
+        shapely.LineString([out.to_local(lane.low, lane.v), out.to_local(lane.high, lane.v)]).buffer(1.2), lane_colour
+    )
     if out.rows:
         spacing = out.rows[1].v - out.rows[0].v if len(out.rows) > 1 else 2.0
         for row in out.rows:

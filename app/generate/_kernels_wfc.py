@@ -106,7 +106,7 @@ def _pop(keys: I64, where: I64, size: int) -> int:
 
 
 @native
-def _only(domain: U64) -> int:
+def _single_pattern(domain: U64) -> int:
     """The only pattern of a domain, or -1 where there are several, -2 where there is none."""
     tile = np.int64(-2)
     for k in range(len(domain)):
@@ -241,7 +241,7 @@ def collapse(
     keys, places = np.empty(n + 1024, np.int64), np.empty(n + 1024, np.int64)
     heap = 0
     for a in range(n):
-        p = _only(domain[a])
+        p = _single_pattern(domain[a])
         if p == -2:
             report[1] = a
             return IMPOSSIBLE
@@ -282,7 +282,7 @@ def collapse(
                     queue[tail if tail <= n else tail - n - 1] = b
                     waiting[b] = 1
                     size += 1
-                p = _only(domain[b])
+                p = _single_pattern(domain[b])
                 if p >= 0 and single[b] < 0:
                     single[b] = p
                     placed[tile[p]] += counted[b]
@@ -351,7 +351,7 @@ def collapse(
                     domain[b, j] = initial[b, j]
                 if widen:
                     report[2] += 1
-                p = _only(domain[b])
+                p = _single_pattern(domain[b])
                 if p >= 0:
                     single[b] = p
                     placed[tile[p]] += counted[b]

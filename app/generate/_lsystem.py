@@ -42,25 +42,25 @@ import numpy as np
 
 from app.errors import CannotGenerate, Problem
 from app.generate import _expressions
-from app.generate._expressions import Expression, refuse
+from app.generate._expressions import Expression, raise_invalid
 
-MOST_SYMBOLS = 100_000
+MAX_SYMBOLS = 100_000
 """Of a system at any time."""
 
-MOST_WORK = 2_500_000
+MAX_WORK = 2_500_000
 """Symbols that are rewritten, of all plants of one generation together."""
 
-MOST_DRAWN = 20_000
+MAX_DRAWN = 20_000
 """Branches, leaves and fruit of one plant."""
 
-MOST_TEXT, MOST_RULES, MOST_WORDS = 20_000, 200, 500
+MAX_TEXT_CHARACTERS, MAX_RULES, MAX_WORDS = 20_000, 200, 500
 """Characters of rules, statements, and symbols on one side of a rule."""
 
-MOST_ITERATIONS = 40
-DEEPEST = 200
+MAX_ITERATIONS = 40
+MAX_DEPTH = 200
 """Brackets within each other."""
 
-LARGEST = 1000.0
+MAX_PLANT_METRES = 1000.0
 """Metres that a plant may reach from its root."""
 
 TURTLE: Mapping[str, tuple[int, int]] = {
@@ -109,7 +109,7 @@ class System:
 class Budget:
     """What one generation may still rewrite."""
 
-    left: int = MOST_WORK
+    left: int = MAX_WORK
 
 
 # --- reading rules ---------------------------------------------------------------------------------------------------
@@ -117,11 +117,11 @@ class Budget:
 
 def parse(text: str) -> System:
     """The system that these rules describe. Invalid names the statement and what is wrong with it."""
-    if len(text) > MOST_TEXT:
-        refuse(f"the rules have {len(text)} characters; the limit is {MOST_TEXT}", "rules")
+    if len(text) > MAX_TEXT_CHARACTERS:
+        raise_invalid(f"the rules have {len(text)} characters; the limit is {MAX_TEXT_CHARACTERS}", "rules")
     statements = _statements(text)
-    if len(statements) > MOST_RULES:
-        refuse(f"there are {len(statements)} statements; the limit is {MOST_RULES}", "rules")
+    if len(statements) > MAX_RULES:
+        raise_invalid(f"there are {len(statements)} statements; the limit is {MAX_RULES}", "rules")
     constants: dict[str, float] = {}
     axiom: tuple[Word, ...] | None = None
     rules: dict[tuple[str, int], list[Rule]] = {}
@@ -134,18 +134,18 @@ def parse(text: str) -> System:
             rules.setdefault((rule.symbol, len(rule.names)), []).append(rule)
         elif match := _AXIOM.fullmatch(statement):
             if axiom is not None:
-                refuse("there is an axiom already", location)
-            axiom = _words(match[1], frozenset(constants), location)
+                raise_invalid("there is an axiom already", location)
+            axiom = _parse_words(match[1], frozenset(constants), location)
         elif match := _CONSTANT.fullmatch(statement):
             if match[1] in constants:
-                refuse(f"{match[1]!r} has a value already", location)
+                raise_invalid(f"{match[1]!r} has a value already", location)
             if "rand" in match[2]:
-                refuse("a constant cannot be drawn by chance: put rand into a rule", location)
+                raise_invalid("a constant cannot be drawn by chance: put rand into a rule", location)
             constants[match[1]] = _expressions.parse(match[2], frozenset(constants), location)(constants, never)
         else:
-            refuse(f"{statement[:60]!r} is none of: axiom: …, name = number, symbol -> symbols", location)
+            raise_invalid(f"{statement[:60]!r} is none of: axiom: …, name = number, symbol -> symbols", location)
     if axiom is None:
-        refuse("an axiom is missing: axiom: F A(1)", "rules")
+        raise_invalid("an axiom is missing: axiom: F A(1)", "rules")
     system = System(axiom, {key: tuple(match) for key, match in rules.items()}, constants)
     _check_symbols(system)
     return system
@@ -170,20 +170,20 @@ def _rule(head: str, tail: str, constants: Mapping[str, float], location: str) -
     head, at, chance = head.partition("@")
     match = _RULE.fullmatch(head)
     if match is None:
-        refuse(f"{head.strip()[:60]!r} is no symbol with names, such as A(l, w) : l > 1 @ 2", location)
+        raise_invalid(f"{head.strip()[:60]!r} is no symbol with names, such as A(l, w) : l > 1 @ 2", location)
     names = tuple(part.strip() for part in match[2].split(",")) if match[2] and match[2].strip() else ()
     if not all(_NAME.fullmatch(name) for name in names) or len(set(names)) != len(names) or len(names) > 8:
-        refuse(f"({match[2]}) must be up to 8 different names", location)
+        raise_invalid(f"({match[2]}) must be up to 8 different names", location)
     scope = frozenset({*constants, *names})
     condition_text = match[3] or ""
     if match[3] is not None and not condition_text.strip():
-        refuse("a condition is missing behind :", location)
+        raise_invalid("a condition is missing behind :", location)
     condition = _expressions.parse(condition_text, scope, location) if condition_text.strip() else None
     weight = _expressions.parse(chance, scope, location) if at else None
-    return Rule(match[1], names, condition, weight, _words(tail, scope, location), location)
+    return Rule(match[1], names, condition, weight, _parse_words(tail, scope, location), location)
 
 
-def _words(text: str, names: frozenset[str], location: str) -> tuple[Word, ...]:
+def _parse_words(text: str, names: frozenset[str], location: str) -> tuple[Word, ...]:
     """Symbols with the expressions of their values; brackets must come in pairs."""
     out: list[Word] = []
     at = open_ = 0
@@ -193,22 +193,22 @@ def _words(text: str, names: frozenset[str], location: str) -> tuple[Word, ...]:
         if letter.isspace():
             continue
         if not (_LETTER.fullmatch(letter) or letter in TURTLE):
-            refuse(
+            raise_invalid(
                 f"{letter!r} is no symbol: letters and {' '.join(s for s in TURTLE if not s.isalpha())} are", location
             )
         open_ += (letter == "[") - (letter == "]")
         if open_ < 0:
-            refuse("] without [", location)
+            raise_invalid("] without [", location)
         rest = re.match(r"\s*\(", text[at:])
         values: tuple[Expression, ...] = ()
         if rest is not None:
             inside, at = _inside(text, at + rest.end(), location)
             values = tuple(_expressions.parse(one, names, location) for one in inside)
         out.append((letter, values))
-        if len(out) > MOST_WORDS:
-            refuse(f"there are more than {MOST_WORDS} symbols on one side", location)
+        if len(out) > MAX_WORDS:
+            raise_invalid(f"there are more than {MAX_WORDS} symbols on one side", location)
     if open_:
-        refuse("[ without ]", location)
+        raise_invalid("[ without ]", location)
     return tuple(out)
 
 
@@ -225,7 +225,7 @@ def _inside(text: str, at: int, location: str) -> tuple[list[str], int]:
             start = at + 1
         deep += (sign == "(") - (sign == ")")
         at += 1
-    return refuse(") is missing", location)
+    return raise_invalid(") is missing", location)
 
 
 def _check_symbols(system: System) -> None:
@@ -239,8 +239,8 @@ def _check_symbols(system: System) -> None:
             takes = [str(n) for symbol, n in system.rules if symbol == letter]
             takes += [f"{minimum} to {maximum}" if minimum < maximum else str(minimum)] if letter in TURTLE else []
             if takes:
-                refuse(f"{letter} has {len(values)} values and takes {' or '.join(takes)}", location)
-            refuse(f"no rule says what becomes of {letter}, and the turtle does not know it", location)
+                raise_invalid(f"{letter} has {len(values)} values and takes {' or '.join(takes)}", location)
+            raise_invalid(f"no rule says what becomes of {letter}, and the turtle does not know it", location)
 
 
 # --- rewriting -------------------------------------------------------------------------------------------------------
@@ -249,23 +249,23 @@ def _check_symbols(system: System) -> None:
 def expand(system: System, iterations: int, chance: np.random.Generator, budget: Budget | None = None) -> list[Symbol]:
     """The symbols after so many rounds of rewriting. CannotGenerate where they become too many, and when."""
     budget = budget or Budget()
-    symbols = _made(system.axiom, system.constants, chance)
+    symbols = _produce_symbols(system.axiom, system.constants, chance)
     for k in range(iterations):
         out: list[Symbol] = []
         changed = False
         for symbol in symbols:
             rules = system.rules.get((symbol[0], len(symbol[1])))
-            after = None if rules is None else _rewritten(system, rules, symbol, chance)
+            after = None if rules is None else _rewrite(system, rules, symbol, chance)
             if after is None:
                 out.append(symbol)
             else:
                 changed = True
                 out += after
-            if len(out) > MOST_SYMBOLS:
-                _explodes(f"has more than {MOST_SYMBOLS} symbols after {k} of {iterations} rounds and before the next")
+            if len(out) > MAX_SYMBOLS:
+                _explodes(f"has more than {MAX_SYMBOLS} symbols after {k} of {iterations} rounds and before the next")
         budget.left -= len(symbols)
         if budget.left < 0:
-            _explodes(f"has taken {MOST_WORK} symbols to rewrite after {k + 1} of {iterations} rounds")
+            _explodes(f"has taken {MAX_WORK} symbols to rewrite after {k + 1} of {iterations} rounds")
         symbols = out
         if not changed:
             break
@@ -277,13 +277,11 @@ def _explodes(problem: str) -> None:
     raise CannotGenerate(why, [Problem(f"the L-system {problem}", where="rules")])
 
 
-def _made(words: Iterable[Word], names: Mapping[str, float], chance: np.random.Generator) -> list[Symbol]:
+def _produce_symbols(words: Iterable[Word], names: Mapping[str, float], chance: np.random.Generator) -> list[Symbol]:
     return [(letter, tuple([value(names, chance) for value in values])) for letter, values in words]
 
 
-def _rewritten(
-    system: System, rules: Sequence[Rule], symbol: Symbol, chance: np.random.Generator
-) -> list[Symbol] | None:
+def _rewrite(system: System, rules: Sequence[Rule], symbol: Symbol, chance: np.random.Generator) -> list[Symbol] | None:
     """What becomes of a symbol; None where no rule holds."""
     names = dict(system.constants)
     holding: list[Rule] = []
@@ -309,7 +307,7 @@ def _rewritten(
             if left < 0:
                 break
     variables = {**names, **dict(zip(chosen.names, symbol[1], strict=True))}
-    return _made(chosen.after, variables, chance)
+    return _produce_symbols(chosen.after, variables, chance)
 
 
 # --- drawing ---------------------------------------------------------------------------------------------------------
@@ -350,8 +348,8 @@ def draw(symbols: Iterable[Symbol], *, angle: float, length: float, radius: floa
         if letter in ("F", "f"):
             start = now.at
             now.at = _plus(start, now.h, length if first is None else first)
-            if not max(map(abs, now.at)) <= LARGEST:
-                _beyond(f"reaches more than {LARGEST:g} m from its root")
+            if not max(map(abs, now.at)) <= MAX_PLANT_METRES:
+                _beyond(f"reaches more than {MAX_PLANT_METRES:g} m from its root")
             if letter == "F":
                 end = max(0.0, values[1]) if len(values) > 1 else now.radius
                 out.branches.append((start, now.at, now.radius, end, now.l, now.u))
@@ -368,16 +366,16 @@ def draw(symbols: Iterable[Symbol], *, angle: float, length: float, radius: floa
         elif letter == "[":
             forked = forked or bool(out.branches)
             stack.append(_State(now.at, now.h, now.l, now.u, now.radius))
-            if len(stack) > DEEPEST:
-                _beyond(f"has more than {DEEPEST} brackets within each other")
+            if len(stack) > MAX_DEPTH:
+                _beyond(f"has more than {MAX_DEPTH} brackets within each other")
         elif letter == "]":
             now = stack.pop()
         elif letter == "L":
             out.leaves.append((now.at, now.h, now.l, abs(length if first is None else first)))
         elif letter == "O":
             out.fruit.append((now.at, abs(radius if first is None else first)))
-        if len(out.branches) + len(out.leaves) + len(out.fruit) > MOST_DRAWN:
-            _beyond(f"has more than {MOST_DRAWN} branches, leaves and fruit")
+        if len(out.branches) + len(out.leaves) + len(out.fruit) > MAX_DRAWN:
+            _beyond(f"has more than {MAX_DRAWN} branches, leaves and fruit")
     return out
 
 
@@ -391,7 +389,7 @@ def _plus(a: Vector, b: Vector, times: float) -> Vector:
     return (a[0] + b[0] * times, a[1] + b[1] * times, a[2] + b[2] * times)
 
 
-def _mixed(a: Vector, c: float, b: Vector, s: float) -> Vector:
+def _combine(a: Vector, c: float, b: Vector, s: float) -> Vector:
     return (a[0] * c + b[0] * s, a[1] * c + b[1] * s, a[2] * c + b[2] * s)
 
 
@@ -403,11 +401,11 @@ def _turn(now: _State, sign: str, degrees: float) -> None:
     if sign in "-^\\":
         s = -s
     if sign in "+-|":
-        now.h, now.l = _mixed(now.h, c, now.l, s), _mixed(now.l, c, now.h, -s)
+        now.h, now.l = _combine(now.h, c, now.l, s), _combine(now.l, c, now.h, -s)
     elif sign in "&^":
-        now.h, now.u = _mixed(now.h, c, now.u, -s), _mixed(now.u, c, now.h, s)
+        now.h, now.u = _combine(now.h, c, now.u, -s), _combine(now.u, c, now.h, s)
     else:
-        now.l, now.u = _mixed(now.l, c, now.u, s), _mixed(now.u, c, now.l, -s)
+        now.l, now.u = _combine(now.l, c, now.u, s), _combine(now.u, c, now.l, -s)
 
 
 def _level(now: _State) -> None:

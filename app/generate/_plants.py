@@ -1,8 +1,8 @@
 """Plants for sites: species as L-systems, grown into meshes that simulators show.
 
 A plant is a mesh of wood (branches as tapering prisms) and one of green (leaves), in OBJ, which nothing collides with,
-and a cylinder that robots do collide with: its trunk, or of a bush nearly all of it. Sites call ``grown`` for a few
-plants of a species and place them scaled and turned as often as they like.
+and a cylinder that robots do collide with: its trunk, or of a bush nearly all of it. Sites call ``grow_plants`` for a
+few plants of a species and place them scaled and turned as often as they like.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from app.generate import RandomSource, _lsystem
 Array = NDArray[np.float64]
 
 MAX_VARIANTS = 16
-FINEST = 4
+VERTEX_DECIMALS = 4
 """Decimals of a metre that are kept of a mesh's vertices: it hides the last bits of a machine's sine, and no twig."""
 
-THINNEST = 0.001
+MIN_BRANCH_METRES = 0.001
 """Radius in metres of the thinnest twig that is drawn."""
 
 
@@ -127,7 +127,7 @@ class Plant:
         return out
 
 
-def grown(species: str, count: int, source: RandomSource) -> list[Plant]:
+def grow_plants(species: str, count: int, source: RandomSource) -> list[Plant]:
     """So many different plants of a species of ``SPECIES``; the same for the same source."""
     plant_species = SPECIES[species]
     system = _lsystem.parse(plant_species.rules)
@@ -176,7 +176,7 @@ def grow(
     if species.body == "crown":
         body = (0.7 * spread, 0.9 * height)
     else:
-        body = (max(THINNEST, drawing.branches[0][2], drawing.branches[0][3]), drawing.stem or height)
+        body = (max(MIN_BRANCH_METRES, drawing.branches[0][2], drawing.branches[0][3]), drawing.stem or height)
     body = (max(0.001, round(body[0], 3)), max(0.01, round(body[1], 3)))
     return Plant(name, species.kind, files, body, round(height, 3), round(spread, 3), tuple(meshes))
 
@@ -191,7 +191,7 @@ def _prisms(branches: Sequence[Any]) -> Array:
     if not branches:
         return _NONE
     start, end, left, up = (np.array([b[k] for b in branches], np.float64) for k in (0, 1, 4, 5))
-    radii = np.maximum(np.array([(b[2], b[3]) for b in branches], np.float64), THINNEST)
+    radii = np.maximum(np.array([(b[2], b[3]) for b in branches], np.float64), MIN_BRANCH_METRES)
     thickest = radii.max(axis=1)
     long = ((end - start) ** 2).sum(axis=1) > 1e-12
     out = []
@@ -215,7 +215,7 @@ def _prisms(branches: Sequence[Any]) -> Array:
             fan = np.stack([np.repeat(rim_[:, :1], sides - 2, axis=1), rim_[:, 1:-1], rim_[:, 2:]], axis=2)
             faces.append(fan[:, :, ::-1] if back else fan)
         out.append(np.concatenate(faces, axis=1).reshape(-1, 3, 3))
-    return _rounded(np.concatenate(out)) if out else _NONE
+    return _round_triangles(np.concatenate(out)) if out else _NONE
 
 
 def _blades(leaves: Sequence[Any]) -> Array:
@@ -227,7 +227,7 @@ def _blades(leaves: Sequence[Any]) -> Array:
     middle = at + heading * size * 0.45
     a, b, c, d = at, middle + left * size * 0.25, at + heading * size, middle - left * size * 0.25
     faces = [np.stack(corners, axis=1) for corners in ((a, b, c), (a, c, d), (a, c, b), (a, d, c))]
-    return _rounded(np.stack(faces, axis=1).reshape(-1, 3, 3))
+    return _round_triangles(np.stack(faces, axis=1).reshape(-1, 3, 3))
 
 
 def _balls(fruit: Sequence[Any]) -> Array:
@@ -243,19 +243,19 @@ def _balls(fruit: Sequence[Any]) -> Array:
             for z in (1, -1):
                 corners = [axes[0] * x, axes[1] * y, axes[2] * z]
                 faces.append(corners if x * y * z > 0 else corners[::-1])
-    return _rounded((middle + radius * np.array(faces)[None]).reshape(-1, 3, 3))
+    return _round_triangles((middle + radius * np.array(faces)[None]).reshape(-1, 3, 3))
 
 
-def _rounded(triangles: Array) -> Array:
+def _round_triangles(triangles: Array) -> Array:
     """To a tenth of a millimetre; triangles that have no area then are left out."""
-    out = np.round(triangles, FINEST) + 0.0
+    out = np.round(triangles, VERTEX_DECIMALS) + 0.0
     normal = np.cross(out[:, 1] - out[:, 0], out[:, 2] - out[:, 0])
     return np.asarray(out[(normal != 0).any(axis=1)], np.float64)
 
 
 def obj(triangles: Array, name: str) -> bytes:
     """Triangles float64 [n, 3, 3] as an OBJ file, equal corners once."""
-    fine = np.round(triangles.reshape(-1, 3) * 10**FINEST).astype(np.int64)
+    fine = np.round(triangles.reshape(-1, 3) * 10**VERTEX_DECIMALS).astype(np.int64)
     corners, index = np.unique(fine, axis=0, return_inverse=True)
     index = index.reshape(-1, 3) + 1
     lines: list[str] = [f"o {name}"]
@@ -267,10 +267,10 @@ def obj(triangles: Array, name: str) -> bytes:
 def _decimal(steps: int) -> str:
     """A whole number of the finest steps, in metres and without needless zeros."""
     sign, steps = ("-", -steps) if steps < 0 else ("", steps)
-    integer, rest = divmod(steps, 10**FINEST)
-    return f"{sign}{integer}.{rest:0{FINEST}d}".rstrip("0").rstrip(".")
+    integer, rest = divmod(steps, 10**VERTEX_DECIMALS)
+    return f"{sign}{integer}.{rest:0{VERTEX_DECIMALS}d}".rstrip("0").rstrip(".")
 
 
-def files_of(plants: Iterable[Plant]) -> dict[str, bytes]:
+def mesh_files(plants: Iterable[Plant]) -> dict[str, bytes]:
     """The meshes of all these plants: what ``Resources`` of a site hold."""
     return {path: data for plant in plants for path, data in sorted(plant.files.items())}

@@ -45,16 +45,16 @@ DATUM = Datum(latitude=52.4205, longitude=5.6132)
 
 HEIGHT = 0.2
 RESOLUTIONS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
-EASY = 2**22
+DEFAULT_MAX_CELLS = 2**22
 """Cells of a grid, and pixels of a picture, up to which the finest of these is taken unless asked otherwise."""
 
-WIDEST = 20.0
+MAX_CLEARANCE_METRES = 20.0
 """Metres of free width beyond which an edge is not looked at."""
 
 SLACK = 1.5
 """Cells by which a way and an obstacle may come nearer to each other in a grid than they are."""
 
-MOST_NODES = 20_000
+MAX_NODES = 20_000
 
 COLOURS: Mapping[str, tuple[int, int, int]] = {
     "grass": (120, 146, 84),
@@ -133,7 +133,7 @@ def angle(value: float) -> float:
     return round(math.remainder(float(value), 2 * math.pi), 6) + 0.0
 
 
-def rounded(geometry: Any) -> Any:
+def round_geometry(geometry: Any) -> Any:
     """A geometry in whole millimetres."""
     return shapely.transform(geometry, lambda xy: np.round(xy, 3) + 0.0)
 
@@ -142,7 +142,7 @@ def rectangle(x: float, y: float, yaw: float, length: float, width: float) -> An
     """A polygon around a middle, its length along the yaw."""
     c, s = math.cos(yaw), math.sin(yaw)
     corners = [(u * length / 2, v * width / 2) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return rounded(shapely.Polygon([(x + c * u - s * v, y + s * u + c * v) for u, v in corners]))
+    return round_geometry(shapely.Polygon([(x + c * u - s * v, y + s * u + c * v) for u, v in corners]))
 
 
 _CIRCLE = [(round(math.cos(math.pi * k / 8), 6), round(math.sin(math.pi * k / 8), 6)) for k in range(16)]
@@ -163,7 +163,7 @@ def rgb(colour: str) -> list[float]:
     return [round(v / 255, 3) for v in COLOURS[colour]]
 
 
-def refused(where: str, problem: str) -> CannotGenerate:
+def invalid_option_error(where: str, problem: str) -> CannotGenerate:
     """The error for one parameter."""
     return CannotGenerate(f"{where}: {problem}", [Problem(problem, where=where)])
 
@@ -172,7 +172,7 @@ class Site:
     """A site on its way to layers.
 
     datum: where it lies. fence: the polygon within which it lies (metres), the environment's or the generator's own;
-    is_given tells which, once ``bounded`` was called. coloured: solids that say no colour have their object's.
+    is_given tells which, once ``set_fence`` was called. coloured: solids that say no colour have their object's.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class Site:
 
     # --- the ground --------------------------------------------------------------------------------------------------
 
-    def bounded(self, area: Any, *, room: float = math.inf) -> Any:
+    def set_fence(self, area: Any, *, room: float = math.inf) -> Any:
         """The fence: the environment's where it has one (the largest of several polygons), else ``area``.
 
         area: a polygon in metres. room: metres between a robot on its way and what stands beside it, at the narrowest:
@@ -217,7 +217,7 @@ class Site:
                 self.notes.drop("polygons of the fence", len(pieces) - 1, "the site lies in the largest one")
             self.fence, self.is_given = pieces[0], True
         else:
-            self.fence = shapely.orient_polygons(rounded(area))
+            self.fence = shapely.orient_polygons(round_geometry(area))
         _ = self.resolution
         return self.fence
 
@@ -225,12 +225,12 @@ class Site:
     def resolution(self) -> float:
         """Metres a cell. CannotGenerate where there would be too many cells."""
         box = self.fence.bounds
-        easy = next((r for r in RESOLUTIONS if _cells(box, r) <= EASY), RESOLUTIONS[-1])
+        easy = next((r for r in RESOLUTIONS if _cells(box, r) <= DEFAULT_MAX_CELLS), RESOLUTIONS[-1])
         fine = max((r for r in RESOLUTIONS if SLACK * r <= self._room + 1e-9), default=RESOLUTIONS[0])
         size = self.options.resolution or min(easy, fine)
         if _cells(box, size) * len(self.levels) > MAX_CELLS:
             side = f"{box[2] - box[0]:.0f} × {box[3] - box[1]:.0f} m"
-            raise refused(
+            raise invalid_option_error(
                 "resolution",
                 f"{side} on {len(self.levels)} levels would be more than {MAX_CELLS} cells of {size:g} m: ask for a "
                 "coarser resolution or a smaller site",
@@ -239,11 +239,11 @@ class Site:
 
     def draw(self, shape: Any, colour: str, *, level: str = GROUND) -> None:
         """Paint ground on the picture, over what is there already. shape: polygons or lines."""
-        self._ground.setdefault(level, []).append((_NUMBER[colour], _listed(shape)))
+        self._ground.setdefault(level, []).append((_NUMBER[colour], _coordinates_list(shape)))
 
     # --- what stands there -------------------------------------------------------------------------------------------
 
-    def put(
+    def add_object(
         self,
         i: str,
         kind: str,
@@ -272,10 +272,10 @@ class Site:
         if shapes:
             tint = {"colour": rgb(colour)} if self.coloured and colour is not None else {}
             properties["shapes"] = [{**_plain(shape), **({} if "colour" in shape else tint)} for shape in shapes]
-        self._objects.setdefault((level, family), []).append((i, rounded(geometry), properties))
+        self._objects.setdefault((level, family), []).append((i, round_geometry(geometry), properties))
         if colour is not None:
             shape = geometry if seen is None else seen
-            self._bodies.setdefault(level, []).append((_NUMBER[colour], _listed(shape)))
+            self._bodies.setdefault(level, []).append((_NUMBER[colour], _coordinates_list(shape)))
 
     def box(
         self,
@@ -292,7 +292,7 @@ class Site:
         """A box on the ground: at (x, y) its middle, size (x, y, z), base metres above the level's floor."""
         x, y, z = (mm(v) for v in size)
         shape: dict[str, Any] = {"type": "box", "size": [x, y, z], "pose": [0.0, 0.0, mm(z / 2), 0.0, 0.0, 0.0]}
-        self.put(
+        self.add_object(
             i,
             kind,
             rectangle(at[0], at[1], yaw, x, y),
@@ -320,15 +320,15 @@ class Site:
         point = shapely.Point(at[0], at[1])
         pose = (at[0], at[1], self.elevation(level), 0.0)
         words = {"seen": disc(at[0], at[1], radius), "width": mm(2 * r), "height": h, **words}
-        self.put(i, kind, point, shapes=[shape], pose=pose, level=level, **words)
+        self.add_object(i, kind, point, shapes=[shape], pose=pose, level=level, **words)
 
     def mark(self, i: str, kind: str, geometry: Any, *, level: str = GROUND, **words: Any) -> None:
         """Something without a body: a region, a point of interest."""
-        self.put(i, kind, geometry, level=level, **words)
+        self.add_object(i, kind, geometry, level=level, **words)
 
     def zone(self, i: str, kind: str, polygon: Any, *, level: str = GROUND, **words: Any) -> None:
         """A zone: keepout, speed …"""
-        self._zones.setdefault(level, []).append((i, rounded(polygon), {"kind": kind, **words}))
+        self._zones.setdefault(level, []).append((i, round_geometry(polygon), {"kind": kind, **words}))
 
     def elevation(self, level: str) -> float:
         """Metres of a level's floor."""
@@ -340,13 +340,13 @@ class Site:
         """A node under its name, which is its id."""
         if name in self._nodes or name in self._edges:
             raise ValueError(f"two nodes are called {name}")
-        if len(self._nodes) >= MOST_NODES:
-            raise CannotGenerate(f"the network has more than {MOST_NODES} nodes: make the site smaller")
+        if len(self._nodes) >= MAX_NODES:
+            raise CannotGenerate(f"the network has more than {MAX_NODES} nodes: make the site smaller")
         properties = {"kind": "node", "name": name, "orientation": orientation(yaw), **words}
         self._nodes[name] = (level, (mm(at[0]), mm(at[1])), properties)
         return name
 
-    def way(
+    def add_edges(
         self,
         a: str,
         b: str,
@@ -393,10 +393,10 @@ class Site:
             parts[PartKey("resources", GROUND, NAME)] = Resources(dict(sorted(self.files.items())))
         grids = self._grids(parts)
         parts.update(grids)
-        self._checked_zones()
+        self._check_zones()
         for level, rows in self._zones.items():
             parts[PartKey("zones", level, ZONES)] = features(rows, "local")
-        widths = self._checked(grids)
+        widths = self._check_edges(grids)
         for level in {level for level, _, _ in self._nodes.values()}:
             nodes = [
                 (i, shapely.Point(at), properties)
@@ -417,14 +417,14 @@ class Site:
         """The slice of the objects on each level, of which one connected piece stays free."""
         resolution = self.resolution
         if self.options.resolution is None and resolution != RESOLUTIONS[0]:
-            why = f"{RESOLUTIONS[0]} m would be more than {EASY} cells; a finer one can be asked for"
+            why = f"{RESOLUTIONS[0]} m would be more than {DEFAULT_MAX_CELLS} cells; a finer one can be asked for"
             self.notes.fill("resolution", resolution, why)
         grid_parameters = Parameters(height=self.options.height, resolution=resolution)
         grid_notes = DerivationNotes()
         grid_parts = {k: p for k, p in parts.items() if k.layer != "location"}
         for key, part in parts.items():
             if isinstance(part, Features) and key.layer == "objects":
-                grid_parts[key] = self._near_slice(part, self.elevation(key.level) + self.options.height)
+                grid_parts[key] = self._below_height(part, self.elevation(key.level) + self.options.height)
         grid_parts[PartKey("location", GROUND, SITE)] = features([("fence", self.fence, {"kind": "fence"})], "local")
         try:
             grid_layers = objects_to_occupancy(Layers(grid_parts, self.datum, self.levels), grid_parameters, grid_notes)
@@ -433,7 +433,7 @@ class Site:
         self.notes.warnings += grid_notes.warnings
         out: dict[PartKey, Part] = {}
         for key, grid in grid_layers.grids().items():
-            cells, closed = connected(grid.cells)
+            cells, closed = keep_largest_space(grid.cells)
             if closed:
                 area = round(closed * grid.resolution**2, 2)
                 self.notes.drop(
@@ -445,7 +445,7 @@ class Site:
             )
         return out
 
-    def _near_slice(self, part: Features, z: float) -> Features:
+    def _below_height(self, part: Features, z: float) -> Features:
         """The objects without the solids that do not reach a height: crowns above a slice are most of a forest."""
         solid_reader = solids.Solids(self.files)
         radii: dict[str, float] = {}
@@ -465,7 +465,7 @@ class Site:
         index = np.array(rows, np.intp)
         return Features(tuple(part.ids[k] for k in rows), part.geometry[index], tuple(properties), part.local[index])
 
-    def _checked_zones(self) -> None:
+    def _check_zones(self) -> None:
         """No edge leads through a keep-out zone."""
         for level, rows in self._zones.items():
             shut = [polygon for _, polygon, properties in rows if properties["kind"] == "keepout"]
@@ -476,11 +476,11 @@ class Site:
                 if len(hits):
                     raise RuntimeError(f"the edge {level_edges[int(hits[0])][0]} leads through a keep-out zone")
 
-    def _checked(self, grids: Mapping[PartKey, Part]) -> dict[str, float]:
+    def _check_edges(self, grids: Mapping[PartKey, Part]) -> dict[str, float]:
         """Metres of free width of each edge. RuntimeError where a robot cannot take one, or come to a node."""
         edges = [(a, b) for a, b, _, _ in self._edges.values()]
         for start, directed in ((0, edges), (1, [(b, a) for a, b in edges])):
-            lost = _unreached(list(self._nodes), directed)
+            lost = _unreachable_nodes(list(self._nodes), directed)
             if lost:
                 direction = "to" if start == 0 else "from"
                 raise RuntimeError(f"no way leads {direction} {len(lost)} of the nodes, as {', '.join(lost[:5])}")
@@ -502,8 +502,8 @@ class Site:
     def _picture(self, level: str, ground: str) -> GeoImage:
         """The level from above."""
         box = self.fence.bounds
-        resolution = next((r for r in RESOLUTIONS if _cells(box, r) <= EASY), RESOLUTIONS[-1])
-        frame = RasterFrame.around(box, resolution)
+        resolution = next((r for r in RESOLUTIONS if _cells(box, r) <= DEFAULT_MAX_CELLS), RESOLUTIONS[-1])
+        frame = RasterFrame.from_box(box, resolution)
         index = np.full((frame.height, frame.width), _NUMBER[ground], np.uint8)
         for rows in (self._ground.get(level, []), self._bodies.get(level, [])):
             for number, shapes in _runs(rows):
@@ -517,7 +517,7 @@ class Site:
 # --- the grid ---------------------------------------------------------------------------------------------------------
 
 
-def connected(cells: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
+def keep_largest_space(cells: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
     """Cells of which only the largest piece of free ones (joined by their sides) is free, the others unknown; and how
     many these were."""
     import cv2
@@ -545,7 +545,7 @@ def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArra
     away = cv2.distanceTransform((~blocked).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     frame = RasterFrame((grid.origin[0], grid.origin[1]), grid.resolution, grid.width, grid.height)
     at, owner = shapely.get_coordinates(np.array(lines, object), return_index=True)
-    cells = frame.of(at)
+    cells = frame.to_cells(at)
     good = np.ones(len(lines), bool)
     outside = ((cells < 0) | (cells > [grid.width, grid.height])).any(axis=1)
     good[owner[outside]] = False
@@ -554,7 +554,7 @@ def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArra
     edges = np.concatenate([np.stack([at[:-1], at[1:]], axis=1)[same], np.stack([at, at], axis=1)])
     number = np.concatenate([owner[:-1][same], owner])
     for spans in _raster.lines(edges, frame):
-        index, row, column = _raster.expanded(spans)
+        index, row, column = _raster.expand_spans(spans)
         near = away[row, column] <= radius / grid.resolution + 1e-4
         good[number[index[near]]] = False
     return good
@@ -563,7 +563,7 @@ def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArra
 def clearance(grid: OccupancyGrid, lines: Sequence[Any]) -> Array:
     """Metres of free width along lines: twice the distance to the nearest cell that is not free, at most WIDEST,
     rounded down to centimetres: float64 [n]."""
-    out = np.full(len(lines), WIDEST)
+    out = np.full(len(lines), MAX_CLEARANCE_METRES)
     if not len(lines):
         return out
     blocked = np.pad(grid.cells != FREE, 1, constant_values=True)
@@ -575,10 +575,10 @@ def clearance(grid: OccupancyGrid, lines: Sequence[Any]) -> Array:
     boxes = shapely.box(x + (first - 1) * r, y + (row - 1) * r, x + (end - 1) * r, y + row * r)
     given = np.array(lines, object)
     pairs, distance = shapely.STRtree(boxes).query_nearest(
-        given, max_distance=WIDEST / 2, return_distance=True, all_matches=False
+        given, max_distance=MAX_CLEARANCE_METRES / 2, return_distance=True, all_matches=False
     )
     out[pairs[0]] = np.floor(np.round(2 * distance, 6) * 100) / 100
-    return np.asarray(np.minimum(out, WIDEST), np.float64)
+    return np.asarray(np.minimum(out, MAX_CLEARANCE_METRES), np.float64)
 
 
 def _cells(box: Sequence[float], resolution: float) -> float:
@@ -604,7 +604,7 @@ def _datum(given: Layers, options: SiteOptions, notes: DerivationNotes) -> Datum
     return option_datum or DATUM
 
 
-def _unreached(names: Sequence[str], edges: Iterable[tuple[str, str]]) -> list[str]:
+def _unreachable_nodes(names: Sequence[str], edges: Iterable[tuple[str, str]]) -> list[str]:
     """The nodes to which no way leads from the first one."""
     following: dict[str, list[str]] = {name: [] for name in names}
     for a, b in edges:
@@ -636,7 +636,7 @@ def _reaches(shape: Mapping[str, Any], z: float, solid_reader: solids.Solids, ra
     return bool(abs(z - middle) <= radius + 0.001)
 
 
-def _listed(shape: Any) -> list[Any]:
+def _coordinates_list(shape: Any) -> list[Any]:
     return list(shape) if isinstance(shape, (list, tuple, np.ndarray)) else [shape]
 
 

@@ -24,11 +24,11 @@ class SiteFrame:
     sine: float = 0.0
     cosine: float = 1.0
 
-    def at(self, u: float, v: float) -> tuple[float, float]:
+    def to_local(self, u: float, v: float) -> tuple[float, float]:
         """Local metres of a drawn place."""
         return mm(self.x + self.cosine * u - self.sine * v), mm(self.y + self.sine * u + self.cosine * v)
 
-    def of(self, geometry: Any) -> Any:
+    def geometry_to_local(self, geometry: Any) -> Any:
         """A drawn geometry in local metres."""
         turn = np.array([[self.cosine, self.sine], [-self.sine, self.cosine]])
 
@@ -39,7 +39,7 @@ class SiteFrame:
         return shapely.transform(geometry, moved)
 
 
-def placed(site: Site, width: float, depth: float, margin: float, room: float = math.inf) -> SiteFrame:
+def place_site(site: Site, width: float, depth: float, margin: float, room: float = math.inf) -> SiteFrame:
     """Bound the site to a rectangle of this size and a margin around it, or put it into the fence that is given.
 
     room: metres beside a robot at the narrowest (``Site.bounded``). The drawn rectangle reaches from (0, 0) to (width,
@@ -47,7 +47,7 @@ def placed(site: Site, width: float, depth: float, margin: float, room: float = 
     CannotGenerate where the fence has no room for it.
     """
     outline = shapely.box(-margin, -margin, width + margin, depth + margin)
-    fence = site.bounded(outline, room=room)
+    fence = site.set_fence(outline, room=room)
     if not site.is_given:
         return SiteFrame()
     shapely.prepare(fence)
@@ -57,7 +57,7 @@ def placed(site: Site, width: float, depth: float, margin: float, room: float = 
             x = middle[0] - (c * width - s * depth) / 2
             y = middle[1] - (s * width + c * depth) / 2
             place = SiteFrame(mm(x), mm(y), angle(yaw), s, c)
-            if shapely.contains(fence, place.of(outline)):
+            if shapely.contains(fence, place.geometry_to_local(outline)):
                 return place
     need = f"{width + 2 * margin:.1f} × {depth + 2 * margin:.1f} m"
     problem = f"the fence has no room for the site, which needs {need}: make the site smaller, or the fence wider"

@@ -21,7 +21,7 @@ from shapely.ops import substring
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.generate._blocks import Street
-from app.generate._site import MOST_NODES, Site
+from app.generate._site import MAX_NODES, Site
 
 Point = tuple[float, float]
 
@@ -68,17 +68,17 @@ class Streets:
         """Metres of a street between its sidewalks."""
         return link.width - 2 * self.walk
 
-    def around(self, junction: int) -> list[int]:
+    def links_at(self, junction: int) -> list[int]:
         """The links at a junction; one that begins and ends there twice."""
         return [k for k, link in enumerate(self.links) for end in link.ends if end == junction]
 
 
-def network_of(streets: Sequence[Street], walk: float) -> Streets:
+def build_streets(streets: Sequence[Street], walk: float) -> Streets:
     """Streets cut where they meet. walk: metres, at most a quarter of the narrowest street."""
     lines = [_longer(s.line) for s in streets]
     joined = shapely.line_merge(shapely.union_all(lines, grid_size=0.001))
     parts = [p for p in shapely.get_parts(joined) if p.geom_type == "LineString" and p.length > 0]
-    parts = _trimmed(parts)
+    parts = _trim(parts)
     count = _ends(parts)
     parts = [_shorter(part, count) for part in parts]
     parts.sort(key=lambda p: (p.bounds, p.length))
@@ -87,11 +87,11 @@ def network_of(streets: Sequence[Street], walk: float) -> Streets:
     links = []
     for part in parts:
         nearest = int(tree.nearest(shapely.line_interpolate_point(part, 0.5, normalized=True)))
-        ends = [junctions.setdefault(_at(c), len(junctions)) for c in (part.coords[0], part.coords[-1])]
+        ends = [junctions.setdefault(_as_point(c), len(junctions)) for c in (part.coords[0], part.coords[-1])]
         links.append(Link(part, streets[nearest].width, (ends[0], ends[1])))
-    if NODES * len(links) > MOST_NODES:
+    if NODES * len(links) > MAX_NODES:
         raise CannotGenerate(
-            f"the town has {len(links)} streets between junctions, and its network would have more than {MOST_NODES} "
+            f"the town has {len(links)} streets between junctions, and its network would have more than {MAX_NODES} "
             "nodes: make it smaller, or its blocks larger"
         )
     narrow = min((link.width for link in links), default=4 * walk)
@@ -110,10 +110,12 @@ def _longer(line: Any) -> Any:
     return shapely.LineString(out)
 
 
-def _trimmed(parts: list[Any]) -> list[Any]:
+def _trim(parts: list[Any]) -> list[Any]:
     """Without short pieces that lead nowhere, and joined again where these were."""
     count = _ends(parts)
-    remaining = [p for p in parts if p.length >= DANGLE or min(count[_at(c)] for c in (p.coords[0], p.coords[-1])) > 1]
+    remaining = [
+        p for p in parts if p.length >= DANGLE or min(count[_as_point(c)] for c in (p.coords[0], p.coords[-1])) > 1
+    ]
     if len(remaining) == len(parts):
         return parts
     return [p for p in shapely.get_parts(shapely.line_merge(shapely.multilinestrings(remaining))) if p.length > 0]
@@ -124,17 +126,17 @@ def _ends(parts: Sequence[Any]) -> dict[Point, int]:
     count: dict[Point, int] = {}
     for part in parts:
         for c in (part.coords[0], part.coords[-1]):
-            count[_at(c)] = count.get(_at(c), 0) + 1
+            count[_as_point(c)] = count.get(_as_point(c), 0) + 1
     return count
 
 
 def _shorter(part: Any, count: dict[Point, int]) -> Any:
     """Without what ``_longer`` added at ends that met nothing."""
-    free = [EXTEND if count[_at(c)] == 1 else 0.0 for c in (part.coords[0], part.coords[-1])]
+    free = [EXTEND if count[_as_point(c)] == 1 else 0.0 for c in (part.coords[0], part.coords[-1])]
     return substring(part, free[0], part.length - free[1]) if any(free) else part
 
 
-def _at(c: Iterable[float]) -> Point:
+def _as_point(c: Iterable[float]) -> Point:
     x, y = c
     return round(float(x), 3) + 0.0, round(float(y), 3) + 0.0
 
@@ -168,18 +170,21 @@ def lanes(site: Site, streets: Streets, speed: float, keep: float) -> list[list[
             yaws = [math.atan2(*(b - a)[::-1]) for a, b in ((at[0], at[1]), (at[-2], at[-1]))]
             first = site.node(f"street_{k + 1}{name}_in", at[0], yaw=yaws[0])
             last = site.node(f"street_{k + 1}{name}_out", at[-1], yaw=yaws[1])
-            site.way(first, last, both=False, speed=speed, bends=at[1:-1].tolist(), surface="asphalt")
-            ends |= {first: (_at(at[0]), _at(at[1] - at[0])), last: (_at(at[-1]), _at(at[-1] - at[-2]))}
+            site.add_edges(first, last, both=False, speed=speed, bends=at[1:-1].tolist(), surface="asphalt")
+            ends |= {
+                first: (_as_point(at[0]), _as_point(at[1] - at[0])),
+                last: (_as_point(at[-1]), _as_point(at[-1] - at[-2])),
+            }
             leaving.setdefault(start, []).append((first, k))
             arriving.setdefault(end, []).append((last, k))
             out[-1].append((first, lane))
     for junction, coming in sorted(arriving.items()):
-        alone = len(streets.around(junction)) < 3
+        alone = len(streets.links_at(junction)) < 3
         for last, k in coming:
             for first, j in leaving.get(junction, []):
                 if alone or j != k:
                     bends = _turn(ends[last], ends[first], streets.junctions[junction], roadway)
-                    site.way(last, first, both=False, speed=speed / 2, bends=bends, surface="asphalt")
+                    site.add_edges(last, first, both=False, speed=speed / 2, bends=bends, surface="asphalt")
     return out
 
 
@@ -194,7 +199,7 @@ def _turn(last: tuple[Point, Point], first: tuple[Point, Point], middle: Point, 
     turn = ux * vy - uy * vx
     if abs(turn) > 0.1 * math.sqrt((ux * ux + uy * uy) * (vx * vx + vy * vy)):
         t = ((bx - ax) * vy - (by - ay) * vx) / turn
-        tried.append([_at((ax + t * ux, ay + t * uy))])
+        tried.append([_as_point((ax + t * ux, ay + t * uy))])
     for bends in tried:
         if shapely.contains(roadway, shapely.LineString([last[0], *bends, first[0]])):
             return bends
@@ -220,7 +225,7 @@ def _lane(streets: Streets, line: Any, start: int, end: int, off: float) -> Any:
 
 def _before(streets: Streets, junction: int) -> float:
     """Metres before a junction's middle at which its streets' crossings lie."""
-    widths = [streets.carriage(streets.links[k]) for k in streets.around(junction)]
+    widths = [streets.carriage(streets.links[k]) for k in streets.links_at(junction)]
     return max(widths) / 2 + streets.walk + 0.5 if len(widths) > 1 else 1.0
 
 
@@ -239,7 +244,7 @@ def sidewalks(
     rings = [shapely.transform(r, lambda xy: np.round(xy, 3) + 0.0) for r in rings]
     streets.loops = [Loop(ring) for ring in rings]
     crossings = _crossings(streets)
-    joined = _joined(len(streets.loops), [(a, b) for a, _, b, _ in crossings])
+    joined = _select_crossings(len(streets.loops), [(a, b) for a, _, b, _ in crossings])
     left = [k for k in range(len(streets.loops)) if k not in joined]
     notes.drop("sidewalks", len(left), "no crossing leads to them")
     crossings = [c for c in crossings if c[0] in joined and c[2] in joined]
@@ -252,12 +257,12 @@ def sidewalks(
         if ends[0] != ends[1]:
             footways.append(ends)
     for k in sorted(joined):
-        _around(site, streets.loops[k], speed)
+        _add_sidewalk(site, streets.loops[k], speed)
     done: set[frozenset[str]] = set()
     for one, other in footways:
         if frozenset((one, other)) not in done:
             done.add(frozenset((one, other)))
-            site.way(one, other, action="cross", speed=speed / 2, surface="asphalt")
+            site.add_edges(one, other, action="cross", speed=speed / 2, surface="asphalt")
 
 
 def _crossings(streets: Streets) -> list[tuple[int, Point, int, Point]]:
@@ -268,16 +273,16 @@ def _crossings(streets: Streets) -> list[tuple[int, Point, int, Point]]:
     out = []
     for link in streets.links:
         long = link.line.length
-        cuts = [_before(streets, end) if len(streets.around(end)) > 1 else math.inf for end in link.ends]
+        cuts = [_before(streets, end) if len(streets.links_at(end)) > 1 else math.inf for end in link.ends]
         places = sorted({cuts[0], long - cuts[1]}) if max(cuts) < math.inf and long > sum(cuts) + 8.0 else [long / 2]
         for place in places:
-            crossing = _across(streets, link, place, tree)
+            crossing = _add_crossing(streets, link, place, tree)
             if crossing is not None:
                 out.append(crossing)
     return out
 
 
-def _across(streets: Streets, link: Link, place: float, tree: Any) -> tuple[int, Point, int, Point] | None:
+def _add_crossing(streets: Streets, link: Link, place: float, tree: Any) -> tuple[int, Point, int, Point] | None:
     """A crossing at so many metres along a link; None where one side has no sidewalk there."""
     ahead: Any = shapely.line_interpolate_point(link.line, place + 0.25)
     behind: Any = shapely.line_interpolate_point(link.line, place - 0.25)
@@ -296,7 +301,7 @@ def _across(streets: Streets, link: Link, place: float, tree: Any) -> tuple[int,
             for x, y in shapely.get_coordinates(shapely.intersection(ray, streets.loops[k].ring)):
                 off = abs(math.sqrt((x - middle.x) ** 2 + (y - middle.y) ** 2) - want)
                 if off <= TOLERANCE and (best is None or off < best[0]):
-                    best = (off, k, _at((x, y)))
+                    best = (off, k, _as_point((x, y)))
         if best is None:
             return None
         sides.append(best[1:])
@@ -304,7 +309,7 @@ def _across(streets: Streets, link: Link, place: float, tree: Any) -> tuple[int,
     return (a, p, b, q)
 
 
-def _joined(count: int, pairs: Sequence[tuple[int, int]]) -> set[int]:
+def _select_crossings(count: int, pairs: Sequence[tuple[int, int]]) -> set[int]:
     """The largest set of sidewalks that crossings join."""
     root = list(range(count))
 
@@ -330,7 +335,7 @@ def _corners(loop: Loop, number: int) -> None:
         a, b = corner - at[k - 1], at[(k + 1) % len(at)] - corner
         turn = abs(math.atan2(float(a[0] * b[1] - a[1] * b[0]), float(a @ b)))
         if turn > CORNER:
-            _stop(loop, _at(corner), f"corner_{number + 1}_{k + 1}")
+            _stop(loop, _as_point(corner), f"corner_{number + 1}_{k + 1}")
 
 
 def _stop(loop: Loop, at: Point, name: str) -> str:
@@ -342,7 +347,7 @@ def _stop(loop: Loop, at: Point, name: str) -> str:
     return name
 
 
-def _around(site: Site, loop: Loop, speed: float) -> None:
+def _add_sidewalk(site: Site, loop: Loop, speed: float) -> None:
     """A sidewalk's nodes and the ways between them."""
     stops = sorted(loop.stops)
     for _, name, at in stops:
@@ -357,7 +362,7 @@ def _around(site: Site, loop: Loop, speed: float) -> None:
         length = (end - start) % total
         bends = sorted(((float(s) - start) % total, k) for k, s in enumerate(along[:-1]))
         between = [at[k].tolist() for s, k in bends if 0.3 < s < length - 0.3]
-        site.way(a, b, speed=speed, bends=between, surface="paving_stones")
+        site.add_edges(a, b, speed=speed, bends=between, surface="paving_stones")
 
 
 # --- a stop -----------------------------------------------------------------------------------------------------------
@@ -379,4 +384,4 @@ def stop(site: Site, streets: Streets, roads: Sequence[Sequence[tuple[str, Any]]
         candidate = (round(float(shapely.distance(start, shapely.Point(walks[k][1]))), 3), walks[k][0], name)
         best = candidate if best is None or candidate < best else best
     assert best is not None
-    site.way(best[1], best[2], action="cross", speed=0.5, surface="asphalt")
+    site.add_edges(best[1], best[2], action="cross", speed=0.5, surface="asphalt")

@@ -16,11 +16,11 @@ from app.generate._site import Site, disc, mm, rgb
 CROWN = "models/crown/meshes/crown.stl"
 CROWNS = ("crown", "crown_light", "crown", "crown_dark")
 
-MOST_TREES = 40_000
+MAX_TREES = 40_000
 """A trunk and a crown have 144 triangles; ten millions are what a derivation looks at."""
 
-MOST_PLANTS = 50_000
-MOST_IN_ROW = 9_000
+MAX_PLANTS = 50_000
+MAX_PER_ROW = 9_000
 """Solids of one object, of which ``app.model.solids`` takes 10 000."""
 
 
@@ -71,7 +71,7 @@ def tree(
             "pose": [0.0, 0.0, middle, 0.0, 0.0, 0.0],
         },
     ]
-    site.put(
+    site.add_object(
         i,
         "tree",
         shapely.Point(at),
@@ -84,7 +84,7 @@ def tree(
     )
 
 
-def jittered(stream: np.random.Generator, count: int, max_offset: float) -> Any:
+def jitter(stream: np.random.Generator, count: int, max_offset: float) -> Any:
     """Offsets float64 [n, 2] along and across, at most so many metres, evenly spread."""
     return np.round((2.0 * stream.random((count, 2)) - 1.0) * max_offset, 3)
 
@@ -95,7 +95,7 @@ def places(out: Field, stream: np.random.Generator, kind: str, step: float, max_
     for row in out.rows:
         if row.kind == kind:
             along = np.array(between(row, step))
-            offset = jittered(stream, len(along), max_offset)
+            offset = jitter(stream, len(along), max_offset)
             u = np.clip(along + offset[:, 0], row.low, row.high)
             rows.append([(mm(a), mm(row.v + b)) for a, b in zip(u, offset[:, 1], strict=True)])
     return rows

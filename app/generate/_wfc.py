@@ -30,25 +30,25 @@ DONE, IMPOSSIBLE, TIRED = 0, 1, 2
 
 Symmetry = Literal["none", "mirror", "rotate", "all"]
 
-MOST_PATTERNS = 4096
-MOST_TILES = 4096
-MOST_WEIGHT = 2**16
+MAX_PATTERNS = 4096
+MAX_TILES = 4096
+MAX_WEIGHT = 2**16
 """What all patterns weigh together, about: entropies are read from a table of this length."""
 
-WORK = 3_000_000_000
+MAX_WORK = 3_000_000_000
 """Words of 64 patterns that are looked at before an attempt is given up: some minutes."""
 
-MOST_PLACES = 2**22
+MAX_PLACES = 2**22
 """Tiles of a result."""
 
 BALANCE = 300
 """Places that smooth what has been placed so far, when patterns are weighed by it."""
 
 ATTEMPTS = 4
-ROUNDS = 12
+MAX_ROUNDS = 12
 """Of joining free space."""
 
-REACH = 32
+SEARCH_RADIUS_TILES = 32
 """Tiles around a piece apart in which a way to the rest is looked for first."""
 
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0))
@@ -86,7 +86,7 @@ class Model:
         return (len(self.patterns) + 63) // 64
 
 
-def turned(cells: NDArray[Any], symmetry: Symmetry) -> list[NDArray[Any]]:
+def symmetries(cells: NDArray[Any], symmetry: Symmetry) -> list[NDArray[Any]]:
     """A sample as it is, mirrored left to right, turned by quarters, or all eight."""
     if symmetry == "none":
         return [cells]
@@ -116,11 +116,11 @@ def learn(
             "cells, or is no whole number of them: give a larger sample, or a smaller tile or pattern"
         )
     sure = np.ones(cells.shape, bool) if valid is None else valid
-    blocks = [_blocks(one, tile) for one in turned(cells, symmetry)]
-    teach = [_blocks(one, tile).min(axis=(2, 3)) for one in turned(sure, symmetry)]
+    blocks = [_blocks(one, tile) for one in symmetries(cells, symmetry)]
+    teach = [_blocks(one, tile).min(axis=(2, 3)) for one in symmetries(sure, symmetry)]
     tiles, index = _distinct(np.concatenate([b.reshape(-1, tile * tile) for b in blocks]))
-    if len(tiles) > MOST_TILES:
-        raise CannotGenerate(f"the sample has {len(tiles)} different tiles, the limit is {MOST_TILES}: ask for smaller")
+    if len(tiles) > MAX_TILES:
+        raise CannotGenerate(f"the sample has {len(tiles)} different tiles, the limit is {MAX_TILES}: ask for smaller")
     maps, at = [], 0
     for b in blocks:
         rows, columns = b.shape[:2]
@@ -128,16 +128,16 @@ def learn(
         at += rows * columns
     windows = []
     for one, good in zip(maps, teach, strict=True):
-        taught = _windows(_wrapped(good, pattern, wrap), pattern).all(axis=(2, 3))
-        windows.append(_windows(_wrapped(one, pattern, wrap), pattern)[taught].reshape(-1, pattern * pattern))
+        taught = _windows(_wrap(good, pattern, wrap), pattern).all(axis=(2, 3))
+        windows.append(_windows(_wrap(one, pattern, wrap), pattern)[taught].reshape(-1, pattern * pattern))
     if not sum(len(f) for f in windows):
         raise CannotGenerate(
             f"no window of {pattern} × {pattern} tiles of the sample is known all over: give a smaller pattern"
         )
     patterns, pattern_index = _distinct(np.concatenate(windows))
-    if len(patterns) > MOST_PATTERNS:
+    if len(patterns) > MAX_PATTERNS:
         raise CannotGenerate(
-            f"the sample has {len(patterns)} different patterns, the limit is {MOST_PATTERNS}: give a smaller pattern, "
+            f"the sample has {len(patterns)} different patterns, the limit is {MAX_PATTERNS}: give a smaller pattern, "
             "fewer symmetries, or a plainer sample"
         )
     counts = np.bincount(pattern_index, minlength=len(patterns))
@@ -146,16 +146,16 @@ def learn(
         pairs = [_pairs(m, t, wrap) for m, t in zip(maps, teach, strict=True)]
         place = np.full(len(tiles), -1, np.int64)
         place[patterns[:, 0]] = np.arange(len(patterns))
-        allowed = _seen(len(patterns), [[place[side] for side in pair] for pair in pairs])
+        allowed = _observed_pairs(len(patterns), [[place[side] for side in pair] for pair in pairs])
     else:
         allowed = agreeing(stack)
-    return Model(tiles.reshape(-1, tile, tile).astype(np.uint8), stack, scaled(counts), allowed)
+    return Model(tiles.reshape(-1, tile, tile).astype(np.uint8), stack, scale_weights(counts), allowed)
 
 
-def scaled(counts: I64) -> I64:
+def scale_weights(counts: I64) -> I64:
     """Weights of at least 1 that are about MOST_WEIGHT together."""
     total = max(int(counts.sum()), 1)
-    return np.maximum(counts * (MOST_WEIGHT - len(counts)) // total, 1).astype(np.int64)
+    return np.maximum(counts * (MAX_WEIGHT - len(counts)) // total, 1).astype(np.int64)
 
 
 def agreeing(patterns: I64) -> U64:
@@ -167,11 +167,11 @@ def agreeing(patterns: I64) -> U64:
         other = patterns[:, max(-dy, 0) : n + min(-dy, 0), max(-dx, 0) : n + min(-dx, 0)].reshape(len(patterns), -1)
         _, key = _distinct(np.concatenate([part, other]))
         a, b = key[: len(patterns)], key[len(patterns) :]
-        out.append(packed(a[:, None] == b[None, :]))
+        out.append(pack_bits(a[:, None] == b[None, :]))
     return np.stack(out)
 
 
-def packed(mask: Bool) -> U64:
+def pack_bits(mask: Bool) -> U64:
     """bool [n, P] as uint64 [n, words], bit p of a row for pattern p."""
     words = (mask.shape[1] + 63) // 64
     bits = np.zeros((len(mask), words * 8), np.uint8)
@@ -180,13 +180,13 @@ def packed(mask: Bool) -> U64:
     return np.ascontiguousarray(bits.view("<u8").astype(np.uint64))
 
 
-def _seen(count: int, pairs: list[list[I64]]) -> U64:
+def _observed_pairs(count: int, pairs: list[list[I64]]) -> U64:
     """allowed of tiles: what stands right of and above each in the sample, and the other way round."""
     right, above = np.zeros((count, count), bool), np.zeros((count, count), bool)
     for left_, right_, low, high in pairs:
         right[left_, right_] = True
         above[low, high] = True
-    return np.stack([packed(right), packed(right.T), packed(above), packed(above.T)])
+    return np.stack([pack_bits(right), pack_bits(right.T), pack_bits(above), pack_bits(above.T)])
 
 
 def _pairs(tiles: NDArray[Any], teach: Bool, wrap: bool) -> list[I64]:
@@ -212,7 +212,7 @@ def _blocks(cells: NDArray[Any], tile: int) -> NDArray[Any]:
     return np.ascontiguousarray(cells.reshape(height // tile, tile, width // tile, tile).transpose(0, 2, 1, 3))
 
 
-def _wrapped(tiles: NDArray[Any], pattern: int, wrap: bool) -> NDArray[Any]:
+def _wrap(tiles: NDArray[Any], pattern: int, wrap: bool) -> NDArray[Any]:
     return np.pad(tiles, (0, pattern - 1), mode="wrap") if wrap and pattern > 1 else tiles
 
 
@@ -240,7 +240,9 @@ class Lattice:
     periodic: bool
 
     @classmethod
-    def of(cls, shape: tuple[int, int], pattern: int, *, periodic: bool = False, target: Bool | None = None) -> Lattice:
+    def from_shape(
+        cls, shape: tuple[int, int], pattern: int, *, periodic: bool = False, target: Bool | None = None
+    ) -> Lattice:
         """All windows of so many tiles; wanted: bool [rows, columns] of tiles, only windows that cover one of these."""
         height, width = shape
         if not periodic:
@@ -269,7 +271,7 @@ class Lattice:
         wall: a tile that stands only where it is fixed."""
         n = patterns.shape[1]
         words = (len(patterns) + 63) // 64
-        out = np.broadcast_to(packed(np.ones((1, len(patterns)), bool)), (len(self.rows), words)).copy()
+        out = np.broadcast_to(pack_bits(np.ones((1, len(patterns)), bool)), (len(self.rows), words)).copy()
         by_tile: dict[tuple[int, int, int], U64] = {}
         for dy in range(n):
             for dx in range(n):
@@ -278,10 +280,10 @@ class Lattice:
                     y, x = y % self.shape[0], x % self.shape[1]
                 fixed_tile = fixed[y, x]
                 if wall >= 0:
-                    out[fixed_tile != wall] &= packed((patterns[:, dy, dx] != wall)[None])
+                    out[fixed_tile != wall] &= pack_bits((patterns[:, dy, dx] != wall)[None])
                 for tile in np.unique(fixed_tile[fixed_tile != -1]).tolist():
                     if (dy, dx, tile) not in by_tile:
-                        by_tile[dy, dx, tile] = packed((patterns[:, dy, dx] == tile)[None])
+                        by_tile[dy, dx, tile] = pack_bits((patterns[:, dy, dx] == tile)[None])
                     out[fixed_tile == tile] &= by_tile[dy, dx, tile]
         return out
 
@@ -355,7 +357,7 @@ class Wave:
 
         fresh = start is None
         settings = np.array(
-            [self.balance, self.repairs, self.model.size + 1, WORK, int(fresh), int(self.scan)], np.int64
+            [self.balance, self.repairs, self.model.size + 1, MAX_WORK, int(fresh), int(self.scan)], np.int64
         )
         return kernels.collapse(
             self.domain,
@@ -389,7 +391,7 @@ class Wave:
         return out
 
 
-def collapsed(
+def collapse_model(
     model: Model,
     shape: tuple[int, int],
     fixed: I64,
@@ -408,11 +410,11 @@ def collapsed(
     entropy is least. joined: all free cells are to be one piece, by their sides. CannotGenerate where that cannot be
     had.
     """
-    if shape[0] * shape[1] > MOST_PLACES:
+    if shape[0] * shape[1] > MAX_PLACES:
         raise CannotGenerate(
-            f"{shape[1]} × {shape[0]} tiles are more than {MOST_PLACES}: make it smaller, or give larger tiles"
+            f"{shape[1]} × {shape[0]} tiles are more than {MAX_PLACES}: make it smaller, or give larger tiles"
         )
-    lattice = Lattice.of(shape, model.size, periodic=periodic)
+    lattice = Lattice.from_shape(shape, model.size, periodic=periodic)
     initial = lattice.fitting(model.patterns, fixed, wall)
     free = fixed[(lattice.rows + model.size - 1) % shape[0], (lattice.columns + model.size - 1) % shape[1]] == -1
     why = ""
@@ -453,11 +455,11 @@ def _join(wave: Wave) -> bool:
     import cv2
 
     tile = wave.model.tile
-    for turn in range(ROUNDS):
-        free = rendered(wave.model, wave.tiles()) == FREE
+    for turn in range(MAX_ROUNDS):
+        free = render(wave.model, wave.tiles()) == FREE
         count, label = cv2.connectedComponents(free.astype(np.uint8), connectivity=4)
         if wave.lattice.periodic:
-            label = _across(np.asarray(label))
+            label = _join_borders(np.asarray(label))
         sizes = np.bincount(label.ravel(), minlength=count)
         sizes[0] = 0
         main = int(np.argmax(sizes))
@@ -472,7 +474,7 @@ def _join(wave: Wave) -> bool:
     return False
 
 
-def _across(label: NDArray[np.int32]) -> NDArray[np.int32]:
+def _join_borders(label: NDArray[np.int32]) -> NDArray[np.int32]:
     """Labels of which those that touch across the borders of a periodic lattice are one."""
     out = label.copy()
     for a, b in ((0, -1), (-1, 0)):
@@ -494,8 +496,8 @@ def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
         cells = rows, columns
         matching = (model.tiles != FREE).all(axis=(1, 2))
     else:
-        low_y, high_y = max(int(rows.min()) - REACH, 0), int(rows.max()) + REACH + 1
-        low_x, high_x = max(int(columns.min()) - REACH, 0), int(columns.max()) + REACH + 1
+        low_y, high_y = max(int(rows.min()) - SEARCH_RADIUS_TILES, 0), int(rows.max()) + SEARCH_RADIUS_TILES + 1
+        low_x, high_x = max(int(columns.min()) - SEARCH_RADIUS_TILES, 0), int(columns.max()) + SEARCH_RADIUS_TILES + 1
         part = main[low_y:high_y, low_x:high_x]
         if not part.any():
             low_y = low_x = 0
@@ -510,7 +512,7 @@ def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
         matching = (model.tiles == FREE).all(axis=(1, 2))
     touched: dict[int, U64] = {}
     masks = {
-        (dy, dx): packed(matching[model.patterns[:, dy, dx]][None])[0]
+        (dy, dx): pack_bits(matching[model.patterns[:, dy, dx]][None])[0]
         for dy in range(model.size)
         for dx in range(model.size)
     }
@@ -544,7 +546,7 @@ def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
         wave.domain[:], wave.initial[:] = before
 
 
-def rendered(model: Model, tiles: I64) -> U8:
+def render(model: Model, tiles: I64) -> U8:
     """Tiles (all of them known) as cells."""
     blocks = model.tiles[tiles]
     rows, columns = tiles.shape

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.generate import MAX_OBJECTS, RandomSource, _automata, _cells, generates
-from app.generate._cells import LOOKS, CellStyle, GridFrame
-from app.generate._site import Site, SiteOptions, angle, disc, mm, refused
+from app.generate._cells import STYLES, CellStyle, GridFrame
+from app.generate._site import Site, SiteOptions, angle, disc, invalid_option_error, mm
 from app.model.frame import GROUND
 from app.model.layers import Layers
 from app.parameters import parameter
@@ -90,13 +90,13 @@ class ForestOptions(SiteOptions):
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=CaveOptions, also={"location"})
 def cave(given: Layers, options: CaveOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A cave: halls and passages in rock, grown by a cellular automaton."""
-    return _grown(given, options, source, notes, LOOKS["rock"], LOOKS["rock"], ground="gravel")
+    return _grow_site(given, options, source, notes, STYLES["rock"], STYLES["rock"], ground="gravel")
 
 
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=HallOptions, also={"location"})
 def cluttered_hall(given: Layers, options: HallOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A hall full of clutter that a cellular automaton heaped up."""
-    return _grown(given, options, source, notes, CLUTTER, LOOKS["wall"], ground="floor")
+    return _grow_site(given, options, source, notes, CLUTTER, STYLES["wall"], ground="floor")
 
 
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=ForestOptions, also={"location"})
@@ -105,23 +105,27 @@ def forest(given: Layers, options: ForestOptions, source: RandomSource, notes: D
     for name in ("trunk", "tree_height"):
         low, high = getattr(options, name)
         if low > high:
-            raise refused(name, "the smaller one comes first")
+            raise invalid_option_error(name, "the smaller one comes first")
     reach = options.spacing * (0.5 - options.jitter)
     if reach < options.trunk[1]:
-        raise refused("jitter", f"trunks of {options.trunk[1]:g} m would touch: give less jitter or a larger spacing")
+        raise invalid_option_error(
+            "jitter", f"trunks of {options.trunk[1]:g} m would touch: give less jitter or a larger spacing"
+        )
     site = Site(given, options, notes)
-    box = site.bounded(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
+    box = site.set_fence(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
     columns, rows = (max(1, int((b - a) / options.spacing)) for a, b in ((box[0], box[2]), (box[1], box[3])))
     if rows * columns > MAX_OBJECTS:
-        raise refused("spacing", f"{columns} × {rows} cells are more than {MAX_OBJECTS}: give a larger spacing")
+        raise invalid_option_error(
+            "spacing", f"{columns} × {rows} cells are more than {MAX_OBJECTS}: give a larger spacing"
+        )
     born, stays = _rule(options.rule)
     alive = source.stream("cells").random((rows, columns)) < options.density
-    alive = _automata.grown(alive, born, stays, options.iterations, outside=False)
+    alive = _automata.run_automaton(alive, born, stays, options.iterations, outside=False)
     _trees(site, alive, box, options, source)
-    return _cells.finished(site, options, notes, ground="meadow")
+    return _cells.finish_site(site, options, notes, ground="meadow")
 
 
-def _grown(
+def _grow_site(
     given: Layers,
     options: CaveOptions,
     source: RandomSource,
@@ -135,28 +139,32 @@ def _grown(
     resolution = options.resolution or _fine(options)
     step = round(options.cell / resolution)
     if step < 1 or abs(step * resolution - options.cell) > 1e-6:
-        raise refused("cell", f"must be a whole number of cells of {resolution:g} m, got {options.cell:g} m")
+        raise invalid_option_error(
+            "cell", f"must be a whole number of cells of {resolution:g} m, got {options.cell:g} m"
+        )
     born, stays = _rule(options.rule)
     site = Site(given, options, notes)
-    place = _cells.placed(site, options.width, options.depth, resolution, step=step)
+    place = _cells.site_grid_frame(site, options.width, options.depth, resolution, step=step)
     coarse = GridFrame(place.x, place.y, options.cell, place.columns // step, place.rows // step)
     if min(coarse.rows, coarse.columns) < 5:
-        raise refused("cell", f"{coarse.columns} × {coarse.rows} cells are too few: at least 5 × 5 are needed")
-    if coarse.rows * coarse.columns * max(options.iterations, 1) > MOST_STEPS:
-        raise refused(
+        raise invalid_option_error(
+            "cell", f"{coarse.columns} × {coarse.rows} cells are too few: at least 5 × 5 are needed"
+        )
+    if coarse.rows * coarse.columns * max(options.iterations, 1) > MAX_STEPS:
+        raise invalid_option_error(
             "iterations",
-            f"{coarse.rows * coarse.columns} cells times {options.iterations} are more than {MOST_STEPS}: give fewer, "
+            f"{coarse.rows * coarse.columns} cells times {options.iterations} are more than {MAX_STEPS}: give fewer, "
             "or larger cells",
         )
     occupied = source.stream("cells").random((coarse.rows, coarse.columns)) < options.density
-    occupied = _automata.grown(occupied, born, stays, options.iterations, outside=True)
+    occupied = _automata.run_automaton(occupied, born, stays, options.iterations, outside=True)
     rim = np.zeros(occupied.shape, bool)
     rim[[0, -1]] = rim[:, [0, -1]] = True
     if site.is_given:
         rim |= ~_within(site.fence, coarse)
     occupied |= rim
     passage = 3 * options.robot_radius if options.passage is None else options.passage
-    joined, closed, passages = _automata.joined(
+    joined, closed, passages = _automata.join_free_space(
         occupied,
         rim,
         options.robot_radius / options.cell,
@@ -169,14 +177,14 @@ def _grown(
     if passages:
         notes.fill("passages", passages, "joined places of free space that the rule left apart")
     if border is look:
-        _cells.stand(site, coarse, joined, look)
+        _cells.add_objects(site, coarse, joined, look)
     else:
-        _cells.stand(site, coarse, joined & rim, border)
-        _cells.stand(site, coarse, joined & ~rim, look)
-    return _cells.finished(site, options, notes, ground=ground)
+        _cells.add_objects(site, coarse, joined & rim, border)
+        _cells.add_objects(site, coarse, joined & ~rim, look)
+    return _cells.finish_site(site, options, notes, ground=ground)
 
 
-MOST_STEPS = 2**32
+MAX_STEPS = 2**32
 """Cells times iterations."""
 
 
@@ -191,7 +199,7 @@ def _rule(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """(neighbours with which a cell comes alive, with which it stays so)."""
     match = RULE.fullmatch(text.strip().upper())
     if match is None:
-        raise refused(
+        raise invalid_option_error(
             "rule", f"must be B and S with numbers of neighbours from 0 to 8, as B5678/S45678, got {text[:40]!r}"
         )
     born, stays = (tuple(sorted({int(c) for c in digits})) for digits in match.groups())
@@ -236,7 +244,7 @@ def _trees(site: Site, alive: Bool, box: tuple[float, ...], options: ForestOptio
             "pose": [0.0, 0.0, mm(0.725 * height), 0.0, 0.0, 0.0],
             "visual": True,
         }
-        site.put(
+        site.add_object(
             f"tree/{count}",
             "tree",
             shapely.Point(x, y),

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._select_grids import called, chosen, grey_warning
+from app.derive._select_grids import grey_warning, grid_label, select_grids
 from app.errors import CannotGenerate
 from app.generate import MAX_CELLS, RandomSource, _evidence, _wfc, generates
-from app.generate._site import refused
+from app.generate._site import invalid_option_error
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey
 from app.model.layers import Layers, Part, PartKey
 from app.parameters import parameter
@@ -25,7 +25,7 @@ from app.parameters import parameter
 U8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
-MOST = 2**20
+MAX_FILLED_CELLS = 2**20
 """Cells that are filled in at once."""
 
 REPAIRS = 100_000
@@ -68,20 +68,20 @@ def complete_grid(given: Layers, options: Options, source: RandomSource, notes: 
     """
     parts: dict[PartKey, Part] = {}
     why = ""
-    for key, grid in chosen(given, options.grid, "obstacles").items():
+    for key, grid in select_grids(given, options.grid, "obstacles").items():
         if not (grid.cells == UNKNOWN).any():
-            why = f"{called(key)} has no unknown cell"
+            why = f"{grid_label(key)} has no unknown cell"
             continue
-        parts[key] = _completed(grid, options, source, notes, key)
+        parts[key] = _complete_grid(grid, options, source, notes, key)
     if not parts:
         raise CannotGenerate(f"{why}: there is nothing to fill in")
     return Layers(parts, given.datum, given.levels)
 
 
-def _completed(
+def _complete_grid(
     grid: OccupancyGrid, options: Options, source: RandomSource, notes: DerivationNotes, key: PartKey
 ) -> OccupancyGrid:
-    name = called(key)
+    name = grid_label(key)
     if grid.cells.size > MAX_CELLS:
         raise CannotGenerate(f"{name} has {grid.cells.size} cells, the limit is {MAX_CELLS}")
     known_cells = grid.cells != UNKNOWN
@@ -89,14 +89,16 @@ def _completed(
     if grey is not None:
         known_cells &= ~grey
         notes.warn(grey_warning(grid, grey, name, "nothing is learned from them, and they stay as they are"))
-    target = _wanted(known_cells, options.reach / grid.resolution)
+    target = _cells_to_fill(known_cells, options.reach / grid.resolution)
     if grey is not None:
         target &= ~grey
     count = int(np.count_nonzero(target))
-    if count > MOST:
-        raise refused("reach", f"{name}: {count} cells would be filled in, the limit is {MOST}: give a smaller reach")
+    if count > MAX_FILLED_CELLS:
+        raise invalid_option_error(
+            "reach", f"{name}: {count} cells would be filled in, the limit is {MAX_FILLED_CELLS}: give a smaller reach"
+        )
     if not count:
-        raise refused("reach", f"{name}: no unknown cell is that near to a known one: give a larger reach")
+        raise invalid_option_error("reach", f"{name}: no unknown cell is that near to a known one: give a larger reach")
     occupied = known_cells & (grid.cells >= grid.occupied_thresh * OCCUPIED)
     n = options.pattern
     counts = _counts(occupied, known_cells, n, options.symmetry)
@@ -116,7 +118,7 @@ def _completed(
         target[tuple(at[share[kind] >= options.confidence].T)] = True
         if not target.any() and not wall.any():
             reason = f"{name}: no unknown cell reaches this confidence: set a lower confidence, or a smaller reach"
-            raise refused("confidence", reason)
+            raise invalid_option_error("confidence", reason)
     if target.any():
         _fill(cells, occupied, known_cells, target, counts, options, source, notes, key)
     if options.confidence:
@@ -144,12 +146,12 @@ def _fill(
     y0, y1 = max(int(rows[0]) - n, 0), int(rows[-1]) + n + 1
     x0, x1 = max(int(columns[0]) - n, 0), int(columns[-1]) + n + 1
     part = np.s_[y0:y1, x0:x1]
-    tiles = _filled(occupied[part], known_cells[part], target[part], counts, options, source, notes, key)
+    tiles = _fill_window(occupied[part], known_cells[part], target[part], counts, options, source, notes, key)
     inside = cells[part]
     inside[target[part]] = np.where(tiles == 1, UNKNOWN if options.confidence else OCCUPIED, FREE)[target[part]]
 
 
-def _filled(
+def _fill_window(
     occupied: Bool,
     known_cells: Bool,
     target: Bool,
@@ -164,12 +166,12 @@ def _filled(
     codes = np.arange(2 ** (n * n))
     patterns = (codes[:, None] >> np.arange(n * n) & 1).reshape(-1, n, n).astype(np.int64)
     tiles = np.array([FREE, OCCUPIED], np.uint8).reshape(2, 1, 1)
-    model = _wfc.Model(tiles, patterns, _wfc.scaled(counts), _wfc.agreeing(patterns))
-    lattice = _wfc.Lattice.of(target.shape, n, target=target)
+    model = _wfc.Model(tiles, patterns, _wfc.scale_weights(counts), _wfc.agreeing(patterns))
+    lattice = _wfc.Lattice.from_shape(target.shape, n, target=target)
     if not len(lattice.rows):
-        raise CannotGenerate(f"{called(key)} is smaller than a window of {n} × {n} cells")
+        raise CannotGenerate(f"{grid_label(key)} is smaller than a window of {n} × {n} cells")
     wider = lattice.fitting(patterns, np.where(known_cells, occupied.astype(np.int8), np.int8(-1)))
-    seen = _wfc.packed((counts > 0)[None])
+    seen = _wfc.pack_bits((counts > 0)[None])
     narrow = wider & seen
     empty = ~narrow.any(axis=1)
     narrow[empty] = wider[empty]
@@ -194,15 +196,15 @@ def _filled(
                 notes.warn(
                     f"{strange} of {len(lattice.rows)} windows that were filled in stand nowhere in the known part: no "
                     "others fit between the known cells",
-                    where=called(key),
+                    where=grid_label(key),
                 )
             return wave.tiles()
     raise CannotGenerate(
-        f"{called(key)}: {repairs} contradictions could not be repaired: give a smaller pattern or reach"
+        f"{grid_label(key)}: {repairs} contradictions could not be repaired: give a smaller pattern or reach"
     )
 
 
-def _wanted(known_cells: Bool, reach: float) -> Bool:
+def _cells_to_fill(known_cells: Bool, reach: float) -> Bool:
     """The unknown cells within so many cells of a known one (middle to middle); all where reach is 0."""
     import cv2
 
@@ -224,7 +226,7 @@ def _counts(occupied: Bool, known_cells: Bool, n: int, symmetry: _wfc.Symmetry) 
         code |= occupied[window].astype(np.int16) << k
         good &= known_cells[window]
     plain = np.bincount(code[good], minlength=len(counts))
-    for order in _wfc.turned(np.arange(n * n).reshape(n, n), symmetry):
+    for order in _wfc.symmetries(np.arange(n * n).reshape(n, n), symmetry):
         codes = np.arange(len(counts))
         moved = sum((codes >> int(k) & 1) << i for i, k in enumerate(order.ravel()))
         np.add.at(counts, np.asarray(moved, np.int64), plain)

@@ -10,7 +10,7 @@ import numpy as np
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import FieldOptions, Row
-from app.generate._site import Site, disc, mm, refused
+from app.generate._site import Site, disc, invalid_option_error, mm
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -20,7 +20,7 @@ class CropRows(FieldOptions):
     """Parameters of a field of crops."""
 
     beds: int | None = parameter(
-        None, "beds; default: as many as the fence holds, 10 without one", minimum=2, maximum=_field.MOST_ROWS
+        None, "beds; default: as many as the fence holds, 10 without one", minimum=2, maximum=_field.MAX_ROWS
     )
     rows_per_bed: int = parameter(3, "rows of plants in a bed", minimum=1, maximum=20)
     row_spacing: float = parameter(0.4, "from row to row in a bed", minimum=0.1, maximum=2.0, unit="m")
@@ -45,17 +45,17 @@ def crop_rows(given: Layers, options: CropRows, source: RandomSource, notes: Der
     out = _field.open_field(
         site,
         options,
-        _field.numbered(options.beds or _field.MOST_ROWS),
+        _field.number_rows(options.beds or _field.MAX_ROWS),
         row_count=None if options.beds else 10,
         spacing=width + options.aisle,
         half=width / 2 + options.plant_diameter / 2 + options.jitter,
         word="aisle",
     )
     plants = sum(int(row.length / options.plant_spacing) + 1 for row in out.rows) * options.rows_per_bed
-    if plants > _trees.MOST_PLANTS:
-        raise refused("plant_spacing", f"there would be {plants} plants; the limit is {_trees.MOST_PLANTS}")
-    if max(row.length for row in out.rows) / options.plant_spacing > _trees.MOST_IN_ROW:
-        raise refused("plant_spacing", f"a row would have more than {_trees.MOST_IN_ROW} plants")
+    if plants > _trees.MAX_PLANTS:
+        raise invalid_option_error("plant_spacing", f"there would be {plants} plants; the limit is {_trees.MAX_PLANTS}")
+    if max(row.length for row in out.rows) / options.plant_spacing > _trees.MAX_PER_ROW:
+        raise invalid_option_error("plant_spacing", f"a row would have more than {_trees.MAX_PER_ROW} plants")
     _field.ground(out, field_colour="soil")
     stream = source.stream("plants")
     for bed in out.rows:
@@ -70,7 +70,7 @@ def crop_rows(given: Layers, options: CropRows, source: RandomSource, notes: Der
 def _row(site: Site, i: str, out: _field.Field, row: Row, options: CropRows, stream: np.random.Generator) -> None:
     """A row of plants as one object, each plant a block."""
     along = np.array(_field.between(row, options.plant_spacing))
-    offset = _trees.jittered(stream, len(along), options.jitter)
+    offset = _trees.jitter(stream, len(along), options.jitter)
     size = 0.75 + 0.25 * stream.random((len(along), 2))
     shapes: list[dict[str, Any]] = []
     seen = []
@@ -79,9 +79,9 @@ def _row(site: Site, i: str, out: _field.Field, row: Row, options: CropRows, str
         side, height = mm(options.plant_diameter * c * 0.8), mm(options.plant_height * d)
         place = [mm(u - row.low), mm(b), mm(height / 2), 0.0, 0.0, 0.0]
         shapes.append({"type": "box", "size": [side, side, height], "pose": place})
-        seen.append(disc(*out.at(u, row.v + b), options.plant_diameter * c / 2))
-    x, y = out.at(row.low, row.v)
-    site.put(
+        seen.append(disc(*out.to_local(u, row.v + b), options.plant_diameter * c / 2))
+    x, y = out.to_local(row.low, row.v)
+    site.add_object(
         i,
         "plant",
         out.line(row),

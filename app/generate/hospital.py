@@ -46,7 +46,7 @@ def hospital(given: Layers, options: Options, source: RandomSource, notes: Deriv
         options.storey_height, lift,
     )  # fmt: skip
     furnish = _furnish if options.furniture else None
-    return _building.raised(
+    return _building.build_site(
         given, options, measures, source, notes, _kinds, furnish, lambda _, room: room.kind == "supply"
     )
 
@@ -72,12 +72,12 @@ def _beds(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     step = width / count
     for k in range(count):
         along = step * (k + 0.5)
-        if things.put("bed", along, room.depth - 1.1, (0.95, 2.1, 0.6), "white"):
-            things.put("cabinet", along + 0.8, room.depth - 0.3, (0.45, 0.45, 0.7), "wood")
+        if things.add_item("bed", along, room.depth - 1.1, (0.95, 2.1, 0.6), "white"):
+            things.add_item("cabinet", along + 0.8, room.depth - 0.3, (0.45, 0.45, 0.7), "wood")
             if chance.random() < 0.5:
-                things.put("chair", along - 0.8, room.depth - 1.6, (0.5, 0.5, 0.9), "goods")
-    things.put("wardrobe", width - 0.35, 0.9, (0.6, 1.2, 2.0), "wood")
-    things.put("basin", 0.3, 0.9, (0.5, 0.5, 0.9), "metal")
+                things.add_item("chair", along - 0.8, room.depth - 1.6, (0.5, 0.5, 0.9), "goods")
+    things.add_item("wardrobe", width - 0.35, 0.9, (0.6, 1.2, 2.0), "wood")
+    things.add_item("basin", 0.3, 0.9, (0.5, 0.5, 0.9), "metal")
 
 
 def _station(things: Furniture, room: Room, chance: np.random.Generator) -> None:
@@ -87,11 +87,11 @@ def _station(things: Furniture, room: Room, chance: np.random.Generator) -> None
         keep = things.building.radius + 3 * things.building.site.resolution + 0.2
         start, end = (low, high - keep) if low < door else (low + keep, high)
         if end - start > 0.6:
-            things.put("counter", (start + end) / 2, 0.5, (end - start, 0.6, 1.1), "furniture")
+            things.add_item("counter", (start + end) / 2, 0.5, (end - start, 0.6, 1.1), "furniture")
     for k in range(int((width - 0.4) / 1.9)):
-        if things.put("desk", 1.1 + 1.9 * k, room.depth - 0.5, (1.6, 0.8, 0.74), "furniture", style="desk"):
+        if things.add_item("desk", 1.1 + 1.9 * k, room.depth - 0.5, (1.6, 0.8, 0.74), "furniture", style="desk"):
             shift = 0.3 * (float(chance.random()) - 0.5)
-            things.put("chair", 1.1 + 1.9 * k + shift, room.depth - 1.25, (0.5, 0.5, 0.9), "goods")
+            things.add_item("chair", 1.1 + 1.9 * k + shift, room.depth - 1.25, (0.5, 0.5, 0.9), "goods")
 
 
 def _supply(things: Furniture, room: Room, chance: np.random.Generator) -> None:
@@ -100,16 +100,16 @@ def _supply(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     for k in range(int((room.depth - 0.4) / 1.1)):
         for along in (0.3, width - 0.3):
             if chance.random() < 0.85:
-                things.put("shelf", along, 0.75 + 1.1 * k, (0.5, 1.0, 2.0), "shelf")
+                things.add_item("shelf", along, 0.75 + 1.1 * k, (0.5, 1.0, 2.0), "shelf")
 
 
 def _treatment(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     """A couch, cupboards along a wall, a trolley."""
     width = room.box[2] - room.box[0]
-    things.put("bed", 0.7, room.depth - 1.3, (0.7, 2.0, 0.7), "white")
+    things.add_item("bed", 0.7, room.depth - 1.3, (0.7, 2.0, 0.7), "white")
     for k in range(int((room.depth - 1.0) / 1.3)):
-        things.put("cupboard", width - 0.3, 0.9 + 1.3 * k, (0.5, 1.2, 1.8), "metal")
-    things.put("trolley", 1.8 + 0.4 * float(chance.random()), room.depth - 0.6, (0.6, 0.45, 0.9), "metal")
+        things.add_item("cupboard", width - 0.3, 0.9 + 1.3 * k, (0.5, 1.2, 1.8), "metal")
+    things.add_item("trolley", 1.8 + 0.4 * float(chance.random()), room.depth - 0.6, (0.6, 0.45, 0.9), "metal")
 
 
 def _lounge(things: Furniture, room: Room, chance: np.random.Generator) -> None:
@@ -117,8 +117,8 @@ def _lounge(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     width = room.box[2] - room.box[0]
     for k in range(int((width - 0.4) / 0.8)):
         if chance.random() < 0.85:
-            things.put("seat", 0.6 + 0.8 * k, room.depth - 0.4, (0.6, 0.6, 0.8), "goods")
-    things.put("table", 0.8 if chance.random() < 0.5 else width - 0.8, 1.6, (0.8, 0.8, 0.5), "wood", style="table")
+            things.add_item("seat", 0.6 + 0.8 * k, room.depth - 0.4, (0.6, 0.6, 0.8), "goods")
+    things.add_item("table", 0.8 if chance.random() < 0.5 else width - 0.8, 1.6, (0.8, 0.8, 0.5), "wood", style="table")
 
 
 _FURNISH = {

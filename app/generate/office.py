@@ -13,7 +13,7 @@ from app.generate._site import SiteOptions
 from app.model.layers import Layers
 from app.parameters import parameter
 
-CHARGED = ("storage", "copy")
+CHARGER_ROOMS = ("storage", "copy")
 """Rooms on the ground with a charger for robots."""
 
 
@@ -47,8 +47,8 @@ def office(given: Layers, options: Options, source: RandomSource, notes: Derivat
         options.storey_height, lift,
     )  # fmt: skip
     furnish = _furnish if options.furniture else None
-    return _building.raised(
-        given, options, measures, source, notes, _kinds, furnish, lambda k, room: k == 0 and room.kind in CHARGED
+    return _building.build_site(
+        given, options, measures, source, notes, _kinds, furnish, lambda k, room: k == 0 and room.kind in CHARGER_ROOMS
     )
 
 
@@ -73,12 +73,12 @@ def _desks(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     gap = (width - count * 1.6) / (count + 1) if count else 0.0
     for k in range(count):
         along = gap + 0.8 + k * (1.6 + gap)
-        if things.put("desk", along, room.depth - 0.5, (1.6, 0.8, 0.74), "furniture", style="desk"):
+        if things.add_item("desk", along, room.depth - 0.5, (1.6, 0.8, 0.74), "furniture", style="desk"):
             shift = 0.4 * (float(chance.random()) - 0.5)
-            things.put("chair", along + shift, room.depth - 1.3, (0.5, 0.5, 0.9), "goods")
+            things.add_item("chair", along + shift, room.depth - 1.3, (0.5, 0.5, 0.9), "goods")
     for k in range(int((room.depth - 2.6) / 1.3)):
         if chance.random() < 0.6:
-            things.put("cupboard", width - 0.25, 1.0 + 1.3 * k, (0.4, 1.2, 1.8), "wood")
+            things.add_item("cupboard", width - 0.25, 1.0 + 1.3 * k, (0.4, 1.2, 1.8), "wood")
 
 
 def _meeting(things: Furniture, room: Room, chance: np.random.Generator) -> None:
@@ -87,21 +87,21 @@ def _meeting(things: Furniture, room: Room, chance: np.random.Generator) -> None
     depth = max(0.0, min(1.2, 0.3 * room.depth))
     inward = room.depth - 0.9 - depth / 2
     long = width - 1.6
-    if long < 0.8 or not things.put("table", width / 2, inward, (long, depth, 0.74), "wood", style="table"):
+    if long < 0.8 or not things.add_item("table", width / 2, inward, (long, depth, 0.74), "wood", style="table"):
         return
     for k in range(int(long / 0.75)):
         for off in (-0.4 - depth / 2, 0.4 + depth / 2):
             if chance.random() < 0.9:
-                things.put("chair", 0.8 + 0.375 + 0.75 * k, inward + off, (0.45, 0.45, 0.9), "goods", gap=0.02)
+                things.add_item("chair", 0.8 + 0.375 + 0.75 * k, inward + off, (0.45, 0.45, 0.9), "goods", gap=0.02)
 
 
 def _kitchen(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     """A counter along the outer wall, a fridge, and a small table."""
     width = room.box[2] - room.box[0]
-    things.put("counter", (width - 0.8) / 2 + 0.05, room.depth - 0.35, (width - 0.9, 0.6, 0.9), "metal")
-    things.put("fridge", width - 0.4, room.depth - 0.4, (0.65, 0.65, 1.8), "white")
+    things.add_item("counter", (width - 0.8) / 2 + 0.05, room.depth - 0.35, (width - 0.9, 0.6, 0.9), "metal")
+    things.add_item("fridge", width - 0.4, room.depth - 0.4, (0.65, 0.65, 1.8), "white")
     side = 0.7 if chance.random() < 0.5 else width - 0.7
-    things.put("table", side, 1.4, (0.8, 0.8, 0.74), "wood", style="table")
+    things.add_item("table", side, 1.4, (0.8, 0.8, 0.74), "wood", style="table")
 
 
 def _storage(things: Furniture, room: Room, chance: np.random.Generator) -> None:
@@ -110,7 +110,7 @@ def _storage(things: Furniture, room: Room, chance: np.random.Generator) -> None
     for k in range(int((room.depth - 0.4) / 1.1)):
         for along in (0.3, width - 0.3):
             if chance.random() < 0.85:
-                things.put("shelf", along, 0.75 + 1.1 * k, (0.5, 1.0, 2.0), "shelf")
+                things.add_item("shelf", along, 0.75 + 1.1 * k, (0.5, 1.0, 2.0), "shelf")
 
 
 def _copy(things: Furniture, room: Room, chance: np.random.Generator) -> None:
@@ -118,7 +118,7 @@ def _copy(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     width = room.box[2] - room.box[0]
     for k in range(int(width / 1.4)):
         if chance.random() < 0.8:
-            things.put("machine", 0.7 + 1.4 * k, room.depth - 0.5, (0.9, 0.7, 1.1), "metal")
+            things.add_item("machine", 0.7 + 1.4 * k, room.depth - 0.5, (0.9, 0.7, 1.1), "metal")
 
 
 def _reception(things: Furniture, room: Room, chance: np.random.Generator) -> None:
@@ -126,8 +126,8 @@ def _reception(things: Furniture, room: Room, chance: np.random.Generator) -> No
     width = room.box[2] - room.box[0]
     for k in range(int((width - 0.4) / 0.8)):
         if chance.random() < 0.8:
-            things.put("seat", 0.6 + 0.8 * k, room.depth - 0.4, (0.6, 0.6, 0.8), "goods")
-    things.put("counter", width - 0.5, room.depth / 2, (0.6, min(2.4, room.depth - 2.0), 1.1), "wood")
+            things.add_item("seat", 0.6 + 0.8 * k, room.depth - 0.4, (0.6, 0.6, 0.8), "goods")
+    things.add_item("counter", width - 0.5, room.depth / 2, (0.6, min(2.4, room.depth - 2.0), 1.1), "wood")
 
 
 _FURNISH = {

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import FieldOptions
-from app.generate._site import Site, refused
+from app.generate._site import Site, invalid_option_error
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -17,7 +17,7 @@ class Orchard(FieldOptions):
     """Parameters of an orchard."""
 
     rows: int | None = parameter(
-        None, "rows of trees; default: as many as the fence holds, 8 without one", minimum=2, maximum=_field.MOST_ROWS
+        None, "rows of trees; default: as many as the fence holds, 8 without one", minimum=2, maximum=_field.MAX_ROWS
     )
     row_spacing: float = parameter(3.6, "from row to row", minimum=1.0, maximum=30.0, unit="m")
     tree_spacing: float = parameter(1.8, "from tree to tree in a row", minimum=0.5, maximum=30.0, unit="m")
@@ -35,9 +35,9 @@ class Orchard(FieldOptions):
 def orchard(given: Layers, options: Orchard, source: RandomSource, notes: DerivationNotes) -> Layers:
     """An orchard: rows of trees with crowns, headlands, a yard with charging docks, and a network of its aisles."""
     if options.crown_diameter < options.trunk_diameter:
-        raise refused("crown_diameter", "a crown is no thinner than its trunk")
+        raise invalid_option_error("crown_diameter", "a crown is no thinner than its trunk")
     site = Site(given, options, notes, coloured=True)
-    lines = _field.numbered(options.rows or _field.MOST_ROWS)
+    lines = _field.number_rows(options.rows or _field.MAX_ROWS)
     out = _field.open_field(
         site,
         options,
@@ -47,8 +47,8 @@ def orchard(given: Layers, options: Orchard, source: RandomSource, notes: Deriva
         half=options.trunk_diameter / 2 + options.jitter,
     )
     trees = sum(int(row.length / options.tree_spacing) + 1 for row in out.rows)
-    if trees > _trees.MOST_TREES:
-        raise refused("tree_spacing", f"there would be {trees} trees; the limit is {_trees.MOST_TREES}")
+    if trees > _trees.MAX_TREES:
+        raise invalid_option_error("tree_spacing", f"there would be {trees} trees; the limit is {_trees.MAX_TREES}")
     _field.ground(out, field_colour="meadow")
     for row in out.rows:
         site.mark(f"row{row.number}", "tree_row", out.line(row), name=f"Row {row.number}")
@@ -62,7 +62,7 @@ def orchard(given: Layers, options: Orchard, source: RandomSource, notes: Deriva
             _trees.tree(
                 site,
                 f"tree{row.number}-{k}",
-                out.at(u, v),
+                out.to_local(u, v),
                 trunk=options.trunk_diameter / 2,
                 height=height,
                 crown=max(options.trunk_diameter, options.crown_diameter * (0.8 + 0.2 * b)) / 2,

@@ -29,9 +29,9 @@ from app.errors import BadUpload, CannotConvert, CannotGenerate, Invalid, Proble
 from app.generate import MAX_CELLS, MAX_OBJECTS, RandomSource, generates
 from app.model import masks, solids
 from app.model.features import Features, features
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, as_seen, unknown_grey
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey, unknown_grey_as_unknown
 from app.model.layers import MAP, Layers, Part, PartKey
-from app.model.obstacles import footprint_of
+from app.model.obstacles import object_footprint
 from app.parameters import parameter
 
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ Cells = NDArray[np.int64]
 NAME = "perturbation"
 """The family of new obstacles."""
 
-STAYS = frozenset(
+FIXED_KINDS = frozenset(
     {
         *("wall", "fence", "hedge", "barrier", "railing", "building", "door", "floor", "lift", "hole", "water", "pond"),
         *("ditch", "stream", "pillar", "column", "stairs", "field", "terrain", "ground_plane", "light"),
@@ -57,10 +57,10 @@ SHAPELESS = 0.25
 HALF = 0.71
 """Of a cell's side: how far its corners are from its middle. Who measures from cell to cell errs by as much."""
 
-TRIES = 40
+MAX_ATTEMPTS = 40
 """Places that are tried for each new obstacle."""
 
-PIECES = 20_000
+MAX_PIECES = 20_000
 """Pieces of occupied cells that are moved; with more the grid is rather noise."""
 
 
@@ -119,12 +119,12 @@ class _Movable:
     gone: bool = False
 
     @property
-    def changed(self) -> bool:
+    def has_changed(self) -> bool:
         return self.gone or (self.moved is not None and any(self.moved))
 
     def now(self) -> Any:
         """The ground it covers now."""
-        return self.body if self.moved is None or not any(self.moved) else _moved(self.body, self.at, self.moved)
+        return self.body if self.moved is None or not any(self.moved) else _move_shape(self.body, self.at, self.moved)
 
 
 @dataclass(slots=True)
@@ -175,7 +175,7 @@ def perturbation(given: Layers, options: Perturbation, source: RandomSource, not
         raise CannotGenerate(f"grid: {reason}", [Problem(reason, where="grid")])
     parts: dict[PartKey, Part] = {}
     for level in levels:
-        parts |= _Level(given, options, source, notes, level).made()
+        parts |= _Level(given, options, source, notes, level).changed_parts()
     if not parts:
         text = "; ".join(f"{w.where}: {w.problem}" for w in notes.warnings)
         text += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped)
@@ -184,7 +184,7 @@ def perturbation(given: Layers, options: Perturbation, source: RandomSource, not
             "or upload or derive objects that stand in the way, or a grid"
         )
     if options.edges == "remove":
-        parts |= _without_lost(given, parts, notes)
+        parts |= _drop_unconnected(given, parts, notes)
     notes.warn("voxels, zones and pictures are as they were: derive them anew where they are to fit")
     return Layers(parts, given.datum, given.levels)
 
@@ -198,7 +198,7 @@ class _Level:
         self.given, self.options, self.source, self.notes, self.level = given, options, source, notes, level
         self.parts: dict[PartKey, Features] = {k: p for k, p in given.vector("objects", level).items() if len(p)}
         self.stored = given.grids(level)
-        grids = {k: as_seen(g) for k, g in self.stored.items()}
+        grids = {k: unknown_grey_as_unknown(g) for k, g in self.stored.items()}
         masked = {k for k, g in grids.items() if k.name in masks.MASKS or masks.NAME in g.properties}
         self.maps = {k: g for k, g in grids.items() if k not in masked}
         noisy = self.maps if options.grid is None else {k: g for k, g in grids.items() if k.name == options.grid}
@@ -209,7 +209,7 @@ class _Level:
         """Chance for one purpose on this level."""
         return self.source.stream(f"{self.level}/{name}")
 
-    def made(self) -> dict[PartKey, Part]:
+    def changed_parts(self) -> dict[PartKey, Part]:
         """The parts of the level that are changed."""
         out: dict[PartKey, Part] = {}
         things = self._things()
@@ -229,7 +229,7 @@ class _Level:
         network, edge_lines = self._network(change, main)
         out |= network
         for key, grid in self.grids.items():
-            cells = _applied(grid, changes[key]) if key in changes else grid.cells
+            cells = _apply_change(grid, changes[key]) if key in changes else grid.cells
             if key in self.noisy:
                 cells = self._noise(key, grid, cells, edge_lines)
             if not np.array_equal(cells, grid.cells):
@@ -245,7 +245,7 @@ class _Level:
             metres = part.in_local(self.given.frame)
             for k, (p, geometry) in enumerate(zip(part.properties, metres, strict=True)):
                 try:
-                    body = footprint_of(p, geometry, solid_reader)
+                    body = object_footprint(p, geometry, solid_reader)
                 except (Invalid, BadUpload) as error:
                     self.notes.warn(f"it stays as it is: {error.detail}", where=part.ids[k])
                     continue
@@ -255,9 +255,11 @@ class _Level:
                     continue
                 x0, y0, x1, y1 = body.bounds
                 pose = p.get("pose")
-                middle = ((x0 + x1) / 2, (y0 + y1) / 2) if pose is None else solids.pose_of(p)[:2]
+                middle = ((x0 + x1) / 2, (y0 + y1) / 2) if pose is None else solids.parse_pose(p)[:2]
                 woven = isinstance(p.get("osm"), dict) and shapely.get_type_id(geometry) != 0  # its nodes would stay
-                stays = str(p.get("kind")) in STAYS or math.hypot(x1 - x0, y1 - y0) > self.options.largest or woven
+                stays = (
+                    str(p.get("kind")) in FIXED_KINDS or math.hypot(x1 - x0, y1 - y0) > self.options.largest or woven
+                )
                 thing = _Movable((key, k), (float(middle[0]), float(middle[1])), body)
                 if stays:
                     thing.moved = None
@@ -275,28 +277,28 @@ class _Level:
         if back:
             self.notes.drop("shifts", back, "another thing stands there")
         fresh = self._obstacles(things, main or self._slice(self.given.parts, None))
-        phrases = self._told(things)
+        phrases = self._summary(things)
         out: dict[PartKey, Part] = {}
         for key, part in self.parts.items():
             part_things = {
-                t.place[1]: t for t in things if isinstance(t.place, tuple) and t.place[0] == key and t.changed
+                t.place[1]: t for t in things if isinstance(t.place, tuple) and t.place[0] == key and t.has_changed
             }
             if part_things:
-                out[key] = _changed(part, part_things, self.given)
+                out[key] = _changed_features(part, part_things, self.given)
         if fresh:
             key = PartKey("objects", self.level, NAME)
             before = out.get(key, self.parts.get(key))
             assert before is None or isinstance(before, Features)
-            out[key] = _joined(before, fresh)
+            out[key] = _append_rows(before, fresh)
             phrases.append(f"{len(fresh)} new obstacles")
         if phrases:
             self.notes.warn(f"disturbed: {', '.join(phrases)}", where=self.level)
         merged = {**self.parts, **out}
-        return self._sliced(merged, main), out
+        return self._slice_changes(merged, main), out
 
-    def _told(self, things: Sequence[_Movable]) -> list[str]:
+    def _summary(self, things: Sequence[_Movable]) -> list[str]:
         removed_count = sum(t.gone for t in things)
-        moved = sum(t.changed for t in things) - removed_count
+        moved = sum(t.has_changed for t in things) - removed_count
         rows = len({t.row for t in things if t.row >= 0 and t.moved is not None})
         phrases = [f"{moved} things moved" + (f" ({rows} rows)" if rows else "")] if moved else []
         return phrases + ([f"{removed_count} gone"] if removed_count else [])
@@ -318,7 +320,7 @@ class _Level:
             angle = math.radians(min(options.turn * s, 180.0)) * turn
             t.moved = (round(x, 3) + 0.0, round(y, 3) + 0.0, round(angle, 6) + 0.0)
 
-    def _sliced(self, merged: dict[PartKey, Any], main: OccupancyGrid | None) -> _Change:
+    def _slice_changes(self, merged: dict[PartKey, Any], main: OccupancyGrid | None) -> _Change:
         """What a slice of the objects shows now and did not before, and the other way round."""
         slice_properties = main.properties.get("slice") if main is not None else None
         height = slice_properties.get("height") if isinstance(slice_properties, dict) else None
@@ -333,7 +335,7 @@ class _Level:
             slice_parameters = replace(slice_parameters, resolution=size)
         if size is None:
             return _Change(1.0)
-        before, after = (_occupied(g) if g is not None else np.empty(0, np.int64) for g in grids)
+        before, after = (_occupied_cells(g) if g is not None else np.empty(0, np.int64) for g in grids)
         freed, filled = np.setdiff1d(before, after, True), np.setdiff1d(after, before, True)
         return _Change(size, _places(freed), _places(filled), _places(before))
 
@@ -359,15 +361,15 @@ class _Level:
         new: list[Any] = []
         rows: list[tuple[str, Any, dict[str, Any]]] = []
         random_position = self._room(main)
-        count = self._many(self.options.obstacles)
+        count = self._scaled_count(self.options.obstacles)
         floor = self.given.elevation(self.level)
         taken = {i for part in self.parts.values() for i in part.ids}
         for _ in range(count if random_position is not None else 0):
             shape, yaw, high, size = self._body(rng)
-            for _ in range(TRIES):
+            for _ in range(MAX_ATTEMPTS):
                 assert random_position is not None
                 x, y = random_position(rng)
-                body = _moved(shape, (0.0, 0.0), (x, y, yaw))
+                body = _move_shape(shape, (0.0, 0.0), (x, y, yaw))
                 near = [bodies[k] for k in tree.query(body)] + new
                 if not any(shapely.intersects(body, other) for other in near):
                     break
@@ -412,7 +414,7 @@ class _Level:
 
         return drawn if len(spots) else None
 
-    def _many(self, count: int) -> int:
+    def _scaled_count(self, count: int) -> int:
         """A count by severity."""
         return min(round(count * self.options.severity), MAX_OBJECTS)
 
@@ -428,9 +430,9 @@ class _Level:
         fits = (np.hypot(stats[:, 2], stats[:, 3]) <= max_diagonal) & (stats[:, 4] >= 4)
         fits[0] = False
         pieces = np.flatnonzero(fits)
-        if len(pieces) > PIECES:
-            self.notes.drop("pieces of the grid", len(pieces) - PIECES, f"at most {PIECES} are moved")
-            pieces = pieces[:PIECES]
+        if len(pieces) > MAX_PIECES:
+            self.notes.drop("pieces of the grid", len(pieces) - MAX_PIECES, f"at most {MAX_PIECES} are moved")
+            pieces = pieces[:MAX_PIECES]
         loose = []
         for k in pieces.tolist():
             x, y, w, h, _ = (int(v) for v in stats[k])
@@ -456,8 +458,8 @@ class _Level:
                 cells[into][inside] = OCCUPIED
         if blocked_count:
             self.notes.drop("shifts", blocked_count, "another thing stands there, or it is not known what does")
-        added = self._painted(key, grid, cells)
-        phrases = self._told(loose) + ([f"{added} new obstacles"] if added else [])
+        added = self._paint_obstacles(key, grid, cells)
+        phrases = self._summary(loose) + ([f"{added} new obstacles"] if added else [])
         if phrases:
             self.notes.warn(f"disturbed, by its cells: {', '.join(phrases)}", where=f"{self.level}/{key.name}")
         row, column = np.nonzero((grid.cells == OCCUPIED) & (cells != OCCUPIED))
@@ -467,18 +469,18 @@ class _Level:
         row, column = np.nonzero(occupied)
         return _Change(0.0, freed, filled, np.stack([column, row], axis=1))
 
-    def _painted(self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8]) -> int:
+    def _paint_obstacles(self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8]) -> int:
         """Paint new obstacles onto the open cells: how many."""
         import cv2
 
         rng = self.draw(f"obstacles/{key.name}")
         spots = _open(cells, self.options.obstacle_size[1] / grid.resolution)
-        done, count = 0, self._many(self.options.obstacles)
+        done, count = 0, self._scaled_count(self.options.obstacles)
         for _ in range(count if len(spots) else 0):
             shape, yaw, _, _ = self._body(rng)
-            for _ in range(TRIES):
+            for _ in range(MAX_ATTEMPTS):
                 row, column = divmod(int(spots[int(rng.integers(len(spots)))]), grid.width)
-                at = shapely.get_coordinates(_moved(shape, (0.0, 0.0), (0.0, 0.0, yaw)))[:-1] / grid.resolution
+                at = shapely.get_coordinates(_move_shape(shape, (0.0, 0.0), (0.0, 0.0, yaw)))[:-1] / grid.resolution
                 reach = int(np.ceil(np.abs(at).max())) + 1
                 spot = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
                 cv2.fillPoly(spot, [np.round(at + reach).astype(np.int32)], 1)
@@ -517,7 +519,7 @@ class _Level:
                 self._warn("blocked", crossed, key)
                 self._warn("under an obstacle", covered, key, "nodes")
             else:
-                out[key] = part.take(~hit)
+                out[key] = part.select(~hit)
                 self._warn("removed", crossed, key)
                 self._warn("removed", covered, key, "nodes")
         return out, edge_lines
@@ -586,7 +588,7 @@ class _Level:
         out[beside & ~near & (chance < min(options.dilate * s, 1.0) * share)] = OCCUPIED
         out[free & ~beside & ~near & (chance < min(options.speckle * s, 1.0) * weight)] = OCCUPIED
         candidates = np.flatnonzero((cells != UNKNOWN) & ~near)
-        for _ in range(self._many(options.dropped) if len(candidates) else 0):
+        for _ in range(self._scaled_count(options.dropped) if len(candidates) else 0):
             row, column = divmod(int(candidates[int(rng.integers(len(candidates)))]), cells.shape[1])
             radius = max(1, round(options.patch / 2 / grid.resolution * (0.3 + 0.7 * float(rng.random()))))
             y0, x0 = max(0, row - radius), max(0, column - radius)
@@ -598,7 +600,7 @@ class _Level:
 
 
 # --- the network as a whole -------------------------------------------------------------------------------------------
-def _without_lost(given: Layers, parts: dict[PartKey, Part], notes: DerivationNotes) -> dict[PartKey, Part]:
+def _drop_unconnected(given: Layers, parts: dict[PartKey, Part], notes: DerivationNotes) -> dict[PartKey, Part]:
     """Without edges whose nodes are gone, on whatever level they are; with a word on what hangs together no more."""
     before = given.vector("topology")
     after: dict[PartKey, Features] = {}
@@ -617,19 +619,19 @@ def _without_lost(given: Layers, parts: dict[PartKey, Part], notes: DerivationNo
         ]
         if any(lost):
             notes.drop("edges", sum(lost), "an obstacle stands where they lead from or to")
-            after[key] = part.take(~np.array(lost))
+            after[key] = part.select(~np.array(lost))
         if after[key] is not before[key]:
             out[key] = after[key]
     used = {
         p[end] for f in before.values() for p in f.properties if p.get("kind") == "edge" for end in ("source", "target")
     }
-    was, now = (_connected(list(f.values()), used - removed) for f in (before, after))
+    was, now = (_count_components(list(f.values()), used - removed) for f in (before, after))
     if now > was:
         notes.warn(f"the network falls into {now} pieces, and was in {was}")
     return out
 
 
-def _connected(collections: Sequence[Features], nodes: set[str]) -> int:
+def _count_components(collections: Sequence[Features], nodes: set[str]) -> int:
     """In how many pieces these nodes of a network are."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -647,7 +649,7 @@ def _connected(collections: Sequence[Features], nodes: set[str]) -> int:
 
 
 # --- objects ----------------------------------------------------------------------------------------------------------
-def _moved(shape: Any, around: tuple[float, float], by: tuple[float, float, float]) -> Any:
+def _move_shape(shape: Any, around: tuple[float, float], by: tuple[float, float, float]) -> Any:
     """A shape turned around a point and shifted, in whole millimetres; heights stay."""
     dx, dy, turn = by
     c, s = math.cos(turn), math.sin(turn)
@@ -661,7 +663,7 @@ def _moved(shape: Any, around: tuple[float, float], by: tuple[float, float, floa
     return shapely.transform(shape, placed, include_z=bool(shapely.has_z(shape)))
 
 
-def _changed(part: Features, things: dict[int, _Movable], given: Layers) -> Features:
+def _changed_features(part: Features, things: dict[int, _Movable], given: Layers) -> Features:
     """A part with its objects where they are now, and without those that are gone."""
     metres = part.in_local(given.frame).copy()
     geometry = part.geometry.copy()
@@ -669,7 +671,7 @@ def _changed(part: Features, things: dict[int, _Movable], given: Layers) -> Feat
     for k, t in things.items():
         if t.gone or t.moved is None:
             continue
-        metres[k] = _moved(metres[k], t.at, t.moved)
+        metres[k] = _move_shape(metres[k], t.at, t.moved)
         if part.local[k]:
             geometry[k] = metres[k]
         else:
@@ -678,15 +680,15 @@ def _changed(part: Features, things: dict[int, _Movable], given: Layers) -> Feat
             geometry[k] = shapely.set_precision(back[0], 1e-12, mode="pointwise")
         object_properties = properties[k]
         if object_properties.get("pose") is not None or object_properties.get("shapes"):
-            pose = list(solids.pose_of(object_properties))
-            place = shapely.get_coordinates(_moved(shapely.Point(pose[:2]), t.at, t.moved))[0].tolist()
+            pose = list(solids.parse_pose(object_properties))
+            place = shapely.get_coordinates(_move_shape(shapely.Point(pose[:2]), t.at, t.moved))[0].tolist()
             yaw = round(math.remainder(pose[5] + t.moved[2], math.tau), 6) + 0.0
             properties[k] = {**object_properties, "pose": [*place, pose[2], pose[3], pose[4], yaw]}
     stays = np.array([k not in things or not things[k].gone for k in range(len(part))], bool)
-    return Features(part.ids, geometry, tuple(properties), part.local.copy(), part.document).take(stays)
+    return Features(part.ids, geometry, tuple(properties), part.local.copy(), part.document).select(stays)
 
 
-def _joined(before: Features | None, rows: list[tuple[str, Any, dict[str, Any]]]) -> Features:
+def _append_rows(before: Features | None, rows: list[tuple[str, Any, dict[str, Any]]]) -> Features:
     """New rows behind what is there."""
     fresh = features(rows, "local")
     if before is None:
@@ -765,7 +767,7 @@ def _with_grey(stored: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid
 _BIAS, _SPAN = 2**30, 2**31
 
 
-def _occupied(grid: OccupancyGrid) -> Cells:
+def _occupied_cells(grid: OccupancyGrid) -> Cells:
     """The occupied cells of a derived grid (yaw 0, origin a multiple of the resolution) as sorted numbers."""
     row, column = np.nonzero(grid.cells == OCCUPIED)
     x, y = (round(v / grid.resolution) for v in grid.origin[:2])
@@ -797,11 +799,11 @@ def _columns(grid: OccupancyGrid, at: Array) -> Array:
     return np.stack([c * u + s * v, -s * u + c * v], axis=1) / grid.resolution
 
 
-def _applied(grid: OccupancyGrid, change: _Change) -> NDArray[np.uint8]:
+def _apply_change(grid: OccupancyGrid, change: _Change) -> NDArray[np.uint8]:
     """The cells with what the obstacles left free and what they cover now."""
     cells = grid.cells.copy()
     for places, value in ((change.freed, FREE), (change.filled, OCCUPIED)):
-        at = _cells_of(grid, change, places)
+        at = _covered_cells(grid, change, places)
         inside = ((at >= 0) & (at < [grid.width, grid.height])).all(axis=1)
         column, row = at[inside].T
         if value == FREE:
@@ -811,7 +813,7 @@ def _applied(grid: OccupancyGrid, change: _Change) -> NDArray[np.uint8]:
     return cells
 
 
-def _cells_of(grid: OccupancyGrid, change: _Change, places: Cells) -> Cells:
+def _covered_cells(grid: OccupancyGrid, change: _Change, places: Cells) -> Cells:
     """The cells of a grid that squares lie in; ``size`` 0: they are its own."""
     if change.size == 0.0 or not len(places):
         return places

@@ -10,8 +10,8 @@ import shapely
 from app.derive import DerivationNotes
 from app.errors import Invalid, Problem
 from app.generate import RandomSource, _lsystem, _plants, generates
-from app.generate._site import Site, SiteOptions, disc, refused
-from app.generate._site_frame import placed
+from app.generate._site import Site, SiteOptions, disc, invalid_option_error
+from app.generate._site_frame import place_site
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -31,7 +31,7 @@ class Options(SiteOptions):
         "axiom: !(0.05) F(0.5) A(1); A(l) : l > 0.2 -> F(l) [ +(30) A(l * 0.7) ] /(120) A(l * 0.8)",
     )
     iterations: int | None = parameter(
-        None, "rounds of rewriting; default: the species' own, or 6", minimum=0, maximum=_lsystem.MOST_ITERATIONS
+        None, "rounds of rewriting; default: the species' own, or 6", minimum=0, maximum=_lsystem.MAX_ITERATIONS
     )
     angle: float = parameter(25.0, "of a turn for which the rules say none", minimum=-360.0, maximum=360.0, unit="°")
     length: float = parameter(
@@ -65,7 +65,7 @@ class Options(SiteOptions):
 )
 def plants(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A stand of plants from L-systems: apple trees, vines, bushes, pines, or by rules of your own."""
-    grown = _grown(options, source)
+    grown = _grow_plants(options, source)
     largest = 1.0 + options.variation
     body = max(p.body[0] for p in grown) * largest
     width = 2 * max(p.spread for p in grown)
@@ -73,27 +73,31 @@ def plants(given: Layers, options: Options, source: RandomSource, notes: Derivat
     need = 2 * (body + options.jitter + options.robot_radius) + 4 * (options.resolution or 0.1) + 0.1
     row_spacing = max(need, 1.1 * width) if options.row_spacing is None else options.row_spacing
     if row_spacing < need:
-        raise refused("row_spacing", f"must be at least {need:.2f} m, so that a robot passes between the plants")
+        raise invalid_option_error(
+            "row_spacing", f"must be at least {need:.2f} m, so that a robot passes between the plants"
+        )
     spacing = max(0.2, 1.1 * width) if options.spacing is None else options.spacing
     head = max(HEADLAND, need)
     site = Site(given, options, notes)
     across, along = options.rows * row_spacing, (options.columns - 1) * spacing
-    place = placed(site, along + 2 * head, across, 1.0, row_spacing / 2 - body - options.jitter - options.robot_radius)
+    place = place_site(
+        site, along + 2 * head, across, 1.0, row_spacing / 2 - body - options.jitter - options.robot_radius
+    )
     site.draw(site.fence, "meadow")
-    site.files.update(_plants.files_of(grown))
+    site.files.update(_plants.mesh_files(grown))
     chance = source.stream("places")
     for row in range(options.rows):
         v = (row + 0.5) * row_spacing
         strip = shapely.box(head - spacing / 2, v - body, head + along + spacing / 2, v + body)
-        site.draw(place.of(strip), "soil")
+        site.draw(place.geometry_to_local(strip), "soil")
         for column in range(options.columns):
             du, dv, turn, size, choice = chance.random(5).tolist()
             plant = grown[int(choice * len(grown))]
             scale = round(1.0 + options.variation * (2.0 * size - 1.0), 3)
             shift = options.jitter * 0.7  # so that no corner of the square lies farther off
-            x, y = place.at(head + column * spacing + shift * (2 * du - 1), v + shift * (2 * dv - 1))
+            x, y = place.to_local(head + column * spacing + shift * (2 * du - 1), v + shift * (2 * dv - 1))
             radius, height = (round(part * scale, 3) for part in plant.body)
-            site.put(
+            site.add_object(
                 f"plant_{row + 1}_{column + 1}",
                 plant.kind,
                 shapely.Point(x, y),
@@ -108,15 +112,15 @@ def plants(given: Layers, options: Options, source: RandomSource, notes: Derivat
     for aisle in range(options.rows + 1):
         v = aisle * row_spacing
         ends = [(head / 2, "west"), (head * 1.5 + along, "east")]
-        names = [site.node(f"aisle_{aisle + 1}_{side}", place.at(u, v), yaw=place.yaw) for u, side in ends]
-        site.way(*names, speed=1.0)
+        names = [site.node(f"aisle_{aisle + 1}_{side}", place.to_local(u, v), yaw=place.yaw) for u, side in ends]
+        site.add_edges(*names, speed=1.0)
         if aisle:
             for side in ("west", "east"):
-                site.way(f"aisle_{aisle}_{side}", f"aisle_{aisle + 1}_{side}", speed=1.0)
+                site.add_edges(f"aisle_{aisle}_{side}", f"aisle_{aisle + 1}_{side}", speed=1.0)
     return site.finish(ground="meadow")
 
 
-def _grown(options: Options, source: RandomSource) -> list[_plants.Plant]:
+def _grow_plants(options: Options, source: RandomSource) -> list[_plants.Plant]:
     """The plants that stand here. Invalid and CannotGenerate say what is wrong with rules."""
     name: str = options.species if options.rules is None else "own"
     if options.rules is None:

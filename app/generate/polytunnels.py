@@ -12,14 +12,14 @@ import numpy as np
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Line, Row
-from app.generate._site import Site, angle, mm, refused, rgb
+from app.generate._site import Site, angle, invalid_option_error, mm, rgb
 from app.model.layers import Layers
 from app.parameters import parameter
 
 CHORDS = 6
 """Straight pieces of an arch."""
 
-MOST_TUNNELS = 60
+MAX_TUNNELS = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Polytunnels(FieldOptions):
     """Parameters of a field of polytunnels."""
 
     tunnels: int | None = parameter(
-        None, "tunnels; default: as many as the fence holds, 2 without one", minimum=1, maximum=MOST_TUNNELS
+        None, "tunnels; default: as many as the fence holds, 2 without one", minimum=1, maximum=MAX_TUNNELS
     )
     rows_per_tunnel: int = parameter(5, "rows of tables in a tunnel", minimum=1, maximum=20)
     row_spacing: float = parameter(
@@ -47,30 +47,34 @@ class Polytunnels(FieldOptions):
 def polytunnels(given: Layers, options: Polytunnels, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Polytunnels: hoops and covers over rows of tables with strawberries, aisles between them, and a yard."""
     if options.tunnel_height <= options.side_height:
-        raise refused("tunnel_height", "must be above side_height")
+        raise invalid_option_error("tunnel_height", "must be above side_height")
     site = Site(given, options, notes, coloured=True)
     count = options.rows_per_tunnel
     tunnel_count = options.tunnels or 2
     out = _field.open_field(
         site,
         options,
-        _lines(options.tunnels or MOST_TUNNELS, count),
+        _lines(options.tunnels or MAX_TUNNELS, count),
         row_count=None if options.tunnels else tunnel_count * (count + 1) + 1,
         spacing=options.row_spacing,
         half=max(options.table_width / 2, 0.04),
     )
-    out.end_with("legs")
+    out.trim_after("legs")
     legs = [row for row in out.rows if row.kind == "legs"]
     if len(legs) < 2:
-        raise refused("rows_per_tunnel", "the fence holds no whole tunnel: make it smaller")
+        raise invalid_option_error("rows_per_tunnel", "the fence holds no whole tunnel: make it smaller")
     if options.tunnels and len(legs) - 1 < options.tunnels:
         notes.drop("tunnels", options.tunnels - len(legs) + 1, "the fence holds no more")
     parts = sum(row.length / options.hoop_spacing * (CHORDS + 1) for row in legs)
     parts += sum(row.length / options.leg_spacing * 2 for row in out.rows if row.kind == "row")
-    if parts > _trees.MOST_PLANTS:
-        raise refused("hoop_spacing", f"there would be {int(parts)} hoops and legs; the limit is {_trees.MOST_PLANTS}")
-    if max(row.length for row in legs) / options.hoop_spacing * CHORDS > _trees.MOST_IN_ROW:
-        raise refused("hoop_spacing", f"a tunnel would have more than {_trees.MOST_IN_ROW // CHORDS} hoops")
+    if parts > _trees.MAX_PLANTS:
+        raise invalid_option_error(
+            "hoop_spacing", f"there would be {int(parts)} hoops and legs; the limit is {_trees.MAX_PLANTS}"
+        )
+    if max(row.length for row in legs) / options.hoop_spacing * CHORDS > _trees.MAX_PER_ROW:
+        raise invalid_option_error(
+            "hoop_spacing", f"a tunnel would have more than {_trees.MAX_PER_ROW // CHORDS} hoops"
+        )
     _field.ground(out, field_colour="grass")
     for k, (low, high) in enumerate(itertools.pairwise(legs), 1):
         site.draw(_cover(out, low, high), "plastic")
@@ -114,8 +118,8 @@ def _legs(site: Site, out: Field, row: Row, options: Polytunnels) -> None:
         {"type": "cylinder", "radius": 0.03, "length": h, "pose": [mm(u - row.low), 0.0, mm(h / 2), 0.0, 0.0, 0.0]}
         for u in _field.between(row, options.hoop_spacing)
     ]
-    x, y = out.at(row.low, row.v)
-    site.put(
+    x, y = out.to_local(row.low, row.v)
+    site.add_object(
         f"legs{row.number}",
         "post",
         out.line(row),
@@ -146,8 +150,8 @@ def _hoops(site: Site, out: Field, number: int, low: Row, high: Row, options: Po
         seen.append(out.area(u - 0.05, low.v, u + 0.05, high.v))
     if not shapes:
         return
-    x, y = out.at(start, (low.v + high.v) / 2)
-    site.put(
+    x, y = out.to_local(start, (low.v + high.v) / 2)
+    site.add_object(
         f"tunnel{number}",
         "tunnel",
         _cover(out, low, high),
@@ -173,8 +177,8 @@ def _table(site: Site, out: Field, row: Row, options: Polytunnels, stream: np.ra
     leaves = 0.2 + 0.1 * float(stream.random())
     place = [mm(row.length / 2), 0.0, mm(low + thick + leaves / 2), 0.0, 0.0, 0.0]
     shapes.append({"type": "box", "size": [mm(row.length), mm(width * 0.9), mm(leaves)], "pose": place})
-    x, y = out.at(row.low, row.v)
-    site.put(
+    x, y = out.to_local(row.low, row.v)
+    site.add_object(
         f"table{row.number}",
         "table",
         out.strip(row, width),

@@ -21,7 +21,7 @@ from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.generate import MAX_OBJECTS, RandomSource, _cells, generates
 from app.generate._noise import Fractal, noise2, noise3
-from app.generate._site import Site, SiteOptions, disc, mm, refused
+from app.generate._site import Site, SiteOptions, disc, invalid_option_error, mm
 from app.model import masks
 from app.model.frame import GROUND
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -33,10 +33,10 @@ U8 = NDArray[np.uint8]
 
 FILE = "heightmaps/terrain.png"
 
-POST = 0.3
+POST_INSET_METRES = 0.3
 """Metres of corner posts from the fence."""
 
-SLOWEST = 10
+MIN_SPEED_PERCENT = 10
 """Percent of the robot's speed on the steepest ground that it can take."""
 
 
@@ -74,10 +74,12 @@ class Options(SiteOptions):
 def terrain(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Hilly ground with woods: a height map for Gazebo, trees, and a grid of what the slopes cost."""
     site = Site(given, options, notes)
-    box = site.bounded(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
+    box = site.set_fence(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
     columns, rows = (max(1, int((b - a) / options.spacing)) for a, b in ((box[0], box[2]), (box[1], box[3])))
     if options.vegetation and rows * columns > MAX_OBJECTS:
-        raise refused("spacing", f"{columns} × {rows} places for trees are too many: give a larger spacing")
+        raise invalid_option_error(
+            "spacing", f"{columns} × {rows} places for trees are too many: give a larger spacing"
+        )
     n = int(options.detail)
     x, y = np.linspace(box[0], box[2], n), np.linspace(box[1], box[3], n)
     share = _heights(x, y, options, source)
@@ -88,7 +90,7 @@ def terrain(given: Layers, options: Options, source: RandomSource, notes: Deriva
     middle = mm((box[0] + box[2]) / 2), mm((box[1] + box[3]) / 2)
     size = [mm(box[2] - box[0]), mm(box[3] - box[1]), mm(options.relief)]
     ground: Mapping[str, Any] = {"type": "heightmap", "file": FILE, "size": size, "position": [0.0, 0.0, 0.0]}
-    site.put("terrain", "terrain", site.fence, shapes=[ground], pose=(*middle, floor - size[2], 0.0))
+    site.add_object("terrain", "terrain", site.fence, shapes=[ground], pose=(*middle, floor - size[2], 0.0))
     trees = 0
     if options.vegetation:
         trees = _trees(site, (x, y, height), (rows, columns), options, source)
@@ -103,9 +105,9 @@ def terrain(given: Layers, options: Options, source: RandomSource, notes: Deriva
     if options.rough == "costs":
         parts[PartKey("occupancy", GROUND, "costs")] = _costs(grid, steep)
     elif options.rough == "speed":
-        parts[PartKey("occupancy", GROUND, "speed")] = _speed(grid, steep)
+        parts[PartKey("occupancy", GROUND, "speed")] = _speed_mask(grid, steep)
     level = np.where((grid.cells == FREE) & (steep >= 1.0), np.uint8(OCCUPIED), grid.cells)
-    topology = _cells.ways_of(replace(grid, cells=level), options.robot_radius, notes)
+    topology = _cells.free_space_network(replace(grid, cells=level), options.robot_radius, notes)
     if topology is not None:
         parts[PartKey("topology", GROUND, NETWORK)] = topology
     return Layers(dict(sorted(parts.items())), layers.datum, layers.levels)
@@ -146,7 +148,7 @@ def _trees(
         if not inner.contains(shapely.Point(at)):
             continue
         count += 1
-        base = mm(float(_at(ground, np.array([at[0]]), np.array([at[1]]))[0]))
+        base = mm(float(_heights_at(ground, np.array([at[0]]), np.array([at[1]]))[0]))
         good = 0.5 * (tall + 0.5 + 0.5 * float(soil[r, c]))  # of chance and of the soil, which lasts
         radius, height = mm(0.1 + 0.15 * thick), mm(5.0 + 7.0 * good)
         # Its trunk is to be met above the level's floor, wherever its foot is.
@@ -164,7 +166,7 @@ def _trees(
             "pose": [0.0, 0.0, mm(stem + 0.1 * height), 0.0, 0.0, 0.0],
             "visual": True,
         }
-        site.put(
+        site.add_object(
             f"tree/{count}",
             "tree",
             shapely.Point(at),
@@ -180,12 +182,12 @@ def _trees(
 
 def _posts(site: Site, ground: tuple[Array, Array, Array], notes: DerivationNotes) -> None:
     """A post at each corner of bare ground: without anything that stands there is nothing to find one's place by."""
-    inner = shapely.buffer(site.fence, -POST, join_style="mitre")
+    inner = shapely.buffer(site.fence, -POST_INSET_METRES, join_style="mitre")
     if inner.is_empty or inner.geom_type != "Polygon":
         raise CannotGenerate("the ground is too narrow for posts at its corners: give some vegetation")
     corners = shapely.get_coordinates(inner.exterior)[:-1]
     for count, (x, y) in enumerate(corners.tolist(), 1):
-        base = mm(float(_at(ground, np.array([x]), np.array([y]))[0]))
+        base = mm(float(_heights_at(ground, np.array([x]), np.array([y]))[0]))
         length = mm(1.0 - base)
         solid = {
             "type": "cylinder",
@@ -194,7 +196,7 @@ def _posts(site: Site, ground: tuple[Array, Array, Array], notes: DerivationNote
             "pose": [0.0, 0.0, mm(length / 2), 0.0, 0.0, 0.0],
         }
         at = mm(x), mm(y)
-        site.put(
+        site.add_object(
             f"post/{count}",
             "post",
             shapely.Point(at),
@@ -208,7 +210,7 @@ def _posts(site: Site, ground: tuple[Array, Array, Array], notes: DerivationNote
     notes.fill("posts", len(corners), "no tree stands there: corner posts are what a robot can see")
 
 
-def _at(ground: tuple[Array, Array, Array], x: Array, y: Array) -> Array:
+def _heights_at(ground: tuple[Array, Array, Array], x: Array, y: Array) -> Array:
     """Heights at points, straight between those of the map."""
     xs, ys, height = ground
     u = np.clip((x - xs[0]) / (xs[-1] - xs[0]), 0.0, 1.0) * (len(xs) - 1)
@@ -230,7 +232,7 @@ def _steepness(grid: OccupancyGrid, ground: tuple[Array, Array, Array]) -> Array
     out = np.empty((grid.height, grid.width))
     for row in range(grid.height):  # a row at a time: the arrays in between stay small
         y = np.full(grid.width, grid.origin[1] + (row + 0.5) * r)
-        out[row] = _at((xs, ys, steep), x, y)
+        out[row] = _heights_at((xs, ys, steep), x, y)
     return np.round(out, 6)
 
 
@@ -242,9 +244,9 @@ def _costs(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
     return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=properties)
 
 
-def _speed(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
+def _speed_mask(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
     """Nav2's speed mask: percent of the robot's speed; 0, no limit, where it is nobody's business."""
-    percent = np.maximum(np.rint(100.0 * (1.0 - np.minimum(steep, 1.0))), SLOWEST).astype(np.uint8)
+    percent = np.maximum(np.rint(100.0 * (1.0 - np.minimum(steep, 1.0))), MIN_SPEED_PERCENT).astype(np.uint8)
     cells = np.where(grid.cells == UNKNOWN, 0, percent).astype(np.uint8)
     info = masks.FilterInfo(masks.SPEED_PERCENT, 0.0, 1.0)
     properties = {masks.NAME: {"params": masks.params("speed", info)}}

@@ -14,7 +14,7 @@ from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, Problem
 from app.generate import RandomSource, _blocks, _plants, _streets, generates
 from app.generate._blocks import Lot
-from app.generate._site import SLACK, Site, SiteOptions, angle, disc, mm, refused
+from app.generate._site import SLACK, Site, SiteOptions, angle, disc, invalid_option_error, mm
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -37,10 +37,10 @@ house : width >= 6 & area <= 400 @ 1 -> flat(rand(1, storeys))
 """
 
 STOREY = 2.9
-MOST_AREA = 25e6
+MAX_AREA_M2 = 25e6
 """Square metres of a boundary."""
 
-MOST_POINTS = 1000
+MAX_BOUNDARY_POINTS = 1000
 MARGIN = 2.0
 BETWEEN_LAMPS = 24.0
 LAMP = (0.08, 5.0)
@@ -87,14 +87,16 @@ def town(given: Layers, options: Options, source: RandomSource, notes: Derivatio
     }
     grammar = _blocks.parse(RULES if options.rules is None else options.rules, constants)
     site = Site(given, options, notes)
-    boundary = _bounded(site, options)
+    boundary = _town_boundary(site, options)
     layout = _blocks.grow(grammar, boundary, source.stream("rules"))
     if not layout.streets:
         raise CannotGenerate("the rules make no street: use ring or cut", [Problem("no street", where="rules")])
-    streets = _streets.network_of(layout.streets, options.sidewalk)
+    streets = _streets.build_streets(layout.streets, options.sidewalk)
     need = options.robot_radius + SLACK * site.resolution
     if streets.walk / 2 < need:
-        raise refused("sidewalk", f"{streets.walk:.2f} m are too narrow for the robot, which needs {2 * need:.2f} m")
+        raise invalid_option_error(
+            "sidewalk", f"{streets.walk:.2f} m are too narrow for the robot, which needs {2 * need:.2f} m"
+        )
     _paint(site, streets, layout, boundary)
     _buildings(site, [lot for lot in layout.lots if lot.use in _blocks.ROOFS])
     ring = any(rule.action == "ring" for rule in grammar.rules[grammar.start])
@@ -110,19 +112,19 @@ def town(given: Layers, options: Options, source: RandomSource, notes: Derivatio
     return site.finish(ground="meadow")
 
 
-def _bounded(site: Site, options: Options) -> Any:
+def _town_boundary(site: Site, options: Options) -> Any:
     """The town's boundary: the one that was asked for, else the fence, else a rectangle."""
     boundary = None if options.boundary is None else _polygon(options.boundary)
     outline = shapely.box(0.0, 0.0, options.width, options.depth) if boundary is None else boundary
-    if outline.area > MOST_AREA:
-        raise refused("boundary", f"{outline.area / 1e6:.1f} km² are more than {MOST_AREA / 1e6:g} km²")
+    if outline.area > MAX_AREA_M2:
+        raise invalid_option_error("boundary", f"{outline.area / 1e6:.1f} km² are more than {MAX_AREA_M2 / 1e6:g} km²")
     around = shapely.buffer(outline, MARGIN, join_style="mitre", mitre_limit=3.0)
-    fence = site.bounded(around, room=options.sidewalk / 2 - options.robot_radius)
+    fence = site.set_fence(around, room=options.sidewalk / 2 - options.robot_radius)
     if not site.is_given:
         return outline
     if boundary is not None:
         if not shapely.contains(fence, boundary):
-            raise refused("boundary", "reaches beyond the fence of the environment")
+            raise invalid_option_error("boundary", "reaches beyond the fence of the environment")
         return boundary
     inner = [p for p in shapely.get_parts(shapely.buffer(fence, -0.5, join_style="mitre")) if p.area > 0]
     if not inner:
@@ -136,8 +138,8 @@ def _polygon(numbers: Sequence[float]) -> Any:
     def wrong(problem: str) -> Invalid:
         return Invalid(f"boundary: {problem}", [Problem(problem, where="boundary")])
 
-    if len(numbers) % 2 or not 6 <= len(numbers) <= 2 * MOST_POINTS:
-        raise wrong(f"must be x,y of 3 to {MOST_POINTS} corners, got {len(numbers)} numbers")
+    if len(numbers) % 2 or not 6 <= len(numbers) <= 2 * MAX_BOUNDARY_POINTS:
+        raise wrong(f"must be x,y of 3 to {MAX_BOUNDARY_POINTS} corners, got {len(numbers)} numbers")
     if max(map(abs, numbers)) > 1e6:
         raise wrong("must lie within a million metres of the origin")
     ring = [(mm(x), mm(y)) for x, y in zip(numbers[::2], numbers[1::2], strict=True)]
@@ -204,7 +206,7 @@ def _buildings(site: Site, lots: Sequence[Lot]) -> None:
                 },
             ]
         tags = {"building": "yes", "building:levels": str(lot.storeys), "roof:shape": OSM_ROOF[use]}
-        site.put(
+        site.add_object(
             f"building_{k + 1}",
             "building",
             area,
@@ -276,7 +278,7 @@ def _lamps(site: Site, streets: _streets.Streets, need: float, notes: Derivation
 def _green(site: Site, lots: Sequence[Lot], source: RandomSource) -> None:
     """Trees in parks, bushes and a tree in gardens, benches on squares."""
     chance = source.stream("green")
-    kinds = {name: _plants.grown(name, count, source) for name, count in (("apple", 3), ("pine", 2), ("bush", 2))}
+    kinds = {name: _plants.grow_plants(name, count, source) for name, count in (("apple", 3), ("pine", 2), ("bush", 2))}
     trees = benches = 0
     for lot in lots:
         inner = shapely.buffer(lot.area, -2.0)
@@ -302,7 +304,7 @@ def _green(site: Site, lots: Sequence[Lot], source: RandomSource) -> None:
                 trees += 1
                 if trees > MAX_TREES:
                     return
-                site.put(
+                site.add_object(
                     f"tree_{trees}", plant.kind, shapely.Point(x, y), shapes=plant.shapes(scale),
                     pose=(x, y, 0.0, 6.28 * turn), width=mm(2 * plant.body[0] * scale),
                     height=mm(plant.height * scale), species=name,

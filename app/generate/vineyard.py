@@ -8,7 +8,7 @@ from typing import Any
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Row
-from app.generate._site import Site, mm, rectangle, refused, rgb
+from app.generate._site import Site, invalid_option_error, mm, rectangle, rgb
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -18,7 +18,7 @@ class Vineyard(FieldOptions):
     """Parameters of a vineyard."""
 
     rows: int | None = parameter(
-        None, "rows of vines; default: as many as the fence holds, 9 without one", minimum=2, maximum=_field.MOST_ROWS
+        None, "rows of vines; default: as many as the fence holds, 9 without one", minimum=2, maximum=_field.MAX_ROWS
     )
     row_spacing: float = parameter(2.5, "from row to row", minimum=1.0, maximum=10.0, unit="m")
     vine_spacing: float = parameter(1.2, "from vine to vine in a row", minimum=0.3, maximum=10.0, unit="m")
@@ -35,19 +35,19 @@ class Vineyard(FieldOptions):
 def vineyard(given: Layers, options: Vineyard, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A vineyard: vines on trellises with posts and wires that no robot may pass, headlands, and a yard."""
     if options.canopy_top <= options.canopy_base:
-        raise refused("canopy_top", "must be above canopy_base")
+        raise invalid_option_error("canopy_top", "must be above canopy_base")
     site = Site(given, options, notes, coloured=True)
     out = _field.open_field(
         site,
         options,
-        _field.numbered(options.rows or _field.MOST_ROWS),
+        _field.number_rows(options.rows or _field.MAX_ROWS),
         row_count=None if options.rows else 9,
         spacing=options.row_spacing,
         half=options.canopy_width / 2 + options.jitter,
     )
     vines = sum(int(row.length / options.vine_spacing) + 1 for row in out.rows)
-    if vines > _trees.MOST_PLANTS:
-        raise refused("vine_spacing", f"there would be {vines} vines; the limit is {_trees.MOST_PLANTS}")
+    if vines > _trees.MAX_PLANTS:
+        raise invalid_option_error("vine_spacing", f"there would be {vines} vines; the limit is {_trees.MAX_PLANTS}")
     _field.ground(out, field_colour="meadow")
     for row in out.rows:
         _trellis(site, out, row, options)
@@ -74,9 +74,9 @@ def _trellis(site: Site, out: Field, row: Row, options: Vineyard) -> None:
     for z in wires:
         place = [mm(row.length / 2), 0.0, mm(z), 0.0, 0.0, 0.0]
         shapes.append({"type": "box", "size": [mm(row.length), 0.01, 0.01], "pose": place, "colour": rgb("metal")})
-    x, y = out.at(row.low, row.v)
+    x, y = out.to_local(row.low, row.v)
     members: dict[str, Any] = {"name": f"Row {row.number}", "height": mm(options.canopy_top), "width": 0.1}
-    site.put(f"trellis{row.number}", "fence", out.line(row), shapes=shapes, pose=(x, y, 0.0, out.yaw), **members)
+    site.add_object(f"trellis{row.number}", "fence", out.line(row), shapes=shapes, pose=(x, y, 0.0, out.yaw), **members)
     site.zone(f"row{row.number}", "keepout", out.strip(row, options.canopy_width), name=f"Row {row.number}")
 
 
@@ -84,7 +84,7 @@ def _vine(
     site: Site, i: str, out: Field, place: tuple[float, float], row: Row, options: Vineyard, chance: list[float]
 ) -> None:
     """A vine: a trunk, and its leaves on the wires."""
-    at = out.at(*place)
+    at = out.to_local(*place)
     low, high = (
         options.canopy_base,
         options.canopy_base + (options.canopy_top - options.canopy_base) * (0.85 + 0.15 * chance[0]),
@@ -101,8 +101,8 @@ def _vine(
             "pose": [0.0, mm(across), mm((low + high) / 2), 0.0, 0.0, 0.0],
         },
     ]
-    x, y = out.at(place[0], row.v)
-    site.put(
+    x, y = out.to_local(place[0], row.v)
+    site.add_object(
         i,
         "plant",
         rectangle(*at, 0.0, 0.08, 0.08),

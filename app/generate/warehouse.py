@@ -12,7 +12,7 @@ import shapely
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Line, Row
-from app.generate._site import SLACK, Site, mm, rectangle, refused
+from app.generate._site import SLACK, Site, invalid_option_error, mm, rectangle
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -44,7 +44,7 @@ class Warehouse(FieldOptions):
     )
     docks: int = parameter(3, "loading docks in the longest side", minimum=1, maximum=50)
     racks: int | None = parameter(
-        None, "double racks; default: as many as the fence holds, 5 without one", minimum=2, maximum=_field.MOST_ROWS
+        None, "double racks; default: as many as the fence holds, 5 without one", minimum=2, maximum=_field.MAX_ROWS
     )
     aisle: float = parameter(2.8, "between two racks", minimum=0.8, maximum=20.0, unit="m")
     rack_depth: float = parameter(
@@ -64,7 +64,7 @@ class Warehouse(FieldOptions):
 def warehouse(given: Layers, options: Warehouse, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A warehouse: a hall with racks and pallets, aisles (one-way on request), loading docks, chargers and parking."""
     site = Site(given, options, notes, coloured=True)
-    lines = [Line("row", k, f"A{k}") for k in range(1, (options.racks or _field.MOST_ROWS) + 1)]
+    lines = [Line("row", k, f"A{k}") for k in range(1, (options.racks or _field.MAX_ROWS) + 1)]
     out = _field.open_field(
         site,
         options,
@@ -77,8 +77,8 @@ def warehouse(given: Layers, options: Warehouse, source: RandomSource, notes: De
     )
     site.draw(site.fence, "floor")
     pallets = sum(4 * row.length / BAY for row in out.rows)
-    if pallets > _trees.MOST_PLANTS:
-        raise refused("racks", f"there would be {int(pallets)} pallets; the limit is {_trees.MOST_PLANTS}")
+    if pallets > _trees.MAX_PLANTS:
+        raise invalid_option_error("racks", f"there would be {int(pallets)} pallets; the limit is {_trees.MAX_PLANTS}")
     for row in out.rows:
         _rack(site, out, row, options, source.stream(f"pallets {row.number}"))
     _field.network(
@@ -109,8 +109,8 @@ def _rack(site: Site, out: Field, row: Row, options: Warehouse, stream: np.rando
         for v in (-depth / 2, depth / 2):
             place = [mm(row.length / 2), mm(v), mm(z), 0.0, 0.0, 0.0]
             shapes.append({"type": "box", "size": [mm(row.length), mm(depth), 0.1], "pose": place})
-    x, y = out.at(row.low, row.v)
-    site.put(
+    x, y = out.to_local(row.low, row.v)
+    site.add_object(
         f"rack{row.number}",
         "shelf",
         out.strip(row, 2 * depth),
@@ -133,7 +133,7 @@ def _rack(site: Site, out: Field, row: Row, options: Warehouse, stream: np.rando
                 number += 1
                 u = row.low + (k + 0.5) * bay + end * (along / 2 + 0.05 + 0.05 * b)
                 size = (along, across, 0.8 + 0.6 * c)
-                spot = out.at(u, row.v + side * (depth / 2))
+                spot = out.to_local(u, row.v + side * (depth / 2))
                 name = f"pallet{row.number}-{number}"
                 site.box(name, "crate", spot, size, yaw=out.yaw, colour="goods" if b < 0.6 else "straw")
 
@@ -147,7 +147,7 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
     names += [f"Parking{k + 1}" for k in range(options.parking)]
     pitch = mm(max(3.0, 2 * radius + 1.2))
     if (len(names) + 1) * pitch > lane.high - lane.low:
-        raise refused(
+        raise invalid_option_error(
             "docks",
             f"{len(names)} docks, chargers and parking places need {(len(names) + 1) * pitch:g} m of the "
             f"longest side, which has {lane.high - lane.low:.1f} m",
@@ -161,10 +161,12 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
         u = mm(first + k * pitch)
         stop = f"At{name}"
         positions[stop] = u
-        site.node(stop, out.at(u, lane.v), yaw=out.yaw)
+        site.node(stop, out.to_local(u, lane.v), yaw=out.yaw)
         wall, near = _field.lowest(out, u, 0.0), _field.lowest(out, u, clear)
         if wall is None or near is None:
-            raise refused("docks", f"the lane has no room for {len(names)} docks, chargers and parking places")
+            raise invalid_option_error(
+                "docks", f"the lane has no room for {len(names)} docks, chargers and parking places"
+            )
         words: dict[str, Any] = {}
         v = near
         if name.startswith("Dock"):
@@ -178,7 +180,7 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
             site.box(
                 name.lower(),
                 "machine",
-                out.at(u, mm(near + 0.5 - clear + WALL - 0.15)),
+                out.to_local(u, mm(near + 0.5 - clear + WALL - 0.15)),
                 (0.6, 0.3, 1.2),
                 yaw=out.yaw,
                 colour="charger",
@@ -186,11 +188,11 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
             )
         else:
             words = {"openrmf": {"parameters": {"is_parking_spot": [4, True]}}}
-            site.draw(rectangle(*out.at(u, v), out.yaw, 2 * radius + 0.4, 2 * radius + 0.4), "concrete")
+            site.draw(rectangle(*out.to_local(u, v), out.yaw, 2 * radius + 0.4, 2 * radius + 0.4), "concrete")
         if v > lane.v - radius:
-            raise refused("yard", f"{options.yard:g} m are too few for a robot of {radius:g} m radius")
-        site.node(name, out.at(u, mm(v)), yaw=facing, **words)
-        site.way(stop, name, speed=0.5)
+            raise invalid_option_error("yard", f"{options.yard:g} m are too few for a robot of {radius:g} m radius")
+        site.node(name, out.to_local(u, mm(v)), yaw=facing, **words)
+        site.add_edges(stop, name, speed=0.5)
     inside = shapely.buffer(site.fence, -WALL, join_style="mitre")
     walls = shapely.difference(shapely.difference(site.fence, inside), shapely.union_all(doors))
     for k, piece in enumerate(sorted(shapely.get_parts(walls), key=lambda p: p.bounds), 1):
@@ -199,7 +201,7 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
         rings = [np.round(shapely.get_coordinates(r), 3).tolist()[:-1] for r in (piece.exterior, *piece.interiors)]
         shape = {"type": "polyline", "points": rings, "height": mm(options.wall_height)}
         members: dict[str, Any] = {"height": mm(options.wall_height), "name": f"Wall {k}"}
-        site.put(f"wall{k}", "wall", piece, shapes=[shape], pose=(0.0, 0.0, 0.0, 0.0), colour="wall", **members)
+        site.add_object(f"wall{k}", "wall", piece, shapes=[shape], pose=(0.0, 0.0, 0.0, 0.0), colour="wall", **members)
     low, high = lane.low, lane.high
     slow = out.area(low, 0.0, high, lane.v + 1.0)
     if slow.geom_type == "Polygon":

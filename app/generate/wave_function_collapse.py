@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Problem
 from app.generate import RandomSource, _cells, _wfc, generates
-from app.generate._cells import LOOKS, CellStyle
-from app.generate._site import Site, SiteOptions, refused
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, as_seen
+from app.generate._cells import STYLES, CellStyle
+from app.generate._site import Site, SiteOptions, invalid_option_error
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey_as_unknown
 from app.model.layers import Layers
 from app.parameters import parameter
 
 U8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
-SIDE = 5.0
+SAMPLE_METRES = 5.0
 """Metres of our own samples."""
 
 RESOLUTION = 0.05
 
-MOST_SAMPLE = 2**18
+MAX_SAMPLE_CELLS = 2**18
 """Tiles of a sample."""
 
 WALL = 0.1
@@ -51,7 +51,7 @@ class Sample:
 
     def cells(self, resolution: float) -> U8:
         """The sample as a grid: 0 free, 100 occupied; row 0 is the lowest."""
-        n = max(1, round(SIDE / resolution))
+        n = max(1, round(SAMPLE_METRES / resolution))
         out = np.full((n, n), FREE, np.uint8)
         for x, y, w, d in self.rectangles:
             x0, y0, x1, y1 = (round(v / resolution) for v in (x, y, x + w, y + d))
@@ -63,21 +63,21 @@ PILLARS = (0.4, 1.65, 2.9, 4.15)
 
 SAMPLES: Mapping[str, Sample] = {
     "warehouse": Sample(
-        LOOKS["rack"],
+        STYLES["rack"],
         (
             *((x, y, 1.4, 0.4) for y in (0.7, 1.8, 2.9) for x in (0.8, 2.9)),
             *((x, 4.0, 0.2, 0.2) for x in (1.0, 3.0)),
         ),
     ),
     "office": Sample(
-        LOOKS["furniture"],
+        STYLES["furniture"],
         (
             *((x, y, 0.8, 0.4) for y in (0.6, 1.4, 3.2, 4.0) for x in (0.6, 1.9)),
             *((x, y, 0.4, 0.4) for y in (0.6, 1.6, 3.0, 4.2) for x in (3.3, 4.2)),
         ),
     ),
     "pillars": Sample(
-        LOOKS["wall"], tuple((x, y, 0.4, 0.4) for x in (0.4, 1.65, 2.9, 4.15) for y in (0.4, 1.65, 2.9, 4.15))
+        STYLES["wall"], tuple((x, y, 0.4, 0.4) for x in (0.4, 1.65, 2.9, 4.15) for y in (0.4, 1.65, 2.9, 4.15))
     ),
 }
 
@@ -131,18 +131,22 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
     sample, known_cells, resolution, look = _sample(given, options, notes)
     pattern = _pattern(options)
     tile = options.tile or (1 if options.model == "overlapping" else 2)
-    sample, known_cells = _whole(sample, known_cells, tile, notes)
-    if sample.size > MOST_SAMPLE * tile * tile:
-        raise refused("sample", f"has {sample.size // tile**2} tiles, the limit is {MOST_SAMPLE}: give a larger tile")
+    sample, known_cells = _whole_tiles(sample, known_cells, tile, notes)
+    if sample.size > MAX_SAMPLE_CELLS * tile * tile:
+        raise invalid_option_error(
+            "sample", f"has {sample.size // tile**2} tiles, the limit is {MAX_SAMPLE_CELLS}: give a larger tile"
+        )
     site = Site(given, options, notes)
-    place = _cells.placed(site, options.width, options.depth, resolution, step=tile)
+    place = _cells.site_grid_frame(site, options.width, options.depth, resolution, step=tile)
     if options.wrap and options.border == "walls":
-        raise refused("wrap", "a sample that goes on at its other side has no walls: give border=open or periodic")
+        raise invalid_option_error(
+            "wrap", "a sample that goes on at its other side has no walls: give border=open or periodic"
+        )
     thick = max(1, round(WALL / (resolution * tile))) if options.border == "walls" else 0
     rows, columns = place.rows // tile, place.columns // tile
     if min(rows, columns) < max(pattern, 2 * thick + 1):
         min_side = max(pattern, 2 * thick + 1) * tile * resolution
-        raise refused(
+        raise invalid_option_error(
             "width", f"{columns} × {rows} tiles are too few: at least {min_side:g} m along each side are needed"
         )
     if thick:
@@ -157,19 +161,19 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
     fixed = np.full((rows, columns), -1, np.int64)
     wall = -1
     if thick:
-        wall = _only((model.tiles == BORDER).all(axis=(1, 2)), "border", "a wall tile")
+        wall = _single_index((model.tiles == BORDER).all(axis=(1, 2)), "border", "a wall tile")
         fixed[:thick], fixed[-thick:], fixed[:, :thick], fixed[:, -thick:] = wall, wall, wall, wall
     size = resolution * tile
     for option, mask, label in (("free", open_, "a free tile"), ("blocked", full, "an occupied tile")):
         for x, y in _points(getattr(options, option), option):
             r, c = int((y - place.y) // size), int((x - place.x) // size)
             if not (0 <= r < rows and 0 <= c < columns):
-                raise refused(option, f"({x:g}, {y:g}) lies outside of the site")
-            number = _only(mask, option, label)
+                raise invalid_option_error(option, f"({x:g}, {y:g}) lies outside of the site")
+            number = _single_index(mask, option, label)
             if fixed[r, c] not in (-1, number):
-                raise refused(option, f"({x:g}, {y:g}) lies on a wall, or is to be free and occupied")
+                raise invalid_option_error(option, f"({x:g}, {y:g}) lies on a wall, or is to be free and occupied")
             fixed[r, c] = number
-    tiles = _wfc.collapsed(
+    tiles = _wfc.collapse_model(
         model,
         (rows, columns),
         fixed,
@@ -180,17 +184,17 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
         repairs=options.repairs,
         wall=wall,
     )
-    cells = _wfc.rendered(model, tiles)
-    _cells.stand(site, place, cells == BORDER, LOOKS["wall"])
-    _cells.stand(site, place, cells == OCCUPIED, look)
-    return _cells.finished(site, options, notes, ground="concrete")
+    cells = _wfc.render(model, tiles)
+    _cells.add_objects(site, place, cells == BORDER, STYLES["wall"])
+    _cells.add_objects(site, place, cells == OCCUPIED, look)
+    return _cells.finish_site(site, options, notes, ground="concrete")
 
 
 def _pattern(options: Options) -> int:
     if options.model == "overlapping":
         return options.pattern or 5
     if options.pattern is not None:
-        raise refused("pattern", "belongs to model=overlapping: a tiled model knows only neighbours")
+        raise invalid_option_error("pattern", "belongs to model=overlapping: a tiled model knows only neighbours")
     return 1
 
 
@@ -205,40 +209,44 @@ def _sample(given: Layers, options: Options, notes: DerivationNotes) -> tuple[U8
     grid = grids.get(options.sample)
     if grid is None:
         grid_names = ", ".join(sorted(grids)) or "none"
-        raise refused(
+        raise invalid_option_error(
             "sample",
             f"there is no sample {options.sample[:80]!r}: give one of {', '.join(SAMPLES)}, or a grid ({grid_names})",
         )
     resolution = round(grid.resolution, 3)
     if options.resolution is not None and abs(options.resolution - grid.resolution) > 1e-6:
-        raise refused("resolution", f"is the sample's, {grid.resolution:g} m: leave it out")
+        raise invalid_option_error("resolution", f"is the sample's, {grid.resolution:g} m: leave it out")
     if resolution != grid.resolution:
         notes.fill("resolution", resolution, f"the sample's {grid.resolution!r} m in whole millimetres")
-    return *binary(grid), resolution or RESOLUTION, LOOKS["obstacle"]
+    return *binary(grid), resolution or RESOLUTION, STYLES["obstacle"]
 
 
 def binary(grid: OccupancyGrid) -> tuple[U8, Bool]:
     """A grid's cells as 0 and 100, by its threshold, and which of them are known."""
-    grid = as_seen(grid)
+    grid = unknown_grey_as_unknown(grid)
     known_cells = grid.cells != UNKNOWN
     occupied = known_cells & (grid.cells >= grid.occupied_thresh * OCCUPIED)
     return np.where(occupied, OCCUPIED, FREE).astype(np.uint8), known_cells
 
 
-def _whole(cells: U8, known_cells: Bool, tile: int, notes: DerivationNotes) -> tuple[U8, Bool]:
+def _whole_tiles(cells: U8, known_cells: Bool, tile: int, notes: DerivationNotes) -> tuple[U8, Bool]:
     """A sample of whole tiles."""
     rows, columns = (n // tile * tile for n in cells.shape)
     lost = cells.size - rows * columns
     if not rows * columns:
-        raise refused("tile", f"the sample of {cells.shape[1]} × {cells.shape[0]} cells is smaller than one tile")
+        raise invalid_option_error(
+            "tile", f"the sample of {cells.shape[1]} × {cells.shape[0]} cells is smaller than one tile"
+        )
     notes.drop("cells of the sample", lost, f"beyond the last whole tile of {tile} cells")
     return cells[:rows, :columns], known_cells[:rows, :columns]
 
 
-def _only(mask: Bool, option: str, label: str) -> int:
+def _single_index(mask: Bool, option: str, label: str) -> int:
     indices = np.flatnonzero(mask)
     if not len(indices):
-        raise refused(option, f"the sample has no {label.split(' ', 1)[1]} of this size: give a smaller tile")
+        raise invalid_option_error(
+            option, f"the sample has no {label.split(' ', 1)[1]} of this size: give a smaller tile"
+        )
     return int(indices[0])
 
 

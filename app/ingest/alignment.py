@@ -89,11 +89,11 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
             loaded.parts.get(target) if request.layer == "occupancy" else _derive_target(loaded, request, target, notes)
         )
         assert isinstance(target_grid, OccupancyGrid)
-        fits = alignment.of_grids(grid, target_grid, angle=request.angle, reach=request.reach, near=request.near)
+        fits = alignment.align_grids(grid, target_grid, angle=request.angle, reach=request.reach, near=request.near)
         fit, report = fits[0], {"others": [f.as_dict() for f in fits[1:4]]}
         if len(fits) > 1 and fits[1].score >= fit.score - 0.05:
             notes.warn("another place fits about as well (see others): the site has a symmetry; give a smaller angle")
-    moved = fit.moved(grid)
+    moved = fit.move_grid(grid)
     report = {
         "grid": {"level": request.level, "name": request.grid},
         **fit.as_dict(),
@@ -129,7 +129,7 @@ def previous_alignment(version: Version, request: AlignmentRequest) -> dict[str,
 
 
 def _fit_by_points(request: AlignmentRequest, notes: DerivationNotes) -> tuple[alignment.Fit, dict[str, Any]]:
-    fit, disagreeing, scale = alignment.of_pairs(
+    fit, disagreeing, scale = alignment.fit_pairs(
         np.array(request.pairs, np.float64).reshape(-1, 2, 2), near=request.near
     )
     if disagreeing:
@@ -142,13 +142,13 @@ def _fit_by_points(request: AlignmentRequest, notes: DerivationNotes) -> tuple[a
 def _derive_target(loaded: Layers, request: AlignmentRequest, target: PartKey, notes: DerivationNotes) -> OccupancyGrid:
     """The layer as the grid that a derivation makes of it."""
     step = derive.all_derivations()[GRID_DERIVATIONS[request.layer]].step()
-    unknown = request.values.keys() - derive.takes(step.name)
+    unknown = request.values.keys() - derive.parameter_names(step.name)
     if unknown:
-        accepted = ", ".join(sorted(derive.takes(step.name)))
+        accepted = ", ".join(sorted(derive.parameter_names(step.name)))
         reason = f"no such parameter of {step.name}; accepted: {accepted}"
         raise Invalid(reason, [Problem(reason, where=f"body.onto.parameters.{name}") for name in sorted(unknown)])
     bare = Layers({k: p for k, p in loaded.parts.items() if k.layer != "occupancy"}, loaded.datum, loaded.levels)
-    derived_layers = derive.run(derive.with_values([step], request.values), bare, notes)
+    derived_layers = derive.run(derive.with_parameters([step], request.values), bare, notes)
     grid = derived_layers.parts.get(PartKey("occupancy", target.level, MAP))
     if not isinstance(grid, OccupancyGrid):
         levels = ", ".join(k.level for k in derived_layers.grids())

@@ -32,13 +32,13 @@ def check(request: DerivationRequest) -> None:
     if request.method not in derivations:
         near = did_you_mean(request.method, derivations)
         raise NotFound(f"there is no derivation {request.method!r}{near}; known ones: {', '.join(derivations)}")
-    method_values = {n: v for n, v in request.values.items() if n in derive.takes(request.method)}
+    method_values = {n: v for n, v in request.values.items() if n in derive.parameter_names(request.method)}
     parameters.parse(derivations[request.method].parameters, method_values, f"parameter of {request.method}")
-    everything = frozenset().union(*(derive.takes(name) for name in derivations))
+    everything = frozenset().union(*(derive.parameter_names(name) for name in derivations))
     for name in request.values:
         if name not in everything:
-            accepted = ", ".join(sorted(derive.takes(request.method))) or "none"
-            near = did_you_mean(name, derive.takes(request.method))
+            accepted = ", ".join(sorted(derive.parameter_names(request.method))) or "none"
+            near = did_you_mean(name, derive.parameter_names(request.method))
             problem = f"no such parameter of {request.method}{near}; accepted: {accepted}"
             raise Invalid(f"{name}: {problem}", [Problem(problem, where=f"parameters.{name}")])
 
@@ -65,14 +65,14 @@ def prepare_derivation(
         used |= {
             k: e
             for k, e in existing_parts.items()
-            if derivation.gives in needed or (derivation.makes and k.name == MAP)
+            if derivation.gives in needed or (derivation.part_names and k.name == MAP)
         }
         # Not only the layers that are needed: a derivation may look at others where they are there (a fence).
         loaded = store.load(base, sorted(used))
         notes = DerivationNotes()
         try:
             layers = Layers(loaded.parts, base.datum, base.levels)
-            chain = derive.with_values(steps, request.values)
+            chain = derive.with_parameters(steps, request.values)
             before = derive.run(chain[:-1], layers, notes)
             derived_layers = derive.run(chain[-1:], before, notes)
             break
@@ -106,7 +106,7 @@ def prepare_derivation(
 
 def _is_display_only(entry: PartEntry) -> bool:
     """Whether a part was made for people to look at, so that it is no evidence."""
-    return not entry.provenance.is_edited and derive.is_drawn(entry.provenance.steps)
+    return not entry.provenance.is_edited and derive.ends_in_display_step(entry.provenance.steps)
 
 
 def _steps(
@@ -129,7 +129,7 @@ def _steps(
 
 def _check_values(request: DerivationRequest, chain: Sequence[Step]) -> None:
     """Nothing is silently ignored: a parameter of a step that is not on the way is refused."""
-    taken = frozenset().union(*(derive.takes(step.name) for step in chain))
+    taken = frozenset().union(*(derive.parameter_names(step.name) for step in chain))
     for name in request.values:
         if name not in taken:
             problem = f"no step on the way takes it ({', then '.join(step.name for step in chain)})"

@@ -37,7 +37,7 @@ def prepare_generation(
     store = open_store(database_url, blob_dir)
     generator, _ = generate.check(order.generator, order.seed, order.values)
     used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in generator.reads}
-    if not generator.works_on:
+    if not generator.editable_layers:
         used = {k: e for k, e in used.items() if not _is_generated(e)}
     loaded = store.load(base, sorted(used))
     given = Layers(loaded.parts, base.datum, base.levels)
@@ -53,7 +53,7 @@ def prepare_generation(
     operations: list[Operation] = [
         Replace(key, part, provenance) for key, part in sorted(generated_layers.parts.items())
     ]
-    if not generator.works_on:
+    if not generator.editable_layers:
         operations += [
             Drop(key)
             for key in sorted(existing_parts)
@@ -80,7 +80,7 @@ def _check_free(
     """A generator may replace what it was made to work on, and its like's work; the rest only where asked."""
     for key in sorted(generated_layers.parts):
         entry = existing_parts.get(key)
-        if entry is None or order.replace or key.layer in generator.works_on or _is_generated(entry):
+        if entry is None or order.replace or key.layer in generator.editable_layers or _is_generated(entry):
             continue
         edited, kind = entry.provenance.is_edited, entry.provenance.information
         why = f"was {kind} and then edited" if edited else f"is {kind}"

@@ -112,7 +112,7 @@ def _stale_clouds(base: Version, upload_bundle: Bundle) -> list[Drop]:
 def _unused_hints(hints: UploadHints, upload_bundle: Bundle) -> list[Problem]:
     """What the sender said and nothing came of, so that a misunderstanding is noticed."""
     out = []
-    drawings = {f.name for f in formats.all_formats().values() if f.drawing}
+    drawings = {f.name for f in formats.all_formats().values() if f.is_drawing}
     if hints.layer is not None and not any(use.format in drawings for use in upload_bundle.files.values()):
         told_for = ", ".join(sorted(drawings))
         out.append(Problem(f"it is for drawings ({told_for}), and there is none in the upload", where="layer"))

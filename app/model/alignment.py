@@ -24,16 +24,16 @@ from app.model.grid import OCCUPIED, OccupancyGrid
 
 Array = NDArray[np.float64]
 
-SIDE = 128
+SEARCH_CELLS = 128
 """Cells along the longer side of a map in the search over all angles."""
 
-PLACES = 16
+MAX_REFINED = 16
 """Places that are refined."""
 
 POINTS = 1500
 """Cells of a map that take part in a refinement; of more, some evenly."""
 
-MOST_PAIRS = 1000
+MAX_PAIRS = 1000
 """Pairs of points."""
 
 _CLOSE = 0.02
@@ -60,14 +60,14 @@ class Fit:
         """The share of all that agrees."""
         return self.agreement * self.overlap
 
-    def of(self, points: Array) -> Array:
+    def apply_to(self, points: Array) -> Array:
         """Points [n, 2] after the motion."""
         return np.asarray(points @ _turn(self.yaw).T + np.array([self.x, self.y]), np.float64)
 
-    def moved(self, grid: OccupancyGrid) -> OccupancyGrid:
+    def move_grid(self, grid: OccupancyGrid) -> OccupancyGrid:
         """The grid at its new place; its cells stay as they are."""
         x, y, yaw = grid.origin
-        new = self.of(np.array([[x, y]]))[0]
+        new = self.apply_to(np.array([[x, y]]))[0]
         return replace(grid, origin=(round(float(new[0]), 9), round(float(new[1]), 9), _angle(yaw + self.yaw)))
 
     def as_dict(self) -> dict[str, float]:
@@ -82,7 +82,7 @@ class Fit:
         }
 
 
-def of_grids(
+def align_grids(
     moving: OccupancyGrid, onto: OccupancyGrid, *, angle: float = math.pi, reach: float | None = None, near: float = 0.1
 ) -> list[Fit]:
     """The places where one grid's obstacles lie on another's, the best first; places that are much alike are one.
@@ -102,34 +102,34 @@ def of_grids(
     fits: list[Fit] = []
     from scipy.spatial import cKDTree
 
-    tree, judge = cKDTree(onto_points), cKDTree(_all(onto))
-    every = _some(_all(moving), 20_000)
-    sample = _some(moving_points)
+    tree, judge = cKDTree(onto_points), cKDTree(_occupied_points(onto))
+    every = _subsample(_occupied_points(moving), 20_000)
+    sample = _subsample(moving_points)
     for yaw, shift in search.places(angle, limit, middle):
-        at = Fit(*_carried(shift, yaw, middle), yaw, 0.0, 0.0)
-        refined = _refined(at, sample, tree, 3 * search.cell, near)
-        distance = float(np.linalg.norm(refined.of(middle[None])[0] - middle))
+        at = Fit(*_shift_for(shift, yaw, middle), yaw, 0.0, 0.0)
+        refined = _refine(at, sample, tree, 3 * search.cell, near)
+        distance = float(np.linalg.norm(refined.apply_to(middle[None])[0] - middle))
         if abs(refined.yaw) <= angle + 1e-3 and distance <= limit + near:
-            fits.append(_judged(refined, every, judge, onto, near))
+            fits.append(_with_quality(refined, every, judge, onto, near))
     fits = _distinct(sorted(fits, key=lambda f: (-f.score, abs(f.yaw))), middle, near)
     if not fits:
         raise CannotConvert("the maps meet nowhere within this angle and reach")
     # Of places that fit as well as the best, the one that moves the map least: sites have symmetries.
     rivals = [f for f in fits if f.score >= fits[0].score - _CLOSE]
-    first = min(rivals, key=lambda f: float(np.linalg.norm(f.of(moving_points) - moving_points, axis=1).mean()))
-    polished = _polished(first, _some(moving_points, 2 * POINTS), tree, middle, near)
-    return [_judged(polished, every, judge, onto, near), *(f for f in fits if f is not first)]
+    first = min(rivals, key=lambda f: float(np.linalg.norm(f.apply_to(moving_points) - moving_points, axis=1).mean()))
+    polished = _polish(first, _subsample(moving_points, 2 * POINTS), tree, middle, near)
+    return [_with_quality(polished, every, judge, onto, near), *(f for f in fits if f is not first)]
 
 
-def of_pairs(pairs: Array, *, near: float = 0.5) -> tuple[Fit, list[int], float]:
+def fit_pairs(pairs: Array, *, near: float = 0.5) -> tuple[Fit, list[int], float]:
     """(the motion that brings the first points of pairs onto the second ones, which pairs disagree, their scale).
 
     pairs: float64 [n, 2, 2], n ≥ 2: [from, to] in metres. near: how far apart, in metres, points that agree may be
     afterwards. scale: how many times as far apart the second points are; a motion has none. Raises Invalid for
     points that say nothing of a turn.
     """
-    if pairs.ndim != 3 or pairs.shape[1:] != (2, 2) or not 2 <= len(pairs) <= MOST_PAIRS:
-        reason = f"from 2 to {MOST_PAIRS} pairs of points [[x, y], [x, y]] are needed"
+    if pairs.ndim != 3 or pairs.shape[1:] != (2, 2) or not 2 <= len(pairs) <= MAX_PAIRS:
+        reason = f"from 2 to {MAX_PAIRS} pairs of points [[x, y], [x, y]] are needed"
         raise Invalid(reason, [Problem(reason, where="pairs")])
     if not np.isfinite(pairs).all() or (np.abs(pairs) > MAX_METRES).any():
         reason = f"coordinates must be finite metres within ±{MAX_METRES:g}"
@@ -182,7 +182,7 @@ class _Search:
 
         self.radius = float(np.linalg.norm(points, axis=1).max())
         low, high = target_points.min(axis=0), target_points.max(axis=0)
-        self.cell = max(near, float(max((high - low).max(), 2 * self.radius)) / SIDE)
+        self.cell = max(near, float(max((high - low).max(), 2 * self.radius)) / SEARCH_CELLS)
         margin = self.radius + 2 * self.cell
         self.low = low - margin
         min_size = np.ceil((high - low + 2 * margin) / self.cell).astype(int) + 1
@@ -201,7 +201,7 @@ class _Search:
         step = min(math.radians(3.0), self.cell / max(self.radius, self.cell))
         count = math.ceil(min(angle, math.pi) / step)
         turns = np.linspace(-1, 1, 2 * count + 1) * min(angle, math.pi) if count else np.zeros(1)
-        allowed = self._allowed(reach, middle)
+        allowed = self._allowed_places(reach, middle)
         peaks: list[tuple[float, float, Array]] = []
         for yaw in turns.tolist():
             score = self._scores(yaw)
@@ -220,7 +220,7 @@ class _Search:
             twins = (abs(_angle(yaw - y)) < 2.5 * step and np.linalg.norm(at - a) < 4 * self.cell for y, a in out)
             if not any(twins):
                 out.append((yaw, at))
-                if len(out) == PLACES:
+                if len(out) == MAX_REFINED:
                     break
         return out
 
@@ -231,7 +231,7 @@ class _Search:
         image[turned[:, 1] % self.height, turned[:, 0] % self.width] = 1.0
         return np.asarray(np.fft.irfft2(self.field * np.fft.rfft2(image).conj(), s=image.shape))
 
-    def _allowed(self, reach: float, middle: Array) -> NDArray[np.bool_] | None:
+    def _allowed_places(self, reach: float, middle: Array) -> NDArray[np.bool_] | None:
         if math.isinf(reach):
             return None
         x = self.low[0] + (np.arange(self.width) + 0.5) * self.cell - middle[0]
@@ -242,7 +242,7 @@ class _Search:
 # --- refinement ------------------------------------------------------------------------------------------------------
 
 
-def _refined(start: Fit, points: Array, tree: Any, wide: float, near: float) -> Fit:
+def _refine(start: Fit, points: Array, tree: Any, wide: float, near: float) -> Fit:
     """Closest points, from a wide search to a narrow one."""
     yaw, shift = start.yaw, np.array([start.x, start.y])
     for reach in (wide, wide / 2, 2 * near, near):
@@ -259,13 +259,13 @@ def _refined(start: Fit, points: Array, tree: Any, wide: float, near: float) -> 
     return Fit(float(shift[0]), float(shift[1]), _angle(yaw), 0.0, 0.0)
 
 
-def _polished(fit: Fit, points: Array, tree: Any, middle: Array, near: float) -> Fit:
+def _polish(fit: Fit, points: Array, tree: Any, middle: Array, near: float) -> Fit:
     """The least distances both ways, cut off at ``near``: closest points rest a little before them, where round things
     may turn or where cells lie on cells. By Nelder and Mead's simplex, from a few turns around the fit."""
     from scipy.optimize import minimize
     from scipy.spatial import cKDTree
 
-    theirs = _some(np.asarray(tree.data), 2 * POINTS)
+    theirs = _subsample(np.asarray(tree.data), 2 * POINTS)
     centred = points - middle
     moving_tree = cKDTree(centred)
     size = float(np.sqrt((centred**2).sum(axis=1).mean()))  # a turn in metres, as far as it moves a usual point
@@ -281,16 +281,16 @@ def _polished(fit: Fit, points: Array, tree: Any, middle: Array, near: float) ->
         options = {"initial_simplex": simplex, "maxfev": tries, "xatol": near / 200, "fatol": 0.0}
         return minimize(cost, start, method="Nelder-Mead", options=options)
 
-    start = np.array([fit.yaw * size, *fit.of(middle[None])[0]])
+    start = np.array([fit.yaw * size, *fit.apply_to(middle[None])[0]])
     tried = [minimise(start + np.array([k * near / 2, 0.0, 0.0]), near / 2, 30) for k in (0, 1, -1, 2, -2, 3, -3)]
     best = minimise(min(tried, key=lambda result: float(result.fun)).x, near / 8, 100).x
     yaw = _angle(float(best[0]) / size)
-    return Fit(*_carried(best[1:], yaw, middle), yaw, 0.0, 0.0)
+    return Fit(*_shift_for(best[1:], yaw, middle), yaw, 0.0, 0.0)
 
 
-def _judged(fit: Fit, every: Array, judge: Any, onto: OccupancyGrid, near: float) -> Fit:
+def _with_quality(fit: Fit, every: Array, judge: Any, onto: OccupancyGrid, near: float) -> Fit:
     """The fit with its quality. every: the moving grid's occupied cells."""
-    placed = fit.of(every)
+    placed = fit.apply_to(every)
     x, y, yaw = onto.origin
     inside = (placed - np.array([x, y])) @ _turn(yaw) / onto.resolution
     margin = near / onto.resolution
@@ -306,9 +306,10 @@ def _judged(fit: Fit, every: Array, judge: Any, onto: OccupancyGrid, near: float
 def _distinct(fits: list[Fit], middle: Array, near: float) -> list[Fit]:
     out: list[Fit] = []
     for fit in fits:
-        moved_middle = fit.of(middle[None])[0]
+        moved_middle = fit.apply_to(middle[None])[0]
         if fit.score > 0 and not any(
-            abs(_angle(fit.yaw - o.yaw)) < 0.05 and np.linalg.norm(moved_middle - o.of(middle[None])[0]) < 4 * near
+            abs(_angle(fit.yaw - o.yaw)) < 0.05
+            and np.linalg.norm(moved_middle - o.apply_to(middle[None])[0]) < 4 * near
             for o in out
         ):
             out.append(fit)
@@ -333,20 +334,20 @@ def _angle(yaw: float) -> float:
     return round(math.remainder(yaw, 2 * math.pi), 12)
 
 
-def _carried(at: Array, yaw: float, middle: Array) -> tuple[float, float]:
+def _shift_for(at: Array, yaw: float, middle: Array) -> tuple[float, float]:
     """The shift of a motion that turns by yaw and brings the middle to ``at``."""
     x, y = (at - _turn(yaw) @ middle).tolist()
     return x, y
 
 
-def _some(points: Array, limit: int = POINTS) -> Array:
+def _subsample(points: Array, limit: int = POINTS) -> Array:
     """At most so many of the points, evenly taken."""
     return points if len(points) <= limit else points[np.linspace(0, len(points) - 1, limit).astype(int)]
 
 
-def _all(grid: OccupancyGrid) -> Array:
+def _occupied_points(grid: OccupancyGrid) -> Array:
     """The middles of occupied cells in metres, float64 [n, 2]."""
-    return _placed(grid, grid.cells == OCCUPIED)
+    return _placed_cells(grid, grid.cells == OCCUPIED)
 
 
 def _outline(grid: OccupancyGrid) -> Array:
@@ -355,10 +356,10 @@ def _outline(grid: OccupancyGrid) -> Array:
 
     solid = (grid.cells == OCCUPIED).astype(np.uint8)
     inner = cv2.erode(solid, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return _placed(grid, (solid - inner).astype(bool))
+    return _placed_cells(grid, (solid - inner).astype(bool))
 
 
-def _placed(grid: OccupancyGrid, chosen: NDArray[np.bool_]) -> Array:
+def _placed_cells(grid: OccupancyGrid, chosen: NDArray[np.bool_]) -> Array:
     row, column = np.nonzero(chosen)
     x, y, yaw = grid.origin
     cells = (np.column_stack([column, row]) + 0.5) * grid.resolution

@@ -128,12 +128,15 @@ def _split_part(part: Features, places: NDArray[np.intp], frame: LocalFrame | No
                 base += f"~{hashlib.sha256(key).hexdigest()[:6]}"
             first[ends, key] = len(name_candidates)
             inner = course.at[1:-1]
-            name_candidates += [_numbered(base, n + 1) for n in range(len(inner))]
+            name_candidates += [_bend_name(base, n + 1) for n in range(len(inner))]
             columns.geometry += list(shapely.points(inner))
             columns.local += [bool(part.local[course.place])] * len(inner)
     names = unique_ids(name_candidates, set(part.ids))
     node_properties = [
-        p for course_by_key in lines.values() for course in course_by_key.values() for p in _known_nodes(part, course)
+        p
+        for course_by_key in lines.values()
+        for course in course_by_key.values()
+        for p in _stored_bend_nodes(part, course)
     ]
     columns.properties += [{"name": name, **p, "kind": "node"} for name, p in zip(names, node_properties, strict=True)]
     pieces: list[str] = []
@@ -141,16 +144,16 @@ def _split_part(part: Features, places: NDArray[np.intp], frame: LocalFrame | No
         begin = first[course.ends, course.key]
         between = names[begin : begin + len(course.at) - 2]
         p = part.properties[course.place]
-        pieces += [_numbered(part.ids[course.place], n + 1) for n in range(len(between) + 1)]
-        columns.add_pieces(course, between, without_identity(p), local=bool(part.local[course.place]))
+        pieces += [_bend_name(part.ids[course.place], n + 1) for n in range(len(between) + 1)]
+        columns.add_pieces(course, between, drop_identity(p), local=bool(part.local[course.place]))
     mask = np.ones(len(part), bool)
     mask[[course.place for course in courses]] = False
-    rest = part.take(mask)
+    rest = part.select(mask)
     columns.ids = [*names, *unique_ids(pieces, {*rest.ids, *names})]
     return columns.after(rest), Split(len(courses), len(names))
 
 
-def _known_nodes(part: Features, course: _Course) -> list[Properties]:
+def _stored_bend_nodes(part: Features, course: _Course) -> list[Properties]:
     """What a file that was read said of the nodes at an edge's bends."""
     count = len(course.at) - 2
     node_properties = part.properties[course.place].get(BENDS)
@@ -197,7 +200,7 @@ class _Columns:
 def _courses(part: Features, places: NDArray[np.intp], frame: LocalFrame | None) -> Iterator[_Course]:
     """The bent edges from node to node, with the vertices that are bends."""
     at_node = _node_positions(part, frame)
-    for k, metric in zip(places.tolist(), part.take(places).in_local(frame), strict=True):
+    for k, metric in zip(places.tolist(), part.select(places).in_local(frame), strict=True):
         p, shape = part.properties[k], part.geometry[k]
         at = shapely.get_coordinates(shape, include_z=bool(shapely.has_z(shape)))
         metres = shapely.get_coordinates(metric)
@@ -223,7 +226,7 @@ def _node_positions(
     """By id: [x, y, z] as anchored (z 0 where there is none), [x, y] in metres, and whether it is anchored locally."""
     point = shapely.get_type_id(part.geometry) == POINT
     rows = [k for k in np.flatnonzero(point).tolist() if part.properties[k].get("kind") == "node"]
-    nodes = part.take([k for k in rows if not part.geometry[k].is_empty])
+    nodes = part.select([k for k in rows if not part.geometry[k].is_empty])
     at = np.nan_to_num(shapely.get_coordinates(nodes.geometry, include_z=True))
     metres = shapely.get_coordinates(nodes.in_local(frame))
     return {i: (at[n], metres[n], bool(nodes.local[n])) for n, i in enumerate(nodes.ids)}
@@ -241,7 +244,7 @@ def _bends(metres: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.array([*indices, len(metres) - 1], np.intp)
 
 
-def without_identity(properties: Properties) -> dict[str, Any]:
+def drop_identity(properties: Properties) -> dict[str, Any]:
     """An edge's properties without what identifies it in a file, and without its bends."""
     return {
         name: {word: v for word, v in value.items() if word not in IDENTITY} if isinstance(value, Mapping) else value
@@ -250,7 +253,7 @@ def without_identity(properties: Properties) -> dict[str, Any]:
     }
 
 
-def _numbered(name: str, number: int) -> str:
+def _bend_name(name: str, number: int) -> str:
     """``name~number``, with a hash for the end of a name that is too long for an id."""
     limit = MAX_ID - 40
     if len(name) > limit:
@@ -271,7 +274,7 @@ def join(layers: Layers) -> Layers:
 def _join_part(part: Features) -> Features:
     chains: dict[str, dict[int, int]] = defaultdict(dict)
     for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
-        bend = _bend_of(i, p) if p.get("kind") == "node" else None
+        bend = _parse_bend_name(i, p) if p.get("kind") == "node" else None
         if bend is not None:
             chains[bend[0]][bend[1]] = k
     if not chains:
@@ -280,10 +283,10 @@ def _join_part(part: Features) -> Features:
     for base, numbered in chains.items():
         if set(numbered) == set(range(1, len(numbered) + 1)):
             network.join(base, [numbered[n] for n in range(1, len(numbered) + 1)])
-    return network.joined()
+    return network.join_edges()
 
 
-def _bend_of(i: str, p: Properties) -> tuple[str, int] | None:
+def _parse_bend_name(i: str, p: Properties) -> tuple[str, int] | None:
     """The base and the number in a bend's name; None for other nodes."""
     for name in (i, p.get("name")):
         match = NAMED.match(name) if isinstance(name, str) and "~" in name else None
@@ -324,7 +327,7 @@ class _Network:
                 return
             if steps:
                 runs.append((path, [pairs[step] for step in steps]))
-        if sum(len(run) for _, run in runs) < len(near) or not all(self._alike(run) for _, run in runs):
+        if sum(len(run) for _, run in runs) < len(near) or not all(self._is_uniform(run) for _, run in runs):
             return
         if any(part.local[k] != part.local[bends[0]] for _, run in runs for k in run):
             return
@@ -357,10 +360,10 @@ class _Network:
         name = None if k is None else self.part.properties[k].get("name")
         return [i, name] if isinstance(name, str) and name != i else [i]
 
-    def _alike(self, run: Sequence[int]) -> bool:
+    def _is_uniform(self, run: Sequence[int]) -> bool:
         """Whether the pieces differ only in their ends: else somebody has edited them one by one."""
         ends = {"source", "target"}
-        run_properties = [without_identity(self.part.properties[k]) for k in run]
+        run_properties = [drop_identity(self.part.properties[k]) for k in run]
         first, *others = ({name: v for name, v in p.items() if name not in ends} for p in run_properties)
         return all(other == first for other in others)
 
@@ -372,16 +375,16 @@ class _Network:
         steps = [shapely.get_coordinates(part.geometry[k], include_z=True) for k in run]
         at = np.concatenate([steps[0][:1], *(step[-1:] for step in steps)])
         line = shapely.linestrings(at[:, :2] if np.isnan(at[:, 2]).any() else at)
-        p = {**without_identity(part.properties[run[0]]), "source": path[0], "target": path[-1], **extra_properties}
+        p = {**drop_identity(part.properties[run[0]]), "source": path[0], "target": path[-1], **extra_properties}
         self.whole.ids.append(i)
         self.whole.geometry.append(line)
         self.whole.properties.append(p)
         self.whole.local.append(bool(part.local[run[0]]))
 
-    def joined(self) -> Features:
+    def join_edges(self) -> Features:
         """The network with these edges."""
         if not self.gone:
             return self.part
-        rest = self.part.take([k for k in range(len(self.part)) if k not in self.gone])
+        rest = self.part.select([k for k in range(len(self.part)) if k not in self.gone])
         self.whole.ids = unique_ids(self.whole.ids, set(rest.ids))
         return self.whole.after(rest)

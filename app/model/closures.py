@@ -56,14 +56,14 @@ class Closures:
 
     def __post_init__(self) -> None:
         if not self.digest:
-            object.__setattr__(self, "digest", digest_of([closure.as_dict() for closure in self.items]))
+            object.__setattr__(self, "digest", closures_digest([closure.as_dict() for closure in self.items]))
 
-    def in_mode(self, mode: ClosureMode) -> Closures | None:
+    def for_mode(self, mode: ClosureMode) -> Closures | None:
         """The same, shown in another way; None if they are ignored."""
         return None if mode == "ignore" else replace(self, mode=mode)
 
 
-def digest_of(closures: list[dict[str, Any]]) -> str:
+def closures_digest(closures: list[dict[str, Any]]) -> str:
     """SHA-256 (hex) of closures as they stand in a manifest."""
     data = json.dumps(closures, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(data.encode()).hexdigest()

@@ -110,7 +110,7 @@ class Features:
         for i, g, p, local in zip(self.ids, self.geometry, self.properties, self.local, strict=True):
             yield Feature(i, g, p, "local" if local else "wgs84")
 
-    def take(self, index: NDArray[np.bool_] | NDArray[np.intp] | Sequence[int]) -> Features:
+    def select(self, index: NDArray[np.bool_] | NDArray[np.intp] | Sequence[int]) -> Features:
         """The features at these places (a boolean mask or indexes), with the same document."""
         indices = np.asarray(index)
         indices = np.flatnonzero(indices) if indices.dtype == bool else indices.astype(np.intp)
@@ -122,9 +122,9 @@ class Features:
             self.document,
         )
 
-    def of_kind(self, *kinds: str) -> Features:
+    def select_kinds(self, *kinds: str) -> Features:
         """The features whose ``kind`` is one of these."""
-        return self.take([k for k, p in enumerate(self.properties) if p.get("kind") in kinds])
+        return self.select([k for k, p in enumerate(self.properties) if p.get("kind") in kinds])
 
     def index(self) -> dict[str, int]:
         """id -> place."""
@@ -141,13 +141,13 @@ class Features:
 
     def in_local(self, frame: LocalFrame | None) -> NDArray[np.object_]:
         """All geometries in metres; MissingDatum if any is on earth and there is no frame."""
-        return self._in(True, frame)
+        return self._geometries_in(True, frame)
 
     def in_wgs84(self, frame: LocalFrame | None) -> NDArray[np.object_]:
         """All geometries in (longitude, latitude); MissingDatum if any is local and there is no frame."""
-        return self._in(False, frame)
+        return self._geometries_in(False, frame)
 
-    def _in(self, local: bool, frame: LocalFrame | None) -> NDArray[np.object_]:
+    def _geometries_in(self, local: bool, frame: LocalFrame | None) -> NDArray[np.object_]:
         other = self.local != local
         if not other.any():
             return self.geometry
@@ -220,7 +220,7 @@ def merge_documents(a: Properties, b: Properties) -> dict[str, Any]:
     return out
 
 
-def alike(*keys: str) -> dict[str, Any]:
+def shared_key_dict(*keys: str) -> dict[str, Any]:
     """A mapping with these keys, all None, whose copies (``.copy()``, then set) share its table of keys.
 
     Such a copy is a usual dict that takes little more than half the memory: for readers that make very many mappings
@@ -242,9 +242,10 @@ def alike(*keys: str) -> dict[str, Any]:
 
 
 class SharedKeyDicts:
-    """Mappings -> the same ones in less memory: those with the same keys share their table of keys (``alike``)."""
+    """Mappings -> the same ones in less memory: those with the same keys share their table of keys
+    (``shared_key_dict``)."""
 
-    MOST = 256
+    MAX_LAYOUTS = 256
     """Tables that are kept."""
 
     def __init__(self) -> None:
@@ -255,9 +256,9 @@ class SharedKeyDicts:
         keys = tuple(said)
         pattern = self._known.get(keys)
         if pattern is None:
-            if len(self._known) >= self.MOST:
+            if len(self._known) >= self.MAX_LAYOUTS:
                 return said
-            pattern = self._known[keys] = alike(*keys)
+            pattern = self._known[keys] = shared_key_dict(*keys)
         out = pattern.copy()
         for key, value in said.items():
             out[key] = value
@@ -300,14 +301,14 @@ def _check_coordinates(f: Features) -> None:
     """Finite everywhere; metres within MAX_METRES; latitude within ±90 and longitude within ±180 degrees."""
     for first in range(0, len(f.ids), CHECKED):
         some = slice(first, first + CHECKED)
-        _check_some(f.ids[some], f.geometry[some], f.local[some])
+        _check_batch(f.ids[some], f.geometry[some], f.local[some])
 
 
 CHECKED = 2**15
 """Features that are checked at a time: the coordinates of all would take as much memory as the features do."""
 
 
-def _check_some(ids: Sequence[str], geometry: NDArray[np.object_], is_local: NDArray[np.bool_]) -> None:
+def _check_batch(ids: Sequence[str], geometry: NDArray[np.object_], is_local: NDArray[np.bool_]) -> None:
     coordinates, owner = shapely.get_coordinates(geometry, include_z=True, return_index=True)
     flat, z = coordinates[:, :2], coordinates[:, 2]
     # shapely gives NaN as the z of a 2-D geometry: only a 3-D one's z is looked at.

@@ -57,7 +57,7 @@ PIECE = 2**24
 """Bytes of a finished file that are taken over at a time."""
 
 
-def taken(buffer: memoryview) -> bytes:
+def buffer_bytes(buffer: memoryview) -> bytes:
     """The content of a file that GDAL has made in memory and nobody reads again: its pages are given back to the system
     as they are copied, so that a large one is not in memory twice. The buffer holds nothing after that."""
     content = np.frombuffer(buffer, np.uint8)
@@ -92,7 +92,7 @@ def native(pixels: NDArray[Any]) -> NDArray[Any]:
     return pixels
 
 
-def opened(rasterio: Any, pixels: NDArray[Any], bands: int, *, described: bool = False) -> Any:
+def open_memory_dataset(rasterio: Any, pixels: NDArray[Any], bands: int, *, described: bool = False) -> Any:
     """A dataset of the first bands of ``native`` pixels [height, width, bands], which are not copied: they must outlive
     it. described: it takes a place, colours, tags and a mask; the pixels themselves may not be written."""
     height, width, _ = pixels.shape

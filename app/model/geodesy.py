@@ -71,7 +71,7 @@ class LocalFrame:
                 out[:, 1] = east * self._sin + north * self._cos
         return out
 
-    def _to_near(self, lonlat: Array) -> Array:
+    def _to_bounded_local(self, lonlat: Array) -> Array:
         """``to_local`` for what is kept or written: nothing infinite or beyond the bound of local coordinates."""
         out = self.to_local(lonlat)
         far = ~(np.abs(out[:, :2]) <= MAX_METRES).all(axis=1)
@@ -103,7 +103,7 @@ class LocalFrame:
 
     def geometries_to_local(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
         """Shapely geometries in degrees -> metres; Invalid where one is too far from the datum for the local frame."""
-        return _transform(geometry, self._to_near)
+        return _transform(geometry, self._to_bounded_local)
 
     def geometries_to_wgs84(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
         """Shapely geometries in metres -> degrees."""

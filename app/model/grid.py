@@ -97,7 +97,7 @@ UNKNOWN_GREY = "unknown_grey"
 since the grid's free_thresh says so; whether anybody has seen them is not known."""
 
 
-def packed_cells(chosen: NDArray[np.bool_]) -> dict[str, Any]:
+def pack_cells(chosen: NDArray[np.bool_]) -> dict[str, Any]:
     """Chosen cells of a grid, bool [height, width], as a JSON-like value."""
     packed = zlib.compress(np.packbits(chosen).tobytes(), 9)
     return {"height": chosen.shape[0], "width": chosen.shape[1], "bits": base64.b64encode(packed).decode()}
@@ -120,7 +120,7 @@ def unknown_grey(grid: OccupancyGrid) -> NDArray[np.bool_] | None:
     return out if out.any() else None
 
 
-def as_seen(grid: OccupancyGrid) -> OccupancyGrid:
+def unknown_grey_as_unknown(grid: OccupancyGrid) -> OccupancyGrid:
     """The grid with its free cells of unknown's grey as unknown: for whatever takes free cells as known to be free."""
     grey = unknown_grey(grid)
     if grey is None:
@@ -136,7 +136,7 @@ def without_unknown_grey(grid: OccupancyGrid, seen: NDArray[np.bool_] | None = N
     grey = None if seen is None else unknown_grey(grid)
     left = None if grey is None or seen is None else grey & ~seen
     if left is not None and left.any():
-        rest[UNKNOWN_GREY] = packed_cells(left)
+        rest[UNKNOWN_GREY] = pack_cells(left)
     return replace(grid, properties=rest)
 
 

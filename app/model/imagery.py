@@ -19,7 +19,7 @@ LOCAL = "local"
 STRIP = 2**18
 """Pixels that are converted at a time: small enough for the processor's cache, so memory stays near the result's."""
 
-USUAL_COLOURS: Mapping[int, tuple[str, ...]] = {
+DEFAULT_COLOURS: Mapping[int, tuple[str, ...]] = {
     1: ("gray",),
     2: ("gray", "alpha"),
     3: ("red", "green", "blue"),
@@ -69,7 +69,7 @@ class GeoImage:
         bands = self.properties.get("bands")
         if isinstance(bands, list | tuple) and len(bands) == count and all(isinstance(b, Mapping) for b in bands):
             return tuple(str(b.get("colour", "undefined")) for b in bands)
-        return USUAL_COLOURS.get(count, ("gray",) + ("undefined",) * (count - 1))
+        return DEFAULT_COLOURS.get(count, ("gray",) + ("undefined",) * (count - 1))
 
     @property
     def nodata(self) -> float | int | None:
@@ -91,16 +91,16 @@ class GeoImage:
         part = np.arange(steps) / steps
         u = np.concatenate([part, np.ones(steps), 1 - part, np.zeros(steps)]) * width
         v = np.concatenate([np.zeros(steps), part, np.ones(steps), 1 - part]) * height
-        return placed(self.transform, u, v)
+        return pixel_positions(self.transform, u, v)
 
 
-def placed(transform: Affine, column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
+def pixel_positions(transform: Affine, column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
     """Where places of the picture (columns and rows from the outer corner of the first pixel) lie: float64 [n, 2]."""
     a, b, c, d, e, f = transform
     return np.column_stack([a * column + b * row + c, d * column + e * row + f])
 
 
-def displayed(picture: GeoImage) -> NDArray[np.uint8]:
+def display_pixels(picture: GeoImage) -> NDArray[np.uint8]:
     """A picture as screens show it: uint8 [height, width, 1…4] (grey, grey + alpha, RGB, RGBA).
 
     8-bit values stay as they are (the picture's own pixels, where nothing has to be changed); others are stretched, so
@@ -111,14 +111,14 @@ def displayed(picture: GeoImage) -> NDArray[np.uint8]:
     height, width, _ = pixels.shape
     clear = next((k for k, colour in enumerate(colours) if colour in CLEAR), None)
     table = _palette(picture)
-    if all(colour in colours for colour in USUAL_COLOURS[3]):
-        shown = [colours.index(colour) for colour in USUAL_COLOURS[3]]
+    if all(colour in colours for colour in DEFAULT_COLOURS[3]):
+        shown = [colours.index(colour) for colour in DEFAULT_COLOURS[3]]
     else:
         first = next((k for k, colour in enumerate(colours) if colour in ("palette", "gray")), None)
         shown = [first if first is not None else next((k for k in range(len(colours)) if k != clear), 0)]
     nodata = picture.nodata
     holes = clear is not None or nodata is not None or pixels.dtype.kind == "f"
-    if pixels.dtype == np.uint8 and table is None and colours == USUAL_COLOURS.get(len(colours)) and nodata is None:
+    if pixels.dtype == np.uint8 and table is None and colours == DEFAULT_COLOURS.get(len(colours)) and nodata is None:
         return pixels
     rows = max(1, STRIP // width)
     low, high = (0.0, 255.0) if pixels.dtype == np.uint8 or table is not None else _range(picture, shown, rows)
@@ -129,7 +129,7 @@ def displayed(picture: GeoImage) -> NDArray[np.uint8]:
     for y in range(0, height, rows):
         block = pixels[y : y + rows]
         values = block[..., shown]
-        valid = _known(values, nodata)
+        valid = _valid_mask(values, nodata)
         if table is not None:
             index = np.clip(values[..., 0], 0, 255).astype(np.uint8)
             out[y : y + rows] = table[index]
@@ -150,7 +150,7 @@ def displayed(picture: GeoImage) -> NDArray[np.uint8]:
     return out
 
 
-def _known(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.bool_]:
+def _valid_mask(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.bool_]:
     """Which pixels hold something: [rows, columns] of values [rows, columns, bands]."""
     valid = np.isfinite(values).all(axis=-1) if values.dtype.kind == "f" else np.ones(values.shape[:-1], bool)
     if nodata is not None and math.isfinite(nodata):
@@ -163,7 +163,7 @@ def _range(picture: GeoImage, shown: list[int], rows: int) -> tuple[float, float
     low, high = math.inf, -math.inf
     for y in range(0, len(picture.pixels), rows):
         values = picture.pixels[y : y + rows][..., shown]
-        values = values[_known(values, picture.nodata)]
+        values = values[_valid_mask(values, picture.nodata)]
         if values.size:
             low, high = min(low, float(values.min())), max(high, float(values.max()))
     if not low < high:  # nothing known, or one value everywhere

@@ -12,7 +12,7 @@ from app.model.frame import GROUND, Datum, Level, is_writable
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
 from app.model.imagery import GeoImage
-from app.model.names import bad_name
+from app.model.names import name_problem
 from app.model.voxels import VoxelMap
 
 Layer = Literal["location", "objects", "topology", "occupancy", "voxels", "imagery", "zones", "resources"]
@@ -46,7 +46,7 @@ class Resources:
 
     def __post_init__(self) -> None:
         for path in self.files:
-            if reason := bad_name(path):
+            if reason := name_problem(path):
                 raise Invalid(f"a resource cannot be called {path[:80]!r}: the name {reason}")
 
 
@@ -106,7 +106,7 @@ class Layers:
         }
         return frozenset(full | ({"location"} if self.datum else set()))
 
-    def of(self, layer: Layer, level: str | None = None, name: str | None = None) -> dict[PartKey, Part]:
+    def parts_of(self, layer: Layer, level: str | None = None, name: str | None = None) -> dict[PartKey, Part]:
         """The parts of a layer, by key order."""
         return {
             key: self.parts[key]
@@ -116,16 +116,16 @@ class Layers:
 
     def vector(self, layer: Layer, level: str | None = None) -> dict[PartKey, Features]:
         """The feature collections of a vector layer, by key order."""
-        return {key: part for key, part in self.of(layer, level).items() if isinstance(part, Features)}
+        return {key: part for key, part in self.parts_of(layer, level).items() if isinstance(part, Features)}
 
     def grids(self, level: str | None = None) -> dict[PartKey, OccupancyGrid]:
         """The occupancy grids, by key order."""
-        return {key: part for key, part in self.of("occupancy", level).items() if isinstance(part, OccupancyGrid)}
+        return {key: part for key, part in self.parts_of("occupancy", level).items() if isinstance(part, OccupancyGrid)}
 
     def resources(self) -> dict[str, bytes]:
         """All resource files by path."""
         out: dict[str, bytes] = {}
-        for part in self.of("resources").values():
+        for part in self.parts_of("resources").values():
             if isinstance(part, Resources):
                 out.update(part.files)
         return out

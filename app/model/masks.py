@@ -24,7 +24,7 @@ TYPES = range(5)
 MASKS = frozenset({"keepout", "speed", "nogo", "preferred"})
 """Names of grids that tell where robots should go, not what stands there."""
 
-DEEPEST = 4
+MAX_NAMESPACES = 4
 """Namespaces around a node that are looked into."""
 
 
@@ -58,7 +58,7 @@ def is_filter_info(name: str, node: Any) -> bool:
 
 def servers(document: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
     """The parameters of each filter info server in a parameter file, in order."""
-    if not isinstance(document, Mapping) or depth > DEEPEST:
+    if not isinstance(document, Mapping) or depth > MAX_NAMESPACES:
         return
     for name, node in document.items():
         if is_filter_info(name, node):

@@ -29,13 +29,13 @@ from app.model.xml_prolog import check_prolog
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
-MOST_FACES = 5_000_000
+MAX_FACES = 5_000_000
 """Triangles of one mesh. A real collision mesh has some thousands."""
 
-MOST_NODES = 100_000
+MAX_NODES = 100_000
 """Elements of a COLLADA scene, instances counted each time: they can be nested so that each level doubles them."""
 
-DEEPEST = 64
+MAX_DEPTH = 64
 """Nodes of a COLLADA scene within each other, instances followed."""
 
 
@@ -70,7 +70,7 @@ class Mesh:
         return out
 
 
-def read_mesh(data: bytes, name: str, max_faces: int = MOST_FACES) -> Mesh:
+def read_mesh(data: bytes, name: str, max_faces: int = MAX_FACES) -> Mesh:
     """A mesh file by its name's ending: .stl, .obj or .dae.
 
     Raises Invalid (TooLarge beyond ``max_faces`` triangles) that names the file.
@@ -78,25 +78,25 @@ def read_mesh(data: bytes, name: str, max_faces: int = MOST_FACES) -> Mesh:
     ending = PurePosixPath(name).suffix.lower()
     reader = _READERS.get(ending)
     if reader is None:
-        _refuse(name, f"is no mesh that can be read: {', '.join(sorted(_READERS))} can")
+        _raise_unreadable(name, f"is no mesh that can be read: {', '.join(sorted(_READERS))} can")
     try:
         vertices, faces, part, names = reader(data, max_faces)
     except TooLarge as error:
         raise TooLarge(f"{name} {error.detail}", [Problem(error.detail, name)]) from error
     except (ValueError, LookupError, ArithmeticError, RecursionError, etree.LxmlError) as error:
-        _refuse(name, f"cannot be read as a mesh: {error}")
+        _raise_unreadable(name, f"cannot be read as a mesh: {error}")
     except FleetMapError as error:
-        _refuse(name, f"cannot be read as a mesh: {error.detail}")
+        _raise_unreadable(name, f"cannot be read as a mesh: {error.detail}")
     if not len(faces):
-        _refuse(name, "has no triangles")
+        _raise_unreadable(name, "has no triangles")
     if not bool((np.abs(vertices) <= MAX_METRES).all()):
-        _refuse(name, f"has vertices that are not finite metres within ±{MAX_METRES:g}")
+        _raise_unreadable(name, f"has vertices that are not finite metres within ±{MAX_METRES:g}")
     if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
-        _refuse(name, "has faces of vertices that are not there")
+        _raise_unreadable(name, "has faces of vertices that are not there")
     return Mesh(vertices, faces, part, names)
 
 
-def load_mesh(data: bytes, name: str, max_faces: int = MOST_FACES) -> tuple[Array, Faces]:
+def load_mesh(data: bytes, name: str, max_faces: int = MAX_FACES) -> tuple[Array, Faces]:
     """(vertices float64 [n, 3] in metres, faces int64 [m, 3]) of a mesh file; see ``read_mesh``."""
     mesh = read_mesh(data, name, max_faces)
     return mesh.vertices, mesh.faces
@@ -105,11 +105,11 @@ def load_mesh(data: bytes, name: str, max_faces: int = MOST_FACES) -> tuple[Arra
 _ParsedMesh = tuple[Array, Faces, NDArray[np.int64], tuple[tuple[str, ...], ...]]
 
 
-def _refuse(name: str, reason: str) -> NoReturn:
+def _raise_unreadable(name: str, reason: str) -> NoReturn:
     raise Invalid(f"{name} {reason}", [Problem(reason, name)])
 
 
-def _enough(count: int, max_faces: int) -> None:
+def _check_count(count: int, max_faces: int) -> None:
     if count > max_faces:
         raise TooLarge(f"has {count} triangles; the limit is {max_faces}")
 
@@ -140,12 +140,12 @@ def _stl(data: bytes, max_faces: int) -> _ParsedMesh:
     count = int.from_bytes(data[80:_STL_HEAD], "little") if len(data) >= _STL_HEAD else -1
     fits = _STL_HEAD + count * _STL_FACE.itemsize
     if count >= 0 and fits <= len(data) and (fits == len(data) or not _is_text(data)):
-        _enough(count, max_faces)
+        _check_count(count, max_faces)
         corners = np.frombuffer(data, _STL_FACE, count, _STL_HEAD)["corners"].astype(np.float64)
     elif _is_text(data):
-        _enough(len(data) // 40, 16 * max_faces)  # no face is said in fewer than 40 characters
+        _check_count(len(data) // 40, 16 * max_faces)  # no face is said in fewer than 40 characters
         facets = sum(1 for _ in _STL_FACET.finditer(data))
-        _enough(facets, max_faces)
+        _check_count(facets, max_faces)
         rows = b" ".join(_STL_VERTEX.findall(data)).decode("ascii")
         flat = _numbers(rows, "vertices")
         if len(flat) != 9 * facets:
@@ -192,7 +192,7 @@ def _obj(data: bytes, max_faces: int) -> _ParsedMesh:
             sizes.append(len(face))
             parts.append(current)
             count += len(face) - 2
-            _enough(count, max_faces)
+            _check_count(count, max_faces)
         elif word in ("o", "g"):
             thing = rest.strip() if word == "o" else thing
             names.append(tuple(dict.fromkeys(filter(None, (rest.strip(), thing)))) or ("",))
@@ -242,7 +242,7 @@ class _Scene:
     """A COLLADA document being read: what has an id, and the triangles that the scene places."""
 
     def __init__(self, root: etree._Element, max_faces: int) -> None:
-        self.root, self.most, self.count = root, max_faces, 0
+        self.root, self.max_faces, self.count = root, max_faces, 0
         self.by_id: dict[str, etree._Element] = {}
         for element in root.iter(etree.Element):
             i = element.get("id")
@@ -275,8 +275,8 @@ class _Scene:
         while stack:
             node, above, named, depth = stack.pop()
             visited += 1 + len(node)
-            if visited > MOST_NODES or depth > DEEPEST:
-                raise ValueError(f"its scene has more than {MOST_NODES} elements, or {DEEPEST} within each other")
+            if visited > MAX_NODES or depth > MAX_DEPTH:
+                raise ValueError(f"its scene has more than {MAX_NODES} elements, or {MAX_DEPTH} within each other")
             named = node.get("name") or node.get("id") or named
             placement = above @ _transform(node)
             further: list[tuple[etree._Element, Array, str, int]] = []
@@ -325,7 +325,7 @@ class _Scene:
         if not len(faces):
             return
         self.count += len(faces)
-        _enough(self.count, self.most)
+        _check_count(self.count, self.max_faces)
         with np.errstate(all="ignore"):  # what is not finite is refused for the whole mesh
             self.vertices.append(vertices @ transform[:3, :3].T + transform[:3, 3])
         self.faces.append(faces + self.offset)
@@ -351,7 +351,7 @@ class _Scene:
                 if width > 64:
                     raise ValueError("a primitive has more than 64 inputs")
                 indices = np.concatenate([np.empty((0, 3), np.int64), *cut(primitive, width, _offset(place["VERTEX"]))])
-                _enough(len(indices), self.most)
+                _check_count(len(indices), self.max_faces)
                 if source not in arrays:
                     at = self._source(source)
                     arrays[source] = at, offset
@@ -413,14 +413,14 @@ def _column(p: etree._Element, width: int, column: int) -> NDArray[np.int64]:
     return flat.reshape(-1, width)[:, column]
 
 
-def _of_triangles(primitive: etree._Element, width: int, column: int) -> Iterator[Faces]:
+def _read_triangles(primitive: etree._Element, width: int, column: int) -> Iterator[Faces]:
     for corners in _lists(primitive, width, column):
         if len(corners) % 3:
             raise ValueError("triangles need three vertices each")
         yield corners.reshape(-1, 3)
 
 
-def _of_polylist(primitive: etree._Element, width: int, column: int) -> Iterator[Faces]:
+def _read_polylist(primitive: etree._Element, width: int, column: int) -> Iterator[Faces]:
     sizes = _integers(primitive.findtext("{*}vcount") or "", "vcount")
     for corners in _lists(primitive, width, column):
         if len(sizes) and (int(sizes.min()) < 0 or int(sizes.max()) > len(corners)):
@@ -430,12 +430,12 @@ def _of_polylist(primitive: etree._Element, width: int, column: int) -> Iterator
         yield _fans(corners, sizes)[0]
 
 
-def _of_polygons(primitive: etree._Element, width: int, column: int) -> Iterator[Faces]:
+def _read_polygons(primitive: etree._Element, width: int, column: int) -> Iterator[Faces]:
     for corners in _lists(primitive, width, column):
         yield _fans(corners, np.array([len(corners)]))[0]
 
 
-def _of_strips(primitive: etree._Element, width: int, column: int) -> Iterator[Faces]:
+def _read_strips(primitive: etree._Element, width: int, column: int) -> Iterator[Faces]:
     for c in _lists(primitive, width, column):
         if len(c) < 3:
             continue
@@ -447,11 +447,11 @@ def _of_strips(primitive: etree._Element, width: int, column: int) -> Iterator[F
 _Cut = Callable[[etree._Element, int, int], Iterator[Faces]]
 
 _PRIMITIVES: Mapping[str, _Cut] = {
-    "triangles": _of_triangles,
-    "polylist": _of_polylist,
-    "polygons": _of_polygons,
-    "trifans": _of_polygons,
-    "tristrips": _of_strips,
+    "triangles": _read_triangles,
+    "polylist": _read_polylist,
+    "polygons": _read_polygons,
+    "trifans": _read_polygons,
+    "tristrips": _read_strips,
 }
 
 

@@ -10,7 +10,7 @@ MAX_DEPTH = 64
 """Longest path in an archive, in characters and in folders."""
 
 
-def bad_name(name: str) -> str | None:
+def name_problem(name: str) -> str | None:
     """Why a relative path must not be used, or None: said as ``it …``."""
     if not name or len(name) > MAX_NAME:
         return f"has not 1 to {MAX_NAME} characters"
@@ -30,14 +30,14 @@ def bad_name(name: str) -> str | None:
     return None
 
 
-NEAR = 0.7
+MIN_SIMILARITY = 0.7
 """Similarity, 0 to 1, from which a name counts as mistyped for another."""
 
 MAX_COMPARED = 10_000
 """Names that a mistyped one is compared with."""
 
 
-def nearest(name: str, choices: Iterable[str], *, similarity: float = NEAR) -> str | None:
+def nearest(name: str, choices: Iterable[str], *, similarity: float = MIN_SIMILARITY) -> str | None:
     """Return the choice that a mistyped name most probably means, upper and lower case alike."""
     import difflib  # only for a name that is wrong
 

@@ -185,7 +185,7 @@ def _cluster(xy: Metres, join: float, fixed: int) -> Places:
         return node
     heads = np.flatnonzero(node == np.arange(n))
     cell = np.floor(xy[heads] / join).astype(np.int64)
-    crowded = _crowded(cell)
+    crowded = _near_others(cell)
     # At most four nodes fit into a cell, so each vertex looks at 36 at most, however dense the drawing is.
     taken: dict[tuple[int, int], list[int]] = {}
     moved: dict[int, int] = {}
@@ -212,7 +212,7 @@ def _cluster(xy: Metres, join: float, fixed: int) -> Places:
     return node
 
 
-def _crowded(cell: NDArray[np.int64]) -> Places:
+def _near_others(cell: NDArray[np.int64]) -> Places:
     """Places whose cell or one of its eight neighbours holds another item."""
     row, column = _compact(cell[:, 0]), _compact(cell[:, 1])
     width = int(column.max()) + 3
@@ -251,7 +251,9 @@ def _split(drawing: _Drawing, xy: Metres, node: Places, join: float) -> tuple[Pl
     tips = np.unique(node[tips])
     if join <= 0.0 or not len(start) or not len(tips):
         return start, end, owner
-    point, segment = _near(shapely.points(xy[tips]), shapely.linestrings(np.stack([xy[start], xy[end]], axis=1)), join)
+    point, segment = _points_near_lines(
+        shapely.points(xy[tips]), shapely.linestrings(np.stack([xy[start], xy[end]], axis=1)), join
+    )
     p = tips[point]
     a, b = start[segment], end[segment]
     along = xy[b] - xy[a]
@@ -271,7 +273,9 @@ def _split(drawing: _Drawing, xy: Metres, node: Places, join: float) -> tuple[Pl
     return v[:-1][link], v[1:][link], owner[s[:-1][link]]
 
 
-def _near(points: NDArray[np.object_], lines: NDArray[np.object_], distance: float) -> tuple[Places, Places]:
+def _points_near_lines(
+    points: NDArray[np.object_], lines: NDArray[np.object_], distance: float
+) -> tuple[Places, Places]:
     """Pairs (point, line) within a distance, sorted; in portions, so that a hostile drawing cannot fill the memory."""
     tree = shapely.STRtree(lines)
     limit = 1_000_000 + 10 * (len(points) + len(lines))
@@ -313,7 +317,7 @@ def _assemble(
     ]
     rank = np.empty(len(drawing.raw), np.intp)
     rank[leaders] = np.arange(len(leaders))
-    a, b, by = _directed(objects, rank[segments[0]], rank[segments[1]], segments[2])
+    a, b, by = _directed_edges(objects, rank[segments[0]], rank[segments[1]], segments[2])
     shared = {k: {w: objects.properties[k][w] for w in CARRIED if w in objects.properties[k]} for k in set(by)}
     edges = [f"{ids[p]}_{ids[q]}" for p, q in zip(a, b, strict=True)]
     if edges and max(map(len, edges)) > MAX_ID - 12:
@@ -337,7 +341,9 @@ def _assemble(
     return Features((*ids, *edges), geometry, tuple(properties), local)
 
 
-def _directed(objects: Features, start: Places, end: Places, owner: Places) -> tuple[list[int], list[int], list[int]]:
+def _directed_edges(
+    objects: Features, start: Places, end: Places, owner: Places
+) -> tuple[list[int], list[int], list[int]]:
     """(from, to, object) of all directed edges, each pair of nodes once, the first in drawing order."""
     directions = {k: direction(objects.properties[k]) for k in set(owner.tolist())}
     pairs: dict[tuple[int, int], int] = {}

@@ -12,8 +12,9 @@ of kind     in ``OBSTACLES``: by its geometry; an OpenStreetMap kind only where 
 with        ``shapes``: by its solids (``app.model.solids``), whatever its kind but those of ``IGNORED``
 with        ``height`` or ``size``: by its geometry, or a box of its size where it is a point, whatever its kind
 of kind     ``door``: as an obstacle only where doors are taken as closed, whatever its shapes
-of kind     in ``BROAD``: as a point without width and size also as ground of which nothing is known
-of kind     in ``SOLID``: without shapes and size as ground of which nothing is known (``surroundings_of``), but from a
+of kind     in ``BROAD_KINDS``: as a point without width and size also as ground of which nothing is known
+of kind     in ``SOLID``: without shapes and size as ground of which nothing is known (``object_surroundings``), but
+from a
             world, which tells all solids of its models: there it has none
 else        not: regions, points of interest, paths, roads, lights, measurements …
 =========== ===========================================================================================================
@@ -71,7 +72,7 @@ OBSTACLES: Mapping[str, float] = {
 """Kinds that stand in the way, and how wide a line of that kind, or a point's disc, is where nothing says: metres.
 The 0.1 m of a wall is what rmf_building_map_tools builds."""
 
-BROAD = frozenset(
+BROAD_KINDS = frozenset(
     {
         *("building", "obstacle", "furniture", "shelf", "rack", "table", "machine", "container"),
         *("water", "pond", "ditch", "stream"),
@@ -79,7 +80,7 @@ BROAD = frozenset(
 )
 """Kinds that cover more ground than the disc of a point of which nothing says how wide it is."""
 
-WIDEST = 1000.0
+MAX_WIDTH_METRES = 1000.0
 """Metres of a line's or a point's width: beyond it is a mistake."""
 
 OF_OSM: Mapping[str, Mapping[str, float]] = {
@@ -139,7 +140,7 @@ class Body:
     top: float
 
 
-def role_of(properties: Properties, *, doors_closed: bool = False) -> Role:
+def object_role(properties: Properties, *, doors_closed: bool = False) -> Role:
     """How an object counts. doors_closed: whether doors are obstacles."""
     kind = str(properties.get("kind") or "")
     if kind in FREE:
@@ -148,12 +149,12 @@ def role_of(properties: Properties, *, doors_closed: bool = False) -> Role:
         return "mark"
     if properties.get("shapes"):
         return "solids"
-    if width_of(properties) is not None:
+    if object_width(properties) is not None:
         return "outline"
     return "bodiless" if kind in SOLID and not _tags(properties) and "gazebo" not in properties else "mark"
 
 
-def body_of(properties: Properties, geometry: Any, width: float | None = None) -> Body | None:
+def object_body(properties: Properties, geometry: Any, width: float | None = None) -> Body | None:
     """The body of an object whose role is ``outline``, or of a lift's walls; None where it has none.
 
     geometry: in local metres. width: of a line, or of a point's disc, instead of the object's own. Raises Invalid where
@@ -161,11 +162,11 @@ def body_of(properties: Properties, geometry: Any, width: float | None = None) -
     """
     if properties.get("kind") == "lift":
         return None if properties.get("shapes") else _cabin(properties, geometry)
-    area = _area(shapely.force_2d(geometry), properties, width or width_of(properties) or 0.0)
-    return None if area is None or area.is_empty else Body(area, *heights_of(properties, geometry))
+    area = _area(shapely.force_2d(geometry), properties, width or object_width(properties) or 0.0)
+    return None if area is None or area.is_empty else Body(area, *object_heights(properties, geometry))
 
 
-def ground_of(properties: Properties, geometry: Any) -> Any | None:
+def object_ground(properties: Properties, geometry: Any) -> Any | None:
     """The ground of a floor or a lift's cabin, on which robots stand: polygons; None where it has none."""
     area = _area(shapely.force_2d(geometry), properties, 0.0)
     return area if area is not None and area.area > 0 else None
@@ -174,18 +175,18 @@ def ground_of(properties: Properties, geometry: Any) -> Any | None:
 def is_unsized(properties: Properties, geometry: Any) -> bool:
     """Whether an object is a mere point and covers more ground than its disc."""
     is_point = shapely.get_type_id(geometry) in (0, 4)
-    is_broad = is_point and str(properties.get("kind")) in BROAD
-    return is_broad and size_of(properties) is None and not says_width(properties)
+    is_broad = is_point and str(properties.get("kind")) in BROAD_KINDS
+    return is_broad and box_size(properties) is None and not has_width(properties)
 
 
-def surroundings_of(properties: Properties, geometry: Any, radius: float) -> Any | None:
+def object_surroundings(properties: Properties, geometry: Any, radius: float) -> Any | None:
     """The ground that an object of unknown extent may cover; None if it has neither a geometry nor a place.
 
     Args:
         geometry: in local metres.
         radius: metres around its geometry and its pose; half the diagonal of its size if that is more.
     """
-    pose, size = properties.get("pose"), size_of(properties)
+    pose, size = properties.get("pose"), box_size(properties)
     xy = pose[:2] if isinstance(pose, (list, tuple)) else ()
     is_place = len(xy) == 2 and all(isinstance(v, (int, float)) and abs(v) <= MAX_METRES for v in xy)
     candidates = (shapely.force_2d(geometry), shapely.Point(xy) if is_place else shapely.Point())
@@ -194,16 +195,16 @@ def surroundings_of(properties: Properties, geometry: Any, radius: float) -> Any
     return shapely.union_all(shapely.buffer(places, reach)) if places else None
 
 
-def footprint_of(properties: Properties, geometry: Any, solid_reader: solids.Solids) -> Any | None:
+def object_footprint(properties: Properties, geometry: Any, solid_reader: solids.Solids) -> Any | None:
     """The ground that an object covers, whatever its height: polygons in metres; None where it stands in no way.
 
     geometry: in local metres. Raises Invalid or BadUpload where its solids cannot be read.
     """
-    role = role_of(properties)
+    role = object_role(properties)
     if role == "solids":
         shadow = solid_reader.footprint(properties)
         return None if shadow.is_empty else shadow
-    body = body_of(properties, geometry) if role == "outline" else None
+    body = object_body(properties, geometry) if role == "outline" else None
     return None if body is None else body.area
 
 
@@ -213,7 +214,7 @@ def _cabin(p: Properties, geometry: Any) -> Body | None:
 
     Source: rmf_building_map_tools, lift.py (doors: x, y in the cabin's frame, width along motion_axis_orientation).
     """
-    size, source_properties = size_of(p), p.get("openrmf")
+    size, source_properties = box_size(p), p.get("openrmf")
     says = source_properties.get("says") if isinstance(source_properties, Mapping) else None
     doors = says.get("doors") if isinstance(says, Mapping) else None
     if size is None or not isinstance(doors, Mapping):
@@ -233,12 +234,12 @@ def _cabin(p: Properties, geometry: Any) -> Body | None:
         along = float(numbers[3]) / 2
         across = max(x, y, CABIN_WALL) / 2  # through the wall that it is in, and not through the one opposite
         gap = shapely.box(-along, -across, along, across)
-        turned = solids.placed(_flat(gap), (float(numbers[0]), float(numbers[1]), 0.0, 0.0, 0.0, float(numbers[2])))
+        turned = solids.apply_pose(_flat(gap), (float(numbers[0]), float(numbers[1]), 0.0, 0.0, 0.0, float(numbers[2])))
         gaps.append(shapely.Polygon(turned[:, :2]))
     if not gaps:
         return None
     walls = shapely.difference(walls, shapely.union_all(gaps))
-    placed = shapely.transform(walls, lambda at: solids.placed(np.c_[at, np.zeros(len(at))], pose)[:, :2])
+    placed = shapely.transform(walls, lambda at: solids.apply_pose(np.c_[at, np.zeros(len(at))], pose)[:, :2])
     return Body(placed, 0.0, size[2] if len(size) > 2 and size[2] > 0 else math.inf)
 
 
@@ -250,7 +251,7 @@ def _flat(polygon: Any) -> Any:
 def _pose(p: Properties, geometry: Any) -> tuple[float, ...] | None:
     """An object's pose; where it has none, its point; None where it has neither."""
     if p.get("pose") is not None:
-        return solids.pose_of(p)
+        return solids.parse_pose(p)
     at = shapely.get_coordinates(geometry)
     return (*at[0], 0, 0, 0, 0) if len(at) else None
 
@@ -261,12 +262,12 @@ def _tags(p: Properties) -> Mapping[str, Any]:
     return tags if isinstance(tags, Mapping) else {}
 
 
-def says_width(properties: Properties) -> bool:
+def has_width(properties: Properties) -> bool:
     """Whether an object itself says how wide it is."""
     return bool(_positive(properties.get("width")) or osm_tags.width(_tags(properties)))
 
 
-def width_of(properties: Properties) -> float | None:
+def object_width(properties: Properties) -> float | None:
     """How wide a line or a point of an object is in metres; None where the object stands in no way."""
     p, kind = properties, str(properties.get("kind") or "")
     tags = _tags(p)
@@ -279,11 +280,11 @@ def width_of(properties: Properties) -> float | None:
         values = OF_OSM[key]
         width = values.get(str(tags[key]), values.get("*", 0.0))
         value = _positive(p.get("width")) or osm_tags.width(tags) or width
-        return min(value, WIDEST) if width else None
-    width = min(_positive(p.get("width")) or 0.0, WIDEST)
+        return min(value, MAX_WIDTH_METRES) if width else None
+    width = min(_positive(p.get("width")) or 0.0, MAX_WIDTH_METRES)
     if kind in OBSTACLES and not tags:
         return width or OBSTACLES[kind]
-    if not tags and (_positive(p.get("height")) or size_of(p)):
+    if not tags and (_positive(p.get("height")) or box_size(p)):
         return width or 0.1
     return None
 
@@ -291,11 +292,13 @@ def width_of(properties: Properties) -> float | None:
 def _area(geometry: Any, p: Properties, width: float) -> Any:
     """The ground that an object covers: a polygon in metres; None where it has none."""
     kind = int(shapely.get_type_id(geometry))
-    size = size_of(p)
+    size = box_size(p)
     if size is not None and (kind in (0, 4) or geometry.is_empty):
         x, y = size[0] / 2, size[1] / 2
         pose = _pose(p, geometry)
-        return None if pose is None else shapely.Polygon(solids.placed(_flat(shapely.box(-x, -y, x, y)), pose)[:, :2])
+        return (
+            None if pose is None else shapely.Polygon(solids.apply_pose(_flat(shapely.box(-x, -y, x, y)), pose)[:, :2])
+        )
     if geometry.is_empty:
         return None
     if kind in (3, 6):
@@ -309,7 +312,7 @@ def _area(geometry: Any, p: Properties, width: float) -> Any:
     return shapely.buffer(geometry, width / 2, cap_style=caps, join_style="mitre", mitre_limit=2.0)
 
 
-def heights_of(properties: Properties, geometry: Any) -> tuple[float, float]:
+def object_heights(properties: Properties, geometry: Any) -> tuple[float, float]:
     """(base, top) of an extruded footprint in metres above the floor; the top is infinite where nothing says."""
     p = properties
     if str(p.get("kind")) in HOLES:
@@ -320,7 +323,7 @@ def heights_of(properties: Properties, geometry: Any) -> tuple[float, float]:
         base = osm_tags.base(tags)
     if top is None:
         top = osm_tags.height(tags)
-    size = size_of(p)
+    size = box_size(p)
     if not top and size is not None and len(size) > 2 and size[2] > 0:
         pose = p.get("pose")
         if shapely.get_type_id(geometry) == 0 and isinstance(pose, (list, tuple)) and len(pose) > 2:
@@ -334,7 +337,7 @@ def _positive(value: Any) -> float | None:
     return float(value) if good else None
 
 
-def size_of(p: Properties) -> tuple[float, ...] | None:
+def box_size(p: Properties) -> tuple[float, ...] | None:
     """[x, y(, z)] of a box; None where nothing says so."""
     size = p.get("size")
     if not isinstance(size, (list, tuple)) or len(size) < 2:

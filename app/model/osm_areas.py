@@ -29,7 +29,7 @@ def is_multipolygon(properties: Properties) -> bool:
     return isinstance(tags, Mapping) and tags.get("type") == "multipolygon"
 
 
-def areas_of(part: Features, rows: Iterable[int]) -> dict[int, Any | None]:
+def multipolygon_areas(part: Features, rows: Iterable[int]) -> dict[int, Any | None]:
     """The area of each multipolygon among these rows, in the coordinates of its ways; None where its rings do not
     close. Ways that are missing are left out."""
     relation_rows = [k for k in rows if part.ids[k].startswith("r") and is_multipolygon(part.properties[k])]
@@ -39,7 +39,7 @@ def areas_of(part: Features, rows: Iterable[int]) -> dict[int, Any | None]:
         way_rows = [index.get(way, -1) for way, _ in _ways(part.properties[k])]
         lines = [shapely.get_coordinates(part.geometry[row]) for row in way_rows if row >= 0]
         complete = not any(part.properties[row]["osm"].get("missing") for row in way_rows if row >= 0)
-        out[k] = assembled(lines) if complete else None
+        out[k] = assemble_area(lines) if complete else None
     return out
 
 
@@ -52,14 +52,14 @@ def incomplete_areas(part: Features, rows: Iterable[int]) -> dict[int, Any]:
     out: dict[int, Any] = {}
     chosen = [k for k in rows if isinstance(part.properties[k].get("osm"), Mapping)]
     index = part.index() if any(is_multipolygon(part.properties[k]) for k in chosen) else {}
-    areas = areas_of(part, [k for k in chosen if part.geometry[k].is_empty])
+    areas = multipolygon_areas(part, [k for k in chosen if part.geometry[k].is_empty])
     for k in chosen:
         p = part.properties[k]
         if is_multipolygon(p) and part.ids[k].startswith("r"):
             way_rows = [(index.get(way, -1), role) for way, role in _ways(p)]
             if (k in areas and areas[k] is None) or any(row < 0 and role != "inner" for row, role in way_rows):
                 out[k] = shapely.geometrycollections([part.geometry[row] for row, _ in way_rows if row >= 0])
-        elif _lacks_nodes(p["osm"]):
+        elif _has_missing_nodes(p["osm"]):
             out[k] = shapely.geometrycollections([part.geometry[k]])
     return out
 
@@ -97,14 +97,14 @@ def _ways(p: Properties) -> list[tuple[str, Any]]:
     ]
 
 
-def _lacks_nodes(source_properties: Mapping[str, Any]) -> bool:
+def _has_missing_nodes(source_properties: Mapping[str, Any]) -> bool:
     """Whether a way goes around an area and some of its nodes have no place."""
     refs, tags = source_properties.get("refs"), source_properties.get("tags")
     is_ring = isinstance(refs, (list, tuple)) and len(refs) > 3 and refs[0] == refs[-1]
     return is_ring and bool(source_properties.get("missing")) and isinstance(tags, Mapping) and not LINES & tags.keys()
 
 
-def assembled(lines: Lines) -> Any | None:
+def assemble_area(lines: Lines) -> Any | None:
     """The area that ways enclose (float64 [n, 2] each): a polygon or several; None where they leave a ring open."""
     rings = _rings(lines)
     if not rings:

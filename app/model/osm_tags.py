@@ -21,7 +21,7 @@ LANE = 3.0
 WALK = 6 / 3.6
 """Metres per second of ``maxspeed=walk``: 6 km/h, as GraphHopper has it."""
 
-WIDEST = 1e6
+MAX_METRES = 1e6
 """Metres; beyond it is a mistake."""
 
 _LENGTH = re.compile(r"\s*(\d{1,9}(?:[.,]\d{1,9})?)\s*(m|cm|mm|km|mi|ft|feet|in|'|\")?\s*", re.ASCII)
@@ -49,7 +49,7 @@ def metres(text: Any) -> float | None:
         value = float(match[1].replace(",", ".")) * _UNITS[match[2]]
     else:
         return None
-    return round(value, 9) if value <= WIDEST else None
+    return round(value, 9) if value <= MAX_METRES else None
 
 
 def speed(value: Any) -> float | None:
@@ -73,7 +73,7 @@ def count(value: Any) -> float | None:
 
 def is_understood(key: str, value: Any) -> bool:
     """Whether a tag's value means something to the functions below; true of all tags that they do not look at."""
-    read = _READ.get(key)
+    read = _PARSERS.get(key)
     return read is None or read(value) is not None or (read is speed and value in _NO_LIMIT)
 
 
@@ -120,10 +120,10 @@ def speed_limit(tags: Mapping[str, Any], direction: Literal["forward", "backward
 _NO_LIMIT = frozenset({"none", "signals", "variable"})
 """Values of ``maxspeed`` that mean no lasting limit (Key:maxspeed)."""
 
-_READ: Mapping[str, Callable[[Any], float | None]] = {
+_PARSERS: Mapping[str, Callable[[Any], float | None]] = {
     **dict.fromkeys(("width", "est_width", "height", "min_height"), metres),
     **dict.fromkeys(("lanes", "building:levels", "building:min_level"), count),
     **dict.fromkeys(("maxspeed", "maxspeed:forward", "maxspeed:backward"), speed),
 }
-READ = frozenset(_READ)
+NUMERIC_KEYS = frozenset(_PARSERS)
 """Keys of the tags whose values are read as numbers."""

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from app.errors import Invalid, MissingDatum
 from app.model.frame import MAX_METRES
-from app.model.gdal import gdal, native, opened
+from app.model.gdal import gdal, native, open_memory_dataset
 from app.model.geodesy import WGS84, LocalFrame, between
-from app.model.imagery import CLEAR, LOCAL, Affine, GeoImage, placed
+from app.model.imagery import CLEAR, LOCAL, Affine, GeoImage, pixel_positions
 
 Method = Literal["nearest", "bilinear", "cubic"]
 TOLERANCE = 1e-4
@@ -27,19 +27,19 @@ TOLERANCE = 1e-4
 STEPS = 64
 """Points on each side of a picture by which its extent in the target is found."""
 
-MOST_PIXELS = 2**28
+MAX_PIXELS = 2**28
 _NO_CRS = "EPSG:3857"
 """Stands for the local frame on both sides where neither is placed on earth: a CRS to itself is no transformation."""
 
 
-def resampled(
+def resample(
     picture: GeoImage,
     frame: LocalFrame | None = None,
     *,
     crs: str = LOCAL,
     resolution: float | None = None,
     method: Method | None = None,
-    most_pixels: int = MOST_PIXELS,
+    most_pixels: int = MAX_PIXELS,
 ) -> GeoImage:
     """The picture on a grid of ``crs`` (``local``: metres of ``frame``; else a name that PROJ knows).
 
@@ -55,25 +55,25 @@ def resampled(
         raise MissingDatum('the picture can only be placed with a datum: PATCH the environment with {"datum": {…}}')
     if picture.crs == crs and resolution is None and _is_upright(picture.transform):
         return picture
-    target, back = _placed_in(crs, frame)
-    source, forth = _placed_in(picture.crs, frame)
+    target, back = _target_crs(crs, frame)
+    source, forth = _target_crs(picture.crs, frame)
     if picture.crs == LOCAL and crs == LOCAL:
         source = target = _NO_CRS
         back = forth = (1.0, 0.0, 0.0, 1.0)
-    base = _turned(picture.transform, forth)
+    base = _rotate_transform(picture.transform, forth)
 
     def to_target(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return _unturned(points if source == target else between(source, target, points), back)
+        return _rotate_back(points if source == target else between(source, target, points), back)
 
     height, width = picture.pixels.shape[:2]
-    outline = to_target(_through(picture.outline(STEPS), forth))
+    outline = to_target(_transform_points(picture.outline(STEPS), forth))
     if not np.isfinite(outline).all() or (crs == LOCAL and np.abs(outline).max() > MAX_METRES):
         raise Invalid(
             "the picture reaches places that the target cannot say: it is too large, or too far from the datum"
         )
     if resolution is None:
         u, v = width / 2, height / 2
-        near = placed(base, np.array([u, u + 1, u]), np.array([v, v, v + 1]))
+        near = pixel_positions(base, np.array([u, u + 1, u]), np.array([v, v, v + 1]))
         p, q, r = to_target(near)
         area = abs((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
         resolution = float(f"{math.sqrt(area):.9g}")
@@ -89,7 +89,7 @@ def resampled(
         )
     grid = (resolution, 0.0, float(low[0]) * resolution, 0.0, -resolution, float(high[1]) * resolution)
     shape = (int(rows), int(columns))
-    pixels, properties = _warped(picture, method, shape, base, source, _turned(grid, back), target)
+    pixels, properties = _warp(picture, method, shape, base, source, _rotate_transform(grid, back), target)
     return replace(picture, pixels=pixels, transform=grid, crs=crs, properties=properties)
 
 
@@ -101,32 +101,32 @@ def _is_upright(transform: Affine) -> bool:
 Turn = tuple[float, float, float, float]
 
 
-def _placed_in(crs: str, frame: LocalFrame | None) -> tuple[str, Turn]:
+def _target_crs(crs: str, frame: LocalFrame | None) -> tuple[str, Turn]:
     """The CRS for PROJ, and how coordinates are turned into its own."""
     if crs == LOCAL:
         return (frame.crs, frame.from_local) if frame is not None else (_NO_CRS, (1.0, 0.0, 0.0, 1.0))
     return crs, (1.0, 0.0, 0.0, 1.0)
 
 
-def _turned(transform: Affine, turn: Turn) -> Affine:
+def _rotate_transform(transform: Affine, turn: Turn) -> Affine:
     """A transform whose coordinates are turned further."""
     a, b, c, d, e, f = transform
     p, q, r, s = turn
     return (p * a + q * d, p * b + q * e, p * c + q * f, r * a + s * d, r * b + s * e, r * c + s * f)
 
 
-def _through(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
+def _transform_points(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
     p, q, r, s = turn
     return np.column_stack([p * points[:, 0] + q * points[:, 1], r * points[:, 0] + s * points[:, 1]])
 
 
-def _unturned(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
+def _rotate_back(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
     """Turned back: the inverse of a rotation is its transpose."""
     p, q, r, s = turn
-    return _through(points, (p, r, q, s))
+    return _transform_points(points, (p, r, q, s))
 
 
-def _warped(
+def _warp(
     picture: GeoImage,
     method: Method | None,
     shape: tuple[int, int],
@@ -164,7 +164,7 @@ def _warped(
         if nodata is None:
             nodata, properties["nodata"] = math.nan, "nan"
         options = {"src_nodata": nodata, "nodata": nodata}
-    with gdal() as rasterio, opened(rasterio, pixels, count) as dataset:
+    with gdal() as rasterio, open_memory_dataset(rasterio, pixels, count) as dataset:
         matrix = rasterio.Affine
         with WarpedVRT(
             dataset,
@@ -190,5 +190,5 @@ def _opaque(band: NDArray[Any], colour: str) -> float:
 
 
 def to_wgs84(picture: GeoImage, frame: LocalFrame | None = None, **options: Any) -> GeoImage:
-    """``resampled`` on a grid of longitude and latitude."""
-    return resampled(picture, frame, crs=WGS84, **options)
+    """``resample`` on a grid of longitude and latitude."""
+    return resample(picture, frame, crs=WGS84, **options)

@@ -46,22 +46,22 @@ from app.model.frame import MAX_METRES
 
 Array = NDArray[np.float64]
 
-MOST_TRIANGLES = 5_000_000
+MAX_TRIANGLES = 5_000_000
 """Of one object."""
 
-MOST_SHAPES = 10_000
+MAX_SHAPES = 10_000
 """Of one object."""
 
-MOST_PIXELS = 4097 * 4097
+MAX_PIXELS = 4097 * 4097
 """Of a height map's picture."""
 
-FINEST = 1400
+MAX_HEIGHTMAP_SIDE = 1400
 """Rows and columns of a height map that are told apart: of a larger picture's neighbouring pixels the highest stays."""
 
 TOLERANCE = 0.002
 """Metres that a round solid's flat sides may lie within the true one."""
 
-MOST_OUTLINES = 5_000
+MAX_OUTLINES = 5_000
 """Triangles whose outlines are joined for a footprint; of a mesh with more the convex hull is taken."""
 
 _NOTHING: Array = np.empty((0, 3, 3))
@@ -104,11 +104,11 @@ class Solids:
 
         Raises Invalid or TooLarge where that is so of the object as a whole.
         """
-        placement = matrix(pose_of(properties))
+        placement = matrix(parse_pose(properties))
         arrays: list[Array] = []
         unreadable: list[Unreadable] = []
         total = 0
-        for k, shape in enumerate(shapes_of(properties)):
+        for k, shape in enumerate(object_shapes(properties)):
             if not self._counts(shape):
                 continue
             try:
@@ -117,19 +117,21 @@ class Solids:
                 unreadable.append(Unreadable(error, _origin(placement, shape)))
                 continue
             total += len(arrays[-1])
-            if total > MOST_TRIANGLES:
-                raise TooLarge(f"an object has more than {MOST_TRIANGLES} triangles")
-        return (_checked(_moved(np.concatenate(arrays), placement), "pose") if arrays else _NOTHING), unreadable
+            if total > MAX_TRIANGLES:
+                raise TooLarge(f"an object has more than {MAX_TRIANGLES} triangles")
+        return (
+            _check_corners(_apply_transform(np.concatenate(arrays), placement), "pose") if arrays else _NOTHING
+        ), unreadable
 
     def footprint(self, properties: Properties) -> Any:
         """The ground that an object's solids stand over: a valid shapely geometry, metres, local frame; empty where it
         has none. Of a mesh with very many triangles it is the convex hull."""
         outlines = []
-        placement = matrix(pose_of(properties))
-        for k, shape in enumerate(shapes_of(properties)):
+        placement = matrix(parse_pose(properties))
+        for k, shape in enumerate(object_shapes(properties)):
             if self._counts(shape):
                 corners = self.shape(shape, f"shapes[{k}]")
-                outlines.append(_shadow(_checked(_moved(corners, placement), "pose")[:, :, :2]))
+                outlines.append(_shadow(_check_corners(_apply_transform(corners, placement), "pose")[:, :, :2]))
         return shapely.union_all(outlines) if outlines else shapely.Polygon()
 
     def bounds(self, properties: Properties) -> tuple[float, float, float, float, float, float] | None:
@@ -150,10 +152,12 @@ class Solids:
         kind = shape.get("type")
         make = _MAKERS.get(kind) if isinstance(kind, str) else None
         if "file" not in shape and isinstance(shape.get("uri"), str):
-            _refuse_absent(str(shape["uri"]))
+            _raise_missing_file(str(shape["uri"]))
         if make is None:
-            _refuse(f"has the type {str(kind)[:80]!r}; there are {', '.join(_MAKERS)}", location)
-        return _checked(_moved(make(self, shape, location), matrix(pose_of(shape, location))), location)
+            _raise_invalid(f"has the type {str(kind)[:80]!r}; there are {', '.join(_MAKERS)}", location)
+        return _check_corners(
+            _apply_transform(make(self, shape, location), matrix(parse_pose(shape, location))), location
+        )
 
     def mesh(self, file: str) -> meshes.Mesh:
         """A mesh file, read once. Raises Invalid that names it."""
@@ -173,7 +177,7 @@ class Solids:
         """A resource's bytes; Invalid says that it is to be supplied."""
         data = self.resources.get(path)
         if data is None:
-            _refuse_absent(path)
+            _raise_missing_file(path)
         return data
 
     def _counts(self, shape: Mapping[str, Any]) -> bool:
@@ -208,25 +212,25 @@ def size(
     return Solids(resources, planes, visuals).size(properties)
 
 
-def shapes_of(properties: Properties) -> Sequence[Mapping[str, Any]]:
+def object_shapes(properties: Properties) -> Sequence[Mapping[str, Any]]:
     """An object's shapes; empty where it says none. Raises Invalid where they are no list of mappings."""
     shapes = properties.get("shapes")
     if shapes is None:
         return []
     if not isinstance(shapes, (list, tuple)) or not all(isinstance(shape, Mapping) for shape in shapes):
-        _refuse("must be a list of mappings with a type", "shapes")
-    if len(shapes) > MOST_SHAPES:
-        _refuse(f"are {len(shapes)}; the limit is {MOST_SHAPES}", "shapes")
+        _raise_invalid("must be a list of mappings with a type", "shapes")
+    if len(shapes) > MAX_SHAPES:
+        _raise_invalid(f"are {len(shapes)}; the limit is {MAX_SHAPES}", "shapes")
     return shapes
 
 
-def pose_of(members: Mapping[str, Any], location: str = "pose") -> tuple[float, ...]:
+def parse_pose(members: Mapping[str, Any], location: str = "pose") -> tuple[float, ...]:
     """[x, y, z, roll, pitch, yaw]; missing ones are 0. Raises Invalid where it is no list of finite numbers."""
     pose = members.get("pose")
     if pose is None:
         return (0.0,) * 6
     if not isinstance(pose, (list, tuple)) or len(pose) > 6:
-        _refuse("must be [x, y, z, roll, pitch, yaw]", f"{location}.pose")
+        _raise_invalid("must be [x, y, z, roll, pitch, yaw]", f"{location}.pose")
     numbers = [_number(value, f"{location}.pose", MAX_METRES) for value in pose]
     return (*numbers, *([0.0] * (6 - len(numbers))))
 
@@ -251,20 +255,20 @@ def matrix(pose: Sequence[float]) -> Array:
     return out
 
 
-def placed(corners: Array, pose: Sequence[float]) -> Array:
+def apply_pose(corners: Array, pose: Sequence[float]) -> Array:
     """Points float64 [..., 3] of a frame with this pose in the frame around it."""
-    return _moved(corners, matrix(pose))
+    return _apply_transform(corners, matrix(pose))
 
 
-def _moved(corners: Array, transform: Array) -> Array:
+def _apply_transform(corners: Array, transform: Array) -> Array:
     if np.array_equal(transform, np.eye(4)):
         return corners
     return np.asarray(corners @ transform[:3, :3].T + transform[:3, 3], np.float64)
 
 
-def _checked(corners: Array, location: str) -> Array:
+def _check_corners(corners: Array, location: str) -> Array:
     if not bool((np.abs(corners) <= MAX_METRES).all()):
-        _refuse(f"gives coordinates that are not finite metres within ±{MAX_METRES:g}", location)
+        _raise_invalid(f"gives coordinates that are not finite metres within ±{MAX_METRES:g}", location)
     return corners
 
 
@@ -272,7 +276,7 @@ def _shadow(corners: Array) -> Any:
     """The union of triangles [n, 3, 2] seen from above; of very many the convex hull."""
     if not len(corners):
         return shapely.Polygon()
-    if len(corners) > MOST_OUTLINES:
+    if len(corners) > MAX_OUTLINES:
         return shapely.convex_hull(shapely.multipoints(corners.reshape(-1, 2)))
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
@@ -292,23 +296,23 @@ def _box(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # n
 
 def _sphere(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
     radius = _length(shape, "radius", location)
-    return _turned(*_arc(radius, 0.0), _sides(radius))
+    return _revolve(*_arc(radius, 0.0), _sides(radius))
 
 
 def _ellipsoid(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
     radii = _vector(shape, "radii", 3, location)
     sides = _sides(float(radii.max()))
-    return _turned(*_arc(1.0, 0.0, sides), sides) * radii
+    return _revolve(*_arc(1.0, 0.0, sides), sides) * radii
 
 
 def _capsule(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
     radius = _length(shape, "radius", location)
-    return _turned(*_arc(radius, _length(shape, "length", location)), _sides(radius))
+    return _revolve(*_arc(radius, _length(shape, "length", location)), _sides(radius))
 
 
 def _cylinder(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
     radius, half = _length(shape, "radius", location), _length(shape, "length", location) / 2.0
-    return _turned(np.array([0.0, radius, radius, 0.0]), np.array([-half, -half, half, half]), _sides(radius))
+    return _revolve(np.array([0.0, radius, radius, 0.0]), np.array([-half, -half, half, half]), _sides(radius))
 
 
 def _plane(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
@@ -318,7 +322,7 @@ def _plane(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  #
     normal = _vector(shape, "normal", 3, location, (0.0, 0.0, 1.0), minimum=-MAX_METRES)
     length = float(np.linalg.norm(normal))
     if not length:
-        _refuse("must not be zero", f"{location}.normal")
+        _raise_invalid("must not be zero", f"{location}.normal")
     a, b, c = normal / length
     if c < -1.0 + 1e-12:
         return np.asarray(flat * np.array([1.0, -1.0, -1.0]), np.float64)
@@ -330,16 +334,16 @@ def _plane(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  #
 def _polyline(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
     rings = shape.get("points")
     if not isinstance(rings, (list, tuple)) or not rings:
-        _refuse("must be a list of rings of [x, y]", f"{location}.points")
+        _raise_invalid("must be a list of rings of [x, y]", f"{location}.points")
     area = shapely.Polygon()
     for ring in rings:
         at = _points(ring, f"{location}.points")
         if len(at) >= 3:
             area = shapely.symmetric_difference(area, shapely.make_valid(shapely.Polygon(at)))
-    return extruded(area, 0.0, _length(shape, "height", location))
+    return extrude(area, 0.0, _length(shape, "height", location))
 
 
-def extruded(area: Any, low: float, high: float) -> Array:
+def extrude(area: Any, low: float, high: float) -> Array:
     """A polygon or several (shapely, metres), from one height to another, as closed triangles: float64 [n, 3, 3]."""
     faces = []
     for polygon in shapely.get_parts(shapely.get_parts(area)):  # a collection may hold several polygons in one part
@@ -351,7 +355,7 @@ def extruded(area: Any, low: float, high: float) -> Array:
         a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
         back = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
         flat[back] = flat[back][:, ::-1]
-        faces += [_at_height(flat, high), _at_height(flat[:, ::-1], low)]
+        faces += [_add_height(flat, high), _add_height(flat[:, ::-1], low)]
         for ring in (oriented.exterior, *oriented.interiors):
             at = shapely.get_coordinates(ring)
             a3, b3 = (np.column_stack([p, np.full(len(p), low)]) for p in (at[:-1], at[1:]))
@@ -363,9 +367,9 @@ def extruded(area: Any, low: float, high: float) -> Array:
 def _mesh(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:
     file, part = shape.get("file"), shape.get("submesh")
     if not isinstance(file, str) or not file:
-        _refuse("must be the path of a mesh among the files of the objects", f"{location}.file")
+        _raise_invalid("must be the path of a mesh among the files of the objects", f"{location}.file")
     if part is not None and not isinstance(part, str):
-        _refuse("must be a name", f"{location}.submesh")
+        _raise_invalid("must be a name", f"{location}.submesh")
     scale = _vector(shape, "scale", 3, location, (1.0, 1.0, 1.0), minimum=-MAX_METRES)
     try:
         corners = solids.mesh(file).triangles(part or None, centre=shape.get("center") is True) * scale
@@ -381,7 +385,7 @@ def _heightmap(solids: Solids, shape: Mapping[str, Any], location: str) -> Array
     """
     file = shape.get("file")
     if not isinstance(file, str) or not file:
-        _refuse("must be the path of a picture among the files of the objects", f"{location}.file")
+        _raise_invalid("must be the path of a picture among the files of the objects", f"{location}.file")
     extent = _vector(shape, "size", 3, location, (1.0, 1.0, 1.0))
     position = _vector(shape, "position", 3, location, (0.0, 0.0, 0.0), minimum=-MAX_METRES)
     grey = _highest(_picture(solids.file(file), file))
@@ -406,7 +410,7 @@ def _heightmap(solids: Solids, shape: Mapping[str, Any], location: str) -> Array
 
 def _highest(grey: Array) -> Array:
     """A picture with at most FINEST rows and columns, each of its pixels the brightest of a block."""
-    step = [math.ceil(n / FINEST) for n in grey.shape]
+    step = [math.ceil(n / MAX_HEIGHTMAP_SIDE) for n in grey.shape]
     if max(step) == 1:
         return grey
     rows, columns = (np.arange(0, n, k) for n, k in zip(grey.shape, step, strict=True))
@@ -427,17 +431,17 @@ def _picture(data: bytes, file: str) -> Array:
     kinds = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF", ".bmp": "BMP"}
     kind = kinds.get(PurePosixPath(file).suffix.lower())
     if kind is None:
-        _refuse(f"must be one of {', '.join(sorted(kinds))}", file)
+        _raise_invalid(f"must be one of {', '.join(sorted(kinds))}", file)
     try:
         with Image.open(io.BytesIO(data), formats=[kind]) as picture:
-            if picture.width * picture.height > MOST_PIXELS:
-                raise TooLarge(f"{file} has {picture.width} × {picture.height} pixels; the limit is {MOST_PIXELS}")
+            if picture.width * picture.height > MAX_PIXELS:
+                raise TooLarge(f"{file} has {picture.width} × {picture.height} pixels; the limit is {MAX_PIXELS}")
             deep = picture.mode in ("I", "F") or picture.mode.startswith("I;16")
             grey = np.asarray(picture if deep else picture.convert("L"), np.float64)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise Invalid(f"{file} cannot be read as a picture: {error}", [Problem(str(error), file)]) from error
     if grey.ndim != 2 or min(grey.shape) < 2 or not bool(np.isfinite(grey).all()):
-        _refuse("must be a picture of at least 2 × 2 pixels", file)
+        _raise_invalid("must be a picture of at least 2 × 2 pixels", file)
     return grey
 
 
@@ -462,7 +466,7 @@ TYPES = frozenset(_MAKERS)
 @cache
 def _unit_box() -> Array:
     low, high = -0.5, 0.5
-    return extruded(shapely.box(low, low, high, high), low, high)
+    return extrude(shapely.box(low, low, high, high), low, high)
 
 
 def _sides(radius: float) -> int:
@@ -483,7 +487,7 @@ def _arc(radius: float, length: float, sides: int = 0) -> tuple[Array, Array]:
     return np.concatenate([r, r[::-1]]), np.concatenate([-z, z[::-1]])
 
 
-def _turned(radii: Array, heights: Array, sides: int) -> Array:
+def _revolve(radii: Array, heights: Array, sides: int) -> Array:
     """A curve (radii, heights), upwards, turned round the z axis: triangles without those of no area at the poles."""
     angle = np.arange(sides + 1) * (2.0 * math.pi / sides)
     c, s = np.cos(angle), np.sin(angle)
@@ -496,33 +500,33 @@ def _turned(radii: Array, heights: Array, sides: int) -> Array:
     return out[flat > 0] if bool((flat > 0).any()) else out
 
 
-def _at_height(flat: Array, z: float) -> Array:
+def _add_height(flat: Array, z: float) -> Array:
     return np.concatenate([flat, np.full((*flat.shape[:-1], 1), z)], axis=-1)
 
 
 def _origin(placement: Array, shape: Mapping[str, Any]) -> tuple[float, float]:
     """A shape's origin seen from above, in the frame around its object; the object's own where its pose is invalid."""
     try:
-        at = (placement @ matrix(pose_of(shape)))[:2, 3]
+        at = (placement @ matrix(parse_pose(shape)))[:2, 3]
     except Invalid:
         at = placement[:2, 3]
     return float(at[0]), float(at[1])
 
 
-def _refuse_absent(path: str) -> NoReturn:
+def _raise_missing_file(path: str) -> NoReturn:
     reason = f"the file {path[:200]} is not there: upload it together with the objects"
     raise Invalid(reason, [Problem(reason, path[:200])])
 
 
-def _refuse(reason: str, location: str) -> NoReturn:
+def _raise_invalid(reason: str, location: str) -> NoReturn:
     raise Invalid(f"{location} {reason}", [Problem(reason, where=location)])
 
 
 def _number(value: Any, location: str, maximum: float, minimum: float | None = None) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= maximum:
-        _refuse(f"must be a finite number of at most {maximum:g}, got {str(value)[:80]}", location)
+        _raise_invalid(f"must be a finite number of at most {maximum:g}, got {str(value)[:80]}", location)
     if minimum is not None and value < minimum:
-        _refuse(f"must be at least {minimum:g}, got {value:g}", location)
+        _raise_invalid(f"must be at least {minimum:g}, got {value:g}", location)
     return float(value)
 
 
@@ -535,11 +539,11 @@ def _vector(
 ) -> Array:
     values = shape.get(word, otherwise)
     if not isinstance(values, (list, tuple)) or len(values) != n:
-        _refuse(f"must be {n} numbers", f"{location}.{word}")
+        _raise_invalid(f"must be {n} numbers", f"{location}.{word}")
     return np.array([_number(v, f"{location}.{word}", MAX_METRES, minimum) for v in values])
 
 
 def _points(ring: Any, location: str) -> Array:
     if not isinstance(ring, (list, tuple)) or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in ring):
-        _refuse("must be a list of rings of [x, y]", location)
+        _raise_invalid("must be a list of rings of [x, y]", location)
     return np.array([[_number(v, location, MAX_METRES) for v in p] for p in ring], np.float64).reshape(-1, 2)

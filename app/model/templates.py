@@ -34,13 +34,13 @@ class Templates:
     set: str = DEFAULT_SET
     formats: Mapping[str, FormatTemplate] = field(default_factory=dict)
 
-    def of(self, name: str) -> FormatTemplate:
+    def for_format(self, name: str) -> FormatTemplate:
         """What is said of a format."""
         return self.formats.get(name) or FormatTemplate()
 
-    def chosen(self, name: str) -> str:
+    def set_of(self, name: str) -> str:
         """The set that holds for a format."""
-        return self.of(name).set or self.set
+        return self.for_format(name).set or self.set
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-like members in one order; empty where nothing was ever said."""
@@ -78,7 +78,7 @@ def template_changes(old: Templates, new: Templates) -> dict[str, Any]:
     if old.set != new.set:
         out["set"] = {"from": old.set, "to": new.set}
     for name in sorted(old.formats.keys() | new.formats.keys()):
-        a, b = old.of(name), new.of(name)
+        a, b = old.for_format(name), new.for_format(name)
         changed: dict[str, Any] = {} if a.set == b.set else {"set": {"from": a.set, "to": b.set}}
         for key in sorted(a.values.keys() | b.values.keys()):
             if (key in a.values) != (key in b.values) or a.values.get(key) != b.values.get(key):

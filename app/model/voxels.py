@@ -161,7 +161,7 @@ def morton(x: NDArray[np.int64], y: NDArray[np.int64], z: NDArray[np.int64]) -> 
     return code
 
 
-def expanded(voxels: VoxelMap, mask: NDArray[np.bool_]) -> tuple[Codes, NDArray[np.intp]]:
+def expand_leaves(voxels: VoxelMap, mask: NDArray[np.bool_]) -> tuple[Codes, NDArray[np.intp]]:
     """All smallest voxels of some leaves: their codes at depth 16, ascending, uint64 [m], and the leaf of each.
 
     mask: bool [n]. The caller bounds m (``voxel_counts``): a leaf at depth 1 has 2^45 of them.
@@ -174,7 +174,7 @@ def expanded(voxels: VoxelMap, mask: NDArray[np.bool_]) -> tuple[Codes, NDArray[
     return voxels.place[leaf] + within.astype(np.uint64), leaf
 
 
-def pruned(voxels: VoxelMap, deepest: int = DEPTH) -> VoxelMap:
+def prune(voxels: VoxelMap, deepest: int = DEPTH) -> VoxelMap:
     """Eight sibling leaves of equal log-odds as one, from ``deepest`` upwards, as OctoMap prunes.
 
     It stops at the first level on which nothing merges, never makes the root a leaf, and does not look at colours: a
@@ -273,7 +273,7 @@ def cut(voxels: VoxelMap, box: Box3, limit: int = 2**24) -> VoxelMap:
     return replace(voxels, depth=depth, code=code, log_odds=voxels.log_odds[source], colour=colour)
 
 
-def parents_of(
+def merge_to_parents(
     code: Codes, odds: NDArray[np.float32], colour: NDArray[np.uint8] | None
 ) -> tuple[NDArray[np.intp], Codes, NDArray[np.float32], NDArray[np.uint8] | None]:
     """The nodes above some nodes of one depth in ascending order: where each one's children start, its code, log-odds
@@ -315,13 +315,13 @@ def _voxel_range(box: Box3, resolution: float) -> tuple[list[int], list[int]]:
         raise Invalid("a box must be min x, min y, min z, max x, max y, max z in metres, the smaller ones first")
     low, high = [], []
     for k in range(3):
-        a, b = (_near(min(max(v / resolution, -HALF - 1.0), HALF + 1.0)) for v in (box[k], box[k + 3]))
+        a, b = (_snap_to_integer(min(max(v / resolution, -HALF - 1.0), HALF + 1.0)) for v in (box[k], box[k + 3]))
         low.append(math.floor(a))
         high.append(max(math.ceil(b), low[-1] + 1))
     return low, high
 
 
-def _near(value: float) -> float:
+def _snap_to_integer(value: float) -> float:
     """A whole number where it is one but for the rounding of a division (0.3 / 0.1)."""
     integer = round(value)
     return float(integer) if abs(value - integer) < 1e-6 else value

@@ -31,19 +31,19 @@ def names(part: Features) -> list[str]:
     worlds = document.get("worlds") if isinstance(document, Mapping) else None
     if not isinstance(worlds, Mapping):
         return []
-    used = {world_of(p) for p in part.properties}
+    used = {object_world(p) for p in part.properties}
     used_worlds = {str(k): w for k, w in worlds.items() if isinstance(w, Mapping) and ("sdf" in w or str(k) in used)}
     return sorted(used_worlds, key=lambda name: rank(name, used_worlds[name]))
 
 
-def world_of(properties: Properties) -> str | None:
+def object_world(properties: Properties) -> str | None:
     """The world that an object belongs to; None: each."""
     source_properties = properties.get(FAMILY)
     name = source_properties.get("world") if isinstance(source_properties, Mapping) else None
     return None if name is None else str(name)
 
 
-def chosen(part: Features, world: str | None) -> tuple[Features, list[str]]:
+def select_world(part: Features, world: str | None) -> tuple[Features, list[str]]:
     """The objects of one world, by its path or its file's name, else of the first; and the other worlds.
 
     NotFound tells the known ones.
@@ -59,4 +59,4 @@ def chosen(part: Features, world: str | None) -> tuple[Features, list[str]]:
     if len(worlds) < 2:
         return part, []
     others = frozenset(worlds[1:])
-    return part.take([k for k, p in enumerate(part.properties) if world_of(p) not in others]), worlds[1:]
+    return part.select([k for k, p in enumerate(part.properties) if object_world(p) not in others]), worlds[1:]

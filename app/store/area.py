@@ -116,7 +116,7 @@ def fence_polygon(sites: Sequence[Features], frame: LocalFrame | None) -> Any:
     fences: list[Any] = []
     for site in sites:
         flat = np.isin(shapely.get_type_id(site.geometry), (3, 6)) & ~shapely.is_empty(site.geometry)
-        chosen = site.take(flat & ~site.local if frame is None else flat)
+        chosen = site.select(flat & ~site.local if frame is None else flat)
         for place, properties in zip(chosen.in_wgs84(frame), chosen.properties, strict=True):
             pieces = [_unwrap(p) for p in shapely.get_parts(shapely.force_2d(place))]
             (fences if properties.get("kind") == FENCE else polygons).extend(p for p in pieces if p is not None)
@@ -199,7 +199,7 @@ def _hull(network: Features, frame: LocalFrame, near: Any) -> Any:
 
 
 def _floor_objects(part: Features, frame: LocalFrame) -> list[Any]:
-    floors = part.take([k for k, p in enumerate(part.properties) if p.get("kind") == FLOOR])
+    floors = part.select([k for k, p in enumerate(part.properties) if p.get("kind") == FLOOR])
     flat = [s for s in _geometries_in_metres(floors, frame) if s.geom_type in ("Polygon", "MultiPolygon")]
     return [p for p in (_polygonal(shapely.make_valid(s)) for s in flat) if p is not None]
 

@@ -96,7 +96,7 @@ class Channels(StoreBase):
             stored_version, sequence = read_version(connection, row, number), int(sequence or 0)
             if mode == "ignore":
                 return stored_version, sequence
-            in_force = read_closures(connection, row).in_mode(mode)
+            in_force = read_closures(connection, row).for_mode(mode)
             return replace(stored_version, closures=in_force), max(sequence, int(row.closures_sequence))
 
     def set_channel(

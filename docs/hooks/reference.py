@@ -207,7 +207,7 @@ def formats_table() -> str:
                 plain(f.title),
                 "yes" if f.read else "no",
                 "yes" if f.write else "no",
-                ", ".join(sorted(f.carries)),
+                ", ".join(sorted(f.layers)),
             )
             for f in all_formats().values()
         ),
@@ -263,11 +263,11 @@ def _facts(known: Format) -> str:
         ("Files", codes(known.files)),
         ("Media types", codes(dict.fromkeys(known.media_types))),
         ("Uploads end in", codes(known.extensions)),
-        ("Layers", ", ".join(sorted(known.carries)) + (" (of a grid only its place)" if known.outlines else "")),
+        ("Layers", ", ".join(sorted(known.layers)) + (" (of a grid only its place)" if known.outlines else "")),
         ("A map needs", wants + (", and a datum" if needs.datum else "")),
         ("A map also uses", ", ".join(sorted(needs.also))),
         ("Coordinates", ANCHORS.get(needs.anchor or "", "")),
-        ("Bends of edges", BENDS.get(known.bends, "")),
+        ("Bends of edges", BENDS.get(known.keeps_bends, "")),
         ("Blocked edges", "stay in a map, with a mark" if known.marks_blocked else ""),
         (
             "Parts",
@@ -325,9 +325,9 @@ def _layers(one: Derivation) -> str:
     rows = [
         ("needs", ", ".join(sorted(one.needs))),
         ("also uses", ", ".join(sorted(one.also))),
-        ("gives", one.gives + (f" ({', '.join(sorted(one.makes))})" if one.makes else "")),
+        ("gives", one.gives + (f" ({', '.join(sorted(one.part_names))})" if one.part_names else "")),
         ("cost", f"{one.cost:g}"),
-        ("further derivations", "none may follow: its result is good for a map only" if one.last else ""),
+        ("further derivations", "none may follow: its result is good for a map only" if one.is_terminal else ""),
     ]
     return table(("", ""), [row for row in rows if row[1]])
 

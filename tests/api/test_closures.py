@@ -12,14 +12,14 @@ import pytest
 import yaml
 
 from app import formats
-from app.model.closures import digest_of
+from app.model.closures import closures_digest
 from tests.api import samples
 from tests.api.conftest import Api
 
 SQUARE = {"type": "Polygon", "coordinates": [[[4, -1], [6, -1], [6, 1], [4, 1], [4, -1]]]}
 """Across the lane between gate and barn, in metres."""
 
-NO_CLOSURES = digest_of([])
+NO_CLOSURES = closures_digest([])
 
 
 def close(api: Api, env: str, **fields: Any) -> dict[str, Any]:
@@ -84,7 +84,9 @@ def test_manifest_lists_closures_and_a_higher_sequence(api: Api, farm: str) -> N
         for o in sorted((one, two), key=lambda o: str(o["id"]))
     ]
     assert now["overlays"] == listed
-    assert now["overlays_digest"] == digest_of(listed) == api.get(f"/maps/{farm}/tmap2").headers["fleetmap-overlays"]
+    assert (
+        now["overlays_digest"] == closures_digest(listed) == api.get(f"/maps/{farm}/tmap2").headers["fleetmap-overlays"]
+    )
     assert now["sequence"] == before["sequence"] + 2
     assert (now["version"], now["root"]) == (before["version"], before["root"])
     assert now["files"] != before["files"]
@@ -191,7 +193,7 @@ def test_marked_edges_say_until_when(api: Api, farm: str) -> None:
 
 
 NETWORKS = sorted(
-    f.name for f in formats.all_formats().values() if f.write and "topology" in f.carries and not f.marks_blocked
+    f.name for f in formats.all_formats().values() if f.write and "topology" in f.layers and not f.marks_blocked
 )
 
 
@@ -291,7 +293,7 @@ def test_closures_are_listed_with_their_ends_as_signed(api: Api, farm: str) -> N
     close(api, farm, polygon=SQUARE, crs="local", detail="ä trailer")
     body = api.get(f"environments/{farm}/versions/latest/manifest?formats=geojson").content
     listed = json.loads(body)
-    assert listed["overlays_digest"] == digest_of(listed["overlays"])
+    assert listed["overlays_digest"] == closures_digest(listed["overlays"])
     assert listed["overlays"][0]["polygon"] == json.loads(json.dumps(SQUARE))
 
 

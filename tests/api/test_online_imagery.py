@@ -25,7 +25,7 @@ from app.formats import Limits
 from app.ingest import online
 from app.ingest.online import Fetcher, Provider, assemble_image, plan_mosaic
 from app.model.geodesy import WGS84, between
-from app.model.imagery import GeoImage, placed
+from app.model.imagery import GeoImage, pixel_positions
 from tests.api.conftest import Api, running, settings_for
 
 FENCE = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>fence</name><Polygon><outerBoundaryIs>
@@ -204,7 +204,7 @@ def check(picture: GeoImage) -> None:
     """Every pixel shows the place that the transform says, and the box is covered with no more than a pixel around."""
     height, width = picture.pixels.shape[:2]
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    at = placed(picture.transform, u.ravel(), v.ravel()).reshape(height, width, 2)
+    at = pixel_positions(picture.transform, u.ravel(), v.ravel()).reshape(height, width, 2)
     near = np.abs(at / 16 - np.round(at / 16)).min(axis=2) * 16 > 0.01  # not on the edge of a block of colour
     assert near.mean() > 0.9
     assert np.array_equal(picture.pixels[..., :3][near], world(at[..., 0], at[..., 1])[near])

@@ -116,7 +116,7 @@ def test_parameters_of_formats_are_listed(api: Api, schema: dict[str, Any]) -> N
     op = schema["paths"]["/api/v1/environments/{env}/versions/{v}/maps/{format}"]["get"]
     listed = {p["name"] for p in op["parameters"] if p["in"] == "query"}
     declared = {o["name"] for f in api.get("formats").json() if f["write"] for o in f["options"] if o["for"] == "write"}
-    steps = {name for step in derive.all_derivations() for name in derive.takes(step)}
+    steps = {name for step in derive.all_derivations() for name in derive.parameter_names(step)}
     assert listed == declared | steps | {"derive", "closures"}
 
 

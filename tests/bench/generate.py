@@ -59,12 +59,12 @@ def collapse() -> list[dict[str, Any]]:
             model = _wfc.learn(sample, tile=1, pattern=PATTERN, symmetry="none")
             try:
                 fixed = np.full((side, side), -1)
-                tiles = _wfc.collapsed(model, (side, side), fixed, RandomSource(seed, "bench").stream, joined=True)
+                tiles = _wfc.collapse_model(model, (side, side), fixed, RandomSource(seed, "bench").stream, joined=True)
             except CannotGenerate:
                 failed += 1
                 continue
             times.append(time.process_time() - start)
-            out = _wfc.rendered(model, tiles)
+            out = _wfc.render(model, tiles)
             apart.append(float(np.abs(pairs(out) - pairs(sample)).max()))
             share.append(abs(float((out == OCCUPIED).mean() - (sample == OCCUPIED).mean())))
         label = f"wave-function collapse, {side} × {side} tiles"
@@ -119,7 +119,11 @@ def passes() -> list[dict[str, Any]]:
 
     rule = (5, 6, 7, 8), (4, 5, 6, 7, 8)
     rows = [
-        _row("automaton's step: NumPy", seconds(step), seconds(lambda: _automata.grown(alive, *rule, 1, outside=True)))
+        _row(
+            "automaton's step: NumPy",
+            seconds(step),
+            seconds(lambda: _automata.run_automaton(alive, *rule, 1, outside=True)),
+        )
     ]
     _kernels_noise.compile_all()
     x, y = np.linspace(0.0, 37.3, SIDE), np.linspace(0.0, 31.1, SIDE)

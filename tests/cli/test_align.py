@@ -103,7 +103,7 @@ def test_the_list_is_the_servers(fleetmap: Fleetmap, offline: Fleetmap, monkeypa
     assert listed.status == 0
     assert "location_to_imagery" not in {row["id"] for row in listed.json}, "this server has no provider"
     assert "location_to_imagery" not in listed.err
-    monkeypatch.setattr("app.cli.client.TRIES", 1)
+    monkeypatch.setattr("app.cli.client.MAX_ATTEMPTS", 1)
     absent = fleetmap("derive", "--json", "--server", "http://127.0.0.1:9")
     assert absent.json == listed.json
     assert "no answer from http://127.0.0.1:9" in absent.err

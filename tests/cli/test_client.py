@@ -112,7 +112,7 @@ def test_a_lost_answer_is_told_in_the_end(talk: Talk, tmp_path: Path) -> None:
     client, script = talk(None)
     with pytest.raises(RequestFailed, match="no answer from"):
         client.upload("/environments/e/versions", [local(tmp_path, "a", b"1")], {})
-    assert len(script.asked) == clients.TRIES
+    assert len(script.asked) == clients.MAX_ATTEMPTS
 
 
 def test_what_must_not_happen_twice_is_asked_once(talk: Talk) -> None:

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from typer.main import get_command
 
 from app.cli import completion, groups, variables
-from app.cli.commands import ALIASES, PANELS, build, needed
+from app.cli.commands import ALIASES, PANELS, build, needed_command
 from app.config import Settings, format_size, parse_size
 from tests.cli.conftest import TOKEN, Fleetmap
 
@@ -67,14 +67,14 @@ def test_help_is_as_wide_as_the_terminal(
 
 
 def test_only_the_command_that_runs_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert needed(["--json", "robots", "list"]) == "robots"
-    assert needed(["--help"]) is None
+    assert needed_command(["--json", "robots", "list"]) == "robots"
+    assert needed_command(["--help"]) is None
     assert list(get_command(build("robots")).commands) == ["robots"]  # type: ignore[attr-defined]
     assert len(get_command(build("rbots")).commands) > 20, "to propose a name"  # type: ignore[attr-defined]
     monkeypatch.setenv("_FLEETMAP_COMPLETE", "complete_bash")
     for typed, only in (("fleetmap export fa", "export"), ("fleetmap ex", None), ("fleetmap export ", "export")):
         monkeypatch.setenv("COMP_WORDS", typed)
-        assert needed([]) == only
+        assert needed_command([]) == only
 
 
 @pytest.mark.parametrize(

@@ -20,12 +20,12 @@ from app.cli.versions import change_line, counts
     ],
 )
 def test_a_problem_names_its_place_as_compilers_do(problem: dict[str, object], line: str) -> None:
-    assert output.place(problem) == line
+    assert output.problem_place(problem) == line
 
 
 def test_texts_of_files_cannot_steer_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     hostile = "\x1b[2J[red]node[/red]\u202e\r\n"
-    output.show(hostile)
+    output.print_result(hostile)
     output.show_table(["name"], [[hostile]])
     output.show_problem({"detail": hostile, "errors": [{"file": hostile, "problem": hostile}]})
     captured = capsys.readouterr()

@@ -18,7 +18,7 @@ from app.convert.files import offline
 from app.model.closures import Closure, Closures
 from app.model.features import features
 from app.model.frame import GROUND, Datum
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, packed_cells
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, pack_cells
 from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
 from tests.api.conftest import Api
 
@@ -158,7 +158,7 @@ def test_buildings_count_where_a_grid_knows_nothing() -> None:
     free = OccupancyGrid(np.full((20, 40), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     unknown = OccupancyGrid(np.full((20, 40), UNKNOWN, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     beyond = OccupancyGrid(np.full((20, 20), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
-    grey = replace(free, free_thresh=0.25, properties={UNKNOWN_GREY: packed_cells(np.ones((20, 40), bool))})
+    grey = replace(free, free_thresh=0.25, properties={UNKNOWN_GREY: pack_cells(np.ones((20, 40), bool))})
     for grid, count in ((free, 0), (unknown, 1), (beyond, 1), (grey, 1)):
         warnings = crossing(worker.from_layers(fmt, detour((5, 1), occupancy=grid), {}, derived=False).report)
         assert len(warnings) == count

@@ -162,6 +162,6 @@ def test_formats_with_parts_declare_their_own_options() -> None:
             options = fmt.write_options()
             assert getattr(options, fmt.parts.name) is None, fmt.name
             assert getattr(options, fmt.parts.level) is None, fmt.name
-            assert fmt.parts.layer in fmt.carries
+            assert fmt.parts.layer in fmt.layers
             assert site.whole_site_options(fmt) == {fmt.parts.level: "*", fmt.parts.name: "*"}
     assert site.whole_site_options(formats.get_format("tmap2")) == {}

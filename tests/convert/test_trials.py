@@ -145,7 +145,7 @@ def test_verdict_of_a_model_does_not_last(version: Any) -> None:
     step = derive.all_derivations()["imagery_to_objects"].step()
     plain = DerivationChain((step,), ())
     assert module._is_lasting(plain)
-    with_model = derive.with_values([step], {"model": "trees"})
+    with_model = derive.with_parameters([step], {"model": "trees"})
     assert not module._is_lasting(DerivationChain(with_model, ()))
     assert module._trial_key(version, plain) != module._trial_key(version, DerivationChain(with_model, ()))
 

@@ -49,20 +49,20 @@ def outcome(how: Any, steps: tuple[derive.Step, ...], layers: Layers) -> Any:
 @pytest.mark.parametrize("stock", STOCKS)
 @pytest.mark.parametrize("name", [d.name for d in derive.all_derivations().values() if d.trial is not None])
 def test_trial_fails_as_the_derivation_does(name: str, stock: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(occupancy_to_voxels, "MOST", 10_000)
-    monkeypatch.setattr(occupancy_to_imagery, "MOST_PIXELS", 1000)
+    monkeypatch.setattr(occupancy_to_voxels, "MAX_LEAVES", 10_000)
+    monkeypatch.setattr(occupancy_to_imagery, "MAX_PIXELS", 1000)
     grids, height = STOCKS[stock]
     layers = Layers({PartKey("occupancy", *k): g for k, g in grids.items()}, levels=(Level("ground", height),))
     for values in ({}, {"resolution": "0.02", "pixel": "0.05"}):
-        steps = derive.with_values([derive.all_derivations()[name].step()], values)
-        assert outcome(derive.attempt, steps, layers) == outcome(derive.run, steps, layers)
+        steps = derive.with_parameters([derive.all_derivations()[name].step()], values)
+        assert outcome(derive.try_steps, steps, layers) == outcome(derive.run, steps, layers)
 
 
 def test_samples_have_both_outcomes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(occupancy_to_voxels, "MOST", 10_000)
+    monkeypatch.setattr(occupancy_to_voxels, "MAX_LEAVES", 10_000)
     steps = (derive.all_derivations()["occupancy_to_voxels"].step(),)
     outcomes = {
-        name: outcome(derive.attempt, steps, Layers({PartKey("occupancy", *k): g for k, g in grids.items()}))
+        name: outcome(derive.try_steps, steps, Layers({PartKey("occupancy", *k): g for k, g in grids.items()}))
         for name, (grids, _) in STOCKS.items()
     }
     assert {name for name, failed in outcomes.items() if failed} == {
@@ -78,15 +78,15 @@ def test_trial_does_without_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("the whole result is made")
 
     monkeypatch.setattr(occupancy_to_voxels, "_leaves", refuse)
-    monkeypatch.setattr(occupancy_to_imagery, "_coloured", refuse)
+    monkeypatch.setattr(occupancy_to_imagery, "_colour_cells", refuse)
     layers = Layers({PartKey("occupancy"): grid(OCCUPIED)})
     for name in ("occupancy_to_voxels", "occupancy_to_imagery"):
-        derive.attempt((derive.all_derivations()[name].step(),), layers)
+        derive.try_steps((derive.all_derivations()[name].step(),), layers)
 
 
 def test_steps_before_the_last_are_carried_out() -> None:
     layers = Layers({PartKey("occupancy"): grid(UNKNOWN)})
     steps = tuple(derive.all_derivations()[name].step() for name in ("occupancy_to_objects", "occupancy_to_voxels"))
     with pytest.raises(CannotDerive) as caught:
-        derive.attempt(steps, layers)
+        derive.try_steps(steps, layers)
     assert caught.value.step == "occupancy_to_objects"

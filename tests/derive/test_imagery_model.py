@@ -189,7 +189,7 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
         detect(content(), confidence=0.95)
     for name in ("../tiny", "other", "tiny.onnx"):
         with pytest.raises(NotFound, match="there are: tiny"):
-            _onnx.supplied(name)
+            _onnx.find_model(name)
     with pytest.raises(Invalid, match="name one"):
         imagery_to_objects(content(), Parameters(segmentation="model"), DerivationNotes())
     with pytest.raises(Invalid, match="belongs to segmentation=model"):

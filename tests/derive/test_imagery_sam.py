@@ -213,8 +213,8 @@ def test_names_of_the_two_files(folder: Path) -> None:
     for name in ("vit_b_encoder", "vit_b_decoder", "m.Encoder", "m.decoder", "yolo", "lone.decoder"):
         (folder / f"{name}.onnx").write_bytes(b"?")
     with pytest.raises(NotFound, match=r"there are: lone\.decoder, m, vit_b, yolo$"):
-        _onnx.supplied("x")
-    assert [f.name for f in _onnx.supplied("vit_b").files] == ["vit_b_encoder.onnx", "vit_b_decoder.onnx"]
+        _onnx.find_model("x")
+    assert [f.name for f in _onnx.find_model("vit_b").files] == ["vit_b_encoder.onnx", "vit_b_decoder.onnx"]
 
 
 # --- models that tell pixels ------------------------------------------------------------------------------------------

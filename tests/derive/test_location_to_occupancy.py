@@ -69,7 +69,7 @@ def test_it_is_the_last_way_to_a_grid() -> None:
     assert plan is not None
     assert [s.name for s in plan.steps] == ["objects_to_occupancy"]
     others = {n for n, d in derive.all_derivations().items() if d.gives == "occupancy"} - {"location_to_occupancy"}
-    cheapest = {d.cost for n, d in derive.all_derivations().items() if n in others and not d.makes}
+    cheapest = {d.cost for n, d in derive.all_derivations().items() if n in others and not d.part_names}
     assert max(cheapest) < derive.all_derivations()["location_to_occupancy"].cost
     plan = derive.plan(both, frozenset({"occupancy"}), frozenset(others))
     assert plan is not None

@@ -528,10 +528,10 @@ def test_a_mesh_that_stands_everywhere_is_limited(monkeypatch: pytest.MonkeyPatc
     from app.derive import _obstacles
     from app.model import solids
 
-    monkeypatch.setattr(_obstacles, "MOST_TRIANGLES", 100)
+    monkeypatch.setattr(_obstacles, "MAX_TRIANGLES", 100)
     with pytest.raises(CannotConvert, match="more than 100 triangles"):
         grid(layers(objects(*[(None, {"kind": "model", "shapes": [BOX]})] * 9)))
-    monkeypatch.setattr(solids, "MOST_TRIANGLES", 20)
+    monkeypatch.setattr(solids, "MAX_TRIANGLES", 20)
     notes = DerivationNotes()
     one = (None, {"kind": "model", "shapes": [BOX]})
     grid(layers(objects(one, (None, {"kind": "model", "shapes": [BOX, BOX]}))), notes, surroundings=1.0)
@@ -724,8 +724,8 @@ def test_the_walls_of_robast_sim_are_on_its_ros_map(shared: Path) -> None:
 @pytest.mark.parametrize("door", ["left", ["x", "y"], 7, None])
 def test_lifts_of_which_nothing_says_where_they_are_open_have_no_walls(door: Any) -> None:
     lift = {"kind": "lift", "size": [2.0, 2.0], "openrmf": {"says": {"doors": {"d": door}}}}
-    assert obstacles.body_of(lift, shapely.Point(4, 4)) is None
+    assert obstacles.object_body(lift, shapely.Point(4, 4)) is None
     good = {"x": 1.0, "y": 0.0, "motion_axis_orientation": 1.57, "width": 1.0}
     lift["openrmf"] = {"says": {"doors": {"d": good}}}
-    assert obstacles.body_of(lift, shapely.Point(4, 4)) is not None
-    assert obstacles.body_of(lift, shapely.Point()) is None, "nothing says where it is"
+    assert obstacles.object_body(lift, shapely.Point(4, 4)) is not None
+    assert obstacles.object_body(lift, shapely.Point()) is None, "nothing says where it is"

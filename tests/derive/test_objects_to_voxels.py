@@ -108,6 +108,6 @@ def test_limits_come_before_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     assert notes.template == [{"what": "resolution", "value": 10.0, "why": "0.1 m would be too many voxels"}]
     from app.derive import objects_to_voxels as module
 
-    monkeypatch.setattr(module, "MOST", 5999)
+    monkeypatch.setattr(module, "MAX_VOXELS", 5999)
     with pytest.raises(CannotConvert, match="more than 5999"):
         voxels(model(BOX))

@@ -20,7 +20,7 @@ from app.formats import get_format
 from app.model.features import features
 from app.model.frame import GROUND, Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.imagery import GeoImage, placed
+from app.model.imagery import GeoImage, pixel_positions
 from app.model.layers import Layer, Layers, PartKey
 from app.store.values import PartEntry, Provenance, Version
 
@@ -52,7 +52,7 @@ def test_each_cell_is_a_pixel_in_its_place(yaw: float) -> None:
     assert (picture.pixels[::-1][cells == UNKNOWN][:, 3] == 0).all(), "what nobody knows is transparent"
     # The middle of the cell in column 5, row 2 by the grid's own rule, and of its pixel by the picture's.
     u, v, c, s = 0.55, 0.25, math.cos(yaw), math.sin(yaw)
-    (xy,) = placed(picture.transform, np.array([5.5]), np.array([20 - 2.5]))
+    (xy,) = pixel_positions(picture.transform, np.array([5.5]), np.array([20 - 2.5]))
     assert xy == pytest.approx([3.0 + c * u - s * v, -2.0 + s * u + c * v], abs=1e-9)
 
 
@@ -75,7 +75,7 @@ def test_a_pixel_of_many_cells_shows_what_matters_most() -> None:
         plan._step(OccupancyGrid(np.broadcast_to(np.uint8(0), (100_000, 100_000)), 0.1), 0.1, "it")
     large = OccupancyGrid(np.broadcast_to(np.uint8(0), (20_000, 14_000)), 0.1)
     step = plan._step(large, None, "it")
-    assert 20_000 * 14_000 / step**2 <= plan.MOST_PIXELS < 20_000 * 14_000 / (step - 1) ** 2
+    assert 20_000 * 14_000 / step**2 <= plan.MAX_PIXELS < 20_000 * 14_000 / (step - 1) ** 2
 
 
 def test_objects_and_edges_are_drawn_over_the_cells() -> None:

@@ -179,9 +179,9 @@ def test_what_is_thick_in_a_wall_is_no_wall() -> None:
     cells[50:70, 5:12] = OCCUPIED  # and no rectangle any more
     f = find_objects(grid(cells))
     assert kinds(f)["obstacle"] == 1
-    (area,) = f.of_kind("obstacle").geometry
+    (area,) = f.select_kinds("obstacle").geometry
     assert area.area == pytest.approx(1.25 * 1.5 + 0.35 * 1.0 + 0.15 * 2.5, rel=0.15)
-    assert f.of_kind("obstacle").properties[0]["height"] == 2.5
+    assert f.select_kinds("obstacle").properties[0]["height"] == 2.5
     large = np.full((300, 300), OCCUPIED, np.uint8)
     large[100:200, 100:200] = FREE
     (around,) = find_objects(grid(large)).geometry
@@ -284,10 +284,10 @@ def test_noise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     cells = np.where(random.random((200, 200)) < 0.3, OCCUPIED, FREE)
     labels = find_objects(grid(cells), minimum_size=0.0)
     assert len(labels) > 100
-    monkeypatch.setattr(known_figures, "PIECES", 100)
+    monkeypatch.setattr(known_figures, "MAX_PIECES", 100)
     assert "noise" in bad(cells)
     monkeypatch.undo()
-    monkeypatch.setattr(known_figures, "MOST", 50)
+    monkeypatch.setattr(known_figures, "MAX_FIGURES", 50)
     assert "more than 50 edges" in bad(cells)
 
 
@@ -359,7 +359,7 @@ def test_the_nine_pillars_of_turtlebot3_world(shared: Path) -> None:
             pillars.append([float(v) for v in str(collision.findtext("pose")).split()[:2]])
     assert len(pillars) == 9
     f = find_objects(next(iter(load(root / "maps").grids().values())))
-    posts = f.of_kind("post")
+    posts = f.select_kinds("post")
     assert len(posts) == 9
     at = np.array([p["pose"][:2] for p in posts.properties])
     away, indices = cKDTree(at).query(pillars)
@@ -419,5 +419,5 @@ def test_a_grid_alone_still_is_a_gazebo_world_of_its_cells() -> None:
     assert chain == recipe.DerivationChain((), (key,))
     # Objects that were made of it stand for it, unless it is named.
     both = [PartKey("objects", "ground", NAME), key]
-    assert gazebo.choose(both, gazebo.write_options()) == both[:1]
-    assert gazebo.choose(both, gazebo.write_options(grid=MAP)) == both
+    assert gazebo.select_parts(both, gazebo.write_options()) == both[:1]
+    assert gazebo.select_parts(both, gazebo.write_options(grid=MAP)) == both

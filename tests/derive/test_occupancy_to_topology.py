@@ -30,7 +30,7 @@ from app.model.grid import (
     UNKNOWN,
     UNKNOWN_GREY,
     OccupancyGrid,
-    packed_cells,
+    pack_cells,
     unknown_grey,
     without_unknown_grey,
 )
@@ -155,10 +155,10 @@ def test_any_origin_and_yaw_moves_the_network_as_a_whole(method: str) -> None:
         g = grid(cells, origin=origin)
         check(g, derived(g, method=method), 0.3)
     plain, turned = derived(grid(cells), spacing=0.0), derived(grid(cells, origin=(5.0, -3.0, 0.5)), spacing=0.0)
-    a = shapely.get_coordinates(plain.of_kind("node").geometry)
+    a = shapely.get_coordinates(plain.select_kinds("node").geometry)
     c, s = math.cos(0.5), math.sin(0.5)
     moved = np.stack([5.0 + c * a[:, 0] - s * a[:, 1], -3.0 + s * a[:, 0] + c * a[:, 1]], axis=1)
-    assert np.allclose(moved, shapely.get_coordinates(turned.of_kind("node").geometry), atol=1e-8)
+    assert np.allclose(moved, shapely.get_coordinates(turned.select_kinds("node").geometry), atol=1e-8)
 
 
 def test_a_corridor_by_hand() -> None:
@@ -166,7 +166,7 @@ def test_a_corridor_by_hand() -> None:
     cells = np.full((9, 42), OCCUPIED)
     cells[1:8, 1:41] = FREE
     f = derived(grid(cells), robot_radius=0.2, spacing=0.0)
-    edges = f.of_kind("edge")
+    edges = f.select_kinds("edge")
     rows = shapely.get_coordinates(edges.geometry)[:, 1]
     long = [e for e in edges if e.geometry.length > 2.0]
     assert len(long) == 2
@@ -274,8 +274,11 @@ def test_a_line_is_simplified_as_far_as_the_tolerance_and_the_obstacles_let() ->
     for f in (coarse, fine, free):
         check(grid(steps), f, 0.1)
     # The middle lines of both agree within the two tolerances.
-    lines = shapely.union_all(coarse.of_kind("edge").geometry)
-    assert shapely.hausdorff_distance(lines, shapely.union_all(fine.of_kind("edge").geometry), 0.2) < 0.3 + 0.05 + 0.15
+    lines = shapely.union_all(coarse.select_kinds("edge").geometry)
+    assert (
+        shapely.hausdorff_distance(lines, shapely.union_all(fine.select_kinds("edge").geometry), 0.2)
+        < 0.3 + 0.05 + 0.15
+    )
 
 
 def test_most_ids_stay_where_the_map_stays() -> None:
@@ -284,14 +287,14 @@ def test_most_ids_stay_where_the_map_stays() -> None:
     cells = cells.copy()
     cells[50:53, 50:53] = OCCUPIED
     after = derived(grid(cells))
-    nodes = set(before.of_kind("node").ids)
-    assert len(nodes & set(after.of_kind("node").ids)) > 0.85 * len(nodes)
+    nodes = set(before.select_kinds("node").ids)
+    assert len(nodes & set(after.select_kinds("node").ids)) > 0.85 * len(nodes)
     # The same place in a map that has grown by a strip on its lower left: nothing moves at all.
     grown = np.full((260, 260), OCCUPIED, np.uint8)
     grown[20:, 20:] = cells
     same = derived(grid(grown, origin=(-2.0, -2.0, 0.0)))
-    shared = set(after.of_kind("node").ids) & set(same.of_kind("node").ids)
-    assert len(shared) > 0.9 * len(after.of_kind("node"))
+    shared = set(after.select_kinds("node").ids) & set(same.select_kinds("node").ids)
+    assert len(shared) > 0.9 * len(after.select_kinds("node"))
 
 
 def test_roadmaps_are_seeded() -> None:
@@ -301,8 +304,10 @@ def test_roadmaps_are_seeded() -> None:
     assert list(a.properties) == list(b.properties)
     assert a.ids != c.ids
     few, many = (derived(g, method="roadmap", samples=n) for n in (50, 800))
-    assert len(few.of_kind("node")) < 120 < 500 < len(many.of_kind("node"))
-    longest = max(e.geometry.length for e in derived(g, method="roadmap", samples=800, max_edge=0.7).of_kind("edge"))
+    assert len(few.select_kinds("node")) < 120 < 500 < len(many.select_kinds("node"))
+    longest = max(
+        e.geometry.length for e in derived(g, method="roadmap", samples=800, max_edge=0.7).select_kinds("edge")
+    )
     assert longest < 4.0
 
 
@@ -320,7 +325,7 @@ def test_a_narrow_passage_is_found_by_a_roadmap_with_few_samples() -> None:
 def mean_clearance(g: OccupancyGrid, f: Features) -> float:
     """Metres to the nearest obstacle, on average along all edges."""
     clearance = distances(g)
-    lines = [e.geometry for e in f.of_kind("edge")]
+    lines = [e.geometry for e in f.select_kinds("edge")]
     at = [cells_at(g, along(line, g.resolution / 5)) for line in lines]
     weight = [line.length for line in lines]
     return float(np.average([clearance[a[:, 0], a[:, 1]].mean() for a in at], weights=weight))
@@ -352,7 +357,7 @@ def test_a_voronoi_diagram_by_hand() -> None:
     away = np.abs(np.array([a for _, a in ring.nodes(data="at")]) - 4.05).max(axis=1)
     assert away.min() > 1.9
     near = derived(grid(cells), method="voronoi", spacing=0.5)
-    assert max(e.geometry.length for e in near.of_kind("edge")) < 0.65
+    assert max(e.geometry.length for e in near.select_kinds("edge")) < 0.65
 
 
 def bad(cells: Any, **values: Any) -> str:
@@ -469,7 +474,7 @@ def test_the_strawberry_map_gives_what_was_drawn_by_hand(
     g, by_hand = strawberry
     f = derived(g, method=method, **({"samples": 2500} if method == "roadmap" else {}))
     network = check(g, f, 0.3)
-    nodes = by_hand.of_kind("node")
+    nodes = by_hand.select_kinds("node")
     at = shapely.get_coordinates(nodes.geometry)[:, :2]
     cell = cells_at(g, at)
     free = g.cells[cell[:, 0], cell[:, 1]] == FREE
@@ -489,7 +494,7 @@ def test_the_strawberry_map_gives_what_was_drawn_by_hand(
     assert near.mean() >= 0.9
     index = nodes.index()
     good = total = 0
-    for edge in by_hand.of_kind("edge"):
+    for edge in by_hand.select_kinds("edge"):
         a, b = (index[edge.properties[w]] for w in ("source", "target"))
         if a == b or not (free[a] and free[b]):
             continue
@@ -566,7 +571,7 @@ def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
     cells[30:90, [30, 89]] = cells[[30, 89], 30:90] = OCCUPIED
     cells[5:15, 5:15] = cells[55:58, 55:58] = UNKNOWN
     key = PartKey("occupancy", GROUND, MAP)
-    properties = {UNKNOWN_GREY: packed_cells(grey & (cells == FREE))}
+    properties = {UNKNOWN_GREY: pack_cells(grey & (cells == FREE))}
     grid = OccupancyGrid(cells, 0.05, free_thresh=0.25, properties=properties)
     layers = Layers({key: grid})
     free = int((cells[30:90, 30:90] == FREE).sum())

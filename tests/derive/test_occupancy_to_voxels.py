@@ -23,7 +23,7 @@ from app.formats import FileGroup, ReadContext, get_format
 from app.model.frame import Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, PartKey
-from app.model.voxels import VoxelMap, expanded, pruned
+from app.model.voxels import VoxelMap, expand_leaves, prune
 
 MAP = PartKey("occupancy")
 
@@ -37,7 +37,7 @@ def extrude(grid: OccupancyGrid, *, elevation: float = 0.0, **more: Any) -> Voxe
 
 def voxels_of(voxels: VoxelMap) -> dict[tuple[int, int, int], bool]:
     """Every smallest voxel, and whether it is occupied."""
-    code, rows = expanded(voxels, np.ones(len(voxels), bool))
+    code, rows = expand_leaves(voxels, np.ones(len(voxels), bool))
     small = VoxelMap(voxels.resolution, np.full(len(code), 16, np.uint8), code, voxels.log_odds[rows])
     places = zip(*(small.axis(k)[0].tolist() for k in range(3)), strict=True)
     return dict(zip(places, small.occupied.tolist(), strict=True))
@@ -67,7 +67,7 @@ def test_columns_by_brute_force(rows: list[list[int]], x: int, y: int, floor: in
         return
     voxels = extrude(grid, elevation=floor * 0.5, height=tall * 0.5, free=free)
     assert voxels_of(voxels) == want
-    assert len(pruned(voxels)) == len(voxels), "no leaf can be merged any further"
+    assert len(prune(voxels)) == len(voxels), "no leaf can be merged any further"
 
 
 @pytest.mark.parametrize("size", [0.5, 0.25, 0.1, 1.0, 1.3])
@@ -156,7 +156,7 @@ def test_octrees_that_would_be_too_large_are_refused(monkeypatch: pytest.MonkeyP
         extrude(grid_of([[OCCUPIED]]), elevation=16383.9)
     with pytest.raises(CannotConvert, match="columns"):
         extrude(grid_of([[FREE] * 100] * 100), resolution=0.001)
-    monkeypatch.setattr(module, "MOST", 100)
+    monkeypatch.setattr(module, "MAX_LEAVES", 100)
     dice = np.random.default_rng(0)
     with pytest.raises(CannotConvert, match="more than 100 voxels"):
         extrude(grid_of(dice.choice([FREE, OCCUPIED], (20, 20)).tolist()))

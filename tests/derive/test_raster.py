@@ -24,7 +24,7 @@ def cells(spans: Iterable[Spans], frame: RasterFrame = FRAME, layers: int = 1) -
     """bool [layers, height, width]."""
     out = np.zeros((layers, frame.height, frame.width), bool)
     for part in spans:
-        layer, row, column = _raster.expanded(part)
+        layer, row, column = _raster.expand_spans(part)
         out[layer, row, column] = True
     return out
 
@@ -162,29 +162,29 @@ def test_collections_count_with_all_they_hold() -> None:
     several = shapely.MultiPolygon([shapely.box(0, 0, 0.25, 0.25), shapely.box(1, 1, 1.25, 1.25)])
     mixed = shapely.GeometryCollection([several, shapely.LineString([(2, 2.1), (2.4, 2.1)])])
     assert cells(_raster.areas([mixed], FRAME, touched=True)).sum() == 4
-    assert len(solids.extruded(mixed, 0.0, 1.0)) == 2 * 12
+    assert len(solids.extrude(mixed, 0.0, 1.0)) == 2 * 12
 
 
 def test_frames_lie_on_whole_cells() -> None:
-    frame = RasterFrame.around((0.3, -0.31, 0.9, 0.6), 0.1)
+    frame = RasterFrame.from_box((0.3, -0.31, 0.9, 0.6), 0.1)
     assert (frame.origin, frame.width, frame.height) == ((0.3, -0.4), 6, 10)
-    assert RasterFrame.around((1.0, 1.0, 1.0, 1.0), 0.5).cells == 1
-    assert _raster.limited(frame, 60, 10) is frame
+    assert RasterFrame.from_box((1.0, 1.0, 1.0, 1.0), 0.5).cells == 1
+    assert _raster.check_frame(frame, 60, 10) is frame
     for maximum, longest in ((59, 100), (1000, 9)):
         with pytest.raises(CannotConvert, match="resolution of at least"):
-            _raster.limited(frame, maximum, longest)
+            _raster.check_frame(frame, maximum, longest)
 
 
 def test_paint_and_grow() -> None:
     grid = np.zeros((24, 20), np.uint8)
     _raster.paint(grid, [np.array([[0, 5, 3, 4], [7, 5, 3, 6], [0, 23, 19, 20]])], 100)
     assert np.argwhere(grid).tolist() == [[5, 3], [5, 4], [5, 5], [23, 19]]
-    _raster.grown(grid, 100, 2.0)
+    _raster.grow(grid, 100, 2.0)
     away = np.hypot(*np.meshgrid(np.arange(20) - 19, np.arange(24) - 23))
     y, x = np.mgrid[:24, :20]
     near = np.min([np.hypot(x - c, y - 5) for c in (3, 4, 5)], axis=0)
     assert ((grid == 100) == ((near <= 2) | (away <= 2))).all()
-    _raster.grown(grid, 50, 3.0)
+    _raster.grow(grid, 50, 3.0)
     assert set(np.unique(grid)) == {0, 100}, "nothing has that value"
 
 
@@ -192,8 +192,8 @@ def test_growing_in_strips_is_growing(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(0)
     wide = np.where(random.random((900, 20_000)) < 1e-5, 100, 0).astype(np.uint8)
     narrow = wide.copy()
-    _raster.grown(wide, 100, 30.0)  # 2^24 cells are less than its rows
-    _raster.grown(narrow[:, :9000], 100, 30.0)
+    _raster.grow(wide, 100, 30.0)  # 2^24 cells are less than its rows
+    _raster.grow(narrow[:, :9000], 100, 30.0)
     assert (wide[:, :8960] == narrow[:, :8960]).all()
     assert wide.any()
 

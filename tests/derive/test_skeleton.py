@@ -125,7 +125,7 @@ def test_cells_come_by_rank_and_place_about_as_many_at_a_time_as_asked() -> None
     random = np.random.default_rng(3)
     mask, rank = (random.random((40, 50)) < 0.6).astype(np.uint8), random.integers(0, 65536, (40, 50)).astype(np.uint16)
     rank[:20] = 7  # more than a part holds
-    parts = list(_skeleton._by_rank(mask, rank, 100))
+    parts = list(_skeleton._cells_by_rank(mask, rank, 100))
     places = np.flatnonzero(mask)
     assert np.concatenate(parts).tolist() == places[np.argsort(rank.ravel()[places], kind="stable")].tolist()
     assert sorted(map(len, parts))[-2:] <= [100, int(mask[:20].sum()) + 100]
@@ -257,7 +257,7 @@ def test_the_graph_is_the_skeleton() -> None:
         padded = np.pad(skeleton.astype(np.uint8), 1)
         cells = np.empty((int(padded.sum()), 2), np.int32)
         rows = np.empty(len(padded) + 1, np.int64)
-        kernels.listed(padded, cells, rows)
+        kernels.list_cells(padded, cells, rows)
         assert (cells == np.argwhere(padded)).all()
         graph = kernels.trace(padded, cells, rows)
         nodes, start, end, begin, path = graph

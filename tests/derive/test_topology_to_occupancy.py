@@ -138,12 +138,12 @@ def test_real_towns_have_free_roads_between_occupied_houses(name: str, shared: P
         for k, p in enumerate(network.properties)  # type: ignore[union-attr, arg-type]
         if p.get("kind") == "edge" and p["osm"]["tags"].get("highway") == "residential"
     ]
-    lines = network.take(rows).in_local(town.frame)  # type: ignore[union-attr]
+    lines = network.select(rows).in_local(town.frame)  # type: ignore[union-attr]
     middle = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
     values = np.array([at(g, x, y) for x, y in middle])
     assert len(values) > 50
     assert (values == FREE).mean() > 0.995
-    houses = osm_layers.parts[PartKey("objects", "ground", "osm")].of_kind("building")  # type: ignore[union-attr]
+    houses = osm_layers.parts[PartKey("objects", "ground", "osm")].select_kinds("building")  # type: ignore[union-attr]
     inner = shapely.get_coordinates(shapely.point_on_surface(houses.in_local(town.frame)))
     high = np.array(g.origin[:2]) + np.array([g.width, g.height]) * g.resolution
     inside = [(x, y) for x, y in inner if g.origin[0] <= x < high[0] and g.origin[1] <= y < high[1]]

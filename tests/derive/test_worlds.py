@@ -19,7 +19,7 @@ from app.derive.objects_to_voxels import Parameters as VoxelParameters
 from app.derive.objects_to_voxels import objects_to_voxels
 from app.errors import Invalid
 from app.formats import Limits
-from app.model.alignment import Fit, of_grids
+from app.model.alignment import Fit, align_grids
 from app.model.features import features
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
@@ -191,11 +191,11 @@ def test_a_robots_map_is_laid_onto_its_world(
     onto = sliced(world(data, pair), height=pair_facts(data, pair)["slice_z_m"])
     grid = of_the_robot(data / maps)
     for out in (Fit(0, 0, 0, 0, 1), Fit(3.0, -2.0, math.radians(-64), 0, 1)):
-        moving = out.moved(grid)
-        fit = of_grids(moving, onto)[0]
-        back = fit.moved(moving)
+        moving = out.move_grid(grid)
+        fit = align_grids(moving, onto)[0]
+        back = fit.move_grid(moving)
         middle = middles(onto).mean(axis=0)[None]
-        offset = Fit(0, 0, back.origin[2], 0, 1).of(middle - grid.origin[:2]) + back.origin[:2] - middle
+        offset = Fit(0, 0, back.origin[2], 0, 1).apply_to(middle - grid.origin[:2]) + back.origin[:2] - middle
         assert np.abs(offset + shift).max() < 0.05 + 1e-9
         assert abs(math.degrees(back.origin[2])) < degrees
         assert fit.agreement > 0.95

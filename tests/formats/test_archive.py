@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from app.errors import BadUpload, TooLarge, UnreadableFile, UnsafeArchive
 from app.formats import Limits, _archive, all_formats
-from app.model.names import bad_name
+from app.model.names import name_problem
 
 FILES = {"doc.kml": b"<kml/>" * 50, "images/é.png": bytes(range(256)), "empty.txt": b"", "inner.zip": b""}
 FILES["inner.zip"] = _archive.pack({"a.txt": b"inside"})
@@ -228,7 +228,7 @@ def test_no_change_of_bytes_does_anything_but_a_refusal_or_the_same_files(data):
     except BadUpload:
         return
     assert sum(map(len, out.values())) <= 10**6
-    assert all(bad_name(n) is None for n in out)
+    assert all(name_problem(n) is None for n in out)
 
 
 @pytest.mark.parametrize("name", ["../a", "/a", "a\\b", "a/", "", "a\nb"])

@@ -749,7 +749,7 @@ def test_rectangles_hold_each_cell_once() -> None:
         for x0, x1, y0, y1 in _sdf_bodies.rectangles(cells):
             count[y0:y1, x0:x1] += 1
         assert (count == cells).all()
-        surface = _sdf_bodies.extruded(cells, 1.0, 1.0).astype(float)
+        surface = _sdf_bodies.extrude(cells, 1.0, 1.0).astype(float)
         volume = np.einsum("ij,ij->i", surface[:, 0], np.cross(surface[:, 1], surface[:, 2])).sum() / 6
         assert volume == pytest.approx(cells.sum())
 
@@ -760,7 +760,7 @@ def test_a_large_grid_stays_handy() -> None:
     cells[::200, :] = cells[:, ::250] = 100
     dice = np.random.default_rng(1)
     cells[dice.integers(0, 4000, 20_000), dice.integers(0, 4000, 20_000)] = 100
-    surface = _sdf_bodies.extruded(cells == 100, 0.05, 2.5)
+    surface = _sdf_bodies.extrude(cells == 100, 0.05, 2.5)
     assert len(surface) < 500_000
     a, b, c = surface.astype(float).transpose(1, 0, 2)
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6

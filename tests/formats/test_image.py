@@ -291,12 +291,12 @@ def test_a_table_is_looked_up_while_writing() -> None:
     table = bytes(255 - v for v in range(256))
     data = _image.encode_png(SHADES, table=table)
     assert (np.asarray(Image.open(io.BytesIO(data))) == 255 - SHADES).all()
-    assert (_image.look_up(SHADES, table) == 255 - SHADES).all()
+    assert (_image.apply_table(SHADES, table) == 255 - SHADES).all()
 
 
 def test_png_of_cells_has_the_top_row_on_top() -> None:
     cells = np.array([[0, 100, 255], [1, 2, 3]], np.uint8)
-    image = Image.open(io.BytesIO(_image.png_of_cells(cells)))
+    image = Image.open(io.BytesIO(_image.cells_to_png(cells)))
     assert image.mode == "L"
     assert np.asarray(image).tolist() == [[1, 2, 3], [0, 100, 255]]
 
@@ -315,7 +315,7 @@ def test_memory_of_writing_stays_near_the_output() -> None:
     cells.flags.writeable = False
     tracemalloc.start()
     try:
-        _image.png_of_cells(cells)
+        _image.cells_to_png(cells)
         assert tracemalloc.get_traced_memory()[1] < cells.nbytes
     finally:
         tracemalloc.stop()
@@ -323,10 +323,10 @@ def test_memory_of_writing_stays_near_the_output() -> None:
 
 @pytest.mark.parametrize("make", [lambda d: d, bytes.lower])
 def test_kind_is_judged_by_content(make: Callable[[bytes], bytes]) -> None:
-    kinds = {name: _image.kind_of(data) for name, data in pictures().items()}
+    kinds = {name: _image.detect_kind(data) for name, data in pictures().items()}
     ends = {"png": "png", "pgm": "pgm", "ppm": "pgm", "pbm": "pgm", "bmp": "bmp", "jpg": "jpeg"}
     assert all(kind == ends[name.rpartition(".")[2]] for name, kind in kinds.items())
-    assert _image.kind_of(make(b"Plain text")) is None
+    assert _image.detect_kind(make(b"Plain text")) is None
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA"])
@@ -385,7 +385,7 @@ def test_a_coloured_png_that_ends_too_soon_is_refused() -> None:
 
 def test_long_packed_pixels_stand_in_several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     original = _image.encode_png(COLOURS)
-    monkeypatch.setattr(_image._Packed, "MOST", 1000)
+    monkeypatch.setattr(_image._IdatWriter, "MOST", 1000)
     parted = _image.encode_png(COLOURS)
     assert parted.count(b"IDAT") == -(-original.index(b"IEND") // 1000) > original.count(b"IDAT") == 1
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(parted))), COLOURS)

@@ -288,7 +288,7 @@ def test_edited_names_and_values_win(orchard):
 def test_deleted_and_added_objects(orchard, same):
     part = objects(orchard)
     new = features([("shed", shapely.Point(7.2, 50.2), {"kind": "poi", "name": "Shed", "roof": "tin"})], "wgs84")
-    both = concatenate([part.take([0, 3, 9]), new])
+    both = concatenate([part.select([0, 3, 9]), new])
     again = objects(load(save(Layers({OBJECTS: both})), "orchard.kml")[0])
     assert sorted(again.ids) == ["Block with a pond", "Plan", "gate", "shed"]
     assert again.properties[again.index()["shed"]] == {"kind": "poi", "name": "Shed", "roof": "tin"}
@@ -297,7 +297,7 @@ def test_deleted_and_added_objects(orchard, same):
 
 def test_the_order_of_the_store_does_not_matter(orchard):
     part = objects(orchard)
-    shuffled = part.take(np.random.default_rng(1).permutation(len(part)))
+    shuffled = part.select(np.random.default_rng(1).permutation(len(part)))
     assert save(Layers({OBJECTS: shuffled})) == save(orchard)
 
 
@@ -336,7 +336,9 @@ def test_several_drawings_in_one_part_keep_their_own_styles(same):
         indices = [k for k, p in enumerate(again.properties) if p["kml"]["document"] == key]
         alone = {"kml": {"documents": {key: again.document["kml"]["documents"][key]}}}
         assert (
-            same("kml", {name: original}, {"b.kml": save(Layers({OBJECTS: again.take(indices).with_document(alone)}))})
+            same(
+                "kml", {name: original}, {"b.kml": save(Layers({OBJECTS: again.select(indices).with_document(alone)}))}
+            )
             == []
         )
 
@@ -567,7 +569,7 @@ def test_a_grid_tells_where_it_lies():
     )
     assert np.allclose(middle, grid.corners().mean(axis=0), atol=1e-3)
     again, read_context = load(save(layers))
-    assert not again.of("occupancy")
+    assert not again.parts_of("occupancy")
     assert any("KMZ" in w.problem for w in read_context.warnings)
     assert again.datum == DATUM
 

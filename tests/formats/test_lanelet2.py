@@ -21,7 +21,7 @@ from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
 from app.formats import FileGroup, Limits, ReadContext, WriteContext, _osm, get_format
-from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, speed_of, two_way
+from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, is_two_way, parse_speed
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
@@ -56,7 +56,7 @@ def edited(layers: Layers, key: PartKey, change: Callable[[str, dict[str, Any]],
     assert isinstance(part, Features)
     properties = [change(i, dict(p)) for i, p in zip(part.ids, part.properties, strict=True)]
     keep = [k for k, p in enumerate(properties) if p is not None]
-    left = part.take(keep)
+    left = part.select(keep)
     new = Features(left.ids, left.geometry, tuple(p for p in properties if p is not None), left.local, left.document)
     return Layers({**layers.parts, key: new}, layers.datum, layers.levels)
 
@@ -337,7 +337,7 @@ def test_lanelets_are_detected_whatever_the_quotes() -> None:
     ],
 )
 def test_speeds(text: str | None, speed: float | None) -> None:
-    assert speed_of(text) == (None if speed is None else pytest.approx(speed, abs=1e-9))
+    assert parse_speed(text) == (None if speed is None else pytest.approx(speed, abs=1e-9))
 
 
 @pytest.mark.parametrize(
@@ -358,7 +358,7 @@ def test_speeds(text: str | None, speed: float | None) -> None:
     ],
 )
 def test_which_lanelets_go_both_ways(tags: dict[str, str], both: bool) -> None:
-    assert two_way(tags) is both
+    assert is_two_way(tags) is both
 
 
 # --- edits ---------------------------------------------------------------------------------------------------------

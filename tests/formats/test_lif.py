@@ -177,7 +177,7 @@ def test_the_sample_in_full(same: Same) -> None:
 def test_order_does_not_depend_on_how_the_items_are_stored() -> None:
     layers, _ = read((SAMPLES / "plant.lif.json").read_bytes())
     turned = {
-        key: part.take(list(reversed(range(len(part)))))
+        key: part.select(list(reversed(range(len(part)))))
         for key, part in layers.parts.items()
         if isinstance(part, Features)
     }

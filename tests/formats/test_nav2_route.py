@@ -495,7 +495,7 @@ def test_words_of_other_types_stay_where_they_are() -> None:
 
 
 def test_nothing_is_read_that_nobody_wants() -> None:
-    context = ReadContext(main="g.json", wanted=frozenset({"voxels"}))
+    context = ReadContext(main="g.json", requested_layers=frozenset({"voxels"}))
     assert formats.read(FileGroup(FORMAT, "g.json", {"g.json": b"{}"}), context).parts == {}
 
 

@@ -226,7 +226,7 @@ def test_what_an_edit_changes_is_served() -> None:
     properties[place["Dock"]]["orientation"] = [0.0, 0.0, math.sin(0.25), math.cos(0.25)]
     properties[place["A"]]["name"] = "Bay"
     keep = [k for k, i in enumerate(part.ids) if i not in ("Dock_A", "C 1_010")]
-    changed = Features(part.ids, part.geometry, tuple(properties), part.local, part.document).take(keep)
+    changed = Features(part.ids, part.geometry, tuple(properties), part.local, part.document).select(keep)
     served, context = write(changed)
     assert "      - orientation: 0.5\n" in served
     assert "      - name: Bay\n" in served
@@ -463,7 +463,7 @@ def test_a_repeated_name_is_served_as_it_was() -> None:
 
 
 def test_nothing_is_read_that_nobody_wants() -> None:
-    context = ReadContext(main="n.yaml", wanted=frozenset({"occupancy"}))
+    context = ReadContext(main="n.yaml", requested_layers=frozenset({"occupancy"}))
     assert formats.read(FileGroup(FORMAT, "n.yaml", {"n.yaml": graph().encode()}), context).parts == {}
 
 

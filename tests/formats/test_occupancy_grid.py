@@ -268,7 +268,7 @@ def test_context_names_grid_and_level() -> None:
     groups, _ = formats.group({"map.yaml": YAML, "map.pgm": PGM})
     layers = formats.read(groups[0], ReadContext(grid="keepout", level="L2"))
     assert list(layers.parts) == [PartKey("occupancy", "L2", "keepout")]
-    assert formats.read(groups[0], ReadContext(wanted=frozenset({"topology"}))).parts == {}
+    assert formats.read(groups[0], ReadContext(requested_layers=frozenset({"topology"}))).parts == {}
 
 
 @pytest.mark.parametrize(
@@ -588,20 +588,20 @@ def test_a_grid_too_wide_for_nav2_is_warned_of() -> None:
 # --- resampling ---------------------------------------------------------------------------------------------------
 def test_coarser_cells_keep_obstacles_and_the_unseen() -> None:
     grid = grid_of([[0, 0, 0, 255, 0], [0, 0, 0, 0, 100], [255, 255, 0, 7, 0]], 0.5)
-    out = occupancy_grid.resampled(grid, 1.0)
+    out = occupancy_grid.resample(grid, 1.0)
     assert seen(out) == [[0, 255, 0], [255, 7, 100]]
     assert (out.resolution, out.origin) == (1.0, grid.origin)
-    assert seen(occupancy_grid.resampled(grid, 10.0)) == [[100]]
+    assert seen(occupancy_grid.resample(grid, 10.0)) == [[100]]
 
 
 def test_cells_that_share_an_old_cell_both_have_its_obstacle() -> None:
     grid = grid_of([[0, 100, 0]], 1.0)
-    assert seen(occupancy_grid.resampled(grid, 1.5)) == [[100, 100]]
+    assert seen(occupancy_grid.resample(grid, 1.5)) == [[100, 100]]
 
 
 def test_finer_cells_are_copies() -> None:
     grid = grid_of([[0, 100], [255, 3]], 1.0)
-    out = occupancy_grid.resampled(grid, 0.5)
+    out = occupancy_grid.resample(grid, 0.5)
     assert seen(out) == [[0, 0, 100, 100], [0, 0, 100, 100], [255, 255, 3, 3], [255, 255, 3, 3]]
 
 
@@ -615,7 +615,7 @@ def test_finer_cells_are_copies() -> None:
 @settings(max_examples=200, deadline=None)
 def test_resampling_agrees_with_areas(cells: list[list[int]], old: float, new: float) -> None:
     grid = grid_of(cells, old)
-    out = occupancy_grid.resampled(grid, new)
+    out = occupancy_grid.resample(grid, new)
     rank = {0: 0, 255: 1, 40: 41, 100: 101}
     slack = 1e-5 * old
     for j in range(out.height):
@@ -667,7 +667,7 @@ def test_baking_a_yaw_keeps_every_place(yaw: float, origin: tuple[float, float])
     dice = np.random.default_rng(5)
     cells = dice.choice(np.array([0, 0, 0, 255, 100], np.uint8), (23, 31))
     grid = OccupancyGrid(cells, 0.2, (*origin, yaw))
-    out = occupancy_grid.normalized(grid)
+    out = occupancy_grid.normalize(grid)
     assert out.origin[2] == 0.0
     for v in out.origin[:2]:
         assert abs(v / 0.2 - round(v / 0.2)) < 1e-6
@@ -696,14 +696,14 @@ def test_baking_a_yaw_keeps_every_place(yaw: float, origin: tuple[float, float])
 def test_quarter_turns_are_exact() -> None:
     cells = np.random.default_rng(2).choice(np.array([0, 100, 255], np.uint8), (5, 7))
     for turns, yaw in enumerate([0.0, math.pi / 2, math.pi, 3 * math.pi / 2]):
-        out = occupancy_grid.normalized(OccupancyGrid(cells, 0.5, (2.0, -1.0, yaw)))
+        out = occupancy_grid.normalize(OccupancyGrid(cells, 0.5, (2.0, -1.0, yaw)))
         expected = np.rot90(cells[::-1], turns)[::-1]
         assert (out.cells == expected).all()
 
 
 def test_an_aligned_grid_stays_as_it_is() -> None:
     grid = grid_of([[0, 100, 255]], 0.05, origin=(0.15, -100.0, 0.0))
-    out = occupancy_grid.normalized(grid)
+    out = occupancy_grid.normalize(grid)
     assert (out.cells == grid.cells).all()
     assert out.origin == grid.origin
 
@@ -713,13 +713,13 @@ def test_normalize_is_a_parameter(facts: Any) -> None:
     served, context = write(grid, normalize="true")
     assert context.warnings == []
     assert facts.load_yaml(served["map.yaml"])["origin"][2] == 0.0
-    assert (independent(served, facts) == occupancy_grid.normalized(grid).cells).all()
+    assert (independent(served, facts) == occupancy_grid.normalize(grid).cells).all()
 
 
 def test_turning_is_bounded() -> None:
     long = OccupancyGrid(np.zeros((1, 2**20), np.uint8), 1.0, (0.0, 0.0, math.pi / 4))
     with pytest.raises(Invalid, match="cells"):
-        occupancy_grid.normalized(long)
+        occupancy_grid.normalize(long)
 
 
 # --- hostile ------------------------------------------------------------------------------------------------------
@@ -834,5 +834,5 @@ def test_wrong_parameters_are_named(old: bytes, new: bytes, where: str) -> None:
 
 
 def test_a_masks_files_are_asked_for_by_name() -> None:
-    assert occupancy_grid.by_file("keepout_filter_info.yaml") == {"grid": "keepout"}
-    assert occupancy_grid.by_file("keepout.yaml") == {"grid": "keepout"}
+    assert occupancy_grid.options_from_filename("keepout_filter_info.yaml") == {"grid": "keepout"}
+    assert occupancy_grid.options_from_filename("keepout.yaml") == {"grid": "keepout"}

@@ -23,7 +23,7 @@ from app.errors import Ambiguous, BadUpload, Invalid, MissingLayer, NotFound, To
 from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format, octomap
 from app.formats.octomap import WriteOptions
 from app.model.layers import Layers, PartKey
-from app.model.voxels import DEPTH, HALF, VoxelMap, coarser, cut, morton, pruned
+from app.model.voxels import DEPTH, HALF, VoxelMap, coarser, cut, morton, prune
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "octomap"
 Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
@@ -178,7 +178,7 @@ def test_our_samples_hold_what_was_built() -> None:
 def test_a_tree_that_is_one_leaf_is_its_eight_octants(odds: float) -> None:
     voxels, _ = read(header("ot", 1) + struct.pack("<fB", odds, 0), "a.ot")
     assert rows(voxels) == [(1, k, odds) for k in range(8)]
-    assert rows(pruned(voxels)) == rows(voxels), "the root never becomes a leaf"
+    assert rows(prune(voxels)) == rows(voxels), "the root never becomes a leaf"
     again, _ = read(write(voxels, kind="bt"))
     assert again.occupied.tolist() == [odds >= 0] * 8
 
@@ -314,22 +314,22 @@ def test_any_tree_comes_back(seed: int, colour: bool) -> None:
 
 def test_pruning_merges_eight_equal_leaves_level_by_level() -> None:
     block = [(16, 0o7000 + k, 0.5) for k in range(64)]
-    assert rows(pruned(leaves(*block))) == [(14, 0o70, 0.5)]
+    assert rows(prune(leaves(*block))) == [(14, 0o70, 0.5)]
     block[13] = (16, block[13][1], 0.25)
-    merged = rows(pruned(leaves(*block)))
+    merged = rows(prune(leaves(*block)))
     assert len(merged) == 7 + 8
     assert [r for r in merged if r[0] == 15] == [(15, 0o700 + k, 0.5) for k in range(8) if k != 1]
     # Seven leaves and one that is split are no eight.
     split = [(15, k, 1.0) for k in range(7)] + [(16, 0o70 + k, 1.0) for k in range(7)]
-    assert rows(pruned(leaves(*split))) == rows(leaves(*split))
+    assert rows(prune(leaves(*split))) == rows(leaves(*split))
 
 
 def test_pruning_ends_where_nothing_merges_as_in_the_library() -> None:
     eight = [(15, k, 1.0) for k in range(8)]
-    assert len(pruned(leaves(*eight))) == 8, "no leaf of depth 16 merges, so the library does not look at depth 15"
-    assert rows(pruned(leaves(*eight), deepest=15)) == [(14, 0, 1.0)]
+    assert len(prune(leaves(*eight))) == 8, "no leaf of depth 16 merges, so the library does not look at depth 15"
+    assert rows(prune(leaves(*eight), deepest=15)) == [(14, 0, 1.0)]
     more = [*eight, *((16, 0o100 * 8 + k, 1.0) for k in range(8))]
-    assert rows(pruned(leaves(*more))) == [(14, 0, 1.0), (15, 0o100, 1.0)]
+    assert rows(prune(leaves(*more))) == [(14, 0, 1.0), (15, 0o100, 1.0)]
 
 
 def test_pruning_averages_colours_and_says_so() -> None:
@@ -337,14 +337,14 @@ def test_pruning_averages_colours_and_says_so() -> None:
     shades = np.full((8, 3), 255, np.uint8)
     shades[0], shades[1] = (10, 20, 30), (20, 20, 31)
     voxels = VoxelMap(0.1, eight.depth, eight.code, eight.log_odds, shades, False)
-    merged = pruned(voxels)
+    merged = prune(voxels)
     assert merged.colour is not None
     assert merged.colour.tolist() == [[15, 20, 30]]
     context = WriteContext(options=WriteOptions(prune=True))
     octomap.write(Layers({PartKey("voxels"): voxels}), context)
     assert [(d["what"], d["count"]) for d in context.dropped] == [("colours", 8)]
     first = VoxelMap(0.1, eight.depth, eight.code, eight.log_odds, shades[::-1].copy(), False)
-    assert pruned(first).colour.tolist() == [[255] * 3]  # type: ignore[union-attr]
+    assert prune(first).colour.tolist() == [[255] * 3]  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("depth", [1, 9, 13, 15])
@@ -449,10 +449,10 @@ def test_which_voxel_map() -> None:
 
 
 def test_a_wanted_file_says_kind_and_name() -> None:
-    assert octomap.by_file("map.ot") == {"kind": "ot"}
-    assert octomap.by_file("map.bt") == {"kind": "bt"}
-    assert octomap.by_file("lab.bt") == {"kind": "bt", "name": "lab"}
-    assert octomap.by_file("map.pgm") == {}
+    assert octomap.options_from_filename("map.ot") == {"kind": "ot"}
+    assert octomap.options_from_filename("map.bt") == {"kind": "bt"}
+    assert octomap.options_from_filename("lab.bt") == {"kind": "bt", "name": "lab"}
+    assert octomap.options_from_filename("map.pgm") == {}
     layers = Layers({PartKey("voxels", "ground", "lab"): leaves((16, 1, 1.0))})
     assert list(octomap.write(layers, WriteContext(options=WriteOptions(kind="bt", name="lab")))) == ["lab.bt"]
     assert list(octomap.write(layers, WriteContext(options=WriteOptions(kind="bt")))) == ["map.bt"]
@@ -557,6 +557,6 @@ def test_nobody_else_is_taken_for_one() -> None:
 
 
 def test_voxels_that_nobody_wants_are_not_read() -> None:
-    context = ReadContext(wanted=frozenset({"topology"}))
+    context = ReadContext(requested_layers=frozenset({"topology"}))
     data = header("bt", 4) + GOOD
     assert octomap.read({"a.bt": data}, context).parts == {}

@@ -94,7 +94,7 @@ def test_facts_of_every_real_building_hold_in_the_layers(shared: Path, facts_jso
             assert {k: kinds[k[:-1]] for k in counted} == {k: level_facts[k] for k in counted}
             assert sum("name" in p for p in network.properties if p["kind"] == "node") == level_facts["named_vertices"]
             graphs = Counter(
-                str(p["openrmf"]["parameters"]["graph_idx"][1]) for p in network.of_kind("edge").properties
+                str(p["openrmf"]["parameters"]["graph_idx"][1]) for p in network.select_kinds("edge").properties
             )
             both = {k: v * 2 for k, v in level_facts["lanes_by_graph_idx"].items()}
             assert graphs == both or level_facts["lanes_unidirectional"]
@@ -104,7 +104,7 @@ def test_facts_of_every_real_building_hold_in_the_layers(shared: Path, facts_jso
             assert scale == pytest.approx(official["scale_m_per_px"], abs=1e-11)
             assert rotation == pytest.approx(official["rotation_rad"], abs=1e-11)
             assert [x, y] == pytest.approx(official["translation"], abs=1e-8)
-            nodes = network.of_kind("node")
+            nodes = network.select_kinds("node")
             at = shapely.get_coordinates(nodes.geometry)
             assert np.abs([at.min(0), at.max(0)] - np.array(official["vertex_bounds_m"])).max() < 6e-5
             first = next(k for k, p in enumerate(nodes.properties) if p["openrmf"]["index"] == 0)
@@ -212,7 +212,7 @@ def test_an_edge_that_is_gone_leaves_a_one_way_lane() -> None:
     key = PartKey("topology", "Ground floor", "network")
     network = part(layers, "topology", "Ground floor")
     forward = network.index()["charger_1_ward: 3"]
-    building, _, _ = write(with_part(layers, key, network.take(np.arange(len(network)) != forward)))
+    building, _, _ = write(with_part(layers, key, network.select(np.arange(len(network)) != forward)))
     lane = building["levels"]["Ground floor"]["lanes"][0]
     assert lane[:2] == [6, 5]
     assert lane[2]["bidirectional"] == [4, False]

@@ -106,7 +106,7 @@ def test_real_extracts_agree_with_counted_facts(name: str, shared: Path, facts_j
     assert len(undirected) == facts["undirected_highway_edges"]
     assert networkx.number_weakly_connected_components(graph) == facts["highway_connected_components"]
     objects = part(layers, OBJECTS)
-    highways = objects.of_kind("highway")
+    highways = objects.select_kinds("highway")
     kinds = [p["osm"]["tags"]["highway"] for p, i in zip(highways.properties, highways.ids, strict=True) if i[0] == "w"]
     assert {k: kinds.count(k) for k in kinds} == facts["highway_kinds"]
     assert sum(i[0] == "w" for i in objects.ids) == facts["ways"]
@@ -190,7 +190,7 @@ def test_nodes_are_scanned_piece_by_piece(piece: int, monkeypatch: pytest.Monkey
     text = "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6">', *nodes, way, "</osm>", ""])
     data = text.encode()
     reference = _osm._events(data, Limits())
-    monkeypatch.setattr(_osm, "SCANNED", piece)
+    monkeypatch.setattr(_osm, "SCAN_BYTES", piece)
     pieces = _osm._scan(data, Limits(), False)
     assert pieces is not None
     assert len(pieces.ids) > 5
@@ -199,7 +199,7 @@ def test_nodes_are_scanned_piece_by_piece(piece: int, monkeypatch: pytest.Monkey
 
 def test_attributes_of_any_name_are_kept_however_many_lists_of_them_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_osm, "PATTERNS", 3)
-    monkeypatch.setattr(_osm, "KNOWN_TEXTS", 2)
+    monkeypatch.setattr(_osm, "MAX_CACHED_TEXTS", 2)
     names = ["version", "__class__", "__dict__", "user", "uid", "changeset", "x:y", "a.b-c"]
     rows = [f'<node id="{k}" {n}="{k} &amp; {n}" visible="true" lat="1.5" lon="{k}"/>' for k, n in enumerate(names, 1)]
     text = f'<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6">\n{" ".join(rows)}\n</osm>'.encode()

@@ -145,7 +145,7 @@ def test_colours_as_floats_survive_as_text() -> None:
     assert voxels.colour.tolist() == [[0x10, 0x20, 0x30]]
 
 
-@pytest.mark.parametrize("size", [0, 1, 5, 1000, 40_000, _lzf.LITTLE // 16 + 7])
+@pytest.mark.parametrize("size", [0, 1, 5, 1000, 40_000, _lzf.MAX_INTERPRETED_BYTES // 16 + 7])
 @pytest.mark.parametrize("kind", ["zeros", "noise", "text", "repeats"])
 def test_compression_unfolds_to_the_same(size: int, kind: str) -> None:
     dice = random.Random(size)
@@ -165,7 +165,7 @@ def test_compression_unfolds_to_the_same(size: int, kind: str) -> None:
 def test_native_and_plain_loops_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     data = bytes(random.Random(3).choices(range(7), k=30_000))
     plain = _lzf.squeeze(data)
-    monkeypatch.setattr(_lzf, "LITTLE", 0)
+    monkeypatch.setattr(_lzf, "MAX_INTERPRETED_BYTES", 0)
     assert _lzf.squeeze(data) == plain
     assert _lzf.expand(plain, len(data)) == data
     for broken in (plain[:-1], plain + b"\x40\xff", b"\xe0\xff\xff" + plain, plain[: len(plain) // 2]):

@@ -17,7 +17,7 @@ from app.convert.files import offline
 from app.errors import Ambiguous, Invalid, MissingLayer, NotFound
 from app.formats import FileGroup, ReadContext, WriteContext, _lzf, get_format
 from app.model.layers import Layers, PartKey
-from app.model.voxels import VoxelMap, coarser, cut, expanded, morton
+from app.model.voxels import VoxelMap, coarser, cut, expand_leaves, morton
 from tests.api.conftest import Api, api  # noqa: F401  fixture
 from tests.formats import clouds
 
@@ -129,7 +129,7 @@ def test_centres_fall_into_the_voxels_they_came_from(shared: Path) -> None:
     assert isinstance(before, VoxelMap)
     after = layers_of("map.pcd", pcd_data, resolution="0.08").parts[PartKey("voxels")]
     assert isinstance(after, VoxelMap)
-    assert np.array_equal(after.code, expanded(before, before.occupied)[0])
+    assert np.array_equal(after.code, expand_leaves(before, before.occupied)[0])
     assert len(after) == 185673, "as liboctomap counts"
 
 
@@ -184,7 +184,7 @@ def test_expanded_by_brute_force() -> None:
     depth = np.array([14, 16, 15], np.uint8)
     code = np.array([5, 6 << 6, (6 << 3) + 1], np.uint64)
     voxels = VoxelMap(0.1, depth, code, np.array([1, -1, 1], np.float32))
-    got, rows = expanded(voxels, voxels.occupied)
+    got, rows = expand_leaves(voxels, voxels.occupied)
     assert got.tolist() == [*range(5 << 6, 6 << 6), *range(((6 << 3) + 1) << 3, ((6 << 3) + 2) << 3)]
     assert rows.tolist() == [0] * 64 + [2] * 8
 
@@ -202,7 +202,7 @@ def big_text(megabytes: int) -> bytes:
 def test_memory_of_a_large_text() -> None:
     data = big_text(8)
     assert len(data) > 7_000_000
-    _lzf.squeeze(bytes(_lzf.LITTLE))  # compiled before anything is traced: that would take long
+    _lzf.squeeze(bytes(_lzf.MAX_INTERPRETED_BYTES))  # compiled before anything is traced: that would take long
     for options in ({}, {"crs": "EPSG:32630", "origin": "0,0,0"}):
         tracemalloc.start()
         layers_of("map.pcd", data, **({} if not options else {"resolution": "1"}))

@@ -99,10 +99,10 @@ def test_facts_of_every_real_graph_hold_in_the_layers(shared: Path, facts_json: 
                 kinds = Counter(p["kind"] for p in network.properties)
                 assert (kinds["node"], kinds["edge"]) == (level_facts["vertices"], level_facts["lanes_directed"])
                 if level_facts["vertices"]:
-                    at = shapely.get_coordinates(network.of_kind("node").geometry)
+                    at = shapely.get_coordinates(network.select_kinds("node").geometry)
                     assert np.abs([at.min(0), at.max(0)] - np.array(level_facts["bounds"])).max() < 6e-5
             for objects in layers.vector("objects").values():
-                doors += len(objects.of_kind("door"))
+                doors += len(objects.select_kinds("door"))
             assert doors == facts["doors"]
 
 
@@ -114,13 +114,13 @@ def test_the_graphs_of_a_folder_are_one_network() -> None:
     ground = part(layers, "topology", "Ground floor")
     shared_node = ground.properties[ground.index()["ward: 3"]]
     assert shared_node["rmf_nav_graph"]["graphs"] == {"0": 1, "1": 0}
-    assert len(ground.of_kind("node")) == 5
-    both = [p for p in ground.of_kind("edge").properties if p["rmf_nav_graph"]["index"] == 3]
+    assert len(ground.select_kinds("node")) == 5
+    both = [p for p in ground.select_kinds("edge").properties if p["rmf_nav_graph"]["index"] == 3]
     assert {(p["source"], p["target"]) for p in both} == {
         ("Ground floor/2", "lift_ground"),
         ("lift_ground", "Ground floor/2"),
     }
-    lift = part(layers, "objects", "Ground floor").of_kind("lift").properties[0]
+    lift = part(layers, "objects", "Ground floor").select_kinds("lift").properties[0]
     assert (lift["size"][:2], lift["pose"][5]) == ([2.0, 2.5], 0.25)
 
 

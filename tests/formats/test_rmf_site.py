@@ -117,9 +117,9 @@ def test_a_site_comes_back_the_same_in_json_and_ron() -> None:
         '"Power Source": {',
     ):
         assert piece in text
-    assert FORMAT.by_file("map.site.ron") == {"encoding": "ron"}
-    assert FORMAT.by_file("map.site.json") == {"encoding": "json"}
-    assert FORMAT.by_file("map.zip") == {}
+    assert FORMAT.options_from_filename("map.site.ron") == {"encoding": "ron"}
+    assert FORMAT.options_from_filename("map.site.json") == {"encoding": "json"}
+    assert FORMAT.options_from_filename("map.zip") == {}
 
 
 def test_what_stands_where_by_hand() -> None:
@@ -200,7 +200,7 @@ def test_an_older_site_in_ron_reads_as_the_same_elements() -> None:
     desk, _ = item(objects(layers, "L1"), "L1/model/50")
     assert desk["pose"] == pytest.approx([1.5, 2.0, 0.0, 0.0, 0.0, math.pi / 4])
     assert desk["openrmf"]["says"] == {"model_name": "OpenRobotics/Desk", "static": True}
-    assert [e["openrmf"]["parameters"]["graph_idx"] for e in network(layers, "L1").of_kind("edge").properties] == [
+    assert [e["openrmf"]["parameters"]["graph_idx"] for e in network(layers, "L1").select_kinds("edge").properties] == [
         [2, 3]
     ]
     site, _, context = write(layers)
@@ -277,12 +277,12 @@ def test_geometry_decides_after_an_edit() -> None:
     layers, _ = read(WARD)
     key = PartKey("topology", "Ground floor", "network")
     moved = changed(network(layers), "Ground floor/15", shapely.Point(7.0, 2.5), name="middle")
-    moved = moved.take([k for k, i in enumerate(moved.ids) if i != "Ground floor/15_charger_1"])
+    moved = moved.select([k for k, i in enumerate(moved.ids) if i != "Ground floor/15_charger_1"])
     edited = with_part(layers, key, moved)
     solid = PartKey("objects", "Ground floor", "openrmf")
     thing = changed(objects(layers), "Ground floor/wall/60", shapely.LineString([[0.0, 0.0], [11.0, 0.5]]))
     thing = changed(thing, "Ground floor/lift/110", shapely.Point(8.5, 5.0), pose=[8.5, 5.0, 0, 0, 0, math.pi / 2])
-    thing = thing.take([k for k, i in enumerate(thing.ids) if i != "Ground floor/model/172"])
+    thing = thing.select([k for k, i in enumerate(thing.ids) if i != "Ground floor/model/172"])
     site, _, _ = write(with_part(edited, solid, thing))
     level, guided = site["levels"]["1"], site["navigation"]["guided"]
     assert level["anchors"]["15"] == {"Translate2D": [7.0, 2.5]}
@@ -406,7 +406,7 @@ def test_any_network_is_written_with_chargers_and_robots_as_asked() -> None:
     assert ("heights of nodes above their level", 1) in {(d["what"], d["count"]) for d in context.dropped}
     again, _ = read({"map.site.json": json.dumps(site).encode()})
     assert np.allclose(
-        shapely.get_coordinates(network(again, "ground").of_kind("node").geometry), [[0, 0], [3, 0], [3, 4]]
+        shapely.get_coordinates(network(again, "ground").select_kinds("node").geometry), [[0, 0], [3, 0], [3, 4]]
     )
     with pytest.raises(MissingLayer, match="rmf_site needs a network"):
         write(Layers({}))

@@ -44,7 +44,7 @@ def test_what_is_served_would_be_loaded_where_the_sample_would(name: str, files:
     """Samples with dangling edges and the like come back with them, and with an error."""
     served = offline(files, name, hints=UploadHints(name), datum=HERE)
     groups, _ = formats.group(files, name)
-    if formats.get_format(name).holds:  # its parts are checked by their own formats' rules
+    if formats.get_format(name).is_container:  # its parts are checked by their own formats' rules
         inside, _ = formats.group(unpack(files, Limits()))
         groups += inside
     bad = any(p.level == ERROR for g in groups for p in formats.check(g.format, g.files))
@@ -61,12 +61,12 @@ def test_a_check_tells_errors_first_each_once_and_how_many_more() -> None:
     def check(files: Files) -> Iterator[Problem]:
         yield Problem("doubt", level="warning")
         yield Problem("doubt", level="warning")
-        yield from (Problem(f"wrong {k}") for k in range(formats.LISTED + 7))
+        yield from (Problem(f"wrong {k}") for k in range(formats.MAX_FINDINGS + 7))
 
     findings = formats.check(with_check(check), {"main": b""})
-    assert [p.level for p in findings] == [ERROR] * (formats.LISTED + 1) + [WARNING]
+    assert [p.level for p in findings] == [ERROR] * (formats.MAX_FINDINGS + 1) + [WARNING]
     assert findings[0] == Problem("wrong 0", "main", level="error")
-    assert "7 more" in findings[formats.LISTED].problem
+    assert "7 more" in findings[formats.MAX_FINDINGS].problem
     assert formats.check(with_check(None), {"main": b""}) == []
 
 
@@ -351,11 +351,11 @@ def test_a_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_of_a_large_network_that_is_served_the_head_is_looked_at() -> None:
     text = yaml.dump(tmap2(lambda top: top["meta"].update(last_updated=0)), default_flow_style=False).encode()
     files = {"a.tmap2.yaml": text + b"# " + bytes([120]) * 2**20 + b"\n"}
-    token = formats.SERVED.set(True)
+    token = formats.JUST_WRITTEN.set(True)
     try:
         assert findings_of("tmap2", files) == {(ERROR, "meta.last_updated")}
     finally:
-        formats.SERVED.reset(token)
+        formats.JUST_WRITTEN.reset(token)
 
 
 # --- Open-RMF -----------------------------------------------------------------------------------------------------

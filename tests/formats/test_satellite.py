@@ -21,12 +21,12 @@ from PIL import Image
 from app import formats, upload_reader
 from app.errors import Ambiguous, Invalid, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
 from app.formats import FileGroup, Limits, ReadContext, WriteContext, _raster, get_format
-from app.formats.satellite import ReadOptions, WriteOptions, by_file, detect
+from app.formats.satellite import ReadOptions, WriteOptions, detect, options_from_filename
 from app.model.frame import Datum
 from app.model.geodesy import crs_bounds
-from app.model.imagery import GeoImage, placed
+from app.model.imagery import GeoImage, pixel_positions
 from app.model.layers import Layers, PartKey
-from app.model.resampling import resampled
+from app.model.resampling import resample
 from app.upload_reader import EnvironmentContext, UploadHints
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "satellite"
@@ -100,7 +100,7 @@ def test_samples(name: str) -> None:
     height, width, bands = picture.pixels.shape
     assert [width, height] == facts["size"]
     assert (bands, picture.pixels.dtype.name, picture.crs) == (facts["bands"], facts["type"], facts["crs"])
-    corners = placed(picture.transform, np.array([0.0, width]), np.array([0.0, height]))
+    corners = pixel_positions(picture.transform, np.array([0.0, width]), np.array([0.0, height]))
     assert np.abs(corners - [facts["upper_left"], facts["lower_right"]]).max() < 5.1e-4
     if "nodata" in facts:
         assert picture.nodata == facts["nodata"]
@@ -390,7 +390,7 @@ def test_a_world_file_without_its_picture_says_what_to_add() -> None:
 
 
 def test_a_crs_stands_beside_the_picture() -> None:
-    wkt = _raster.wkt_of(UTM).encode()
+    wkt = _raster.crs_to_wkt(UTM).encode()
     world = b"2 0 0 -2 665000 5905000"
     for name, body in (("a.prj", wkt), ("a.png.aux.xml", b"<PAMDataset><SRS>" + wkt + b"</SRS></PAMDataset>")):
         files = {"a.png": image(), "a.pgw": world, name: body}
@@ -431,7 +431,7 @@ def test_two_opposite_corners() -> None:
 def test_four_corners_of_a_turned_picture() -> None:
     ends = np.array([[-0.5, 53.2], [-0.4992, 53.2003], [-0.4994, 53.1999], [-0.5002, 53.1996]])
     picture, context = read({"a.png": image((40, 80, 3))}, options={"corners": tuple(ends[:, ::-1].ravel().tolist())})
-    corners = placed(picture.transform, np.array([0.0, 80.0, 80.0, 0.0]), np.array([0.0, 0.0, 40.0, 40.0]))
+    corners = pixel_positions(picture.transform, np.array([0.0, 80.0, 80.0, 0.0]), np.array([0.0, 0.0, 40.0, 40.0]))
     assert np.abs(corners - ends).max() < 1e-12
     assert context.warnings == []
 
@@ -451,7 +451,7 @@ def test_a_floor_plan_with_its_scale() -> None:
     )
     assert picture.crs == "local"
     # Turned a quarter to the left round its lower left corner: its right side points north, its upper side west.
-    corners = placed(picture.transform, np.array([0.0, 40.0, 0.0]), np.array([30.0, 30.0, 0.0]))
+    corners = pixel_positions(picture.transform, np.array([0.0, 40.0, 0.0]), np.array([30.0, 30.0, 0.0]))
     assert np.abs(corners - [[5.0, 6.0], [5.0, 10.0], [2.0, 6.0]]).max() < 1e-12
 
 
@@ -618,18 +618,20 @@ def test_which_picture() -> None:
     fmt = get_format("satellite")
     keys = [PartKey("imagery", name="a"), PartKey("imagery", name="b")]
     with pytest.raises(MissingLayer, match="GeoTIFF"):
-        fmt.choose([], WriteOptions())
+        fmt.select_parts([], WriteOptions())
     with pytest.raises(Ambiguous, match="picture=…: a, b"):
-        fmt.choose(keys, WriteOptions())
-    assert fmt.choose(keys, WriteOptions(picture="b")) == keys[1:]
+        fmt.select_parts(keys, WriteOptions())
+    assert fmt.select_parts(keys, WriteOptions(picture="b")) == keys[1:]
     usual = PartKey("imagery", name="satellite")
-    assert fmt.choose([*keys, usual], WriteOptions()) == [usual]
+    assert fmt.select_parts([*keys, usual], WriteOptions()) == [usual]
     with pytest.raises(NotFound):
-        fmt.choose(keys, WriteOptions(picture="c"))
-    assert by_file("satellite.tif") == {"file_type": "tif"}
-    assert by_file("satellite.pgw") == by_file("satellite.png.aux.xml") == {"file_type": "png"}
-    assert by_file("plan.png") == {"file_type": "png", "picture": "plan"}
-    assert by_file("plan.txt") == {}
+        fmt.select_parts(keys, WriteOptions(picture="c"))
+    assert options_from_filename("satellite.tif") == {"file_type": "tif"}
+    assert (
+        options_from_filename("satellite.pgw") == options_from_filename("satellite.png.aux.xml") == {"file_type": "png"}
+    )
+    assert options_from_filename("plan.png") == {"file_type": "png", "picture": "plan"}
+    assert options_from_filename("plan.txt") == {}
 
 
 # --- limits -------------------------------------------------------------------------------------------------------
@@ -682,7 +684,7 @@ def test_lying_sizes(width: int, height: int) -> None:
 
 def test_resampled_is_the_same_function_for_everybody() -> None:
     data = written(utm((8, 8, 1)), crs="wgs84")[0]["satellite.tif"]
-    direct = resampled(utm((8, 8, 1)), crs="EPSG:4326")
+    direct = resample(utm((8, 8, 1)), crs="EPSG:4326")
     assert np.array_equal(read({"a.tif": data})[0].pixels, direct.pixels)
 
 

@@ -503,7 +503,7 @@ def test_the_order_of_items_does_not_matter() -> None:
         served, _ = write(Layers({NETWORK: part}))
         order = list(range(len(part)))
         random.Random(4).shuffle(order)
-        assert write(Layers({NETWORK: part.take(order)}))[0] == served
+        assert write(Layers({NETWORK: part.select(order)}))[0] == served
 
 
 def test_equal_edge_ids_stay_in_one_order() -> None:

@@ -132,10 +132,10 @@ def test_multipolygon_without_one_of_its_ways_is_warned_of() -> None:
 
 def test_rings_that_do_not_close_make_no_area() -> None:
     line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-    assert osm_areas.assembled([line]) is None
-    assert osm_areas.assembled([]) is None
-    assert osm_areas.assembled([line, line[::-1]]) is None, "a way there and back encloses nothing"
-    assert osm_areas.assembled([line, np.array([[1.0, 1.0], [0.0, 0.0]])]).area == pytest.approx(0.5)
+    assert osm_areas.assemble_area([line]) is None
+    assert osm_areas.assemble_area([]) is None
+    assert osm_areas.assemble_area([line, line[::-1]]) is None, "a way there and back encloses nothing"
+    assert osm_areas.assemble_area([line, np.array([[1.0, 1.0], [0.0, 0.0]])]).area == pytest.approx(0.5)
 
 
 def test_lift_has_walls_a_free_cabin_and_open_doors(shared: Path) -> None:

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from app import generate
 from app.derive import DerivationNotes
 from app.model.features import Features
-from app.model.imagery import GeoImage, displayed
+from app.model.imagery import GeoImage, display_pixels
 from app.model.layers import Layers
 
 SHEET = Path(__file__).resolve().parents[2] / "docs" / "images" / "sites.png"
@@ -29,15 +29,15 @@ def sites() -> list[str]:
 def tile(name: str) -> Image.Image:
     """A site from above, its lowest level, with the network's edges."""
     layers = generate.run(name, SEED, {}, Layers(), DerivationNotes())
-    key, picture = next(iter(layers.of("imagery").items()))
+    key, picture = next(iter(layers.parts_of("imagery").items()))
     assert isinstance(picture, GeoImage)
-    image = Image.fromarray(np.ascontiguousarray(displayed(picture)[..., :3]))
+    image = Image.fromarray(np.ascontiguousarray(display_pixels(picture)[..., :3]))
     scale = min(TILE[0] / image.width, TILE[1] / image.height)
     image = image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.BOX)
     pen = ImageDraw.Draw(image)
     a, _, c, _, e, f = picture.transform
     for part in layers.vector("topology", key.level).values():
-        edges: Features = part.of_kind("edge")
+        edges: Features = part.select_kinds("edge")
         for line in edges.in_local(layers.frame):
             xy = shapely.get_coordinates(line)
             at = np.column_stack([(xy[:, 0] - c) / a, (xy[:, 1] - f) / e]) * scale

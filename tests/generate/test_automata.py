@@ -56,10 +56,10 @@ def pieces(free: Bool) -> int:
 def test_conways_glider_flies() -> None:
     glider = picture(".#......", "..#.....", "###.....", "........", "........", "........")
     later = picture("........", "..#.....", "...#....", ".###....", "........", "........")
-    assert (_automata.grown(glider, *LIFE, 4, outside=False) == later).all()
+    assert (_automata.run_automaton(glider, *LIFE, 4, outside=False) == later).all()
     block = picture("....", ".##.", ".##.", "....")
-    assert (_automata.grown(block, *LIFE, 1000, outside=False) == block).all()
-    assert (_automata.grown(glider, *LIFE, 0, outside=False) == glider).all()
+    assert (_automata.run_automaton(block, *LIFE, 1000, outside=False) == block).all()
+    assert (_automata.run_automaton(glider, *LIFE, 0, outside=False) == glider).all()
 
 
 @pytest.mark.parametrize("outside", [False, True])
@@ -68,14 +68,14 @@ def test_rules_are_kept_as_by_hand(outside: bool, born: str, stays: str) -> None
     alive = np.random.default_rng(3).random((23, 31)) < 0.45
     b, s = ({int(c) for c in digits} for digits in (born, stays))
     expected = by_hand(by_hand(alive, b, s, outside), b, s, outside)
-    assert (_automata.grown(alive, b, s, 2, outside=outside) == expected).all()
+    assert (_automata.run_automaton(alive, b, s, 2, outside=outside) == expected).all()
 
 
 def test_many_rows_are_worked_on_in_strips(monkeypatch: pytest.MonkeyPatch) -> None:
     alive = np.random.default_rng(4).random((50, 40)) < 0.45
-    expected = _automata.grown(alive, *LIFE, 3, outside=True)
+    expected = _automata.run_automaton(alive, *LIFE, 3, outside=True)
     monkeypatch.setattr(_automata, "STRIP", 40 * 7)
-    assert (_automata.grown(alive, *LIFE, 3, outside=True) == expected).all()
+    assert (_automata.run_automaton(alive, *LIFE, 3, outside=True) == expected).all()
 
 
 def test_a_step_costs_no_more_than_twice_what_numpy_needs_for_the_sums_alone() -> None:
@@ -91,7 +91,7 @@ def test_a_step_costs_no_more_than_twice_what_numpy_needs_for_the_sums_alone() -
         np.isin(total, (5, 6, 7, 8)) | (alive & (total == 4))
 
     def ours() -> None:
-        _automata.grown(alive, (5, 6, 7, 8), (4, 5, 6, 7, 8), 1, outside=True)
+        _automata.run_automaton(alive, (5, 6, 7, 8), (4, 5, 6, 7, 8), 1, outside=True)
 
     assert shortest_time(ours) <= 2 * shortest_time(sums) + 0.02
 
@@ -112,7 +112,7 @@ def test_rooms_are_joined_for_a_robot_and_holes_are_filled() -> None:
     rock[36:38, 24:26] = False  # no robot fits in
     rim = np.zeros_like(rock)
     rim[[0, -1]] = rim[:, [0, -1]] = True
-    out, filled, passages = _automata.joined(rock, rim, 1.2, 4, 4)
+    out, filled, passages = _automata.join_free_space(rock, rim, 1.2, 4, 4)
     assert passages == 3
     assert filled == 4
     assert pieces(~out) == 1
@@ -122,7 +122,7 @@ def test_rooms_are_joined_for_a_robot_and_holes_are_filled() -> None:
     assert pieces(fits) == 1
     assert fits[8, 8]
     assert fits[29, 44]
-    none, filled_count, _ = _automata.joined(np.ones((9, 9), bool), np.zeros((9, 9), bool), 1.0, 3, 1)
+    none, filled_count, _ = _automata.join_free_space(np.ones((9, 9), bool), np.zeros((9, 9), bool), 1.0, 3, 1)
     assert none.all()
     assert filled_count == 0
 

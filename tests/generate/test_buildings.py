@@ -71,8 +71,12 @@ def test_open_rmf_reads_walls_doors_and_the_lift(office: Layers) -> None:
     assert [row[3] for row in chargers] == ["dock_1", "dock_2"]
     back = read(FileGroup(get_format("openrmf"), "building.yaml", files), ReadContext())
     for level in ("ground", "L2"):
-        walls = office.vector("objects", level)[PartKey("objects", level, "openrmf")].of_kind("wall", "door", "floor")
-        again = back.vector("objects", level)[PartKey("objects", level, "openrmf")].of_kind("wall", "door", "floor")
+        walls = office.vector("objects", level)[PartKey("objects", level, "openrmf")].select_kinds(
+            "wall", "door", "floor"
+        )
+        again = back.vector("objects", level)[PartKey("objects", level, "openrmf")].select_kinds(
+            "wall", "door", "floor"
+        )
         assert len(walls) == len(again)
         assert shapely.hausdorff_distance(*(shapely.union_all(f.geometry) for f in (walls, again))) < 1e-6
 

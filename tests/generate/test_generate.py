@@ -63,7 +63,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     def fewer(given: Layers, options: Posts, source: RandomSource, notes: DerivationNotes) -> Layers:
         """Only some of the posts."""
         (key, part), *_ = given.vector("objects").items()
-        return Layers({key: part.take(np.arange(options.count))}, given.datum, given.levels)
+        return Layers({key: part.select(np.arange(options.count))}, given.datum, given.levels)
 
 
 @pytest.fixture

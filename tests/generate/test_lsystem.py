@@ -197,8 +197,8 @@ def test_the_turtle_turns_as_it_should() -> None:
 
 @pytest.mark.parametrize("name", sorted(_plants.SPECIES))
 def test_species_grow_into_sound_meshes(name: str) -> None:
-    first, second = _plants.grown(name, 2, DICE)
-    again = _plants.grown(name, 2, DICE)
+    first, second = _plants.grow_plants(name, 2, DICE)
+    again = _plants.grow_plants(name, 2, DICE)
     assert first == again[0]
     assert first.files != second.files
     radius, length = first.body
@@ -216,7 +216,7 @@ def test_species_grow_into_sound_meshes(name: str) -> None:
 
 
 def test_the_same_seed_grows_the_same_bytes_everywhere() -> None:
-    (plant,) = _plants.grown("apple", 1, DICE)
+    (plant,) = _plants.grow_plants("apple", 1, DICE)
     digest = hashlib.sha256(b"".join(data for _, data in sorted(plant.files.items()))).hexdigest()
     assert digest == DIGEST
 

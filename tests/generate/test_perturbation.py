@@ -21,7 +21,7 @@ from app.errors import CannotGenerate, Invalid, MissingLayer
 from app.generate import _site
 from app.generate._site import Site, SiteOptions
 from app.model.features import Features, features
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, packed_cells, unknown_grey
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, pack_cells, unknown_grey
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
 from tests.generate.looks import digest, make, world
@@ -43,7 +43,7 @@ def disturbed(given: Layers, seed: int = 7, **values: Any) -> tuple[Layers, Laye
 def orchard() -> Layers:
     """Four rows of nine posts, 3 m apart, 2 m in the row, with a way between two of them."""
     site = Site(Layers(), SiteOptions(resolution=0.05), DerivationNotes())
-    site.bounded(shapely.box(-3, -3, 20, 13))
+    site.set_fence(shapely.box(-3, -3, 20, 13))
     for row in range(4):
         for k in range(9):
             site.post(f"tree/{row}/{k}", "tree", (2.0 * k, 3.0 * row), 0.15, 2.5)
@@ -51,7 +51,7 @@ def orchard() -> Layers:
     for k in range(9):
         site.node(f"n{k}", (2.0 * k, 4.5))
     for k in range(8):
-        site.way(f"n{k}", f"n{k + 1}")
+        site.add_edges(f"n{k}", f"n{k + 1}")
     return site.finish()
 
 
@@ -330,7 +330,7 @@ def test_free_cells_of_unknowns_grey_stay_as_they_are() -> None:
     cells = room().cells.copy()
     grey = np.zeros(cells.shape, bool)
     grey[:, 121:] = cells[:, 121:] == FREE
-    properties = {UNKNOWN_GREY: packed_cells(grey)}
+    properties = {UNKNOWN_GREY: pack_cells(grey)}
     before = Layers({PartKey("occupancy"): OccupancyGrid(cells, 0.05, free_thresh=0.25, properties=properties)})
     after, _, _ = disturbed(before, obstacles=40, speckle=0.2, erode=0.9, severity=1.0)
     assert (grid(after).cells != cells)[:, :100].any()

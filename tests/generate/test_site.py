@@ -31,7 +31,7 @@ GRID = PartKey("occupancy", GROUND, "map")
 def yard(notes: DerivationNotes | None = None, given: Layers | None = None, **options: Any) -> Site:
     """Twenty by ten metres with a shed of 4 × 2 m in the middle of its upper half."""
     site = Site(given or Layers(), SiteOptions(**options), notes or DerivationNotes())
-    site.bounded(shapely.box(0, 0, 20, 10))
+    site.set_fence(shapely.box(0, 0, 20, 10))
     site.box("shed", "building", (10, 7), (4, 2, 3), colour="roof", name="Shed")
     return site
 
@@ -97,7 +97,7 @@ def test_free_space_is_one_piece_and_the_rest_is_told() -> None:
     (entry,) = notes.dropped
     assert entry["what"] == "free cells"
     assert entry["count"] == pytest.approx(1.8 * 1.8 / 0.05**2, rel=0.05)
-    cells, closed = _site.connected(np.zeros((3, 3), np.uint8))
+    cells, closed = _site.keep_largest_space(np.zeros((3, 3), np.uint8))
     assert (closed, cells.tolist()) == (0, [[0] * 3] * 3)
 
 
@@ -105,8 +105,8 @@ def test_edges_know_their_width_and_none_leads_through_an_obstacle() -> None:
     site = yard()
     for name, place in (("a", (3, 2)), ("b", (17, 2)), ("c", (17, 7))):
         site.node(name, place)
-    site.way("a", "b", speed=1.0)
-    site.way("b", "c", action="row_change")
+    site.add_edges("a", "b", speed=1.0)
+    site.add_edges("b", "c", action="row_change")
     network = site.finish().vector("topology")[PartKey("topology", GROUND, "network")]
     edge = network.properties[network.index()["a_b"]]
     assert edge["width"] == 4.0, "2 m to the fence below, 4 m to the shed"
@@ -115,7 +115,7 @@ def test_edges_know_their_width_and_none_leads_through_an_obstacle() -> None:
     site = yard()
     for name, place in (("a", (1, 7)), ("b", (19, 7))):
         site.node(name, place)
-    site.way("a", "b")
+    site.add_edges("a", "b")
     with pytest.raises(RuntimeError, match=r"the edge a_b is nearer to an obstacle than 0\.3 m"):
         site.finish()
     site = yard()
@@ -141,13 +141,13 @@ def test_what_cannot_be_driven_is_a_mistake_of_the_generator() -> None:
     site = yard()
     for name, place in (("a", (1, 2)), ("b", (5, 2)), ("c", (9, 2))):
         site.node(name, place)
-    site.way("a", "b")
+    site.add_edges("a", "b")
     with pytest.raises(RuntimeError, match="no way leads to 1 of the nodes, as c"):
         site.finish()
-    site.way("b", "c", both=False)
+    site.add_edges("b", "c", both=False)
     with pytest.raises(RuntimeError, match="no way leads from 1 of the nodes, as c"):
         site.finish()
-    site.way("c", "b", both=False)
+    site.add_edges("c", "b", both=False)
     site.finish()
     site.zone("wet", "keepout", shapely.box(6, 1, 7, 3))
     with pytest.raises(RuntimeError, match="through a keep-out zone"):
@@ -155,7 +155,7 @@ def test_what_cannot_be_driven_is_a_mistake_of_the_generator() -> None:
     with pytest.raises(ValueError, match="two nodes"):
         site.node("a", (1, 1))
     with pytest.raises(ValueError, match="two edges"):
-        site.way("a", "b")
+        site.add_edges("a", "b")
 
 
 def test_the_fence_and_the_datum_of_the_environment_count() -> None:
@@ -189,18 +189,18 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
 def test_sizes_are_told_before_work_starts() -> None:
     site = Site(Layers(), SiteOptions(resolution=0.01), DerivationNotes())
     with pytest.raises(CannotGenerate, match="resolution: 100 × 100 m on 1 levels would be more than"):
-        site.bounded(shapely.box(0, 0, 100, 100))
+        site.set_fence(shapely.box(0, 0, 100, 100))
     site = Site(Layers(), SiteOptions(), DerivationNotes())
     with pytest.raises(CannotGenerate, match="coarser"):
-        site.bounded(shapely.box(0, 0, 1e6, 1e6))
+        site.set_fence(shapely.box(0, 0, 1e6, 1e6))
     notes = DerivationNotes()
     site = Site(Layers(), SiteOptions(datum=(52.0, 5.0)), notes)
-    site.bounded(shapely.box(0, 0, 300, 200))
+    site.set_fence(shapely.box(0, 0, 300, 200))
     site.box("shed", "building", (10, 10), (4, 4, 3))
     assert grid_of(site.finish()).resolution == 0.2
     assert [t["what"] for t in notes.template] == ["resolution"]
     site = Site(Layers(), SiteOptions(height=2.9), DerivationNotes())
-    site.bounded(shapely.box(0, 0, 20, 10))
+    site.set_fence(shapely.box(0, 0, 20, 10))
     site.box("kerb", "wall", (10, 7), (4, 2, 1))
     with pytest.raises(CannotGenerate, match="no stored object stands in a robot's way at 2"):
         site.finish()
@@ -224,12 +224,12 @@ def test_the_picture_shows_what_stands_where() -> None:
 def test_levels_have_grids_and_pictures_of_their_own() -> None:
     levels = (Level(), Level("L2", 4.0))
     site = Site(Layers(), SiteOptions(), DerivationNotes(), levels=levels)
-    site.bounded(shapely.box(0, 0, 20, 10))
+    site.set_fence(shapely.box(0, 0, 20, 10))
     site.box("desk", "furniture", (5, 5), (2, 1, 0.8))
     site.box("desk2", "furniture", (15, 5), (2, 1, 0.8), level="L2")
     site.node("lift", (2, 2))
     site.node("lift2", (2, 2), level="L2")
-    site.way("lift", "lift2", action="lift")
+    site.add_edges("lift", "lift2", action="lift")
     layers = site.finish(ground="floor")
     for level, x in (("ground", 5), ("L2", 15)):
         grid = layers.parts[PartKey("occupancy", level, "map")]

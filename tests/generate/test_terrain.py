@@ -198,7 +198,7 @@ def test_the_height_map_lies_below_the_floor_and_trees_stand_on_it() -> None:
     low_x, low_y, low, high_x, high_y, high = solids.bounds(ground, files) or (0.0,) * 6
     assert (low_x, low_y, high_x, high_y) == pytest.approx((0, 0, 20, 15))
     assert (low, high) == pytest.approx((-2.0, 0.0), abs=0.01)
-    trees = objects.of_kind("tree")
+    trees = objects.select_kinds("tree")
     assert len(trees) > 3
     for properties in trees.properties:
         x, y, z, *_ = properties["pose"]

@@ -119,8 +119,8 @@ def test_rules_that_lead_nowhere(rules: str, why: str) -> None:
 
 
 def test_a_grammar_that_explodes_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert _blocks.MOST_SHAPES == 30_000
-    monkeypatch.setattr(_blocks, "MOST_SHAPES", 500)
+    assert _blocks.MAX_SHAPES == 30_000
+    monkeypatch.setattr(_blocks, "MAX_SHAPES", 500)
     with pytest.raises(CannotGenerate, match="the rules make more than 500 shapes"):
         grown("a -> cut(0.5, 0) a a", shapely.box(0, 0, 3000, 3000))
 
@@ -128,12 +128,12 @@ def test_a_grammar_that_explodes_is_stopped(monkeypatch: pytest.MonkeyPatch) -> 
 def test_streets_that_cross_and_end_make_lanes_to_the_right() -> None:
     """A cross of two streets of 12 m: four links, four lanes in, four out, and no lane turns round at the middle."""
     lines = [shapely.LineString([(0, 50), (100, 50)]), shapely.LineString([(50, 0), (50, 100)])]
-    streets = _streets.network_of([_blocks.Street(line, 12.0) for line in lines], 2.0)
+    streets = _streets.build_streets([_blocks.Street(line, 12.0) for line in lines], 2.0)
     assert len(streets.links) == 4
     assert sorted(streets.junctions)[2] == (50, 50)
     assert (streets.walk, streets.carriage(streets.links[0])) == (2.0, 8.0)
     middle = streets.junctions.index((50, 50))
-    assert len(streets.around(middle)) == 4
+    assert len(streets.links_at(middle)) == 4
     end = streets.junctions.index((0, 50))
     lane = _streets._lane(streets, shapely.LineString([(0, 50), (50, 50)]), end, middle, 2)
     at = shapely.get_coordinates(lane)
@@ -153,8 +153,8 @@ def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
     assert sum(p["action"] == "cross" for p in edges) >= 8
     assert not any(d["what"] == "sidewalks" for d in notes.dropped)
     objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
-    roads = objects.of_kind("road")
-    buildings = objects.of_kind("building")
+    roads = objects.select_kinds("road")
+    buildings = objects.select_kinds("building")
     for road, p in zip(roads.geometry, roads.properties, strict=True):
         assert not shapely.intersects(shapely.buffer(road, p["width"] / 2), buildings.geometry).any()
     area = shapely.union_all(buildings.geometry).area
@@ -162,7 +162,7 @@ def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
     for p in buildings.properties:
         assert p["height"] >= p["levels"] * 2.9
         assert p["osm"]["tags"]["building:levels"] == str(p["levels"])
-    lamps = objects.of_kind("pole")
+    lamps = objects.select_kinds("pole")
     assert len(lamps) > 5
     assert b'k="roof:shape"' in write_layers(layers, "osm", {}, looks.CAME).files["map.osm"]
 
@@ -172,7 +172,7 @@ def test_the_boundary_is_given_or_the_fence() -> None:
     boundary = ",".join(f"{v:g}" for point in ring.exterior.coords[:-1] for v in point)
     layers, _ = looks.make("town", boundary=boundary, resolution=0.2)
     looks.agrees_with_itself(layers, 0.3)
-    buildings = layers.vector("objects")[PartKey("objects", GROUND, "generated")].of_kind("building")
+    buildings = layers.vector("objects")[PartKey("objects", GROUND, "generated")].select_kinds("building")
     assert len(buildings) > 4
     assert shapely.contains(ring, buildings.geometry).all()
     fence = features([("f", ring, {"kind": "fence"})], "local")
@@ -215,7 +215,7 @@ def test_rules_of_ones_own_may_leave_streets_open() -> None:
     looks.agrees_with_itself(layers, 0.3)
     objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
     assert Counter(p["kind"] for p in objects.properties)["building"] == 4
-    assert {p["roof"] for p in objects.of_kind("building").properties} == {"hip"}
+    assert {p["roof"] for p in objects.select_kinds("building").properties} == {"hip"}
     assert np.isfinite(shapely.bounds(objects.geometry)).all()
 
 

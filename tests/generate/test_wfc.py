@@ -45,7 +45,7 @@ def collapse(sample: U8, size: int, pattern: int, draw: Any = DRAW, symmetry: An
     """A grid of so many cells a side from a sample."""
     model = _wfc.learn(sample, tile=1, pattern=pattern, symmetry=symmetry, wrap=more.pop("wrap", False))
     fixed = more.pop("fixed", np.full((size, size), -1))
-    return _wfc.rendered(model, _wfc.collapsed(model, (size, size), fixed, draw, **more))
+    return _wfc.render(model, _wfc.collapse_model(model, (size, size), fixed, draw, **more))
 
 
 def pairs(cells: U8) -> list[float]:
@@ -81,7 +81,7 @@ def test_a_board_of_two_colours_has_two_patterns() -> None:
 def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
     sample = SAMPLES["warehouse"].cells(0.05)
     model = _wfc.learn(sample, tile=4, pattern=1, symmetry="none")
-    tiles = _wfc.collapsed(model, (30, 40), np.full((30, 40), -1), DRAW)
+    tiles = _wfc.collapse_model(model, (30, 40), np.full((30, 40), -1), DRAW)
     blocks = sample.reshape(25, 4, 25, 4).transpose(0, 2, 1, 3).reshape(25, 25, 16)
     sample_pairs = [
         {(a.tobytes(), b.tobytes()) for a, b in zip(p.reshape(-1, 16), q.reshape(-1, 16), strict=True)}
@@ -101,7 +101,7 @@ def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
 def test_every_window_stands_in_the_sample(scan: bool, symmetry: Any) -> None:
     sample = SAMPLES["office"].cells(0.1)
     sample[5:9, 40] = OCCUPIED
-    sample_windows = set().union(*(windows(np.ascontiguousarray(one), 3) for one in _wfc.turned(sample, symmetry)))
+    sample_windows = set().union(*(windows(np.ascontiguousarray(one), 3) for one in _wfc.symmetries(sample, symmetry)))
     out = collapse(sample, 60, 3, symmetry=symmetry, scan=scan)
     assert windows(out, 3) <= sample_windows
     wide = collapse(sample, 40, 3, symmetry=symmetry, scan=scan, periodic=True)

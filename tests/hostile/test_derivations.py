@@ -45,7 +45,7 @@ GRIDS = {
     "1 x 1 unknown": grid(205, 1, 1),
     "a line": grid(254, 200, 1),
 }
-OF_GRIDS = sorted(name for name, d in derive.all_derivations().items() if "occupancy" in d.needs and not d.last)
+OF_GRIDS = sorted(name for name, d in derive.all_derivations().items() if "occupancy" in d.needs and not d.is_terminal)
 METHODS: dict[str, list[dict[str, Any]]] = {
     "occupancy_to_topology": [{"method": "skeleton"}, {"method": "roadmap"}, {"method": "voronoi"}]
 }

@@ -12,7 +12,7 @@ import pytest
 
 from app import upload_reader
 from app.errors import BadUpload, Problem
-from app.formats import Limits, grouped
+from app.formats import Limits, group_warnings
 from app.model.frame import Datum
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import KML, SAMPLES
@@ -193,14 +193,14 @@ def test_utf16_stylesheet_is_reported() -> None:
 def test_warnings_that_repeat_are_one() -> None:
     same = [Problem(f"the edge 'e{k}' leads to 'x{k}', which is no node", "a.yaml", where=f"n{k}") for k in range(41)]
     other = Problem("no list of nodes", "a.yaml")
-    warnings = grouped([*same, other, other], 1000)
+    warnings = group_warnings([*same, other, other], 1000)
     assert [w.problem for w in warnings] == [
         "the edge 'e0' leads to 'x0', which is no node (and 40 more like it: n1; n2)",
         "no list of nodes",
     ]
-    assert grouped(same[:3], 1000) == same[:3]
+    assert group_warnings(same[:3], 1000) == same[:3]
     many = [Problem(word * 9, "a") for word in "abcdef"]
-    assert [w.problem for w in grouped(many, 5)][5:] == ["and 1 more warnings"]
+    assert [w.problem for w in group_warnings(many, 5)][5:] == ["and 1 more warnings"]
 
 
 def test_nodes_with_the_same_unknown_key_are_one_warning() -> None:

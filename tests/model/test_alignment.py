@@ -36,7 +36,7 @@ def hall(resolution: float = 0.05, noise: float = 0.0) -> OccupancyGrid:
 def away(fit: Fit, x: float, y: float, yaw: float) -> tuple[float, float]:
     """(metres at the hall's middle, degrees) between a fit and a known motion."""
     middle = np.array([[3.0, 6.0]])
-    computed, expected = fit.of(middle), Fit(x, y, yaw, 0, 1).of(middle)
+    computed, expected = fit.apply_to(middle), Fit(x, y, yaw, 0, 1).apply_to(middle)
     return float(np.linalg.norm(computed - expected)), abs(math.degrees(math.remainder(fit.yaw - yaw, 2 * math.pi)))
 
 
@@ -47,9 +47,9 @@ def test_a_known_motion_is_found_again(x: float, y: float, degrees: float) -> No
     onto = hall()
     # What is moved is a coarser, damaged map of the hall, brought out of its place.
     out = Fit(x, y, math.radians(degrees), 0.0, 1.0)
-    moving = out.moved(hall(0.1, noise=0.2))
-    fit = alignment.of_grids(moving, onto)[0]
-    back = fit.moved(moving)
+    moving = out.move_grid(hall(0.1, noise=0.2))
+    fit = alignment.align_grids(moving, onto)[0]
+    back = fit.move_grid(moving)
     assert math.dist(back.origin[:2], (-3.0, 2.0)) < 0.1, "within a cell of the coarser map"
     assert abs(math.degrees(back.origin[2])) < 0.2
     assert fit.agreement > 0.9
@@ -60,14 +60,14 @@ def test_a_known_motion_is_found_again(x: float, y: float, degrees: float) -> No
 
 def test_the_search_keeps_to_what_is_asked() -> None:
     onto = hall()
-    moving = Fit(0.5, 0.0, math.radians(90), 0.0, 1.0).moved(hall())
-    for fit in alignment.of_grids(moving, onto, angle=math.radians(20)):
+    moving = Fit(0.5, 0.0, math.radians(90), 0.0, 1.0).move_grid(hall())
+    for fit in alignment.align_grids(moving, onto, angle=math.radians(20)):
         assert abs(fit.yaw) <= math.radians(20) + 2e-3
-    far = Fit(30.0, 0.0, 0.0, 0.0, 1.0).moved(hall())
-    assert alignment.of_grids(far, onto)[0].x == pytest.approx(-30, abs=0.05)
+    far = Fit(30.0, 0.0, 0.0, 0.0, 1.0).move_grid(hall())
+    assert alignment.align_grids(far, onto)[0].x == pytest.approx(-30, abs=0.05)
     fits: list[Fit] = []
     try:
-        fits = alignment.of_grids(far, onto, reach=25.0)
+        fits = alignment.align_grids(far, onto, reach=25.0)
     except CannotConvert as error:
         assert "nowhere" in error.detail
     assert all(f.score < 0.7 for f in fits)
@@ -77,8 +77,8 @@ def test_of_equal_places_the_nearest_is_taken() -> None:
     cells = np.zeros((100, 100), np.uint8)
     cells[0:2], cells[-2:], cells[:, 0:2], cells[:, -2:] = (OCCUPIED,) * 4
     square = OccupancyGrid(cells, 0.1)
-    moving = Fit(0.3, -0.2, math.radians(3), 0.0, 1.0).moved(square)
-    fits = alignment.of_grids(moving, square)
+    moving = Fit(0.3, -0.2, math.radians(3), 0.0, 1.0).move_grid(square)
+    fits = alignment.align_grids(moving, square)
     assert abs(math.degrees(fits[0].yaw) + 3) < 0.2
     assert len([f for f in fits if f.score > 0.95]) >= 4, "a square fits four ways"
 
@@ -87,9 +87,9 @@ def test_grids_that_show_nothing_are_refused() -> None:
     nothing = OccupancyGrid(np.zeros((10, 10), np.uint8), 0.1)
     for a, b in ((nothing, hall()), (hall(), nothing)):
         with pytest.raises(CannotConvert, match="0 occupied cells"):
-            alignment.of_grids(a, b)
+            alignment.align_grids(a, b)
     solid = OccupancyGrid(np.full((40, 40), OCCUPIED, np.uint8), 0.1)
-    assert alignment.of_grids(solid, solid)[0].score > 0.9
+    assert alignment.align_grids(solid, solid)[0].score > 0.9
 
 
 POINTS = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 5.0], [3.0, 8.0], [-4.0, 2.0]])
@@ -98,7 +98,7 @@ POINTS = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 5.0], [3.0, 8.0], [-4.0, 2.0]
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_points_by_least_squares(count: int) -> None:
     truth = Fit(5.0, -1.0, math.radians(33.0), 0, 1)
-    fit, bad, scale = alignment.of_pairs(np.stack([POINTS[:count], truth.of(POINTS[:count])], axis=1))
+    fit, bad, scale = alignment.fit_pairs(np.stack([POINTS[:count], truth.apply_to(POINTS[:count])], axis=1))
     assert away(fit, truth.x, truth.y, truth.yaw) == pytest.approx((0, 0), abs=1e-9)
     assert (fit.residual, bad) == (pytest.approx(0, abs=1e-9), [])
     assert scale == pytest.approx(1.0)
@@ -106,20 +106,20 @@ def test_points_by_least_squares(count: int) -> None:
 
 def test_wrong_pairs_are_left_out_and_told() -> None:
     truth = Fit(5.0, -1.0, math.radians(-120.0), 0, 1)
-    targets = truth.of(POINTS)
+    targets = truth.apply_to(POINTS)
     targets[2] += (6.0, -3.0)
-    fit, bad, _ = alignment.of_pairs(np.stack([POINTS, targets], axis=1))
+    fit, bad, _ = alignment.fit_pairs(np.stack([POINTS, targets], axis=1))
     assert bad == [2]
     assert fit.agreement == 0.8
     assert away(fit, truth.x, truth.y, truth.yaw) == pytest.approx((0, 0), abs=1e-9)
     many = np.random.default_rng(1).uniform(-50, 50, (200, 2))
-    moved = truth.of(many) + np.random.default_rng(2).normal(0, 0.05, many.shape)
+    moved = truth.apply_to(many) + np.random.default_rng(2).normal(0, 0.05, many.shape)
     moved[::3] = np.random.default_rng(4).uniform(-50, 50, moved[::3].shape)
-    fit, bad, _ = alignment.of_pairs(np.stack([many, moved], axis=1))
+    fit, bad, _ = alignment.fit_pairs(np.stack([many, moved], axis=1))
     assert set(range(0, 200, 3)) - set(bad) == set() or len(set(range(0, 200, 3)) - set(bad)) <= 1
     assert away(fit, truth.x, truth.y, truth.yaw) < (0.1, 0.2)
     assert fit.residual == pytest.approx(0.07, abs=0.03)
-    _, _, scale = alignment.of_pairs(np.stack([POINTS[:2], 2 * POINTS[:2]], axis=1))
+    _, _, scale = alignment.fit_pairs(np.stack([POINTS[:2], 2 * POINTS[:2]], axis=1))
     assert scale == pytest.approx(2.0)
 
 
@@ -132,5 +132,5 @@ def test_wrong_pairs_are_left_out_and_told() -> None:
 )  # fmt: skip
 def test_points_that_say_nothing(pairs: Any) -> None:
     with pytest.raises(Invalid) as refused:
-        alignment.of_pairs(pairs)
+        alignment.fit_pairs(pairs)
     assert refused.value.problems[0].where == "pairs"

@@ -19,7 +19,7 @@ KEY = PartKey("topology", GROUND, NETWORK)
 AT = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (10.0, 8.0)}
 DETOUR = [(2.0, 0.0), (2.0, 6.0), (7.0, 6.0), (10.0, 0.0)]
 HOUSE = shapely.box(3, -2, 6, 5)
-STRAIGHT = sorted(name for name, known in formats.all_formats().items() if known.bends != "shape")
+STRAIGHT = sorted(name for name, known in formats.all_formats().items() if known.keeps_bends != "shape")
 
 
 def network(*edges: tuple[str, str, str, list[tuple[float, float]]], **properties: Any) -> Layers:
@@ -107,7 +107,7 @@ def test_parallel_edges_get_nodes_of_their_own() -> None:
 def test_an_edge_between_networks_and_one_to_nowhere_stay_whole() -> None:
     lost = network(("a_b", "a", "b", [(5.0, 5.0)]))
     part = part_of(lost)
-    incomplete = Layers({KEY: part.take([k for k, i in enumerate(part.ids) if i != "b"])})
+    incomplete = Layers({KEY: part.select([k for k, i in enumerate(part.ids) if i != "b"])})
     assert bends.split(incomplete)[0] is incomplete
 
 
@@ -120,7 +120,7 @@ def test_places_on_earth_bend_by_metres() -> None:
     straight = part_of(bends.split(Layers({KEY: earth}, datum))[0])
     assert not straight.local.any()
     index = straight.index()
-    positions = shapely.get_coordinates(straight.take([index["a~b~2"]]).in_local(frame))
+    positions = shapely.get_coordinates(straight.select([index["a~b~2"]]).in_local(frame))
     assert positions == pytest.approx(np.array([[2.0, 6.0]]), abs=1e-6)
     assert edges(bends.split(Layers({KEY: earth}))[0]) == edges(Layers({KEY: straight})), "without a datum, too"
 
@@ -171,7 +171,7 @@ def test_no_written_edge_leads_through_a_house(name: str) -> None:
     assert formats.write(fmt, again, WriteContext()) == files
 
 
-NAMED = [name for name in STRAIGHT if name != "prm" and formats.get_format(name).bends == "nodes"]
+NAMED = [name for name in STRAIGHT if name != "prm" and formats.get_format(name).keeps_bends == "nodes"]
 """Formats with names of nodes, which bends have; prm has none."""
 
 

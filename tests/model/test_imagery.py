@@ -12,8 +12,8 @@ from pyproj import Transformer
 from app.errors import Invalid, MissingDatum
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
-from app.model.imagery import GeoImage, displayed, placed
-from app.model.resampling import resampled, to_wgs84
+from app.model.imagery import GeoImage, display_pixels, pixel_positions
+from app.model.resampling import resample, to_wgs84
 
 UTM = "EPSG:32630"
 HERE = Datum(53.2686, -0.5245)
@@ -31,7 +31,7 @@ def truth(image: GeoImage, source: GeoImage, to_source: Any) -> tuple[np.ndarray
     """For every pixel of the result: the value that stands there by PROJ alone, and how near to a pixel's edge."""
     height, width = image.pixels.shape[:2]
     rows, columns = (v.ravel() + 0.5 for v in np.mgrid[0:height, 0:width])
-    places = to_source(placed(image.transform, columns, rows))
+    places = to_source(pixel_positions(image.transform, columns, rows))
     a, b, c, d, e, f = source.transform
     back = np.linalg.inv(np.array([[a, b], [d, e]]))
     u, v = back @ (places - [c, f]).T
@@ -48,7 +48,7 @@ def truth(image: GeoImage, source: GeoImage, to_source: Any) -> tuple[np.ndarray
 def test_every_pixel_stands_where_proj_says(heading: float, transform: Any) -> None:
     source = numbered(transform=transform, nodata=0)
     frame = local_frame(Datum(HERE.latitude, HERE.longitude, heading=heading))
-    image = resampled(source, frame, method="nearest")
+    image = resample(source, frame, method="nearest")
     earth = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
     tmerc = Transformer.from_crs(
         f"+proj=tmerc +lat_0={HERE.latitude} +lon_0={HERE.longitude} +k=1 +ellps=WGS84", "EPSG:4326", always_xy=True
@@ -97,10 +97,10 @@ def test_a_plane_stays_a_plane() -> None:
     heights = (0.25 * columns - 0.125 * rows)[..., None]
     source = GeoImage(heights, (0.5, 0.0, EAST, 0.0, -0.5, NORTH), UTM)
     frame = local_frame(HERE)
-    image = resampled(source, frame)
+    image = resample(source, frame)
     assert image.properties["nodata"] == "nan"
     v, u = np.nonzero(np.isfinite(image.pixels[..., 0]))
-    earth = frame.to_wgs84(placed(image.transform, u + 0.5, v + 0.5))
+    earth = frame.to_wgs84(pixel_positions(image.transform, u + 0.5, v + 0.5))
     xy = np.column_stack(Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(earth[:, 0], earth[:, 1]))
     column, row = (xy[:, 0] - EAST) / 0.5, (NORTH - xy[:, 1]) / 0.5
     within = (column > 1) & (row > 1) & (column < 79) & (row < 59)
@@ -112,23 +112,23 @@ def test_a_plane_stays_a_plane() -> None:
 @pytest.mark.parametrize(("kind", "band"), [(np.uint8, "alpha"), (np.uint16, "mask"), (np.int8, "mask")])
 def test_outside_is_said_by_a_further_band(kind: Any, band: str) -> None:
     source = GeoImage(np.full((40, 40, 3), 100, kind), (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM)
-    image = resampled(source, local_frame(HERE))
+    image = resample(source, local_frame(HERE))
     assert image.colours == ("red", "green", "blue", band)
     opaque = image.pixels[..., 3] != 0
     assert 0.4 < opaque.mean() < 0.6, "half of the box around a turned square"
     assert (image.pixels[opaque][:, :3] == 100).all(), "transparency does not darken the edge"
-    assert displayed(image)[..., 3].tolist() == np.where(opaque, 255, 0).tolist() or band == "alpha"
+    assert display_pixels(image)[..., 3].tolist() == np.where(opaque, 255, 0).tolist() or band == "alpha"
 
 
 def test_what_lies_right_is_left_alone() -> None:
     plan = numbered(crs="local")
-    assert resampled(plan) is plan
-    assert resampled(numbered(), crs=UTM).crs == UTM
+    assert resample(plan) is plan
+    assert resample(numbered(), crs=UTM).crs == UTM
 
 
 def test_a_turned_plan_is_set_upright_without_a_datum() -> None:
     plan = numbered((40, 40), "local", (0.0, 0.5, 0.0, 0.5, 0.0, 0.0), nodata=0)
-    image = resampled(plan, method="nearest")
+    image = resample(plan, method="nearest")
     # x runs along the rows, y along the columns: transposed, and upside down since rows run down.
     assert image.transform == (0.5, 0.0, 0.0, 0.0, -0.5, 20.0)
     assert np.array_equal(image.pixels[..., 0], plan.pixels[..., 0].T[::-1])
@@ -137,21 +137,21 @@ def test_a_turned_plan_is_set_upright_without_a_datum() -> None:
 def test_palettes_are_never_mixed() -> None:
     values = (np.arange(1600).reshape(40, 40, 1) % 2 * 200).astype(np.uint8)
     properties = {"bands": [{"colour": "palette"}], "palette": [[k, 0, 0, 255] for k in range(256)], "nodata": 7}
-    image = resampled(GeoImage(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(HERE))
+    image = resample(GeoImage(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(HERE))
     assert set(np.unique(image.pixels)) == {0, 7, 200}
 
 
 def test_what_cannot_be_is_said() -> None:
     with pytest.raises(MissingDatum, match="datum"):
-        resampled(numbered())
+        resample(numbered())
     with pytest.raises(MissingDatum, match="datum"):
         to_wgs84(numbered(crs="local"))
     with pytest.raises(Invalid, match="coarser"):
-        resampled(numbered(), local_frame(HERE), resolution=1e-4)
+        resample(numbered(), local_frame(HERE), resolution=1e-4)
     with pytest.raises(Invalid, match="cannot say"):
-        resampled(numbered(), local_frame(Datum(-53.0, 179.0)))
+        resample(numbered(), local_frame(Datum(-53.0, 179.0)))
     with pytest.raises(Invalid, match="no way"):
-        resampled(numbered(crs="EPSG:99999"), local_frame(HERE))
+        resample(numbered(crs="EPSG:99999"), local_frame(HERE))
 
 
 # --- displayed ----------------------------------------------------------------------------------------------------
@@ -160,13 +160,13 @@ SQUARE = (1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
 
 def shown(values: Any, kind: Any = np.uint8, **properties: Any) -> list[Any]:
     pixels = np.array(values, kind)
-    return displayed(GeoImage(pixels, SQUARE, "local", properties)).tolist()
+    return display_pixels(GeoImage(pixels, SQUARE, "local", properties)).tolist()
 
 
 def test_bytes_are_shown_as_they_are() -> None:
     for bands in (1, 2, 3, 4):
         pixels = np.random.default_rng(bands).integers(0, 255, (700, 900, bands), dtype=np.uint8)
-        assert np.array_equal(displayed(GeoImage(pixels, SQUARE)), pixels)
+        assert np.array_equal(display_pixels(GeoImage(pixels, SQUARE)), pixels)
 
 
 def test_other_types_are_stretched() -> None:

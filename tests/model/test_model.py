@@ -16,12 +16,12 @@ from app.model.features import (
     MAX_ID,
     NO_GEOMETRY,
     Features,
-    alike,
     concatenate,
     features,
     from_columns,
     points,
     segments,
+    shared_key_dict,
     unique_ids,
 )
 from app.model.frame import MAX_METRES, Datum, Level, is_writable
@@ -122,7 +122,7 @@ def test_the_bad_one_of_very_many_is_named() -> None:
 
 
 def test_copies_of_a_pattern_are_usual_mappings_that_take_less_memory() -> None:
-    pattern = alike("kind", "source", "target")
+    pattern = shared_key_dict("kind", "source", "target")
     one, two = pattern.copy(), pattern.copy()
     one["kind"], one["source"], one["target"] = "edge", "a", "b"
     assert one == {"kind": "edge", "source": "a", "target": "b"}
@@ -189,10 +189,10 @@ def test_features_cannot_be_changed() -> None:
 def test_parts_of_a_collection() -> None:
     rows = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", None, {"kind": "edge"}), ("c", None, {})]
     collection = features(rows, "local", {"x": {"name": "n"}})
-    assert collection.of_kind("node", "edge").ids == ("a", "b")
-    assert collection.take(np.array([False, True, True])).ids == collection.take([1, 2]).ids == ("b", "c")
-    assert collection.take([2, 0]).ids == ("c", "a")
-    assert collection.take([]).document == {"x": {"name": "n"}}
+    assert collection.select_kinds("node", "edge").ids == ("a", "b")
+    assert collection.select(np.array([False, True, True])).ids == collection.select([1, 2]).ids == ("b", "c")
+    assert collection.select([2, 0]).ids == ("c", "a")
+    assert collection.select([]).document == {"x": {"name": "n"}}
     assert collection.index() == {"a": 0, "b": 1, "c": 2}
     assert [(f.id, f.anchor) for f in collection] == [("a", "local"), ("b", "local"), ("c", "local")]
     other = features([("d", None, {})], "wgs84", {"x": {"style": 1}, "y": 2})
@@ -383,7 +383,7 @@ def test_layers_hold_what_their_keys_say() -> None:
     )
     assert layers.layers == {"occupancy", "topology", "resources"}
     assert list(layers.grids("L1")) == [upper]
-    assert len(layers.of("occupancy", name="map")) == 2
+    assert len(layers.parts_of("occupancy", name="map")) == 2
     assert list(layers.vector("topology")) == [PartKey("topology", name="network")]
     assert layers.resources() == {"a.png": b"1"}
     assert (layers.elevation("L1"), layers.elevation("L9")) == (3.0, 0.0)

@@ -43,23 +43,23 @@ def lift(**doors: Any) -> dict[str, Any]:
     ],
 )
 def test_role_follows_kind_shapes_and_tags(properties: dict[str, Any], role: str) -> None:
-    assert obstacles.role_of(properties) == role
+    assert obstacles.object_role(properties) == role
 
 
 def test_door_is_an_outline_where_doors_are_closed() -> None:
-    assert obstacles.role_of({"kind": "door"}, doors_closed=True) == "outline"
+    assert obstacles.object_role({"kind": "door"}, doors_closed=True) == "outline"
 
 
 def test_height_is_the_top_above_the_floor() -> None:
-    assert obstacles.heights_of({"kind": "wall", "base": 1.0, "height": 4.0}, LINE) == (1.0, 4.0)
-    assert obstacles.heights_of({"kind": "crate", "size": [1, 1, 2], "pose": [0, 0, 1.5]}, POINT) == (1.5, 3.5)
-    assert obstacles.heights_of({"kind": "wall"}, LINE) == (0.0, math.inf)
+    assert obstacles.object_heights({"kind": "wall", "base": 1.0, "height": 4.0}, LINE) == (1.0, 4.0)
+    assert obstacles.object_heights({"kind": "crate", "size": [1, 1, 2], "pose": [0, 0, 1.5]}, POINT) == (1.5, 3.5)
+    assert obstacles.object_heights({"kind": "wall"}, LINE) == (0.0, math.inf)
     tags = {"building": "yes", "building:min_level": "1", "building:levels": "3"}
-    assert obstacles.heights_of({"kind": "building", "osm": {"tags": tags}}, AREA) == (3.0, 9.0)
+    assert obstacles.object_heights({"kind": "building", "osm": {"tags": tags}}, AREA) == (3.0, 9.0)
 
 
 def test_lines_of_walls_close_corners_and_others_end_where_they_end() -> None:
-    wall, fence = (obstacles.body_of({"kind": kind, "width": 0.2}, LINE) for kind in ("wall", "fence"))
+    wall, fence = (obstacles.object_body({"kind": kind, "width": 0.2}, LINE) for kind in ("wall", "fence"))
     assert wall is not None
     assert fence is not None
     assert wall.area.bounds == pytest.approx((-0.1, -0.1, 4.1, 0.1))
@@ -68,13 +68,13 @@ def test_lines_of_walls_close_corners_and_others_end_where_they_end() -> None:
 
 def test_walls_of_a_lift_are_open_at_its_doors() -> None:
     """A cabin of 2 × 2 m turned by 90 degrees: the door on its lower side is on the right."""
-    body = obstacles.body_of(lift(front=DOOR), POINT)
+    body = obstacles.object_body(lift(front=DOOR), POINT)
     assert body is not None
     assert (body.base, body.top) == (0.0, 2.5)
     assert body.area.area == pytest.approx(2.1**2 - 2.0**2 - 0.05)
     assert body.area.bounds == pytest.approx((8.95, -1.05, 11.05, 1.05))
     assert not body.area.intersects(shapely.box(11.0, -0.49, 11.1, 0.49))
-    ground = obstacles.ground_of(lift(front=DOOR), POINT)
+    ground = obstacles.object_ground(lift(front=DOOR), POINT)
     assert ground is not None
     assert ground.bounds == pytest.approx((9, -1, 11, 1))
 
@@ -84,14 +84,14 @@ def test_walls_of_a_lift_are_open_at_its_doors() -> None:
 )
 def test_lift_without_a_known_door_has_no_walls(doors: dict[str, Any]) -> None:
     """Walls without a way in would lock the cabin."""
-    assert obstacles.body_of(lift(**doors), POINT) is None
+    assert obstacles.object_body(lift(**doors), POINT) is None
 
 
 def test_flood_reaches_what_is_joined_to_the_border() -> None:
     cells = np.zeros((9, 12), np.uint8)
     cells[2:7, 2:7], cells[3:6, 3:6] = OCCUPIED, FREE
     cells[2:7, 8], cells[4, 8] = OCCUPIED, FREE
-    _raster.flooded(cells, FREE, UNKNOWN)
+    _raster.flood(cells, FREE, UNKNOWN)
     assert (cells[3:6, 3:6] == FREE).all()
     assert np.count_nonzero(cells == FREE) == 9
     assert np.count_nonzero(cells == OCCUPIED) == 16 + 4

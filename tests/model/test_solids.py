@@ -148,14 +148,14 @@ def test_a_height_map_is_closed_and_north_is_up() -> None:
     highest = triangles.reshape(-1, 3)[triangles.reshape(-1, 3)[:, 2].argmax()]
     assert highest.tolist() == [12, 1, 4], "the brightest pixel, top right, is at the full height"
     # Two triangles of area 1 rise to a height of 3 at one corner each, on a floor 3 mm thick.
-    assert volume(solids.placed(triangles, (-10, 0, -1, 0, 0, 0))) == pytest.approx(2 * 1 * 3 / 3 + 8 * 0.003)
+    assert volume(solids.apply_pose(triangles, (-10, 0, -1, 0, 0, 0))) == pytest.approx(2 * 1 * 3 / 3 + 8 * 0.003)
     deep = one(shape, {"h.png": picture([[0, 65535], [0, 0]], "I;16")})
     assert deep[:, :, 2].max() == pytest.approx(4)
     assert volume(deep) > 0
 
 
 def test_a_large_height_map_keeps_its_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(solids, "FINEST", 4)
+    monkeypatch.setattr(solids, "MAX_HEIGHTMAP_SIDE", 4)
     rows = [[0] * 9 for _ in range(6)]
     rows[0][8] = 100
     rows[5][4] = 50

@@ -94,7 +94,7 @@ def bench(store: Store, n: int) -> None:
 
 def edited(original: Features, some: Any, metres: float, k: int) -> Features:
     """These features with another name, moved a little or not."""
-    part = original.take(some)
+    part = original.select(some)
     moved = points(shapely.get_coordinates(part.geometry) + np.random.default_rng(k).random((len(part), 2)) * metres)
     return Features(part.ids, moved, tuple({**p, "name": f"v{k}"} for p in part.properties), part.local.copy())
 

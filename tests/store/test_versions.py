@@ -104,7 +104,7 @@ def test_the_same_again_changes_nothing(farm: Store):
     assert not prepared.changed
     assert not prepared.chunks
     assert farm._chunks.reads - reads == 2  # the part's root: compared, and checked for damage
-    shuffled = network(300).take(np.random.default_rng(0).permutation(300))
+    shuffled = network(300).select(np.random.default_rng(0).permutation(300))
     assert not farm.prepare(first, Changes((Replace(TOPOLOGY, shuffled),))).changed
     assert not farm.prepare(first, Changes(replaces(everything()))).changed
     digest = farm.blobs.put(b"again")
@@ -226,7 +226,7 @@ def test_features_come_by_id_and_by_document_order(farm: Store):
     some = farm.get(version, TOPOLOGY, ["n7", "n250", "nope"])
     assert some.ids == ("n250", "n7")
     index = part.index()
-    assert rows(some) == rows(part.take([index["n250"], index["n7"]]))
+    assert rows(some) == rows(part.select([index["n250"], index["n7"]]))
 
 
 def test_an_old_version_reads_like_the_head(farm: Store):
@@ -253,7 +253,7 @@ def test_a_version_costs_what_it_changes(farm: Store):
     changed = Features(
         near.ids, near.geometry.copy(), tuple({**p, "name": "x"} for p in near.properties), near.local.copy()
     )
-    one = farm.prepare(head, Changes((Put(TOPOLOGY, changed.take([0])),)))
+    one = farm.prepare(head, Changes((Put(TOPOLOGY, changed.select([0])),)))
     many = farm.prepare(head, Changes((Put(TOPOLOGY, changed),)))
     assert len(one.chunks) <= 6
     assert sum(map(len, one.chunks.values())) < 20_000
@@ -736,6 +736,6 @@ def test_what_is_derived_anew_from_other_inputs_is_a_version_though_it_is_the_sa
 
 def test_an_edit_that_changes_nothing_renews_nothing(farm: Store):
     first = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("a")))
-    assert save(farm, "farm", Put(TOPOLOGY, network(3).take([0]))).number == first.number
+    assert save(farm, "farm", Put(TOPOLOGY, network(3).select([0]))).number == first.number
     edited = derived("a").with_edit_step()
     assert save(farm, "farm", Replace(TOPOLOGY, network(3), edited)).number == first.number
