@@ -1,7 +1,7 @@
 """The settings: environment variables ``FLEETMAP_*``, a ``.env`` file, or flags of ``fleetmap serve``.
 
 Nothing is read at import: a factory makes ``Settings()`` and passes it on. Every setting is described here, for the
-documentation too; every field of ``app.formats.Limits`` is the setting ``FLEETMAP_MAX_<FIELD>``.
+documentation too; every field of ``app.limits.Limits`` is the setting ``FLEETMAP_MAX_<FIELD>``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pydantic import Field, SecretStr, ValidationInfo, field_validator, model_va
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.events.ros_names import parse_keys, parse_selectors
-from app.formats import Limits
+from app.limits import Limits
 from app.logs import LogFormat
 
 _DEFAULTS = Limits()

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from app import formats
 from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFile
-from app.formats import FileGroup, Files, Format, Limits, ReadContext, _archive, _content, _json, _shell, _xml, _yaml
+from app.formats import FileGroup, Files, Format, ReadContext, _content
+from app.limits import Limits
 from app.model import network
 from app.model.features import Features, concatenate, from_columns, unique_ids
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum, Level
@@ -27,6 +28,7 @@ from app.model.geodesy import local_frame
 from app.model.imagery import GeoImage
 from app.model.layers import NETWORK, SITE, ZONES, Layer, Layers, Part, PartKey, Resources, is_empty, join_levels
 from app.model.names import did_you_mean
+from app.syntax import archives, json, shell, xml, yaml
 
 TEMPLATE_FOLDERS = ("location", "metric", "topological", "world")
 """The folders of an environment_template's ``config``; the folder says what a drawing is meant for."""
@@ -35,7 +37,7 @@ _FOLDER_LAYER: Mapping[str, Layer] = {"location": "location", "topological": "to
 
 VARIABLES_FILES = ("properties.sh", "environment.sh")
 
-_OF_FILES = re.compile(rf"^line \d+: ({'|'.join(sorted(_shell.OF_FILES))}) is left out: only a shell")
+_OF_FILES = re.compile(rf"^line \d+: ({'|'.join(sorted(shell.OF_FILES))}) is left out: only a shell")
 
 DRAWN_LAYERS: tuple[Layer, ...] = ("objects", "topology", "location", "zones")
 
@@ -143,7 +145,7 @@ def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
         members = {name: data}
         if name.lower().endswith(".zip") and data[:2] == b"PK":
             with _errors_in_file(name):
-                members = _archive.unpack(data, dataclasses.replace(limits, unpacked_bytes=left))
+                members = archives.unpack(data, dataclasses.replace(limits, unpacked_bytes=left))
             left -= sum(map(len, members.values()))
         for member, content in members.items():
             if member in out:
@@ -274,11 +276,11 @@ def _unread_file_warnings(name: str, data: bytes, limits: Limits) -> Problem:
     first = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
     try:
         if end in _JSON_ENDS or (first and first in b"{[" and end not in _YAML_ENDS):
-            _json.load(data, limits)
+            json.load(data, limits)
         elif end in _YAML_ENDS:
-            _yaml.load(data, limits)
+            yaml.load(data, limits)
         elif end in _XML_ENDS or first == b"<":
-            _xml.parse(data, limits)
+            xml.parse(data, limits)
     except BadUpload as error:
         problem = next(iter(error.problems), Problem(error.detail))
         return dataclasses.replace(problem, file=name)
@@ -377,8 +379,8 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
     names = sorted(n for n in files if PurePosixPath(n).name in VARIABLES_FILES and files[n])
     for name in names:
         with _errors_in_file(name):
-            assigned, doubts = _shell.assignments(files[name])
-        variables.update({n: v for n, v in assigned.items() if v or n not in _shell.OF_FILES})
+            assigned, doubts = shell.assignments(files[name])
+        variables.update({n: v for n, v in assigned.items() if v or n not in shell.OF_FILES})
         bundle.files[name] = FileUse("environment", used=True)
         # Where the package's files lie is told anew whenever it is served: no loss worth a word.
         bundle.warnings += [Problem(doubt, name) for doubt in doubts if not _OF_FILES.search(doubt)]

@@ -16,15 +16,15 @@ from typing import Any
 
 import pytest
 
-from app.derive import _native
+from app import native
 from tests.postgres import postgres_cluster, postgres_url  # noqa: F401  fixtures
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 TOP = Path(__file__).resolve().parents[1]
 COMPILE = """
 import importlib
-from app.derive import _native
-for name in _native._modules():
+from app import native
+for name in native._modules():
     importlib.import_module(name).compile_all()
 """
 
@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = tempfile.mkdtemp(prefix="fleetmap-bytecode-")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         os.environ["PYTHONPYCACHEPREFIX"] = folder
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(_native.folder().parent))
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(native.folder().parent))
     if config.getoption("numprocesses", None):  # many tests: workers of servers may not write what they compile
         process = subprocess.Popen([sys.executable, "-c", COMPILE], cwd=TOP)
         config.add_cleanup(process.wait)

@@ -26,7 +26,7 @@ from unittest import mock
 
 import httpx
 
-from app.derive import _native
+from app import native
 from tests.api import samples
 from tests.api.conftest import ADMIN, API, parts, running, settings_for
 from tests.api.test_damage import NETWORK, cached, fill, flip, mounted_disk
@@ -480,7 +480,7 @@ def main() -> int:
     parser.add_argument("--times", type=int, help="how often each fault comes; the default depends on the fault")
     parser.add_argument("--only", default="", help="only rows whose name has this in it")
     values = parser.parse_args()
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(_native.folder().parent))
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(native.folder().parent))
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # starts are measured as users see them
     with tempfile.TemporaryDirectory(prefix="fleetmap-figures-") as name:
         if values.table == "hostile":

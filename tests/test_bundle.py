@@ -12,7 +12,7 @@ import pytest
 import shapely
 
 from app.errors import BadUpload, Invalid, UnreadableFile
-from app.formats import Limits
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import PartKey

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from app.formats import _archive
 from app.store.store import Store
+from app.syntax import archives
 from tests.api.conftest import Api, running, settings_for
 from tests.postgres import Cluster
 
@@ -174,7 +174,7 @@ def test_a_template_comes_back_as_a_package(api: Api, shared: Path, same: Same, 
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
     env = f"zip-{name.replace('_', '-')}"
     api.post("environments", {"name": env})
-    version = api.upload(env, {"site.zip": _archive.pack(files)}, format="environment").json()
+    version = api.upload(env, {"site.zip": archives.pack(files)}, format="environment").json()
     loose = api.post("environments", {"name": f"{env}-loose"[:63]}).json()["name"]
     assert api.upload(loose, files).json()["root"] == version["root"]
     answer = api.get(f"/maps/{env}/environment")

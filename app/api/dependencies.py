@@ -16,8 +16,8 @@ from app.api.signed import SignedLinks
 from app.convert.maps import Maps
 from app.errors import Unavailable
 from app.fleet import ReportQueue as FleetIntake
-from app.formats import Limits
 from app.ingest import Ingest
+from app.limits import Limits
 from app.pool import Pool
 from app.signing import Keys
 from app.store.store import Store

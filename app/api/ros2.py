@@ -11,11 +11,12 @@ from app.errors import CannotConvert, NotFound
 from app.events import cdr
 from app.events.ros2 import TopicContent
 from app.events.ros_names import EnvironmentSelector, namespace_of
-from app.formats import ReadContext, _yaml
+from app.formats import ReadContext
 from app.model.frame import GROUND
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP
 from app.store.values import LATEST, Version
+from app.syntax import yaml
 
 PRODUCTION = "production"
 PAGE = 1000
@@ -97,5 +98,5 @@ def _grid(services: Services, version: Version, values: Mapping[str, str], deriv
 def _network(services: Services, version: Version, derive: bool) -> str:
     """The tmap2 as JSON: topological_navigation publishes it so, and who reads YAML reads JSON."""
     cached_map = services.maps.get_blocking(version, "tmap2", {}, derive=derive)
-    document = _yaml.load(cached_map.files[0].read(), services.options.limits)
+    document = yaml.load(cached_map.files[0].read(), services.options.limits)
     return json.dumps(document, ensure_ascii=False)

@@ -27,8 +27,8 @@ from starlette.concurrency import run_in_threadpool
 from app.api.middleware import multipart_boundary
 from app.api.problems import MalformedBody
 from app.errors import DISK_FULL_ERRNOS, Invalid, NoRoom, Problem, TooLarge, Unavailable
-from app.formats import Limits
 from app.ingest import SpooledFile
+from app.limits import Limits
 from app.store.database import check_room
 
 BATCH = 2**20

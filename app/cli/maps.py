@@ -234,10 +234,11 @@ def check(
     """
     local.require_server_python("check")
     from app import formats, upload_reader
+    from app.limits import Limits
 
     collected, _, notes = _collect(paths)
     collected = with_companions(collected)
-    files = upload_reader.unpack({f.name: f.path.read_bytes() for f in collected}, formats.Limits())
+    files = upload_reader.unpack({f.name: f.path.read_bytes() for f in collected}, Limits())
     groups, rest = formats.group({name: data for name, data in files.items() if data}, format)
     results: list[dict[str, Any]] = []
     for group in groups:

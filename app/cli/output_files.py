@@ -77,7 +77,7 @@ def inside(folder: Path, name: str) -> Path:
 
 def bundle(files: Mapping[str, bytes], output: Path, *, folder: bool) -> list[str]:
     """A map's files as a folder, a file (several as a ZIP), or on standard output: the names that were written."""
-    from app.formats._archive import pack
+    from app.syntax.archives import pack
 
     targets = {name: inside(output, name) for name in files}
     if folder:

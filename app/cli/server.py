@@ -101,13 +101,13 @@ def _compile(folder: Path) -> None:
 
     Where ``NUMBA_CACHE_DIR`` names a folder, that one is taken. Until it is done, workers compile what they need.
     """
-    from app.derive import _native
+    from app import native
 
-    cache_path = os.environ.setdefault(_native.FOLDER, str(folder.resolve()))
-    if _native.is_filled(Path(cache_path)):
+    cache_path = os.environ.setdefault(native.FOLDER, str(folder.resolve()))
+    if native.is_filled(Path(cache_path)):
         return
     process = multiprocessing.get_context("spawn").Process(
-        target=_native.fill_quietly, args=(Path(cache_path),), daemon=True
+        target=native.fill_quietly, args=(Path(cache_path),), daemon=True
     )
     process.start()
 

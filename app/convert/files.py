@@ -12,7 +12,8 @@ from app.convert import recipe as recipes
 from app.convert import site
 from app.convert import worker as making
 from app.errors import CannotConvert, Invalid, NotFound, Problem
-from app.formats import Files, Format, Limits
+from app.formats import Files, Format
+from app.limits import Limits
 from app.model.frame import Datum
 from app.model.layers import Layer, Layers
 from app.store.values import PartEntry, Provenance

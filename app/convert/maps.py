@@ -36,13 +36,15 @@ from app.errors import (
     Unavailable,
     UnreadableFile,
 )
-from app.formats import Limits, _shell, environment
+from app.formats import environment
+from app.limits import Limits
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.model.names import did_you_mean
 from app.pool import CancelHandle, WorkerDied
 from app.store.store import Store
 from app.store.values import Version
+from app.syntax import shell
 from app.upload_reader import UploadHints
 
 Run = Callable[..., Any]
@@ -317,7 +319,7 @@ class Maps:
         out: dict[str, str] = {}
         for part in self._store.load(version, keys).vector("objects").values() if keys else ():
             stored = part.document.get(environment.NAME)
-            out |= _shell.exported_variables(stored.get("variables") if isinstance(stored, Mapping) else None)[0]
+            out |= shell.exported_variables(stored.get("variables") if isinstance(stored, Mapping) else None)[0]
         return dict(sorted(out.items()))
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:

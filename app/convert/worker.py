@@ -16,15 +16,16 @@ from app.convert import recipe as recipes
 from app.convert import site
 from app.convert.recipe import ChainFailure, DerivationChain, Spread
 from app.derive import Step
-from app.derive._crossings import crossings
 from app.errors import CannotConvert, CannotDerive, FleetMapError, MissingLayer, Problem
-from app.formats import UNTITLED, Format, NestedMap, WriteContext, _archive
+from app.formats import UNTITLED, Format, NestedMap, WriteContext
 from app.model.closures import Closures
+from app.model.crossings import crossings
 from app.model.features import Features
 from app.model.frame import GROUND
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
 from app.model.templates import NO_TEMPLATES, Templates
 from app.store.values import PartEntry, Provenance, Version, datum_information
+from app.syntax import archives
 from app.templates import DEFAULT, resolve
 
 if TYPE_CHECKING:
@@ -422,7 +423,7 @@ def media_type(fmt: Format, name: str) -> str:
 
 def zip_files(files: Mapping[str, bytes]) -> bytes:
     """Several files as one archive, the same bytes each time."""
-    return _archive.pack(files)
+    return archives.pack(files)
 
 
 def _report_layers(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from app.derive._kernels_space import F64, I64, U8
-from app.derive._native import native
+from app.native import native
 
 
 @native

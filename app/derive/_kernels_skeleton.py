@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from app.derive._kernels_space import F64, I32, I64, U8, U16, clear, distance2, gaps
-from app.derive._native import native
+from app.native import native
 
 Graph = tuple[I64, I64, I64, I64, I64]
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive._native import native
+from app.native import native
 
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]

@@ -17,7 +17,7 @@ import numpy as np
 
 from app.derive._kernels_skeleton import pieces, slim, steps
 from app.derive._kernels_space import F64, I32, I64, U8, U16, gaps
-from app.derive._native import native
+from app.native import native
 
 _SIMPLE = np.array([pieces(code) == 1 for code in range(256)], np.uint8)
 """By code of a neighbourhood (``_kernels_skeleton``): whether a cell can go without changing pieces or holes."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import DerivationNotes, _raster
+from app.derive import DerivationNotes
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer, NotFound, Problem, TooLarge
-from app.model import obstacles, solids, worlds
+from app.model import obstacles, raster, solids, worlds
 from app.model.features import NO_GEOMETRY, Features, Properties
 from app.model.grid import OCCUPIED, UNKNOWN
 from app.model.layers import Layers
@@ -87,18 +87,18 @@ class LevelObstacles:
         np.maximum.at(highest, index, self.triangles[:, :, 2].max(axis=1))
         return np.asarray(((lowest <= height) & (highest > height))[index])
 
-    def draw(self, cells: NDArray[np.uint8], frame: _raster.RasterFrame, low: float, high: float) -> None:
+    def draw(self, cells: NDArray[np.uint8], frame: raster.RasterFrame, low: float, high: float) -> None:
         """Occupy every cell that is touched between two heights by what ``cut`` has given for them."""
         slab = np.array([[low, high]])
-        _raster.paint(cells, _raster.surfaces(self.triangles, frame, slab), OCCUPIED)
-        _raster.paint(cells, _raster.insides(self.triangles, self.owner, frame, slab[:, 0]), OCCUPIED)
-        _raster.paint(cells, _raster.areas(self.footprints, frame, touched=True), OCCUPIED)
+        raster.paint(cells, raster.surfaces(self.triangles, frame, slab), OCCUPIED)
+        raster.paint(cells, raster.insides(self.triangles, self.owner, frame, slab[:, 0]), OCCUPIED)
+        raster.paint(cells, raster.areas(self.footprints, frame, touched=True), OCCUPIED)
 
-    def draw_unknown(self, cells: NDArray[np.uint8], frame: _raster.RasterFrame) -> None:
+    def draw_unknown(self, cells: NDArray[np.uint8], frame: raster.RasterFrame) -> None:
         """Make the ground of ``unknown`` unknown where it is not occupied."""
         if self.unknown:
             solid = cells == OCCUPIED
-            _raster.paint(cells, _raster.areas(self.unknown, frame, touched=True), UNKNOWN)
+            raster.paint(cells, raster.areas(self.unknown, frame, touched=True), UNKNOWN)
             cells[solid] = OCCUPIED
 
     def bounds(self) -> tuple[float, float, float, float] | None:
@@ -148,36 +148,12 @@ def sites(
     return {level: reader.finish(site, level) for level, site in out.items()}
 
 
-def fences(layers: Layers, notes: DerivationNotes) -> dict[str, Any]:
-    """The polygons of the location layer by level, joined, in metres (shapely)."""
-    out: dict[str, Any] = {}
-    for key, part in layers.vector("location").items():
-        flat = np.isin(shapely.get_type_id(part.geometry), (3, 6)) & ~shapely.is_empty(part.geometry)
-        chosen = part.select(flat)
-        if not len(chosen):
-            continue
-        try:
-            metres = chosen.in_local(layers.frame)
-        except (MissingDatum, Invalid) as error:
-            notes.warn(f"the fence is not used: {error.detail}", where=key.name)
-            continue
-        joined = shapely.union_all(shapely.make_valid(shapely.force_2d(metres)))
-        if not joined.is_empty and joined.area > 0:
-            out[key.level] = joined if key.level not in out else shapely.union(out[key.level], joined)
-    return out
-
-
 def unreadable_error(reasons: Iterable[str], summary: str) -> MissingLayer:
     """The error for a map that would be a guess, since solids cannot be read. what: what is therefore not known."""
     named = list(dict.fromkeys(reasons))
     more = f"; and {len(named) - 3} more" if len(named) > 3 else ""
     detail = f"{summary}, since solids of the objects cannot be read: {'; '.join(named[:3])}{more}"
     return MissingLayer(detail, [Problem(reason) for reason in named[:100]])
-
-
-def level_fence(fences: Mapping[str, Any], level: str, ground: str) -> Any:
-    """A level's fence, else that of the ground; None where there is none."""
-    return fences.get(level, fences.get(ground))
 
 
 class _Reader:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._select import parts_with_name, select_per_level
 from app.errors import CannotConvert, Invalid
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.imagery import CLEAR, LOCAL, GeoImage, display_pixels
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resample
+from app.model.selection import parts_with_name, select_per_level
 
 SATELLITE = "satellite"
 """The usual name of a picture."""

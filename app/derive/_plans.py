@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._raster import RasterFrame, check_frame
 from app.errors import CannotConvert
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage, display_pixels, pixel_positions
+from app.model.raster import RasterFrame, check_frame
 
 RESOLUTION = 0.05
 """Metres a cell unless asked otherwise or the picture is coarser."""

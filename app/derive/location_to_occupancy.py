@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import shapely
 
 from app.derive import DerivationNotes, derives
-from app.derive._obstacles import fences, sites, unreadable_error
+from app.derive._obstacles import sites, unreadable_error
 from app.derive.objects_to_occupancy import cell_size, empty_cells, grid_frame
 from app.errors import MissingLayer
+from app.model.fences import fences
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
 
@@ -43,7 +44,7 @@ def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivat
     if unreadable:
         raise unreadable_error(unreadable, "a blank grid would call ground free that is not known")
     parts: dict[PartKey, Part] = {}
-    for level, fence in fences(layers, notes).items():
+    for level, fence in fences(layers, notes.warn).items():
         frame = grid_frame(shapely.bounds(fence).tolist(), parameters.resolution, notes)
         cells = empty_cells(frame, fence, [])
         if level in obstacles:

@@ -9,22 +9,22 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import DerivationNotes, _raster, derives
+from app.derive import DerivationNotes, derives
 from app.derive._obstacles import (
     DEFAULT_SURROUNDINGS_METRES,
     NOT_AN_OBSTACLE,
     LevelObstacles,
-    fences,
-    level_fence,
     sites,
     unreadable_error,
 )
-from app.derive._raster import RasterFrame
 from app.errors import Invalid, MissingLayer, Problem
+from app.model import raster
+from app.model.fences import fences, level_fence
 from app.model.frame import GROUND
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
 from app.model.obstacles import UNKNOWN_RADIUS_METRES
+from app.model.raster import RasterFrame
 from app.parameters import parameter
 
 ENCLOSE = (
@@ -143,7 +143,7 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
         surroundings=parameters.surroundings,
         unknown_radius=parameters.unknown_radius,
     )
-    around = fences(layers, notes)
+    around = fences(layers, notes.warn)
     parts: dict[PartKey, Part] = {}
     reach: list[tuple[float, float]] = []
     for level, site in obstacles.items():
@@ -199,12 +199,12 @@ def _grid(
     cells = empty_cells(frame, fence, site.free)
     section.draw(cells, frame, low, high)
     if fence is None and not site.free and not parameters.outside_free:
-        _raster.flood(cells, FREE, UNKNOWN)
+        raster.flood(cells, FREE, UNKNOWN)
         why = "neither floors nor a fence say how far the site reaches"
         notes.fill("ground that no walls enclose", "unknown", why, "outside_free")
     enclosed = bool((cells == FREE).any())
     section.draw_unknown(cells, frame)
-    _raster.grow(cells, OCCUPIED, parameters.inflate / frame.resolution)
+    raster.grow(cells, OCCUPIED, parameters.inflate / frame.resolution)
     if not (cells == FREE).any():
         if site.unreadable:
             raise unreadable_error(site.unreadable, f"no free ground of the level {level} is known")
@@ -217,7 +217,7 @@ def grid_frame(box: tuple[float, ...], resolution: float | None, notes: Derivati
     """The grid around a box (min x, min y, max x, max y in metres). CannotConvert where it would be too large."""
     low_x, low_y, high_x, high_y = box[:4]
     if resolution is not None:
-        return _raster.check_frame(
+        return raster.check_frame(
             RasterFrame.from_box((low_x, low_y, high_x, high_y), resolution), MAX_CELLS, MAX_SIDE_CELLS
         )
     frame = RasterFrame.from_box((low_x, low_y, high_x, high_y), RESOLUTIONS[0])
@@ -228,7 +228,7 @@ def grid_frame(box: tuple[float, ...], resolution: float | None, notes: Derivati
     if frame.resolution != RESOLUTION:
         side = f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m"
         notes.fill("resolution", frame.resolution, f"{RESOLUTION} m would be too many cells for {side}")
-    return _raster.check_frame(frame, MAX_CELLS, MAX_SIDE_CELLS)
+    return raster.check_frame(frame, MAX_CELLS, MAX_SIDE_CELLS)
 
 
 def empty_cells(frame: RasterFrame, fence: Any, free: list[Any]) -> NDArray[np.uint8]:
@@ -237,5 +237,5 @@ def empty_cells(frame: RasterFrame, fence: Any, free: list[Any]) -> NDArray[np.u
     inside = free
     if fence is not None:
         inside = [shapely.intersection(fence, ground) for ground in free] if free else [fence]
-    _raster.paint(cells, _raster.areas([g for g in inside if g.area > 0], frame, touched=False), FREE)
+    raster.paint(cells, raster.areas([g for g in inside if g.area > 0], frame, touched=False), FREE)
     return cells

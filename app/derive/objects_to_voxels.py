@@ -11,13 +11,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import DerivationNotes, _raster, derives
+from app.derive import DerivationNotes, derives
 from app.derive._obstacles import LevelObstacles, sites, unreadable_error
-from app.derive._raster import Array, RasterFrame, Spans
 from app.errors import CannotConvert, MissingLayer
-from app.model import solids, voxels
+from app.model import raster, solids, voxels
 from app.model.frame import GROUND
 from app.model.layers import MAP, Layers, PartKey
+from app.model.raster import Array, RasterFrame, Spans
 from app.model.voxels import HALF, VoxelMap
 from app.parameters import parameter
 
@@ -151,9 +151,9 @@ def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, no
     first = math.floor(low[2] / edge + 1e-6)
     end = max(math.ceil(high[2] / edge - 1e-6), first + 1)
     levels = np.round(np.arange(first, end + 1) * edge, 9)
-    codes = _codes(_raster.surfaces(corners, frame, np.column_stack([levels[:-1], levels[1:]])), frame, first)
+    codes = _codes(raster.surfaces(corners, frame, np.column_stack([levels[:-1], levels[1:]])), frame, first)
     if parameters.filled:
-        inside = _codes(_raster.insides(corners, owner, frame, (levels[:-1] + levels[1:]) / 2), frame, first)
+        inside = _codes(raster.insides(corners, owner, frame, (levels[:-1] + levels[1:]) / 2), frame, first)
         codes = _distinct(np.concatenate([codes, inside]))
     if not len(codes):
         raise MissingLayer("no stored object has a body of any extent")
@@ -174,7 +174,7 @@ def _codes(spans: Iterable[Spans], frame: RasterFrame, first: int) -> voxels.Cod
     for part in spans:
         portion = np.cumsum(part[:, 3] - part[:, 2]) // CELLS_PER_BLOCK
         for some in np.split(part, np.flatnonzero(np.diff(portion)) + 1):
-            layer, row, column = _raster.expand_spans(some)
+            layer, row, column = raster.expand_spans(some)
             waiting.append(_distinct(voxels.morton(column + x0, row + y0, layer + first)))
             size += len(waiting[-1])
             if size > MAX_VOXELS:

@@ -11,13 +11,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import DerivationNotes, _raster, derives
-from app.derive._raster import RasterFrame
-from app.derive._select_grids import as_planned, grid_label, select_grids
+from app.derive import DerivationNotes, derives
 from app.errors import CannotConvert, MissingDatum
+from app.model import raster
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import Layers, Part, PartKey
+from app.model.raster import RasterFrame
+from app.model.selection import as_planned, grid_label, select_grids
 from app.parameters import parameter
 
 NAME = "plan"
@@ -81,7 +82,7 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Derivati
     """
     parts: dict[PartKey, Part] = {}
     for key, stored in select_grids(layers, parameters.grid, GRID_PURPOSE).items():
-        grid = as_planned(stored, grid_label(key), notes)
+        grid = as_planned(stored, grid_label(key), notes.warn)
         step = _step(grid, parameters.pixel, grid_label(key))
         cells = _coarser(grid.cells, step)
         size = grid.resolution * step
@@ -191,5 +192,5 @@ def _paint(
     inside = shapely.transform(np.array(shapes, object), lambda xy: (xy - [x, y]) @ turn)
     pieces = shapely.get_parts(shapely.get_parts(inside))
     mask = np.zeros(pixels.shape[:2], np.uint8)
-    _raster.paint(mask, _raster.areas(list(pieces[shapely.get_dimensions(pieces) > 0]), frame, touched=False), 1)
+    raster.paint(mask, raster.areas(list(pieces[shapely.get_dimensions(pieces) > 0]), frame, touched=False), 1)
     pixels[mask == 1] = (*colour, 255)

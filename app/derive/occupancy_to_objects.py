@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
 from app.derive._figures import MAX_FIGURES, Box, Disc, MaskShapes, ShapeLimits, figures
-from app.derive._select_grids import as_planned, grid_label, select_grids
 from app.errors import CannotConvert, TooLarge
 from app.model.features import features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, Part, PartKey
+from app.model.selection import as_planned, grid_label, select_grids
 from app.parameters import parameter
 
 NAME = "occupancy"
@@ -103,7 +103,11 @@ def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Derivati
     used: set[str] = set()
     for key, grid in select_grids(layers, parameters.grid, "obstacles").items():
         rows = _objects(
-            as_planned(grid, grid_label(key), notes), parameters, layers.elevation(key.level), notes, grid_label(key)
+            as_planned(grid, grid_label(key), notes.warn),
+            parameters,
+            layers.elevation(key.level),
+            notes,
+            grid_label(key),
         )
         used.update(row[2]["kind"] for row in rows)
         parts[PartKey("objects", key.level, NAME)] = features(rows, "local")

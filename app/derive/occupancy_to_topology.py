@@ -19,11 +19,11 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._select_grids import grey_warning, grid_label, select_grids
 from app.errors import CannotConvert, Invalid, Problem, TooLarge
 from app.model.features import Features, Properties, SharedKeyDicts, from_columns, points
 from app.model.grid import OccupancyGrid, unknown_grey, unknown_grey_as_unknown
 from app.model.layers import NETWORK, Layers, Part, PartKey
+from app.model.selection import grey_warning, grid_label, select_grids
 from app.parameters import parameter
 
 if TYPE_CHECKING:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._select_grids import as_planned, grid_label
 from app.errors import CannotConvert, MissingLayer
 from app.model import masks
 from app.model.grid import UNKNOWN, OccupancyGrid, unknown_grey_as_unknown
 from app.model.layers import MAP, Layers, Part, PartKey
+from app.model.selection import as_planned, grid_label
 from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, morton
 from app.parameters import parameter
 
@@ -74,7 +74,7 @@ def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Derivatio
     parts: dict[PartKey, Part] = {}
     for key, grid in _default_grids(layers).items():
         block = _grid_columns(
-            as_planned(grid, grid_label(key), notes), parameters, layers.elevation(key.level), key.name
+            as_planned(grid, grid_label(key), notes.warn), parameters, layers.elevation(key.level), key.name
         )
         if block is not None:
             voxels = VoxelMap(block.edge, *_leaves(block))

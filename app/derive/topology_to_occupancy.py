@@ -10,11 +10,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import DerivationNotes, _raster, derives
-from app.derive._obstacles import LevelObstacles, fences, level_fence, sites
+from app.derive import DerivationNotes, derives
+from app.derive._obstacles import LevelObstacles, sites
 from app.derive.objects_to_occupancy import HEIGHT, cell_size, empty_cells, grid_frame
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
+from app.model import raster
 from app.model.features import Features, Properties
+from app.model.fences import fences, level_fence
 from app.model.frame import GROUND
 from app.model.grid import FREE, OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
@@ -72,7 +74,7 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivat
     is a whole multiple of the resolution, yaw 0. Raises MissingLayer where no edge is to be driven on, MissingDatum for
     places on earth without one, CannotConvert where the grid would be too large.
     """
-    around = fences(layers, notes)
+    around = fences(layers, notes.warn)
     obstacles = _obstacles(layers, notes) if parameters.obstacles else {}
     parts: dict[PartKey, Part] = {}
     for level in dict.fromkeys(key.level for key in layers.vector("topology")):
@@ -86,14 +88,14 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivat
         )
         cells = empty_cells(frame, None, [shapely.Point(box[0], box[1])])  # a floor without an area: all is unknown
         ground = open_ if fence is None else shapely.intersection(open_, fence)
-        _raster.paint(cells, _raster.areas(ground, frame, touched=False), FREE)
+        raster.paint(cells, raster.areas(ground, frame, touched=False), FREE)
         if level in obstacles:
             section = obstacles[level].cut(HEIGHT, HEIGHT)
             section.draw(cells, frame, HEIGHT, HEIGHT)
             section.draw_unknown(cells, frame)
         if len(through):
             inside = through if fence is None else shapely.intersection(through, fence)
-            _raster.paint(cells, _raster.areas(inside, frame, touched=False), FREE)
+            raster.paint(cells, raster.areas(inside, frame, touched=False), FREE)
         parts[PartKey("occupancy", level, MAP)] = OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
     if not parts:
         raise MissingLayer(

@@ -24,11 +24,13 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Files, Limits, _json, _raster
+from app.formats import Files
+from app.limits import Limits
 from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.imagery import LOCAL, GeoImage
 from app.model.layers import PART_TYPES, Layers, Part, PartKey, Resources
+from app.syntax import geotiff, json
 
 FOLDER = "fleet_map/"
 MAIN = f"{FOLDER}content.json"
@@ -122,7 +124,7 @@ def read(files: Files, main: str, limits: Limits, unread: Callable[[], Collectio
     unread: the names of files that no format reads; it is called where files were added, since such a file changes no
     map (a README, what a file manager leaves behind).
     """
-    top = _json.load(files[main], limits)
+    top = json.load(files[main], limits)
     if not isinstance(top, dict) or top.get("version") != VERSION:
         return f"its version is not {VERSION}"
     folder = main.removesuffix(MAIN)
@@ -175,9 +177,9 @@ def _decode_part(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes
 
 def _check_place(picture: GeoImage) -> None:
     """Refuse a picture that lies nowhere, or whose CRS PROJ would look for in files."""
-    if picture.crs != LOCAL and not _raster.CRS_NAME.fullmatch(picture.crs):
-        _raster.crs_from_wkt(picture.crs)
-    if (reason := _raster.position_problem(picture)) is not None:
+    if picture.crs != LOCAL and not geotiff.CRS_NAME.fullmatch(picture.crs):
+        geotiff.crs_from_wkt(picture.crs)
+    if (reason := geotiff.position_problem(picture)) is not None:
         raise UnreadableFile(f"a picture: {reason}", [Problem(reason)])
 
 

@@ -11,9 +11,10 @@ from collections.abc import Iterator
 from typing import Any
 
 from app.errors import Problem
-from app.formats import Files, _yaml
+from app.formats import Files
 from app.formats._rules import LIMITS, error_finding, is_number, numbers, shown, warning_finding
 from app.model.frame import MAX_DATUM_LATITUDE
+from app.syntax import yaml
 
 SIZES = ("xmin", "xmax", "ymin", "ymax")
 SAME_DEGREES = 1e-9
@@ -22,7 +23,7 @@ SAME_DEGREES = 1e-9
 def check(files: Files) -> Iterator[Problem]:
     """A site's datum as its readers look it up."""
     main = next(iter(files))
-    top = _yaml.load(files[main], LIMITS)
+    top = yaml.load(files[main], LIMITS)
     if not isinstance(top, dict):
         yield error_finding("a datum is a mapping", main)
         return

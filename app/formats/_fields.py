@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from app.errors import Problem, UnreadableFile
-from app.formats import ReadContext, _yaml
+from app.formats import ReadContext
 from app.model.frame import MAX_METRES
+from app.syntax import yaml
 
 MAX_FINDINGS = 1000
 MAX_NAMES_SHOWN = 6
@@ -199,7 +200,7 @@ class _Findings:
 def _walk(value: Any, shape: Any, path: Path, findings: _Findings) -> None:
     if shape is ANY or value is None:
         return
-    if isinstance(value, _yaml.Tagged):
+    if isinstance(value, yaml.Tagged):
         value = value.value
     kind = type(shape)
     if kind is Record:
@@ -239,7 +240,7 @@ def _walk(value: Any, shape: Any, path: Path, findings: _Findings) -> None:
 def _number(value: Any) -> float | None:
     if isinstance(value, str):
         try:
-            value = _yaml.scalar(str.__str__(value).strip() or "~")
+            value = yaml.scalar(str.__str__(value).strip() or "~")
         except ValueError:
             return None
     if isinstance(value, bool) or not isinstance(value, (int, float)):

@@ -42,7 +42,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import ReadContext, _image, _xml
+from app.formats import ReadContext
 from app.formats._fields import COORDINATE, LATITUDE, LONGITUDE, Number, OneOf
 from app.model.features import MAX_ID, NO_GEOMETRY, Features, unique_ids
 from app.model.frame import MAX_METRES, Datum, Level
@@ -50,6 +50,7 @@ from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import MAP, NETWORK, SITE, VECTOR_LAYERS, ZONES, Layers, Part, PartKey
+from app.syntax import images, xml
 
 FAMILY = "kml"
 MAIN = "map.kml"
@@ -457,15 +458,15 @@ def read_kml(
     pictures: what relative references may mean (KMZ). entry: the name of this document inside its archive. Raises
     UnreadableFile with the line.
     """
-    root = _xml.parse(data, context.limits, remove_blank_text=True)
+    root = xml.parse(data, context.limits, remove_blank_text=True)
     if local_name(root) not in CONTAINERS | ITEMS:
         raise UnreadableFile(
             f"the root element is <{local_name(root)}>: KML starts with <kml>",
             [Problem(f"<{local_name(root)}> is not KML", line=root.sourceline)],
         )
-    _xml.report_active_content(data, context)
+    xml.report_active_content(data, context.warn)
     defined = {schema.get("name", "") for schema in root.iter("{*}Schema")}
-    _xml.report_unknown_elements(data, root, ELEMENTS | defined, context, free={*FREE, *defined}, namespace="kml")
+    xml.report_unknown_elements(data, root, ELEMENTS | defined, context.warn, free={*FREE, *defined}, namespace="kml")
     _check_values(root, context)
     reader = _Reader(context, pictures)
     reader.read(root, entry)
@@ -692,7 +693,7 @@ class _Reader:
 
     def _grid(self, data: bytes, href: str, parameters: Mapping[str, Any]) -> OccupancyGrid:
         """A grid: the image's palette index is the cell."""
-        image = _image.read_image(data, self.context.limits)
+        image = images.read_image(data, self.context.limits)
         if image.mode != "P":
             raise UnreadableFile(f"{href} is no longer the picture of a grid: its colours have changed")
         properties = parameters.get("properties")
@@ -709,7 +710,7 @@ class _Reader:
 
     def _picture(self, data: bytes, href: str, parameters: Mapping[str, Any]) -> GeoImage:
         """A picture: its pixels, and the exact place that its overlay has in our words."""
-        image = _image.read_image(data, self.context.limits)
+        image = images.read_image(data, self.context.limits)
         if image.mode not in ("L", "LA", "RGB", "RGBA"):
             raise UnreadableFile(f"{href} is no longer the picture that was written: its colours have changed")
         pixels = np.asarray(image, np.uint8).reshape(image.height, image.width, -1)
@@ -822,9 +823,9 @@ class _Reader:
         self.columns.setdefault(level, []).append((ids, list(geometry), properties))
         documents = self.documents.setdefault(level, {})
         if self.context.keep_source_properties:
-            xml = _keep_element_text(root, items, [t[0] if t else None for t in titles], properties)
-            key = name or hashlib.sha256(f"{entry or ''}\0{xml}".encode()).hexdigest()[:DOCUMENT_KEY_DIGITS]
-            documents[key] = {"xml": xml} if entry is None else {"xml": xml, "entry": entry}
+            document_xml = _keep_element_text(root, items, [t[0] if t else None for t in titles], properties)
+            key = name or hashlib.sha256(f"{entry or ''}\0{document_xml}".encode()).hexdigest()[:DOCUMENT_KEY_DIGITS]
+            documents[key] = {"xml": document_xml} if entry is None else {"xml": document_xml, "entry": entry}
             for item_properties in properties:
                 item_properties[FAMILY]["document"] = key
 
@@ -1114,7 +1115,7 @@ def _identify(
 ) -> tuple[list[str], list[tuple[etree._Element, str] | None]]:
     """Ids (the id attribute where it is the only one of its kind, else the name) and (element, text) of the names."""
     attributes = [
-        e.get("id") or next((v for a, v in _xml.attributes(e).items() if a.endswith("}id")), "") if e.attrib else ""
+        e.get("id") or next((v for a, v in xml.attributes(e).items() if a.endswith("}id")), "") if e.attrib else ""
         for e in (item.element for item in items)
     ]
     counts = Counter(attributes)

@@ -13,8 +13,9 @@ from collections.abc import Collection, Iterator, Mapping
 from lxml import etree
 
 from app.errors import Problem
-from app.formats import Files, _archive, _xml
+from app.formats import Files
 from app.formats._rules import HEAD_BYTES, LIMITS, duplicates, error_finding, is_brief, names, warning_finding
+from app.syntax import archives, xml
 
 SPACES = ("http://www.opengis.net/kml/", "http://earth.google.com/kml/")
 
@@ -31,7 +32,7 @@ def check(files: Files) -> Iterator[Problem]:
 def check_archive(files: Files) -> Iterator[Problem]:
     """An archive with a drawing and what it refers to."""
     main = next(iter(files))
-    entries: Mapping[str, bytes] = _archive.unpack(files[main], LIMITS)
+    entries: Mapping[str, bytes] = archives.unpack(files[main], LIMITS)
     kml = [name for name in entries if name.lower().endswith(".kml")]
     if not kml:
         yield error_finding("there is no .kml in the archive", main)
@@ -50,7 +51,7 @@ def _document(data: bytes, main: str, entries: Collection[str] | None) -> Iterat
         ):
             yield error_finding("the root is not <kml> in its namespace", main)
         return
-    root = _xml.parse(data, LIMITS)
+    root = xml.parse(data, LIMITS)
     name = etree.QName(root)
     if name.localname != "kml":
         one = error_finding if name.localname not in PARTS else warning_finding

@@ -20,7 +20,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Invalid
-from app.formats import LayerRequirements, WriteContext, _image, _text
+from app.formats import LayerRequirements, WriteContext
 from app.formats._kml import (
     COORDINATES,
     DEFAULT_PART,
@@ -45,6 +45,7 @@ from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.grid import OccupancyGrid
 from app.model.imagery import DEFAULT_COLOURS, LOCAL, GeoImage, display_pixels
 from app.model.layers import Layer, Layers, PartKey
+from app.syntax import decimals, images
 
 KML = "http://www.opengis.net/kml/2.2"
 GX = "http://www.google.com/kml/ext/2.2"
@@ -184,7 +185,7 @@ _LETTERS = {0: "P", 1: "L", 2: "L"}
 
 
 def _coordinate_texts(
-    geometry: NDArray[np.object_], decimals: int, form: Callable[..., str], glue: str, *, thin: bool = False
+    geometry: NDArray[np.object_], digits: int, form: Callable[..., str], glue: str, *, thin: bool = False
 ) -> _Texts:
     """All coordinates as text at once. form: joins the numbers of one position; glue: stands between positions. thin:
     rings that were drawn as three points get back to three.
@@ -204,10 +205,10 @@ def _coordinate_texts(
     lists[~from_area] = parts[~area & ~nothing]
     lists[from_area] = shapely.get_rings(parts[area])
     points, list_of = shapely.get_coordinates(lists, include_z=True, return_index=True)
-    columns = [_text.numbers(points[:, 0], decimals), _text.numbers(points[:, 1], decimals)]
+    columns = [decimals.numbers(points[:, 0], digits), decimals.numbers(points[:, 1], digits)]
     deep = shapely.has_z(lists)
     if deep.any():
-        heights = _text.numbers(np.where(np.isnan(points[:, 2]), 0.0, points[:, 2]), _text.METRES)
+        heights = decimals.numbers(np.where(np.isnan(points[:, 2]), 0.0, points[:, 2]), decimals.METRES)
         flat = (~deep[list_of]).tolist()
         triples = zip(*columns, heights, flat, strict=True)
         positions = [form(x, y) if plain else form(x, y, z) for x, y, z, plain in triples]
@@ -243,7 +244,7 @@ def _bracket(*numbers: str) -> str:
 
 
 def _degrees(geometry: NDArray[np.object_], *, thin: bool = False) -> _Texts:
-    return _coordinate_texts(geometry, _text.DEGREES, _comma, " ", thin=thin)
+    return _coordinate_texts(geometry, decimals.DEGREES, _comma, " ", thin=thin)
 
 
 def _element(geometry: Any, lists: Iterator[str], extra: str = "") -> str:
@@ -293,7 +294,7 @@ def _datum(layers: Layers) -> str:
     if datum is None:
         return ""
     data = "".join(_data(n, v) for n, v in {"kind": "datum", **datum.as_dict()}.items())
-    at = ",".join(_text.numbers([datum.longitude, datum.latitude], _text.DEGREES))
+    at = ",".join(decimals.numbers([datum.longitude, datum.latitude], decimals.DEGREES))
     return (
         f"<Placemark><name>datum</name><ExtendedData>{_data('layer', 'location')}{data}</ExtendedData>"
         f"<Point><coordinates>{at}</coordinates></Point></Placemark>\n"
@@ -382,7 +383,7 @@ def _local_texts(part: Features) -> list[str]:
     if not len(indices):
         return out
     geometry = part.geometry[indices]
-    texts = _coordinate_texts(geometry, _text.METRES, _bracket, ",")
+    texts = _coordinate_texts(geometry, decimals.METRES, _bracket, ",")
     for n, k in enumerate(indices.tolist()):
         shape, lists = texts.shape[n], texts.texts_of(n)
         if shape == "P":
@@ -403,7 +404,7 @@ def _overlays(
 ) -> tuple[list[str], dict[str, bytes]]:
     """Each grid and picture as a GroundOverlay at its place, with all that its image does not say, and the images."""
     out: list[str] = []
-    images: dict[str, bytes] = {}
+    image_files: dict[str, bytes] = {}
     counts: Counter[str] = Counter()
     for key, part in layers.parts.items():
         if not isinstance(part, OccupancyGrid | GeoImage):
@@ -414,15 +415,15 @@ def _overlays(
         label = key.name if key.level == GROUND else f"{key.level}-{key.name}"
         stem = re.sub(r"[^\w.-]+", "_", label).strip(".") or key.layer
         name, n = f"{stem}.png", 2
-        while name in taken or name in images:
+        while name in taken or name in image_files:
             name, n = f"{stem}-{n}.png", n + 1
-        images[name] = _png(key, part, context) if with_pictures else b""
+        image_files[name] = _png(key, part, context) if with_pictures else b""
         out.append(_overlay(key, part, name, corners))
         counts[key.layer] += 1
     for layer, count in sorted(counts.items() if not with_pictures else ()):
         why = "their images travel in KMZ, or beside the KML with pictures=true; without them it tells where they lie"
         context.drop(layer, count, why)
-    return out, images if with_pictures else {}
+    return out, image_files if with_pictures else {}
 
 
 def _corners(
@@ -457,11 +458,11 @@ def _corners(
 
 def _png(key: PartKey, part: OccupancyGrid | GeoImage, context: WriteContext) -> bytes:
     if isinstance(part, OccupancyGrid):
-        return _image.overlay_png(part)
+        return images.overlay_png(part)
     if not _is_displayable(part):
         why = "an overlay's image has 8-bit grey or colours: bands, values and palettes beyond them are drawn as shown"
         context.drop(f"imagery {key.level}/{key.name}: pixel values", 1, why)
-    return _image.encode_png(display_pixels(part))
+    return images.encode_png(display_pixels(part))
 
 
 def _is_displayable(picture: GeoImage) -> bool:
@@ -501,7 +502,7 @@ def _overlay(key: PartKey, part: OccupancyGrid | GeoImage, href: str, ring: NDAr
         )
     data = _place_members(key) + "".join(_data(n, v) for n, v in parameters.items())
     box = zip(("north", "south", "east", "west", "rotation"), (north, south, east, west, turn), strict=True)
-    sides_text = "".join(f"<{n}>{_text.number(v, _text.DEGREES)}</{n}>" for n, v in box if n != "rotation" or v)
+    sides_text = "".join(f"<{n}>{decimals.number(v, decimals.DEGREES)}</{n}>" for n, v in box if n != "rotation" or v)
     quad = _degrees(shapely.linestrings(ring[None])).texts[0]
     return (
         f"<GroundOverlay><name>{escape(key.name)}</name><ExtendedData>{data}</ExtendedData>"
@@ -750,7 +751,7 @@ def _move_overlay(element: etree._Element, geometry: Any, lists: list[str]) -> s
         quad = f'<gx:LatLonQuad xmlns:gx="{GX}"><coordinates>{" ".join(corners)}</coordinates></gx:LatLonQuad>'
         element.append(etree.fromstring(quad))
     elif not geometry.is_empty:
-        box = zip(("west", "south", "east", "north"), _text.numbers(geometry.bounds, _text.DEGREES), strict=True)
+        box = zip(("west", "south", "east", "north"), decimals.numbers(geometry.bounds, decimals.DEGREES), strict=True)
         namespace = etree.QName(element).namespace
         declared = f' xmlns="{namespace}"' if namespace else ""
         sides = "".join(f"<{n}>{v}</{n}>" for n, v in box)

@@ -7,10 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from app.errors import Problem, UnreadableFile
-from app.formats import ReadContext, WriteContext, _yaml
+from app.formats import ReadContext, WriteContext
 from app.model import masks
 from app.model.grid import UNKNOWN, OccupancyGrid
 from app.model.masks import KEEPOUT, SPEED_METRES, SPEED_PERCENT, FilterInfo
+from app.syntax import yaml
 
 SUFFIX = "_filter_info"
 
@@ -37,7 +38,7 @@ def read(file: str, data: bytes, context: ReadContext) -> dict[str, Any]:
     Raises UnreadableFile where the parameters are of the wrong type.
     """
     try:
-        document = _yaml.load(data, context.limits)
+        document = yaml.load(data, context.limits)
     except UnreadableFile as error:
         raise UnreadableFile(
             f"{file}: {error.detail}",
@@ -109,4 +110,4 @@ def write(grid: OccupancyGrid, stem: str, context: WriteContext) -> dict[str, by
     kind = next(masks.servers(document)).get("type", KEEPOUT)
     if kind in (SPEED_PERCENT, SPEED_METRES) and bool((grid.cells == UNKNOWN).any()):
         context.warn("a speed mask with unknown cells: Nav2 takes them for errors", file=f"{stem}.yaml")
-    return {file: _yaml.mapping(document, 0).encode()}
+    return {file: yaml.mapping(document, 0).encode()}

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from app.errors import Problem
-from app.formats import Files, _yaml
+from app.formats import Files
 from app.formats._rules import (
     LIMITS,
     MAX_WHOLE_YAML_BYTES,
@@ -22,6 +22,7 @@ from app.formats._rules import (
     shown,
     warning_finding,
 )
+from app.syntax import yaml
 
 PREFIX = "tag:fawkesrobotics.org,navgraph/"
 OURS = (PREFIX, "!")
@@ -37,7 +38,7 @@ def check(files: Files) -> Iterator[Problem]:
     if len(files[main]) > MAX_WHOLE_YAML_BYTES:
         yield warning_finding(f"not checked: it is larger than {MAX_WHOLE_YAML_BYTES} bytes", main)
         return
-    top = _yaml.load(files[main], LIMITS, tags=OURS, typed=False)
+    top = yaml.load(files[main], LIMITS, tags=OURS, typed=False)
     if not isinstance(top, dict):
         yield error_finding("a graph is a mapping", main)
         return
@@ -78,7 +79,7 @@ def check(files: Files) -> Iterator[Problem]:
 
 
 def _split_tag(item: Any) -> tuple[str, Any]:
-    return (item.tag, item.value) if isinstance(item, _yaml.Tagged) else ("", item)
+    return (item.tag, item.value) if isinstance(item, yaml.Tagged) else ("", item)
 
 
 def _properties(properties: Any, main: str, location: str) -> Iterator[Problem]:

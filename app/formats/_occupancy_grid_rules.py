@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 
 from app.errors import BadUpload, Problem
-from app.formats import Files, Limits, _image, _yaml
+from app.formats import Files
 from app.formats._rules import LIMITS, cpp_bool, cpp_number, error_finding, shown, warning_finding
+from app.limits import Limits
+from app.syntax import images, yaml
 
 REQUIRED = ("image", "resolution", "origin", "free_thresh", "occupied_thresh", "negate")
 MODES = ("trinary", "scale", "raw")
@@ -33,10 +35,10 @@ _YAML = Limits(yaml_nodes=10_000)
 
 def check(files: Files) -> Iterator[Problem]:
     """A YAML as map_server reads it, and its picture's header. A picture alone has no rules."""
-    main = next((n for n in files if _image.detect_kind(files[n]) is None), None)
+    main = next((n for n in files if images.detect_kind(files[n]) is None), None)
     if main is None:
         return
-    members = _yaml.load(files[main], _YAML, typed=False)
+    members = yaml.load(files[main], _YAML, typed=False)
     if not isinstance(members, dict):
         yield error_finding("a map's YAML is a mapping", main)
         return
@@ -117,14 +119,14 @@ def _picture(
         )
         return
     data = files[name]
-    kind = _image.detect_kind(data)
+    kind = images.detect_kind(data)
     if kind is None:
         yield warning_finding(
             "neither PGM, PNG, BMP nor JPEG: whether map_server reads it depends on its GraphicsMagick", name
         )
         return
     try:
-        width, height = _image.read_size(data, LIMITS)
+        width, height = images.read_size(data, LIMITS)
     except BadUpload as error:
         yield error_finding(error.detail, name)
         return
@@ -162,7 +164,7 @@ def _greys(
         pixels: bytes = data[-count:]
     elif count <= DECODED:
         try:
-            pixels = _image.read_grey(data, LIMITS).pixels()[0].tobytes()
+            pixels = images.read_grey(data, LIMITS).pixels()[0].tobytes()
         except BadUpload as error:
             yield error_finding(error.detail, name)
             return

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from app.errors import Problem
-from app.formats import Files, _yaml
+from app.formats import Files
 from app.formats._rules import (
     LIMITS,
     MAX_WHOLE_YAML_BYTES,
@@ -27,6 +27,7 @@ from app.formats._rules import (
     shown,
     warning_finding,
 )
+from app.syntax import yaml
 
 SYSTEMS = ("reference_image", "web_mercator", "cartesian_meters", "wgs84")
 KINDS: Mapping[int, type | tuple[type, ...]] = {1: (str, int, float), 2: int, 3: (int, float), 4: bool}
@@ -47,7 +48,7 @@ def check(files: Files) -> Iterator[Problem]:
     if len(files[main]) > MAX_WHOLE_YAML_BYTES:
         yield warning_finding(f"not checked: it is larger than {MAX_WHOLE_YAML_BYTES} bytes", main)
         return
-    top = _yaml.load(files[main], LIMITS)
+    top = yaml.load(files[main], LIMITS)
     if not isinstance(top, dict):
         yield error_finding("a building is a mapping", main)
         return

@@ -23,8 +23,9 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Limits, _xml
+from app.limits import Limits
 from app.model.features import shared_key_dict
+from app.syntax import xml
 
 Attributes = dict[str, str]
 Tags = dict[str, str]
@@ -100,7 +101,7 @@ def parse(data: bytes, limits: Limits, *, highways_only: bool = False) -> Data:
         return _pbf(data, limits)
     if not data.strip():
         raise UnreadableFile("the file is empty", [Problem("empty file", line=1)])
-    _xml.check_prolog(data)
+    xml.check_prolog(data)
     return _scan(data, limits, highways_only) or _events(data, limits)
 
 
@@ -476,7 +477,7 @@ class _StrictParser:
             _raise_unreadable(f"<{element.tag}> is no element of an OSM file", element)
 
     def attributes(self, element: etree._Element) -> Attributes:
-        out = _xml.attributes(element)
+        out = xml.attributes(element)
         limit = self.limits.xml_attribute_bytes
         if any(len(v) > limit for v in out.values()):
             _raise_unreadable(f"an attribute is longer than {limit} characters", element)

@@ -16,8 +16,9 @@ from itertools import pairwise
 from lxml import etree
 
 from app.errors import Problem
-from app.formats import Files, _osm, _xml
+from app.formats import Files, _osm
 from app.formats._rules import HEAD_BYTES, LIMITS, duplicates, error_finding, is_brief, names, warning_finding
+from app.syntax import xml
 
 KINDS = ("node", "way", "relation")
 MAX_WAY_NODES = 2000
@@ -33,7 +34,7 @@ def check(files: Files) -> Iterator[Problem]:
         if not re.search(rb"""<osm\b[^>]*\bversion=["']0\.6["']""", files[main][:HEAD_BYTES]):
             yield error_finding("must be 0.6", main, where="version")
         return
-    root = _xml.parse(_osm.unpack(files[main], LIMITS), LIMITS)
+    root = xml.parse(_osm.unpack(files[main], LIMITS), LIMITS)
     if root.tag not in ("osm", "osmChange"):
         yield error_finding(f"the root is <{root.tag}>, not <osm>", main, line=root.sourceline)
         return

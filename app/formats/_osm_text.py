@@ -13,7 +13,7 @@ from io import BytesIO
 from typing import Any
 
 from app.formats._osm import INT64, MAX_UNKNOWN_DEPTH
-from app.formats._text import DEGREES, numbers
+from app.syntax.decimals import DEGREES, numbers
 
 MAX_CACHED_ATTRIBUTES = 4096
 """Mappings of attributes whose text is kept for the next element."""

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from app.errors import TooLarge
 from app.formats import ReadContext
-from app.formats._lzf import expand, squeeze
 from app.formats._points import IDENTITY_VIEWPOINT, RGB, Cloud, check_columns, check_count, table, unreadable_error
+from app.syntax.lzf import expand, squeeze
 
 Data = Literal["ascii", "binary", "binary_compressed"]
 KINDS: tuple[Data, ...] = get_args(Data)

@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Limits, Parts, ReadContext, WriteContext
+from app.formats import Files, Parts, ReadContext, WriteContext
 from app.formats._select import file_stem, select_part
+from app.limits import Limits
 from app.model.frame import MAX_DATUM_LATITUDE, Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.layers import MAP, Layers, Part, PartKey, Resources, cloud_name

@@ -17,12 +17,13 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import WriteContext, _yaml
+from app.formats import WriteContext
 from app.formats._network import natural_sort_key
 from app.model.features import Features, Properties
 from app.model.frame import MAX_METRES
 from app.model.layers import Layers
 from app.parameters import parameter
+from app.syntax import yaml
 
 BUILDING, NAV_GRAPH = "openrmf", "rmf_nav_graph"
 """The families: under these names stands what only a building or a navigation graph knows of an item."""
@@ -66,7 +67,7 @@ def number(value: Any, location: str) -> float:
     """A number of usual size, also one in quotes."""
     if isinstance(value, str):
         try:
-            value = _yaml.scalar(value)
+            value = yaml.scalar(value)
         except ValueError:
             value = None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -306,9 +307,9 @@ class Flow:
             if text is None:
                 if len(self._cache) >= self.MAX_CACHED:
                     self._cache.clear()
-                text = "{" + ", ".join(f"{_yaml.text(k)}: {self(value[k])}" for k in sorted(value)) + "}"
+                text = "{" + ", ".join(f"{yaml.text(k)}: {self(value[k])}" for k in sorted(value)) + "}"
                 self._cache[key] = text
             return text
         if isinstance(value, (list, tuple)):
             return "[" + ", ".join(map(self, value)) + "]"
-        return _yaml.text(value)
+        return yaml.text(value)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from app.errors import Problem
-from app.formats import Files, _yaml
+from app.formats import Files
 from app.formats._rules import (
     LIMITS,
     MAX_WHOLE_YAML_BYTES,
@@ -24,6 +24,7 @@ from app.formats._rules import (
     shown,
     warning_finding,
 )
+from app.syntax import yaml
 
 CONSTRAINTS = ("forward", "backward")
 
@@ -38,7 +39,7 @@ def check(files: Files) -> Iterator[Problem]:
         if len(data) > MAX_WHOLE_YAML_BYTES:
             yield warning_finding(f"not checked: it is larger than {MAX_WHOLE_YAML_BYTES} bytes", name)
             continue
-        yield from _graph(_yaml.load(data, LIMITS), name)
+        yield from _graph(yaml.load(data, LIMITS), name)
 
 
 def _graph(top: Any, main: str) -> Iterator[Problem]:

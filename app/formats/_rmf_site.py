@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import orjson
 
-from app.formats import _ron
 from app.formats._network import number
 from app.formats._rmf import CABIN_HEIGHT, mapping, parameter_value, raise_unreadable
 from app.model.frame import MAX_METRES
+from app.syntax import ron
 
 NAME = "rmf_site"
 VERSION = "0.1"
@@ -76,7 +76,7 @@ ORDER = {
 
 _SIDES = frozenset({"Left", "Right"})
 _GRAPHS = frozenset({"All"})
-SHAPE = _ron.Shape(
+SHAPE = ron.Shape(
     tuples=frozenset(
         {
             *("trans", "euler_xyz", "quat", "Translate2D", "color", "reference_anchors", "anchor", "scale"),

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from app.errors import Problem
-from app.formats import Files, _json, _ron
+from app.formats import Files
 from app.formats._rules import (
     LIMITS,
     duplicates,
@@ -22,6 +22,7 @@ from app.formats._rules import (
     shown,
     warning_finding,
 )
+from app.syntax import json, ron
 
 REQUIRED: Mapping[str, tuple[str, ...]] = {
     "doors": ("anchors", "name", "kind"),
@@ -40,7 +41,7 @@ def check(files: Files) -> Iterator[Problem]:
     main = next(iter(files))
     if is_brief(files[main]):
         return
-    top = _ron.load(files[main], LIMITS) if main.endswith(".ron") else _json.load(files[main], LIMITS)
+    top = ron.load(files[main], LIMITS) if main.endswith(".ron") else json.load(files[main], LIMITS)
     if not isinstance(top, dict):
         yield error_finding("a site is a mapping", main)
         return

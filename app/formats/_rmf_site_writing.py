@@ -18,7 +18,7 @@ import orjson
 import shapely
 
 from app.errors import MissingLayer
-from app.formats import WriteContext, _rmf, _rmf_site, _ron
+from app.formats import WriteContext, _rmf, _rmf_site
 from app.formats._network import get_source_properties
 from app.formats._rmf import BUILDING, NAV_GRAPH, Storey, mapping, parameter_value
 from app.formats._rmf_images import find_stored_image
@@ -26,6 +26,7 @@ from app.formats._rmf_site import NAME, SAME_METRES, VERSION, Cabin, metres, pla
 from app.model.features import Features, Properties
 from app.model.layers import Layers, Resources
 from app.parameters import parameter
+from app.syntax import ron
 
 FILE, FILE_RON = "map.site.json", "map.site.ron"
 ZOOM = 15
@@ -62,7 +63,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     writer = _Writer(layers, context, storeys)
     site = _rmf_site.sort_members(writer.site())
     if writer.options.encoding == "ron":
-        main = {FILE_RON: _ron.dump(site, _rmf_site.SHAPE)}
+        main = {FILE_RON: ron.dump(site, _rmf_site.SHAPE)}
     else:
         main = {FILE: orjson.dumps(site, option=orjson.OPT_INDENT_2 | orjson.OPT_APPEND_NEWLINE)}
     return {**main, **dict(sorted(writer.used.items()))}

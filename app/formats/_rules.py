@@ -9,7 +9,8 @@ from collections.abc import Iterable
 from typing import Any, TypeGuard
 
 from app.errors import Problem
-from app.formats import JUST_WRITTEN, Limits
+from app.formats import JUST_WRITTEN
+from app.limits import Limits
 
 LIMITS = Limits()
 """A check reads what is served, or files that the user of a command line has: within the usual bounds."""

@@ -26,10 +26,12 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Files, Limits, ReadContext, _fields, _xml
-from app.formats._text import number
+from app.formats import Files, ReadContext, _fields
+from app.limits import Limits
 from app.model.frame import MAX_METRES
 from app.model.solids import matrix
+from app.syntax import xml
+from app.syntax.decimals import number
 
 Matrix = NDArray[np.float64]
 
@@ -104,7 +106,7 @@ def element_path(element: etree._Element) -> str:
 
 def parse(data: bytes, limits: Limits) -> etree._Element:
     """The ``<sdf>`` element without comments and indentation."""
-    root = _xml.parse(data, limits, remove_blank_text=True)
+    root = xml.parse(data, limits, remove_blank_text=True)
     if root.tag != "sdf":
         raise unreadable_error(f"the root element must be <sdf>, it is <{str(root.tag)[:80]}>", root)
     return root
@@ -205,7 +207,7 @@ def parse_pose(parent: etree._Element) -> Pose | None:
     if element is None:
         return None
     values = numbers(element_text(element), element)
-    attributes = {k: v for k, v in _xml.attributes(element).items() if v and k != "degrees"}
+    attributes = {k: v for k, v in xml.attributes(element).items() if v and k != "degrees"}
     if element.get("rotation_format") == "quat_xyzw":
         if len(values) not in (0, 7):
             raise unreadable_error(f"a pose with a quaternion must have 7 numbers, it has {len(values)}", element)

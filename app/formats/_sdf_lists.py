@@ -22,9 +22,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import ReadContext, _sdf, _yaml
+from app.formats import ReadContext, _sdf
 from app.model.frame import MAX_METRES, is_writable
 from app.model.solids import matrix
+from app.syntax import yaml
 
 NAMESPACE = "gazebo"
 
@@ -104,7 +105,7 @@ class ParsedList:
 
 def read(library: _sdf.Library, main: str, context: ReadContext) -> ParsedList:
     """A list with all it refers to. Raises UnreadableFile or TooLarge."""
-    data = _yaml.load(library.files[main], context.limits)
+    data = yaml.load(library.files[main], context.limits)
     reader = _Reader(library, main, context)
     if isinstance(data, Mapping) and "components" in data:
         reader.components(data["components"])
@@ -236,7 +237,7 @@ class _Reader:
                 f"custom object {reference} includes itself, or is nested more than {MAX_NESTED_OBJECTS} deep", location
             )
         if path not in self._lists:
-            document = _yaml.load(self.library.files[path], self.context.limits)
+            document = yaml.load(self.library.files[path], self.context.limits)
             self._lists[path] = _list(document.get("components") if isinstance(document, Mapping) else None, path)
         for k, item in enumerate(self._lists[path]):
             item_location = f"{reference}: components[{k}]"

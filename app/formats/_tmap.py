@@ -32,13 +32,14 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, ReadContext, WriteContext, _fields, _yaml, all_formats
+from app.formats import Files, ReadContext, WriteContext, _fields, all_formats
 from app.formats._fields import ANY, COORDINATE, NOT_NEGATIVE, POINT, SPEED, WIDTH, Number, Quaternion, Text, record
-from app.formats._text import METRES, encode_pieces, numbers
 from app.model.features import Features, Properties, from_columns, points, unique_ids
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, PartKey
 from app.parameters import parameter
+from app.syntax import yaml
+from app.syntax.decimals import METRES, encode_pieces, numbers
 
 NAME = "tmap2"
 LAST_UPDATED = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}_[0-9]{2}-[0-9]{2}-[0-9]{2}\Z")
@@ -198,7 +199,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     """
     if not (context.wants("topology") or context.wants("objects")):
         return Layers()
-    top = _yaml.load(files[context.main or next(iter(files))], context.limits)
+    top = yaml.load(files[context.main or next(iter(files))], context.limits)
     legacy = isinstance(top, list)
     entries, document = _top(top, context)
     nodes = [_entry(entry, k) for k, entry in enumerate(entries)]
@@ -310,7 +311,7 @@ def _name(raw_name: Any, k: int, context: ReadContext) -> str:
                 f"{location}: a node must have a name", [Problem("a node must have a name", where=location)]
             )
         context.warn(f"the name {raw_name!r} is no text; it is served as one", where=location)
-        name = _yaml.text(raw_name)
+        name = yaml.text(raw_name)
     if not 0 < len(name) <= MAX_NAME or (
         not name.isprintable() and any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in name)
     ):
@@ -359,12 +360,12 @@ def _edges(
         for edge in node.get("edges") or ():
             to = edge.get("node")
             if not isinstance(to, str) and to is not None and not isinstance(to, (dict, list)):
-                to = _yaml.text(to)
+                to = yaml.text(to)
             target = index_by_name.get(to) if isinstance(to, str) else None
             edge_id = edge.get("edge_id")
             if not isinstance(edge_id, str):
                 edge_id = (
-                    f"{names[k]}_{to}" if edge_id is None or isinstance(edge_id, (dict, list)) else _yaml.text(edge_id)
+                    f"{names[k]}_{to}" if edge_id is None or isinstance(edge_id, (dict, list)) else yaml.text(edge_id)
                 )
             if target is None:
                 dangling.setdefault(k, []).append(edge)
@@ -426,7 +427,7 @@ def _numbers(rows: Sequence[tuple[Any, ...]], width: int, names: Sequence[str], 
 
 def _number(value: Any, location: str) -> float:
     try:
-        number = _yaml.scalar(value) if isinstance(value, str) else value
+        number = yaml.scalar(value) if isinstance(value, str) else value
     except ValueError:
         number = None
     if isinstance(number, bool) or not isinstance(number, (int, float)):
@@ -646,7 +647,7 @@ class _Writer:
                 document[key] = title
                 self.context.fill(key, title, "no source names it")
             elif not isinstance(value, str):
-                document[key] = _yaml.text(value)
+                document[key] = yaml.text(value)
                 self.context.warn(f"the source's {key} is no text; {document[key]!r} is written", where=key)
         if self.options.pointset is not None:
             document["name"] = document["pointset"] = self.options.pointset
@@ -695,7 +696,7 @@ class _Writer:
         kinds = [p.get("kind") for p in part.properties]
         places = [k for k, point in enumerate(is_point.tolist()) if point and kinds[k] == "node"]
         names = self._names(part, places, taken)
-        name_texts = {i: _yaml.text(name) for i, name in names.items()}
+        name_texts = {i: yaml.text(name) for i, name in names.items()}
         edges = self._edges(part, kinds, name_texts)
         coordinates = self._positions(part, places, 0.0 if level == GROUND else self.layers.elevation(level))
         out = []
@@ -755,10 +756,10 @@ class _Writer:
             if not (kind == "edge" and isinstance(source, str) and isinstance(target, str) and source in name_texts):
                 dropped_count += kind != "node"
                 continue
-            to = name_texts.get(target) or _yaml.text(target)
+            to = name_texts.get(target) or yaml.text(target)
             if self._is_plain(p, self.plain_edge) and "action" not in p:
                 plain += 1
-                text = f"{a} {_yaml.text(i)}\n{b} {to}\n{c}"
+                text = f"{a} {yaml.text(i)}\n{b} {to}\n{c}"
             else:
                 i, text = self._edge(p, i, to)  # noqa: PLW2901  by the id that is written: read again, the order stays
             edges[source].append((len(i), i, text))
@@ -775,7 +776,7 @@ class _Writer:
         if self.turn is not None:
             inside = [k for k, p in enumerate(nodes.properties) if self._is_in_child_frame(p)]
             xyz[inside] = (xyz[inside] - self.turn.shift) @ self.turn.matrix()
-        texts = list(map(_yaml.decimal, numbers(xyz.ravel(), METRES)))
+        texts = list(map(yaml.decimal, numbers(xyz.ravel(), METRES)))
         return list(zip(texts[::3], texts[1::3], texts[2::3], strict=True))
 
     def _is_in_child_frame(self, p: Properties) -> bool:
@@ -799,7 +800,7 @@ class _Writer:
         pieces = self.templates.get(key)
         if pieces is None:
             pieces = self.templates[key] = self._edge_template(extra_members, action, more, fill=fill)
-        return i, f"{pieces[0]} {_yaml.text(i)}\n{pieces[1]} {target}\n{pieces[2]}"
+        return i, f"{pieces[0]} {yaml.text(i)}\n{pieces[1]} {target}\n{pieces[2]}"
 
     def _edge_template(
         self, extra_members: Mapping[str, Any], action: Any, more: dict[str, Any] | None, *, fill: bool
@@ -885,7 +886,7 @@ class _Writer:
                 extra_members, node, more, has_yaw=quaternion is not None, fill=fill
             )
         meta = extra_members.get("meta")
-        called = _yaml.text(str(meta["node"])) if isinstance(meta, dict) and "node" in meta else name_text
+        called = yaml.text(str(meta["node"])) if isinstance(meta, dict) and "node" in meta else name_text
         pose = self._pose(node.get("pose"), at, quaternion or [0.0, 0.0, 0.0, 1.0], turned=self._is_in_child_frame(p))
         return (
             f"{pieces[0]} {called}\n{pieces[1]}{_list_text(edges)}{pieces[2]} {name_text}\n{pieces[3]}{pose}{pieces[4]}"
@@ -899,8 +900,8 @@ class _Writer:
         if isinstance(extra, dict):
             position = {**dict(zip("xyz", map(float, at), strict=True)), **_mapping_text(extra.get("position"))}
             orientation = {**dict(zip("xyzw", quaternion, strict=True)), **_mapping_text(extra.get("orientation"))}
-            return _yaml.block({**extra, "orientation": orientation, "position": position}, 4)
-        ox, oy, oz, ow = map(_yaml.text, quaternion)
+            return yaml.block({**extra, "orientation": orientation, "position": position}, 4)
+        ox, oy, oz, ow = map(yaml.text, quaternion)
         return (
             f"\n      orientation:\n        w: {ow}\n        x: {ox}\n        y: {oy}\n        z: {oz}\n"
             f"      position:\n        x: {at[0]}\n        y: {at[1]}\n        z: {at[2]}\n"
@@ -1021,7 +1022,7 @@ def _dangling(edge: Mapping[str, Any], name: str) -> tuple[int, str, str]:
         if edge_id is None
         else str(edge_id)
     )
-    return len(i), i, f"    - {_yaml.mapping({**edge, 'edge_id': i}, 6)[6:]}"
+    return len(i), i, f"    - {yaml.mapping({**edge, 'edge_id': i}, 6)[6:]}"
 
 
 def _split(values: Mapping[str, Any], column: int, *holes: str) -> list[str]:
@@ -1033,11 +1034,11 @@ def _split(values: Mapping[str, Any], column: int, *holes: str) -> list[str]:
     part: dict[str, Any] = {}
     for key in sorted(values):
         if key in holes:
-            pieces.append(f"{_yaml.mapping(part, column) if part else ''}{' ' * column}{key}:")
+            pieces.append(f"{yaml.mapping(part, column) if part else ''}{' ' * column}{key}:")
             part = {}
         else:
             part[key] = values[key]
-    return [*pieces, _yaml.mapping(part, column) if part else ""]
+    return [*pieces, yaml.mapping(part, column) if part else ""]
 
 
 # --- telling ---------------------------------------------------------------------------------------------------------

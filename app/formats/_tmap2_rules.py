@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from app.errors import Problem
-from app.formats import Files, _yaml
+from app.formats import Files
 from app.formats._rules import (
     HEAD_BYTES,
     LIMITS,
@@ -26,6 +26,7 @@ from app.formats._rules import (
     shown,
     warning_finding,
 )
+from app.syntax import yaml
 
 TOP = ("meta", "metric_map", "name", "nodes", "pointset")
 META = ("map", "node", "pointset")
@@ -60,7 +61,7 @@ def check(files: Files) -> Iterator[Problem]:
     network = _regular(data)
     if network is None:
         network = ([], [])
-        yield from _check_document(_yaml.load(data, LIMITS), main, *network)
+        yield from _check_document(yaml.load(data, LIMITS), main, *network)
     yield from _network(*network, main)
 
 

@@ -23,25 +23,16 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import (
-    Files,
-    Format,
-    LayerRequirements,
-    ReadContext,
-    WriteContext,
-    _datum_rules,
-    _fields,
-    _yaml,
-    register,
-)
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _datum_rules, _fields, register
 from app.formats._fields import ANGLE, COORDINATE, LATITUDE, LONGITUDE, Number, OneOf, record
-from app.formats._text import DEGREES
 from app.model.features import Features, features
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
 from app.model.geodesy import distance
 from app.model.grid import OccupancyGrid
 from app.model.layers import SITE, Layers, PartKey
 from app.parameters import parameter
+from app.syntax import yaml
+from app.syntax.decimals import DEGREES
 
 NAME = "datum"
 FENCE = "fence"
@@ -128,7 +119,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
     All other keys are kept in the collection's document. Raises UnreadableFile with the key that is wrong.
     """
-    top = _yaml.load(files[context.main or next(iter(files))], context.limits)
+    top = yaml.load(files[context.main or next(iter(files))], context.limits)
     if not isinstance(top, dict):
         raise _unreadable_error("must be a mapping with datum_latitude and datum_longitude", "")
     for key in ("gmapping", "mapviz_initialize_origin", "navsat_transform_node"):
@@ -178,7 +169,7 @@ def _number(value: Any, location: str) -> float:
     """A finite number, also one in quotes."""
     if isinstance(value, str):
         try:
-            value = _yaml.scalar(value)
+            value = yaml.scalar(value)
         except ValueError:
             value = None
     if value is None or isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -254,21 +245,21 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if datum is None or frame is None:
         raise ValueError("a datum is needed")
     fence, document, closed = _select_fence(layers, context)
-    latitude, longitude = _yaml.text(datum.latitude), _yaml.text(datum.longitude)
+    latitude, longitude = yaml.text(datum.latitude), yaml.text(datum.longitude)
     out = [HEAD, f"datum_latitude: {latitude}\ndatum_longitude: {longitude}\n"]
     if datum.altitude:
-        out.append(f"datum_altitude: {_yaml.text(datum.altitude)}\n")
+        out.append(f"datum_altitude: {yaml.text(datum.altitude)}\n")
     out.append(FENCE_HEAD)
     ring = None if fence is None else shapely.get_coordinates(fence.exterior)
     if ring is None:
         context.warn("the environment has no fence: gnss_fence_coords is empty", where="gnss_fence.gnss_fence_coords")
         pairs = []
     else:
-        pairs = [f"[{_yaml.text(y)}, {_yaml.text(x)}]" for x, y in (ring if closed else ring[:-1]).tolist()]
+        pairs = [f"[{yaml.text(y)}, {yaml.text(x)}]" for x, y in (ring if closed else ring[:-1]).tolist()]
     out.append(f"gnss_fence:\n  gnss_fence_coords: [{', '.join(pairs)}]\n")
     more_fence = document.pop("gnss_fence", None)
     if isinstance(more_fence, dict) and more_fence:
-        out.append(_yaml.mapping(more_fence, 2))
+        out.append(yaml.mapping(more_fence, 2))
     out.append(f"{SIZE_HEAD}gmapping:\n")
     out.append(_mapping_text(_size(document, layers, ring, context), 2, ("xmin", "xmax", "ymin", "ymax")))
     old = (document.get("datum_latitude"), document.get("datum_longitude"))
@@ -276,7 +267,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     out.append("\nnavsat_transform_node:\n" + _navsat(document, datum, context))
     extra_members = {key: value for key, value in document.items() if key not in _KNOWN}
     if extra_members:
-        out.append("\n" + _yaml.mapping(extra_members, 0))
+        out.append("\n" + yaml.mapping(extra_members, 0))
     return {"datum.yaml": "".join(out).encode()}
 
 
@@ -374,14 +365,14 @@ def _mapviz(document: Mapping[str, Any], datum: Datum, old: tuple[Any, Any], con
         old = (None, None)
     origins = mapviz.get("local_xy_origins") if isinstance(mapviz, dict) else None
     if not isinstance(mapviz, dict) or not isinstance(origins, list):
-        return _yaml.block(mapviz, 0)
+        return yaml.block(mapviz, 0)
     moved = []
     for origin in origins:
         if isinstance(origin, dict) and (origin.get("latitude"), origin.get("longitude")) == old:
             moved.append({**origin, "latitude": datum.latitude, "longitude": datum.longitude})
         else:
             moved.append(origin)
-    return _yaml.block({**mapviz, "local_xy_origins": moved}, 0)
+    return yaml.block({**mapviz, "local_xy_origins": moved}, 0)
 
 
 def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) -> str:
@@ -398,15 +389,15 @@ def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) ->
     # The source's own yaw where it says the same: it may be several turns, and has digits that degrees would lose.
     if isinstance(yaw, bool) or not isinstance(yaw, (int, float)) or _heading(yaw) != datum.heading:
         yaw = -math.radians(datum.heading) + 0.0
-    values = [_yaml.text(datum.latitude), _yaml.text(datum.longitude), *map(_yaml.text, [yaw, *more])]
+    values = [yaml.text(datum.latitude), yaml.text(datum.longitude), *map(yaml.text, [yaw, *more])]
     return _mapping_text({**defaults, **navsat}, 2, NAVSAT) + f"  datum: [{', '.join(values)}]\n"
 
 
 def _mapping_text(values: Mapping[str, Any], column: int, first: Sequence[str]) -> str:
     """A mapping's text: these keys in this order, then the others sorted."""
-    out = [_yaml.mapping({key: values[key]}, column) for key in first if key in values]
+    out = [yaml.mapping({key: values[key]}, column) for key in first if key in values]
     extra_members = {key: value for key, value in values.items() if key not in first}
-    return "".join(out) + (_yaml.mapping(extra_members, column) if extra_members else "")
+    return "".join(out) + (yaml.mapping(extra_members, column) if extra_members else "")
 
 
 _KEY = re.compile(rb"(?m)^datum_latitude\s*:")

@@ -6,7 +6,7 @@ world, points of interest and all other objects, ``config/properties.sh`` what t
 ``config/environment.sh`` where its files are. Source: LCAS/environment_template, releases v1.0.x and older.
 
 Robots source the two scripts, so they are made anew and never copied: literal variables of an upload come back through
-``_shell.exports``, and the variables that name files are worked out by the script from where it lies, for the files
+``shell.exports``, and the variables that name files are worked out by the script from where it lies, for the files
 that are there; as in the template those of maps that are missing are empty. The archive holds what is stored;
 ``complete`` adds what derivations can make of it.
 
@@ -27,25 +27,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.errors import CannotConvert, FleetMapError, MissingLayer, Problem, UnreadableFile
-from app.formats import (
-    Files,
-    Format,
-    LayerRequirements,
-    Limits,
-    NestedMap,
-    ReadContext,
-    WriteContext,
-    _archive,
-    _content,
-    _shell,
-    register,
-)
+from app.formats import Files, Format, LayerRequirements, NestedMap, ReadContext, WriteContext, _content, register
 from app.formats._network import shorten_list
+from app.limits import Limits
 from app.model.features import Features
 from app.model.frame import GROUND, Level
 from app.model.layers import LAYERS, MAP, NETWORK, Layer, Layers, Part, PartKey, cloud_name, is_empty
 from app.model.voxels import VoxelMap
 from app.parameters import parameter
+from app.syntax import archives, shell
 
 NAME = "environment"
 MAIN = "environment.zip"
@@ -79,7 +69,7 @@ class WriteOptions:
 
 def detect(name: str, data: bytes) -> bool:
     """An archive with one of the template's folders in it."""
-    if name.lower().endswith(".kmz") or not _archive.is_archive(data):
+    if name.lower().endswith(".kmz") or not archives.is_archive(data):
         return False
     return any(folder in data for folder in _FOLDER_NAMES)
 
@@ -89,7 +79,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if context.folder is None:
         reason = "an environment package inside another one is not opened: upload it by itself"
         raise UnreadableFile(reason, [Problem(reason)])
-    members = _archive.unpack(files[context.main or next(iter(files))], context.limits)
+    members = archives.unpack(files[context.main or next(iter(files))], context.limits)
     if not members:
         raise UnreadableFile("the archive is empty", [Problem("the archive is empty")])
     return context.folder(members)
@@ -100,7 +90,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``environment.zip``. Raises MissingLayer where there is nothing to put into it."""
-    return {MAIN: _archive.pack(_Writer(layers, context).files())}
+    return {MAIN: archives.pack(_Writer(layers, context).files())}
 
 
 class _Writer:
@@ -414,7 +404,7 @@ class _Writer:
             stored = part.document.get(NAME) if key.name == NAME else None
             values = stored.get("variables") if isinstance(stored, Mapping) else None
             all_variables |= values if isinstance(values, Mapping) else {}
-        out, file_names, reasons = _shell.exported_variables(all_variables)
+        out, file_names, reasons = shell.exported_variables(all_variables)
         self.context.drop(
             "variables that name files",
             len(file_names),
@@ -428,10 +418,10 @@ class _Writer:
         properties = {n: v for n, v in variables.items() if n != RELEASE}
         release = {n: v for n, v in variables.items() if n == RELEASE}
         head = b"# What this environment is called. Sourced by environment.sh.\n"
-        self.out["properties.sh"] = head + _shell.exports(properties)
+        self.out["properties.sh"] = head + shell.exports(properties)
         lines = [
             "# Where the maps of this environment are: source this file in bash.",
-            *_shell.exports(release).decode().splitlines(),
+            *shell.exports(release).decode().splitlines(),
             "",
             'CONFIG_DIR=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)',
             self.path("PROPERTIES_FILE", "properties.sh"),

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, _yaml, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, register
 from app.formats._fields import COORDINATE, WIDTH, record
 from app.formats._network import (
     Array,
@@ -38,11 +38,12 @@ from app.formats._network import (
     shorten_list,
     source_document,
 )
-from app.formats._text import METRES, numbers
 from app.formats._undirected import NODE_CANONICAL, Line, edges, lines, warn_isolated
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.frame import MAX_METRES
 from app.model.layers import NETWORK, Layers, PartKey
+from app.syntax import yaml
+from app.syntax.decimals import METRES, numbers
 
 NAME = "ffr_network"
 FILE = "network.ffr.yaml"
@@ -65,7 +66,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not context.wants("topology"):
         return Layers()
     main = context.main or next(iter(files))
-    top = _yaml.load(files[main], context.limits)
+    top = yaml.load(files[main], context.limits)
     if not isinstance(top, dict) or not isinstance(top.get(POINTS), list):
         reason = f"an FFR network is a mapping with a list of {POINTS}"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where=POINTS)])
@@ -116,7 +117,7 @@ def _points(points: Sequence[Any]) -> tuple[list[str], Array, list[bool], list[d
         name = point.get("name")
         if isinstance(name, bool) or not isinstance(name, (int, float, str)):
             raise_unreadable("a point must have a name", f"{location}.name")
-        names.append(check_name(name if isinstance(name, str) else _yaml.text(name), f"{location}.name"))
+        names.append(check_name(name if isinstance(name, str) else yaml.text(name), f"{location}.name"))
         rows.append((*_xy(point, location), number(point.get("z", 0.0), f"{location}.z")))
         high.append("z" in point)
         rests.append({key: value for key, value in point.items() if key not in ("name", *AXES)})
@@ -174,7 +175,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         context.drop("levels of nodes", len(net.nodes), "all networks are joined into one")
     document = source_document(layers, NAME)
     xy = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
-    xy_texts = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
+    xy_texts = list(map(yaml.decimal, numbers(xy.ravel(), METRES)))
     at = list(zip(xy_texts[::2], xy_texts[1::2], strict=True))
     spots = [_spot(x, y) for x, y in xy.tolist()]
     if len(set(spots)) < len(spots):
@@ -182,7 +183,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         context.warn(f"{len(spots) - len(set(spots))} {reason}")
     top = document.get("top")
     top = {key: v for key, v in top.items() if key not in (POINTS, LINES)} if isinstance(top, dict) else {}
-    out = [_yaml.mapping(top, 0)] if top else []
+    out = [yaml.mapping(top, 0)] if top else []
     out.append(f"{POINTS}:\n" if order else f"{POINTS}: []\n")
     dropped_count = unnamed = 0
     for k in order:
@@ -194,10 +195,10 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         members = {key: v for key, v in more.items() if key not in ("name", *AXES)} if isinstance(more, dict) else {}
         unnamed += isinstance(p.get("name"), str) and p["name"] not in ("", name)
         dropped_count += bool(p.keys() - NODE_CANONICAL - {NAME})
-        text = f"- name: {_yaml.text(name)}\n  x: {at[k][0]}\n  y: {at[k][1]}\n"
+        text = f"- name: {yaml.text(name)}\n  x: {at[k][0]}\n  y: {at[k][1]}\n"
         if node.z or its.get("z") is True:
-            text += f"  z: {_yaml.decimal(numbers([node.z or 0.0], METRES)[0])}\n"
-        out.append(f"{text}{_yaml.mapping(members, 2) if members else ''}")
+            text += f"  z: {yaml.decimal(numbers([node.z or 0.0], METRES)[0])}\n"
+        out.append(f"{text}{yaml.mapping(members, 2) if members else ''}")
     context.drop("attributes of nodes", dropped_count, "the format has no place for them")
     context.drop("names of nodes that are not their ids", unnamed, "a point's name is its node's id")
     ranks = {k: rank for rank, k in enumerate(order)}
@@ -205,10 +206,10 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     for line in sorted(lines(net, context, NAME), key=lambda one: (ranks[one.a], ranks[one.b])):
         ends = (_parse_end("start", line.said, at[line.a]), _parse_end("end", line.said, at[line.b]))
         extra_members = {key: value for key, value in line.said.items() if key not in ("start", "end")}
-        line_texts.append(f"- {ends[0]}  {ends[1]}{_yaml.mapping(extra_members, 2) if extra_members else ''}")
+        line_texts.append(f"- {ends[0]}  {ends[1]}{yaml.mapping(extra_members, 2) if extra_members else ''}")
     dangling = document.get("dangling")
     dangling = [one for one in dangling if isinstance(one, dict) and one] if isinstance(dangling, list) else []
-    line_texts += [f"- {_yaml.mapping(one, 2)[2:]}" for one in dangling]
+    line_texts += [f"- {yaml.mapping(one, 2)[2:]}" for one in dangling]
     out += [f"{LINES}:\n", *line_texts] if line_texts else [f"{LINES}: []\n"]
     return {FILE: "".join(out).encode()}
 
@@ -216,7 +217,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 def _parse_end(end: str, members: Mapping[str, Any], at: tuple[str, str]) -> str:
     more = members.get(end)
     extra_members = {key: value for key, value in more.items() if key not in "xy"} if isinstance(more, dict) else {}
-    return f"{end}:\n    x: {at[0]}\n    y: {at[1]}\n{_yaml.mapping(extra_members, 4) if extra_members else ''}"
+    return f"{end}:\n    x: {at[0]}\n    y: {at[1]}\n{yaml.mapping(extra_members, 4) if extra_members else ''}"
 
 
 # --- telling ---------------------------------------------------------------------------------------------------------

@@ -36,24 +36,24 @@ from app.formats import (
     Files,
     Format,
     LayerRequirements,
-    Limits,
     ReadContext,
     WriteContext,
     _sdf,
     _sdf_bodies,
     _sdf_lists,
-    _xml,
     register,
 )
 from app.formats._sdf_elements import KNOWN
 from app.formats._select import select_part
-from app.formats._text import DEGREES, number
+from app.limits import Limits
 from app.model import masks, solids, worlds
 from app.model.features import Feature, Features, features, unique_ids
 from app.model.frame import GROUND, Datum, is_writable
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey, Resources
 from app.parameters import parameter
+from app.syntax import xml
+from app.syntax.decimals import DEGREES, number
 
 NAME = "gazebo"
 MAIN = "world.sdf"
@@ -138,8 +138,8 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not _sdf.is_sdf(files[main]) and _sdf_lists.detect(main, files[main]):
         return _read_list(library, main, context)
     root = _sdf.parse(files[main], context.limits)
-    _xml.report_active_content(files[main], context, has_scripts=True)
-    _xml.report_unknown_elements(files[main], root, KNOWN, context, free={"plugin"})
+    xml.report_active_content(files[main], context.warn, has_scripts=True)
+    xml.report_unknown_elements(files[main], root, KNOWN, context.warn, free={"plugin"})
     _sdf.report_suspicious_values(root, context)
     version = _sdf.parse_version(root.get("version"))
     if version is None or not (1, 4) <= version <= _sdf.NEWEST:
@@ -616,7 +616,7 @@ class _Writer:
                 name_element.text = name
                 element.append(name_element)
         else:
-            attributes = _xml.attributes(element)
+            attributes = xml.attributes(element)
             element.attrib.clear()
             element.attrib.update({"name": name, **attributes})
         if name in self.taken:
@@ -752,7 +752,7 @@ def _is_pose(value: Any) -> bool:
 def _element(text: str, tags: Sequence[str]) -> etree._Element | None:
     """A kept element; None where it is none of these."""
     try:
-        element = _xml.parse(text.encode(), Limits(), remove_blank_text=True)
+        element = xml.parse(text.encode(), Limits(), remove_blank_text=True)
     except (BadUpload, etree.LxmlError, ValueError):
         return None
     return element if element.tag in tags else None

@@ -31,11 +31,12 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _json, register
-from app.formats._text import DEGREES, METRES
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
 from app.model.features import MAX_ID, NO_GEOMETRY, Features, Properties, unique_ids
 from app.model.frame import GROUND, MAX_METRES, Datum, Level
 from app.model.layers import NETWORK, VECTOR_LAYERS, Layer, Layers, Part, PartKey
+from app.syntax import json
+from app.syntax.decimals import DEGREES, METRES
 
 FAMILY = "geojson"
 LOCAL_2D = "http://www.opengis.net/def/crs/OGC/0/Engineering2D"
@@ -84,7 +85,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     places that are not on earth and for coordinate systems other than WGS 84; TooLarge beyond the limits.
     """
     data = files[context.main].removeprefix(b"\xef\xbb\xbf")
-    top = _json.load(data, context.limits)
+    top = json.load(data, context.limits)
     return _Reader(data, top, context).layers()
 
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from xml.sax.saxutils import unescape
 
 from app.formats import Files, Format, ReadContext, WriteContext, _kml_rules, register
-from app.formats._archive import is_archive
 from app.formats._kml import FAMILY, MAIN, read_kml
 from app.formats._kml_writing import NEEDS, write_kml
 from app.model.layers import Layers
 from app.parameters import parameter
+from app.syntax.archives import is_archive
 
 _HREF = re.compile(rb"<href>([^<]+)</href>")
 _HEADS = (b"<kml", b":kml", b"opengis.net/kml", b"earth.google.com/kml")

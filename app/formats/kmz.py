@@ -11,11 +11,11 @@ from dataclasses import replace
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, ReadContext, WriteContext, _kml_rules, register
-from app.formats import _archive as archive
 from app.formats._kml import FAMILY, read_kml
 from app.formats._kml_writing import NEEDS, write_kml
 from app.model.layers import Layers, Part, PartKey, Resources
 from app.model.names import name_problem
+from app.syntax import archives as archive
 
 MAIN = "map.kmz"
 DOCUMENT = "doc.kml"

@@ -52,19 +52,19 @@ from app.formats import (
     _fields,
     _lanes,
     _osm_text,
-    _yaml,
     register,
 )
 from app.formats._lanes import Arm, Array, Border
 from app.formats._network import CROSS_PART_PROPERTIES, Edge, MergedNetwork, get_source_properties, merge_networks
 from app.formats._osm import INT64, Data, Tags, Way, parse
 from app.formats._osm_text import NO_ATTRIBUTES, as_texts, attribute_text, element_id, integers
-from app.formats._text import number
 from app.model.features import NO_GEOMETRY, Features, Properties, SharedKeyDicts, from_columns, unique_ids
 from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Anchor, Datum
 from app.model.geodesy import local_frame
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
+from app.syntax import yaml
+from app.syntax.decimals import number
 
 NAME = "lanelet2"
 MAIN = "lanelet2.osm"
@@ -455,7 +455,7 @@ def _projector_text(data: bytes, name: str) -> str:
 
 def _projector_type(data: bytes, name: str, context: ReadContext) -> str:
     try:
-        document = _yaml.load(data, context.limits)
+        document = yaml.load(data, context.limits)
     except UnreadableFile as error:
         problems = [Problem(p.problem, name, p.line, p.where) for p in error.problems]
         raise UnreadableFile(f"{name}: {error.detail}", problems) from error

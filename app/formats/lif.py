@@ -28,17 +28,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import (
-    Files,
-    Format,
-    LayerRequirements,
-    ReadContext,
-    WriteContext,
-    _fields,
-    _json,
-    _lif_rules,
-    register,
-)
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, _lif_rules, register
 from app.formats._fields import ANGLE, COORDINATE, NOT_NEGATIVE, SPEED, Number, OneOf, record
 from app.formats._network import (
     CROSS_PART_PROPERTIES,
@@ -63,18 +53,19 @@ from app.formats._network import (
     shorten_list,
     yaw_or_source,
 )
-from app.formats._text import METRES
 from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, unique_ids
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
+from app.syntax import json
+from app.syntax.decimals import METRES
 
 NAME = "lif"
 VERSION = "1.0.0"
 EPOCH = "1970-01-01T00:00:00.00Z"
 """Where a source tells no time: the same network must give the same bytes."""
 
-ORDER = _json.rank_keys(
+ORDER = json.rank_keys(
     "metaInformation projectIdentification lifId creator exportTimestamp lifVersion origins originId layoutId "
     "layoutName layoutVersion layoutLevelId layoutDescription layouts nodes edges stations nodeId nodeName "
     "nodeDescription mapId nodePosition edgeId edgeName edgeDescription startNodeId endNodeId stationId "
@@ -182,7 +173,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     """Networks by level, and stations as objects, in local metres. Raises UnreadableFile naming the item."""
     if not (context.wants("topology") or context.wants("objects")):
         return Layers()
-    top = _json.load(files[context.main or next(iter(files))], context.limits)
+    top = json.load(files[context.main or next(iter(files))], context.limits)
     if not isinstance(top, dict) or not isinstance(top.get("layouts", top.get("origins")), list):
         reason = "a LIF file is one object with an array of layouts"
         raise UnreadableFile(reason, [Problem(reason, where="layouts")])
@@ -583,7 +574,7 @@ class _Writer:
         if free_layouts or not inside:
             out["layouts"] = free_layouts
         self._report()
-        return orjson.dumps(_json.sort_keys(out, ORDER), option=orjson.OPT_INDENT_2) + b"\n"
+        return orjson.dumps(json.sort_keys(out, ORDER), option=orjson.OPT_INDENT_2) + b"\n"
 
     def _top(self) -> dict[str, Any]:
         top: dict[str, Any] = {}

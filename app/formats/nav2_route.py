@@ -37,7 +37,6 @@ from app.formats import (
     ReadContext,
     WriteContext,
     _fields,
-    _json,
     _nav2_route_rules,
     register,
 )
@@ -59,10 +58,11 @@ from app.formats._network import (
     shorten_list,
     source_document,
 )
-from app.formats._text import METRES
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.layers import NETWORK, Layers, PartKey
 from app.parameters import parameter
+from app.syntax import json
+from app.syntax.decimals import METRES
 
 NAME = "nav2_route"
 FRAME = "map"
@@ -126,7 +126,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     """The graph as topology, local metres. Raises UnreadableFile naming the feature; TooLarge beyond the limits."""
     if not context.wants("topology"):
         return Layers()
-    top = _json.load(files[context.main or next(iter(files))], context.limits)
+    top = json.load(files[context.main or next(iter(files))], context.limits)
     rows = top.get("features") if isinstance(top, dict) else None
     if not isinstance(top, dict) or not isinstance(rows, list):
         raise UnreadableFile(
@@ -395,13 +395,13 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     return {"graph.geojson": _Writer(layers, context).data()}
 
 
-ORDER = _json.rank_keys(
+ORDER = json.rank_keys(
     "type name id startid endid frame trigger cost overridable metadata operations properties geometry coordinates"
 )
 
 
 def _dump(value: Any) -> bytes:
-    return orjson.dumps(_json.sort_keys(value, ORDER))
+    return orjson.dumps(json.sort_keys(value, ORDER))
 
 
 class _Writer:

@@ -27,17 +27,7 @@ import numpy as np
 import shapely
 
 from app.errors import Problem, UnreadableFile
-from app.formats import (
-    Files,
-    Format,
-    LayerRequirements,
-    ReadContext,
-    WriteContext,
-    _fields,
-    _navgraph_rules,
-    _yaml,
-    register,
-)
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, _navgraph_rules, register
 from app.formats._fields import ANGLE, COORDINATE, Number, Record, record
 from app.formats._network import (
     CROSS_PART_PROPERTIES,
@@ -64,10 +54,11 @@ from app.formats._network import (
     source_document,
     yaw_or_source,
 )
-from app.formats._text import METRES, numbers
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.layers import NETWORK, Layers, PartKey
 from app.parameters import parameter
+from app.syntax import yaml
+from app.syntax.decimals import METRES, numbers
 
 NAME = "navgraph"
 PREFIX = "tag:fawkesrobotics.org,navgraph/"
@@ -119,7 +110,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not context.wants("topology"):
         return Layers()
     data = files[context.main or next(iter(files))]
-    top = _yaml.load(data, context.limits, tags=TAGS, typed=False)
+    top = yaml.load(data, context.limits, tags=TAGS, typed=False)
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
         raise UnreadableFile("there is no list of nodes: not a navgraph", [Problem("no list", where="nodes")])
     nodes = [_ParsedNode(item, k, context) for k, item in enumerate(top["nodes"])]
@@ -196,7 +187,7 @@ class _ParsedNode:
 
 def _untag(item: Any, location: str, context: ReadContext) -> tuple[str | None, Any]:
     """(the tag's own name, the value)."""
-    if not isinstance(item, _yaml.Tagged):
+    if not isinstance(item, yaml.Tagged):
         return None, item
     tag = item.tag.removeprefix(PREFIX) if item.tag.startswith(PREFIX) else item.tag[1:]
     if not _WORD.match(tag):
@@ -215,12 +206,12 @@ def _name(value: Any, location: str) -> str:
 
 def _plain(value: Any, location: str) -> Any:
     """A value as JSON-like data; scalars without quotes get their meaning."""
-    if isinstance(value, _yaml.PlainScalar):
+    if isinstance(value, yaml.PlainScalar):
         try:
-            return _yaml.scalar(str.__str__(value))
+            return yaml.scalar(str.__str__(value))
         except ValueError as error:
             raise_unreadable(str(error), location)
-    if isinstance(value, _yaml.Tagged):
+    if isinstance(value, yaml.Tagged):
         raise_unreadable(f"the tag {value.tag[:80]} has no meaning here", location)
     if isinstance(value, dict):
         return {key: _plain(v, location) for key, v in value.items()}
@@ -379,11 +370,11 @@ class _Writer:
         order = self._node_order(connections)
         out = [f"%YAML 1.2\n%TAG ! {PREFIX}\n---\n", self._head(), "nodes:" if order else "nodes: []"]
         xy = np.array([(self.net.nodes[k].x, self.net.nodes[k].y) for k in order], np.float64).reshape(-1, 2)
-        texts = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
+        texts = list(map(yaml.decimal, numbers(xy.ravel(), METRES)))
         linked = {k for c in connections for k in (c.a, c.b)}
         for k, x, y in zip(order, texts[::2], texts[1::2], strict=True):
             out.append(self._node(k, x, y, linked=k in linked))
-        names = [_yaml.text(name) for name in self.names]
+        names = [yaml.text(name) for name in self.names]
         out.append("\nconnections:\n" if connections else "\nconnections: []\n")
         for c in connections:
             tag = f"!{c.tag} " if c.tag else ""
@@ -400,9 +391,9 @@ class _Writer:
             top["graph-name"] = source_value or self.context.title
             self.context.fill("graph-name", top["graph-name"], "no source names it", "graph_name")
         first = {key: top.pop(key) for key in ("graph-name", "root") if key in top}
-        out = [_yaml.mapping({key: value}, 0) for key, value in first.items()]
+        out = [yaml.mapping({key: value}, 0) for key, value in first.items()]
         if top:
-            out.append(_yaml.mapping(top, 0))
+            out.append(yaml.mapping(top, 0))
         defaults = self.document.get("defaults")
         if isinstance(defaults, dict) and defaults:
             out.append("default-properties:\n" + _list_text(defaults, self.document.get("words"), 2))
@@ -434,13 +425,13 @@ class _Writer:
                 properties.setdefault(key, p[key])
             else:
                 self.lost["node attributes"] += 1
-        body = f"name: {_yaml.text(name)}\n    pos: [{x}, {y}]\n"
+        body = f"name: {yaml.text(name)}\n    pos: [{x}, {y}]\n"
         text = f"\n  - !{tag}\n    {body}" if tag else f"\n  - {body}"
         if properties:
             text += "    properties:\n" + _list_text(properties, source_members.get("words"), 6)
         more = source_members.get("more")
         if isinstance(more, dict) and (more := {w: v for w, v in more.items() if w not in NODE_KEYS}):
-            text += _yaml.mapping(more, 4)
+            text += yaml.mapping(more, 4)
         self.lost["dangling"] += count(source_members.get("dangling"))
         return text[:-1]
 
@@ -606,9 +597,9 @@ def _list_text(properties: Mapping[str, Any], flags: Any, column: int) -> str:
     out = []
     for key in sorted(properties):
         if key in bare and properties[key] is True:
-            out.append(f"{pad}- {_yaml.text(key)}\n")
+            out.append(f"{pad}- {yaml.text(key)}\n")
         else:
-            out.append(f"{pad}- {_yaml.mapping({key: properties[key]}, column + 2)[column + 2 :]}")
+            out.append(f"{pad}- {yaml.mapping({key: properties[key]}, column + 2)[column + 2 :]}")
     return "".join(out)
 
 

@@ -30,18 +30,16 @@ from app.formats import (
     Files,
     Format,
     LayerRequirements,
-    Limits,
     Parts,
     ReadContext,
     WriteContext,
     _fields,
-    _image,
     _masks,
     _occupancy_grid_rules,
-    _yaml,
     register,
 )
 from app.formats._select import file_stem, select_part
+from app.limits import Limits
 from app.model.frame import MAX_METRES
 from app.model.grid import (
     FREE,
@@ -58,6 +56,7 @@ from app.model.grid import (
 )
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
+from app.syntax import images, yaml
 
 NAME = "occupancy_grid"
 MODES: tuple[Mode, ...] = ("trinary", "scale", "raw")
@@ -156,14 +155,14 @@ def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
         stem = main.rpartition(".")[0]
         return [n for n in names if n in (stem + ".yaml", stem + ".yml")]
     try:
-        image = _yaml.load(data, Limits(yaml_nodes=10_000))["image"]
+        image = yaml.load(data, Limits(yaml_nodes=10_000))["image"]
         return [n for n in [_find_image(str(image), main, names)[0]] if n] + _masks.companions(main, names)
     except (*BAD_INPUT, FleetMapError):  # the reader says what is wrong with it
         return []
 
 
 def _is_image(name: str, data: bytes) -> bool:
-    return _image.detect_kind(data) is not None or name.lower().endswith(IMAGE_ENDS)
+    return images.detect_kind(data) is not None or name.lower().endswith(IMAGE_ENDS)
 
 
 def _find_image(reference: str, main: str, names: Iterable[str]) -> tuple[str | None, str]:
@@ -221,7 +220,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadContext) -> Layers:
     data = files[main]
-    document = _yaml.load(data, context.limits)
+    document = yaml.load(data, context.limits)
     if not isinstance(document, dict):
         raise UnreadableFile(f"{main}: a map's YAML is a mapping with the keys {', '.join(REQUIRED)}")
     if options != ReadOptions():
@@ -298,7 +297,7 @@ def _layers(
     meaning = _masks.read(mask_file, files[mask_file], context) if mask_file else {}
     try:
         if context.decode_cells:
-            shades = _image.read_grey(files[picture], context.limits)
+            shades = images.read_grey(files[picture], context.limits)
             rule = _rule(
                 parameters["mode"], parameters["negate"], parameters["occupied_thresh"], parameters["free_thresh"]
             )
@@ -307,7 +306,7 @@ def _layers(
             if grey is not None:
                 meaning = {**meaning, UNKNOWN_GREY: pack_cells(grey)}
         else:
-            width, height = _image.read_size(files[picture], context.limits)
+            width, height = images.read_size(files[picture], context.limits)
             cells = outline(height, width)
     except BadUpload as error:
         raise type(error)(f"{picture}: {error.detail}", [Problem(error.detail, picture)]) from error
@@ -331,7 +330,7 @@ def _reads_unknown_as_free(rule: Table, mode: Mode, *, negate: bool) -> bool:
 
 
 def _cells(
-    shades: _image.Grey, rule: Table, mode: Mode, shade: int | None
+    shades: images.Grey, rule: Table, mode: Mode, shade: int | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """Canonical cells (bottom row first) of a picture, a strip of rows at a time, and which opaque ones have the wanted
     grey; None where there are none."""
@@ -339,7 +338,7 @@ def _cells(
     grey = None if shade is None else np.zeros(cells.shape, bool)
     table = rule.tobytes()
     for y, block, opaque in shades.strips():
-        values = _image.apply_table(block, table)
+        values = images.apply_table(block, table)
         if opaque is not None and mode != "raw":
             values = np.where(opaque, values, np.uint8(UNKNOWN))
         top = shades.height - y
@@ -495,7 +494,7 @@ def _with_grey(grid: OccupancyGrid, pixels: Table) -> tuple[OccupancyGrid, Table
 def _present_file(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Which of the 256 values occur."""
     seen = np.zeros(256, bool)
-    rows = max(1, _image.STRIP // cells.shape[1])
+    rows = max(1, images.STRIP // cells.shape[1])
     for y in range(0, len(cells), rows):
         block = cells[y : y + rows]
         counts = {value: int(np.count_nonzero(block == value)) for value in MAP_SAVER_PIXELS}
@@ -537,7 +536,7 @@ def _apply_thresholds(grid: OccupancyGrid, context: WriteContext) -> OccupancyGr
     table[[FREE, OCCUPIED, UNKNOWN]] = FREE, OCCUPIED, UNKNOWN
     between = int(grid.cells.size) - sum(int(np.count_nonzero(grid.cells == v)) for v in (FREE, OCCUPIED, UNKNOWN))
     context.drop("cells between free and occupied", between, "mode=trinary knows free, occupied and unknown only")
-    return replace(grid, cells=_image.apply_table(grid.cells, table.astype(np.uint8).tobytes())) if between else grid
+    return replace(grid, cells=images.apply_table(grid.cells, table.astype(np.uint8).tobytes())) if between else grid
 
 
 def _yaml_text(grid: OccupancyGrid, picture: str) -> bytes:
@@ -570,7 +569,7 @@ _ESCAPE = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
 
 def _text(value: str) -> str:
     """A YAML scalar that is read as this text."""
-    if _PLAIN.fullmatch(value) and value not in _yaml.CONSTANTS:
+    if _PLAIN.fullmatch(value) and value not in yaml.CONSTANTS:
         return value
     quoted = json.dumps(value, ensure_ascii=False)
     return _ESCAPE.sub(lambda match: f"\\u{ord(match.group()):04x}", quoted)
@@ -602,18 +601,18 @@ def _picture(grid: OccupancyGrid, pixels: Table, kind: Literal["pgm", "png"]) ->
         )  # all of it at once: a buffer that grows is copied, and so is what ``join`` or ``+`` make of parts
         out.seek(0)
         out.write(header)
-        rows = max(1, _image.STRIP // grid.width)
+        rows = max(1, images.STRIP // grid.width)
         for top in range(grid.height, 0, -rows):
             out.write(grid.cells[max(0, top - rows) : top][::-1].tobytes().translate(table))
         return out.getvalue()
     rule = _rule(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
     if rule[pixels[UNKNOWN]] == UNKNOWN or not bool((grid.cells == UNKNOWN).any()):
-        return _image.encode_png(grid.cells, flip=True, table=table)
+        return images.encode_png(grid.cells, flip=True, table=table)
     both = np.empty((grid.height, grid.width, 2), np.uint8)
-    both[..., 0] = _image.apply_table(grid.cells, table)
+    both[..., 0] = images.apply_table(grid.cells, table)
     both[..., 1] = 255
     both[..., 1][grid.cells == UNKNOWN] = 0
-    return _image.encode_png(both, flip=True)
+    return images.encode_png(both, flip=True)
 
 
 # --- other cells --------------------------------------------------------------------------------------------------
@@ -637,7 +636,7 @@ def resample(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
             for n, last in zip(shape, grid.cells.shape, strict=True)
         )
         return replace(grid, cells=grid.cells.take(rows, 0).take(columns, 1), resolution=resolution)
-    ranks = _image.apply_table(grid.cells, _RANK.tobytes())
+    ranks = images.apply_table(grid.cells, _RANK.tobytes())
     for axis in (0, 1):
         n, old = shape[axis], ranks.shape[axis]
         edges = np.arange(n + 1) * ratio
@@ -648,7 +647,7 @@ def resample(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
         for step in range(1, int((ends - starts).max())):
             np.maximum(out, np.take(ranks, np.minimum(starts + step, ends - 1), axis), out=out)
         ranks = out
-    return replace(grid, cells=_image.apply_table(ranks, _OF_RANK.tobytes()), resolution=resolution)
+    return replace(grid, cells=images.apply_table(ranks, _OF_RANK.tobytes()), resolution=resolution)
 
 
 def normalize(grid: OccupancyGrid) -> OccupancyGrid:
@@ -667,10 +666,10 @@ def normalize(grid: OccupancyGrid) -> OccupancyGrid:
     high = np.maximum(np.ceil(corners.max(axis=0) - 1e-6).astype(np.int64), low + 1)
     width, height = (int(v) for v in high - low)
     _check_count(width * height, "normalize")
-    source = _image.apply_table(grid.cells, _RANK.tobytes())
+    source = images.apply_table(grid.cells, _RANK.tobytes())
     ranks = np.empty((height, width), np.uint8)
     u = np.arange(width) + (float(low[0]) + 0.5 - steps[0])
-    step = max(1, _image.STRIP // 8 // width)
+    step = max(1, images.STRIP // 8 // width)
     for row in range(0, height, step):
         v = (np.arange(row, min(height, row + step)) + (float(low[1]) + 0.5 - steps[1]))[:, None]
         column = np.floor(u * cos + v * sin + 1e-9).astype(np.int32)
@@ -686,7 +685,7 @@ def normalize(grid: OccupancyGrid) -> OccupancyGrid:
         at_y = np.floor(p * sin + q * cos + (steps[1] - float(low[1]))).astype(np.intp).clip(0, height - 1)
         np.maximum.at(ranks, (at_y, at_x), source[row + high_line, high_column])
     origin = (round(float(low[0]) * size, 9), round(float(low[1]) * size, 9), 0.0)
-    return replace(grid, cells=_image.apply_table(ranks, _OF_RANK.tobytes()), origin=origin)
+    return replace(grid, cells=images.apply_table(ranks, _OF_RANK.tobytes()), origin=origin)
 
 
 def _check_count(count: int, location: str) -> None:

@@ -47,7 +47,6 @@ from app.formats import (
     _fields,
     _openrmf_rules,
     _rmf,
-    _yaml,
     register,
 )
 from app.formats._fields import ANGLE, ANY, COORDINATE, LENGTH, NOT_NEGATIVE, SPEED, Number, OneOf, Typed, record
@@ -66,7 +65,6 @@ from app.formats._rmf import (
     raise_unreadable,
 )
 from app.formats._rmf_images import companion_hook, find_stored_image, images
-from app.formats._text import DEGREES, METRES, encode_pieces, numbers
 from app.model.features import (
     Features,
     Properties,
@@ -80,6 +78,8 @@ from app.model.features import (
 from app.model.frame import GROUND, Level
 from app.model.geodesy import check_crs
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
+from app.syntax import yaml
+from app.syntax.decimals import DEGREES, METRES, encode_pieces, numbers
 
 NAME = BUILDING
 FILE = "building.yaml"
@@ -355,7 +355,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     Coordinates are local metres, or degrees where the building's are. Raises UnreadableFile naming the place.
     """
     main = context.main or next(iter(files))
-    top = _yaml.load(files[main], context.limits)
+    top = yaml.load(files[main], context.limits)
     if not isinstance(top, dict):
         raise_unreadable("must be a mapping with levels", "")
     _fields.check(top, SHAPE, context)
@@ -431,7 +431,7 @@ def _reference(top: Mapping[str, Any], levels: Mapping[str, _Level]) -> str:
     raw_value = top.get("reference_level_name")
     if raw_value is None or raw_value == "":
         return next(iter(levels))
-    name = raw_value if isinstance(raw_value, str) else _yaml.text(raw_value)
+    name = raw_value if isinstance(raw_value, str) else yaml.text(raw_value)
     if name not in levels:
         raise_unreadable(f"names the level {name[:80]!r}, which is not there", "reference_level_name")
     return name
@@ -459,7 +459,7 @@ def _edge(row: Any, location: str) -> tuple[int, int, dict[str, Any], list[Any]]
 
 
 def _text(value: Any) -> str:
-    return value if isinstance(value, str) else "" if value is None else _yaml.text(value)
+    return value if isinstance(value, str) else "" if value is None else yaml.text(value)
 
 
 def _node_ids(level: _Level, taken: set[str]) -> list[str]:
@@ -842,8 +842,8 @@ class _Writer:
         top = self._top()
         before = {key: value for key, value in top.items() if key < "levels"}
         after = {key: value for key, value in top.items() if key > "levels"}
-        text = [_yaml.mapping(before, 0) if before else "", "levels:\n", *levels, lifts]
-        text.append(_yaml.mapping(after, 0) if after else "")
+        text = [yaml.mapping(before, 0) if before else "", "levels:\n", *levels, lifts]
+        text.append(yaml.mapping(after, 0) if after else "")
         self._report()
         levels.clear()
         return {FILE: encode_pieces(text), **dict(sorted(self.used.items()))}
@@ -903,7 +903,7 @@ class _Writer:
         return _to_file(self.system, at, self.transforms[storey]), owner
 
     def _texts(self, raw: Array) -> list[tuple[str, str]]:
-        texts = list(map(_yaml.decimal, numbers(raw.ravel(), self.decimals)))
+        texts = list(map(yaml.decimal, numbers(raw.ravel(), self.decimals)))
         return list(zip(texts[::2], texts[1::2], strict=True))
 
     # levels
@@ -928,13 +928,13 @@ class _Writer:
         self._objects(storey, vertices, sections)
         self._dangling(storey, vertices, sections)
         sections["vertices"] = _section_lines(vertices.rows)
-        out = [f"  {_yaml.text(storey.name)}:\n"]
+        out = [f"  {yaml.text(storey.name)}:\n"]
         for key in sorted({*members, *(k for k, rows in sections.items() if rows)}):
             if key in sections:
                 out.append(f"    {key}:\n")
                 out += sections[key]
             else:
-                out.append(_yaml.mapping({key: members[key]}, 4))
+                out.append(yaml.mapping({key: members[key]}, 4))
         return out
 
     def _drawings(self, members: dict[str, Any], level: str) -> None:
@@ -1006,7 +1006,7 @@ class _Writer:
         if further:
             parameters = {**(parameters or {}), **{key: _rmf.typed_parameter(value) for key, value in further.items()}}
         self.dropped["nodes' orientations"] += p.get("orientation") is not None
-        row = f"[{position[0]}, {position[1]}, {_yaml.text(round(z, METRES) + 0.0)}, {_yaml.text(name)}"
+        row = f"[{position[0]}, {position[1]}, {yaml.text(round(z, METRES) + 0.0)}, {yaml.text(name)}"
         if parameters or source_members.get("more"):
             row += f", {self.flow(parameters or {})}"
         return row + "".join(f", {self.flow(v)}" for v in source_members.get("more") or ()) + "]"
@@ -1096,7 +1096,7 @@ class _Writer:
                 elif kind == "fiducial" and len(at) == 1:
                     name = str(p.get("name") or "")
                     more = get_source_properties(p, NAME).get("more") or []
-                    row = f"[{at[0][0]}, {at[0][1]}, {_yaml.text(name)}{''.join(', ' + self.flow(v) for v in more)}]"
+                    row = f"[{at[0][0]}, {at[0][1]}, {yaml.text(name)}{''.join(', ' + self.flow(v) for v in more)}]"
                     rows_by_section.setdefault("fiducials", []).append((key, row))
                     scaling.fiducials.append((name, float(at[0][0]), -float(at[0][1])))
                 else:
@@ -1190,7 +1190,7 @@ class _Writer:
             return "lifts: {}\n"
         # The first lift whose shaft holds a vertex is the vertex' lift, so their order is kept.
         rows = zip(names, lifts, strict=True)
-        return "lifts:\n" + "".join(_yaml.mapping({name: members}, 2) for name, (_, _, members) in rows)
+        return "lifts:\n" + "".join(yaml.mapping({name: members}, 2) for name, (_, _, members) in rows)
 
     def _report(self) -> None:
         if self.why:

@@ -46,26 +46,17 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import (
-    Files,
-    Format,
-    LayerRequirements,
-    Limits,
-    ReadContext,
-    WriteContext,
-    _osm_rules,
-    _osm_text,
-    _xml,
-    register,
-)
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _osm_rules, _osm_text, register
 from app.formats._osm import INT64, Data, Tags, Way, is_pbf, parse, unpack
 from app.formats._osm_text import NO_ATTRIBUTES, Node, as_texts, attribute_text, element_id, integers, plain
-from app.formats._text import DEGREES, numbers
+from app.limits import Limits
 from app.model import osm_tags
 from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, points, segments, shared_key_dict
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.model.osm_areas import multipolygon_areas
+from app.syntax import xml
+from app.syntax.decimals import DEGREES, numbers
 
 FAMILY = "osm"
 GENERATOR = "Fleet Map Server"
@@ -296,7 +287,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     Raises UnreadableFile, with a line where there is one, for what is no OSM file and for places that are not on earth.
     """
     topology, objects = context.wants("topology"), context.wants("objects")
-    _xml.report_active_content(files[context.main][:PROLOG_BYTES], context, has_scripts=True)
+    xml.report_active_content(files[context.main][:PROLOG_BYTES], context.warn, has_scripts=True)
     data = parse(files[context.main], context.limits, highways_only=not objects)
     for problem, line, location in data.problems:
         context.warn(problem, line=line, where=location)

@@ -28,18 +28,7 @@ from typing import Any
 import numpy as np
 
 from app.errors import FleetMapError, Problem, UnreadableFile
-from app.formats import (
-    BAD_INPUT,
-    Files,
-    Format,
-    LayerRequirements,
-    ReadContext,
-    WriteContext,
-    _fields,
-    _image,
-    _yaml,
-    register,
-)
+from app.formats import BAD_INPUT, Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, register
 from app.formats._fields import NOT_NEGATIVE, Number, record
 from app.formats._network import (
     Array,
@@ -64,6 +53,7 @@ from app.model.frame import GROUND, MAX_METRES
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, NETWORK, Layers, PartKey
 from app.parameters import parameter
+from app.syntax import images, yaml
 
 NAME = "prm"
 FILE = "prm.yaml"
@@ -140,7 +130,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not context.wants("topology"):
         return Layers()
     main = context.main or next(iter(files))
-    top = _yaml.load(files[main], context.limits)
+    top = yaml.load(files[main], context.limits)
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
         reason = "a roadmap is a mapping with a list of nodes"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
@@ -188,10 +178,10 @@ def _picture(members: Any, files: Files, main: str, context: ReadContext) -> _Pi
         if not name.lower().endswith((".yaml", ".yml")):
             continue
         try:
-            beside = _yaml.load(files[name], context.limits)
+            beside = yaml.load(files[name], context.limits)
             base = re.split(r"[/\\]", str(beside["image"]))[-1]
             image = files[f"{name.rpartition('/')[0]}/{base}".lstrip("/")]
-            rows = _image.read_size(image, context.limits)[1]
+            rows = images.read_size(image, context.limits)[1]
             return _parse_picture({**beside, "height": rows})
         except (*BAD_INPUT, FleetMapError):  # the map's own reader says what is wrong with it
             continue
@@ -264,7 +254,7 @@ def _nodes(entries: Sequence[Any]) -> tuple[list[str], Array, list[dict[str, Any
 def _id(value: Any, location: str) -> str:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise_unreadable("an id is a number or a text", location)
-    return check_name(value if isinstance(value, str) else _yaml.text(value), location)
+    return check_name(value if isinstance(value, str) else yaml.text(value), location)
 
 
 def _edges(
@@ -331,7 +321,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     ids = _ids(net)
     top = document.get("top")
     top = {key: v for key, v in top.items() if key not in OWN_KEYS} if isinstance(top, dict) else {}
-    out = [_yaml.mapping(top, 0)] if top else []
+    out = [yaml.mapping(top, 0)] if top else []
     out.append("nodes:\n" if net.nodes else "nodes: []\n")
     dropped_count = renamed = 0
     for k, (node, i) in enumerate(zip(net.nodes, ids, strict=True)):
@@ -345,8 +335,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
             members["name"] = node.id
         renamed += str(i) != node.id and NAME not in p
         dropped_count += bool(p.keys() - NODE_CANONICAL - {NAME})
-        x, y = (_yaml.text(_plain(v)) for v in pixels[k].tolist())
-        out.append(f"- id: {_yaml.text(i)}\n  x: {x}\n  y: {y}\n{_yaml.mapping(members, 2) if members else ''}")
+        x, y = (yaml.text(_plain(v)) for v in pixels[k].tolist())
+        out.append(f"- id: {yaml.text(i)}\n  x: {x}\n  y: {y}\n{yaml.mapping(members, 2) if members else ''}")
     context.drop("attributes of nodes", dropped_count, "the format has no place for them")
     if renamed:
         context.warn(f"{renamed} nodes got a number for an id; their own one is their name, where they had none")
@@ -369,15 +359,15 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if weighed:
         context.fill("edges: weight", "distance in pixels", f"{weighed} edges come from a format that does not say it")
     out += ["edges:\n", *line_texts] if line_texts else ["edges: []\n"]
-    out.append(_yaml.mapping({PICTURE: picture.as_dict()}, 0))
+    out.append(yaml.mapping({PICTURE: picture.as_dict()}, 0))
     return {FILE: "".join(out).encode()}
 
 
 def _edge(a: Any, b: Any, members: dict[str, Any]) -> str:
-    weight = f"  weight: {_yaml.text(members['weight'])}\n" if isinstance(members.get("weight"), (int, float)) else ""
+    weight = f"  weight: {yaml.text(members['weight'])}\n" if isinstance(members.get("weight"), (int, float)) else ""
     extra_members = {key: value for key, value in members.items() if key != "weight" or not weight}
-    ends = f"- from: {_yaml.text(a)}\n  to: {_yaml.text(b)}\n"
-    return f"{ends}{weight}{_yaml.mapping(extra_members, 2) if extra_members else ''}"
+    ends = f"- from: {yaml.text(a)}\n  to: {yaml.text(b)}\n"
+    return f"{ends}{weight}{yaml.mapping(extra_members, 2) if extra_members else ''}"
 
 
 def _plain(value: float) -> float:

@@ -40,7 +40,6 @@ from app.formats import (
     _fields,
     _rmf,
     _rmf_nav_graph_rules,
-    _yaml,
     register,
 )
 from app.formats._fields import ANGLE, ANY, COORDINATE, SPEED, WIDTH, Number, OneOf, record
@@ -59,7 +58,6 @@ from app.formats._rmf import (
     parameter_value,
     raise_unreadable,
 )
-from app.formats._text import METRES, numbers
 from app.model.features import (
     Features,
     Properties,
@@ -72,6 +70,8 @@ from app.model.features import (
 )
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
+from app.syntax import yaml
+from app.syntax.decimals import METRES, numbers
 
 NAME = NAV_GRAPH
 SHAFT_GAP = 0.05
@@ -174,7 +174,7 @@ def _graphs(files: Files, context: ReadContext) -> dict[int, dict[str, Any]]:
     named = sorted(files, key=lambda name: (not _stem(name).isdigit(), len(_stem(name)), name))
     for name in named:
         context.main = name
-        top = _yaml.load(files[name], context.limits)
+        top = yaml.load(files[name], context.limits)
         if not isinstance(top, dict):
             raise_unreadable("must be a mapping with levels", "")
         stem = _stem(name)
@@ -617,13 +617,13 @@ class _Writer:
         before = {**{k: v for k, v in top.items() if k < "levels"}, "doors": doors}
         after = {**{k: v for k, v in top.items() if k > "levels"}, "lifts": lifts}
         out = BytesIO()  # as bytes the rows take a third of their memory
-        out.write(f"{_yaml.mapping(before, 0)}levels:\n".encode())
+        out.write(f"{yaml.mapping(before, 0)}levels:\n".encode())
         names: Counter[str] = Counter()
         for storey in self.storeys:
             rows = self._level(storey, graph, names)
             while batch := list(islice(rows, LINES_PER_WRITE)):
                 out.write("".join(batch).encode())
-        out.write(_yaml.mapping(after, 0).encode())
+        out.write(yaml.mapping(after, 0).encode())
         twice = sorted(name for name, count in names.items() if count > 1)
         if twice:
             listed = ", ".join(twice[:5]) + (" …" if len(twice) > 5 else "")
@@ -639,14 +639,14 @@ class _Writer:
         order = sorted((k for k, at in enumerate(listed) if isinstance(at, int)), key=lambda k: (listed[k], k))
         order = list(dict.fromkeys([*order, *(k for e in edges for k in (e.source, e.target))]))
         new_index = {k: n for n, k in enumerate(order)}
-        yield f"  {_yaml.text(storey.name)}:\n"
+        yield f"  {yaml.text(storey.name)}:\n"
         yield from _section("lanes", self._lanes(storey, graph, edges, new_index))
         yield from _section("vertices", self._vertices(storey, order, names))
         extra_members = mapping(mapping(storey.document.get("level"), "level").get(str(graph)), "level")
-        yield _yaml.mapping(extra_members, 4) if extra_members else ""
+        yield yaml.mapping(extra_members, 4) if extra_members else ""
 
     def _vertices(self, storey: _LevelWriter, order: Sequence[int], names: Counter[str]) -> Iterator[str]:
-        texts = list(map(_yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
+        texts = list(map(yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
         for n, k in enumerate(order):
             options = {**self._vertex(storey, k), **self.robots.vertex_properties(storey.name, storey.ids[k])}
             if options.get("name"):

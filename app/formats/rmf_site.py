@@ -26,18 +26,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.formats import (
-    Files,
-    Format,
-    LayerRequirements,
-    ReadContext,
-    _json,
-    _rmf,
-    _rmf_site,
-    _rmf_site_rules,
-    _ron,
-    register,
-)
+from app.formats import Files, Format, LayerRequirements, ReadContext, _rmf, _rmf_site, _rmf_site_rules, register
 from app.formats._network import number
 from app.formats._rmf import BUILDING, NAV_GRAPH, Array, mapping, raise_unreadable
 from app.formats._rmf_images import companion_hook, images
@@ -58,6 +47,7 @@ from app.formats._rmf_site_writing import FILE, FILE_RON, WriteOptions, write
 from app.model.features import Features, Properties, features, points, segments, unique_ids
 from app.model.frame import GROUND, Datum, Level
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
+from app.syntax import json, ron
 
 _VERSION = re.compile(r"(\d{1,6})\.(\d{1,6})")
 _TAGS: Mapping[str, str] = {
@@ -110,7 +100,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     """
     main = context.main or next(iter(files))
     data = files[main]
-    top = _ron.load(data, context.limits) if _is_ron(main, data) else _json.load(data, context.limits)
+    top = ron.load(data, context.limits) if _is_ron(main, data) else json.load(data, context.limits)
     if not isinstance(top, dict):
         raise_unreadable("must be a site: a mapping with format_version and levels", "")
     reader = _Reader(top, context)

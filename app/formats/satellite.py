@@ -24,27 +24,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
-from app.formats import (
-    Files,
-    Format,
-    LayerRequirements,
-    Limits,
-    Parts,
-    ReadContext,
-    WriteContext,
-    _image,
-    _raster,
-    _xml,
-    register,
-)
+from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, WriteContext, register
 from app.formats._select import file_stem, select_part
-from app.formats._text import DEGREES, METRES
+from app.limits import Limits
 from app.model.frame import MAX_METRES, is_writable
 from app.model.geodesy import WGS84
 from app.model.imagery import DEFAULT_COLOURS, LOCAL, Affine, GeoImage, display_pixels, pixel_positions
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resample
 from app.parameters import parameter
+from app.syntax import geotiff, images, xml
+from app.syntax.decimals import DEGREES, METRES
 
 NAME = "satellite"
 TIFF_ENDS = (".tif", ".tiff")
@@ -128,7 +118,7 @@ def detect(name: str, data: bytes) -> bool:
     """A GeoTIFF, or a world file. A picture alone may be of anything."""
     end = _world_file_ending(name)
     if end is None:
-        return _raster.is_georeferenced(data)
+        return geotiff.is_georeferenced(data)
     if len(data) > MAX_WORLD or b"\0" in data:
         return False
     return end != ".wld" or (len(data.split()) >= 6 and all(map(_NUMBER.fullmatch, data.split()[:6])))
@@ -142,11 +132,11 @@ def yields(name: str) -> bool:
 def lacking(name: str, data: bytes) -> str:
     """What to add to a picture that does not say where it lies."""
     del name
-    return HOW_TO_SUPPLY if _is_picture(data) and not _raster.is_georeferenced(data) else ""
+    return HOW_TO_SUPPLY if _is_picture(data) and not geotiff.is_georeferenced(data) else ""
 
 
 def _is_picture(data: bytes) -> bool:
-    return _image.detect_kind(data) in ("png", "jpeg", "bmp") or _raster.is_tiff(data)
+    return images.detect_kind(data) in ("png", "jpeg", "bmp") or geotiff.is_tiff(data)
 
 
 def _world_file_ending(name: str) -> str | None:
@@ -219,12 +209,12 @@ def read(files: Files, context: ReadContext) -> Layers:
     return Layers({PartKey("imagery", context.level, name): picture})
 
 
-def _decode(data: bytes, limits: Limits) -> _raster.Raster:
-    if _raster.is_tiff(data):
-        return _raster.read_tiff(data, limits)
-    pixels = _image.png_pixels(data, limits)
+def _decode(data: bytes, limits: Limits) -> geotiff.Raster:
+    if geotiff.is_tiff(data):
+        return geotiff.read_tiff(data, limits)
+    pixels = images.png_pixels(data, limits)
     if pixels is None:
-        image = _image.read_image(data, limits)
+        image = images.read_image(data, limits)
         if image.mode.startswith("I"):
             pixels = _pixels(image, image.mode, np.uint16)
         else:
@@ -232,7 +222,7 @@ def _decode(data: bytes, limits: Limits) -> _raster.Raster:
             grey = image.mode in ("1", "L", "LA", "La")
             pixels = _pixels(image, ("LA" if clear else "L") if grey else ("RGBA" if clear else "RGB"), np.uint8)
     bands = [{"colour": colour} for colour in DEFAULT_COLOURS[pixels.shape[2]]]
-    return _raster.Raster(pixels, None, None, {"bands": bands})
+    return geotiff.Raster(pixels, None, None, {"bands": bands})
 
 
 def _pixels(image: Image.Image, mode: str, kind: type[np.generic]) -> NDArray[Any]:
@@ -240,7 +230,7 @@ def _pixels(image: Image.Image, mode: str, kind: type[np.generic]) -> NDArray[An
     memory."""
     bands = len(Image.new(mode, (1, 1)).getbands())
     out = np.empty((image.height, image.width, bands), kind)
-    rows = max(1, _image.STRIP // image.width)
+    rows = max(1, images.STRIP // image.width)
     for y in range(0, image.height, rows):
         strip = image.crop((0, y, image.width, min(image.height, y + rows)))
         if strip.mode != mode:
@@ -257,7 +247,7 @@ def _check_options(options: ReadOptions) -> None:
     if (
         options.crs is not None
         and options.crs.lower() not in (LOCAL, "wgs84")
-        and not _raster.CRS_NAME.fullmatch(options.crs)
+        and not geotiff.CRS_NAME.fullmatch(options.crs)
     ):
         problems.append(Problem(f"crs must be EPSG:<number>, wgs84 or local, got {options.crs[:80]!r}", where="crs"))
     corners = options.corners
@@ -278,7 +268,7 @@ def _check_options(options: ReadOptions) -> None:
 
 
 def _place(
-    raster: _raster.Raster, image: str, world: str | None, files: Files, options: ReadOptions, context: ReadContext
+    raster: geotiff.Raster, image: str, world: str | None, files: Files, options: ReadOptions, context: ReadContext
 ) -> tuple[Affine, str]:
     """Where the picture lies: what it says itself, else its world file, else the options."""
     height, width = raster.pixels.shape[:2]
@@ -309,7 +299,7 @@ def _place(
 
 
 def _find_crs(
-    transform: Affine, raster: _raster.Raster, teller: str, options: ReadOptions, context: ReadContext
+    transform: Affine, raster: geotiff.Raster, teller: str, options: ReadOptions, context: ReadContext
 ) -> str:
     option = options.crs
     if raster.crs is not None:
@@ -368,7 +358,7 @@ def _from_corners(corners: Sequence[float], width: int, height: int, image: str,
     if max(longitude) - min(longitude) > 180.0:
         longitude = [v + 360.0 if v < 0.0 else v for v in longitude]
     ends = ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height))
-    fit = _raster.fit_affine([(u, v, x, y) for (u, v), x, y in zip(ends, longitude, latitude, strict=True)])
+    fit = geotiff.fit_affine([(u, v, x, y) for (u, v), x, y in zip(ends, longitude, latitude, strict=True)])
     if fit is None or not math.isfinite(fit[1]):
         reason = "the corners lie on one line"
         raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where="corners")])
@@ -396,9 +386,9 @@ def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
             if lower.endswith(".prj"):
                 text: str | None = data.decode("utf-8-sig")
             else:
-                text = _xml.parse(data, context.limits).findtext(".//SRS")
+                text = xml.parse(data, context.limits).findtext(".//SRS")
             if text and text.strip():
-                return _raster.crs_from_wkt(text)
+                return geotiff.crs_from_wkt(text)
         except (UnreadableFile, UnicodeError) as error:
             reason = error.detail if isinstance(error, UnreadableFile) else "it is not UTF-8 text"
             raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name)]) from error
@@ -407,7 +397,7 @@ def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
 
 def _check_place(picture: GeoImage, image: str) -> None:
     """Refuse what lies nowhere: beyond the local frame, or where PROJ knows no place on earth."""
-    reason = _raster.position_problem(picture)
+    reason = geotiff.position_problem(picture)
     if reason is not None:
         local = picture.crs == LOCAL
         advice = "say crs=EPSG:<number>" if local else "say another with crs=EPSG:<number>, or crs=local"
@@ -446,11 +436,11 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         )
     tags = _tags(picture)
     if named is None:
-        tags[_raster.OWN_TAG] = LOCAL
+        tags[geotiff.OWN_TAG] = LOCAL
     credit = [*picture.attribution, *context.attribution]
     if credit:
         tags.setdefault("TIFFTAG_COPYRIGHT", "; ".join(dict.fromkeys(credit)))
-    return {f"{stem}.tif": _raster.write_cog(picture, named, tags)}
+    return {f"{stem}.tif": geotiff.write_cog(picture, named, tags)}
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
@@ -504,7 +494,7 @@ def _write_png(picture: GeoImage, crs: str | None, stem: str, context: WriteCont
     a, b, c, d, e, f = picture.transform
     digits = METRES if crs is None or abs(a) + abs(e) > 0.1 else DEGREES
     numbers = [*map(_exact, (a, d, b, e)), _round(c + a / 2 + b / 2, digits), _round(f + d / 2 + e / 2, digits)]
-    out = {f"{stem}.png": _image.encode_png(pixels), f"{stem}.pgw": ("\n".join(numbers) + "\n").encode()}
+    out = {f"{stem}.png": images.encode_png(pixels), f"{stem}.pgw": ("\n".join(numbers) + "\n").encode()}
     if crs is None:
         context.warn(
             "its coordinates are metres of the local frame; upload it again with crs=local", file=f"{stem}.pgw"
@@ -527,7 +517,7 @@ def _aux_xml(crs: str) -> bytes:
     """GDAL's file for what a picture cannot say itself: QGIS and GDAL take the CRS from it."""
     from xml.sax.saxutils import escape
 
-    return f"<PAMDataset>\n  <SRS>{escape(_raster.crs_to_wkt(crs))}</SRS>\n</PAMDataset>\n".encode()
+    return f"<PAMDataset>\n  <SRS>{escape(geotiff.crs_to_wkt(crs))}</SRS>\n</PAMDataset>\n".encode()
 
 
 register(

@@ -19,7 +19,7 @@ import numpy as np
 import shapely
 
 from app.errors import MissingDatum, TooLarge
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _text, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
 from app.formats._network import (
     check_name,
     duplicates,
@@ -35,6 +35,7 @@ from app.formats._network import (
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.frame import MAX_METRES, Anchor
 from app.model.layers import NETWORK, Layers, PartKey
+from app.syntax import decimals
 
 NAME = "waypoints_csv"
 METRES, DEGREES = ("x", "y"), ("latitude", "longitude")
@@ -119,11 +120,11 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if len(set(net.levels)) > 1:
         context.drop("levels of nodes", len(net.nodes), "all networks are one table")
     places = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
-    decimals = _text.METRES
+    digits = decimals.METRES
     if axes == DEGREES:
         if layers.frame is None:
             raise MissingDatum("waypoints in degrees need a datum: give the environment one")
-        places, decimals = layers.frame.to_wgs84(places)[:, ::-1], _text.DEGREES
+        places, digits = layers.frame.to_wgs84(places)[:, ::-1], decimals.DEGREES
     dropped_count = 0
     out = io.StringIO(newline="")
     table = csv.writer(out, lineterminator="\n")
@@ -132,8 +133,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         p, source_members = node.properties, get_source_properties(node.properties, NAME)
         angle = yaw_or_source(source_members.get("yaw"), p.get("orientation"))
         cells = {key: str(value) for key, value in source_members.items()}
-        cells |= dict(zip(axes, _text.numbers(position, decimals), strict=True))
-        cells |= {"name": str(p.get("name") or node.id), "yaw": "" if angle is None else _text.number(angle, 12)}
+        cells |= dict(zip(axes, decimals.numbers(position, digits), strict=True))
+        cells |= {"name": str(p.get("name") or node.id), "yaw": "" if angle is None else decimals.number(angle, 12)}
         table.writerow([cells.get(str(column), "") for column in columns])
         dropped_count += bool(p.keys() - {"kind", "name", "orientation", NAME})
         context.drop("orientations of nodes", angle is not None and "yaw" not in columns, "the table has no column yaw")

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive._native import native
+from app.native import native
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]

@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive._native import native
+from app.native import native
 
 U64 = NDArray[np.uint64]
 I64 = NDArray[np.int64]

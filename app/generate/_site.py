@@ -19,18 +19,18 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import DerivationNotes, _raster
-from app.derive._obstacles import fences
-from app.derive._raster import RasterFrame
+from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotConvert, CannotGenerate, Invalid, Problem
 from app.generate import MAX_CELLS, MAX_OBJECTS
-from app.model import solids
+from app.model import raster, solids
 from app.model.features import Features, Properties, features
+from app.model.fences import fences
 from app.model.frame import GROUND, Datum, Level
 from app.model.grid import FREE, UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import MAP, NETWORK, SITE, ZONES, Layers, Part, PartKey, Resources
+from app.model.raster import RasterFrame
 from app.parameters import parameter
 
 Array = NDArray[np.float64]
@@ -209,7 +209,7 @@ class Site:
         the cells are fine enough to show it. Raises CannotGenerate where a grid of it would be too large.
         """
         self._room = room
-        stored_fence = fences(self.given, self.notes).get(GROUND)
+        stored_fence = fences(self.given, self.notes.warn).get(GROUND)
         if stored_fence is not None:
             pieces = [p for p in shapely.get_parts(stored_fence) if p.geom_type == "Polygon"]
             pieces.sort(key=lambda p: (-p.area, *p.bounds))
@@ -507,7 +507,7 @@ class Site:
         index = np.full((frame.height, frame.width), _NUMBER[ground], np.uint8)
         for rows in (self._ground.get(level, []), self._bodies.get(level, [])):
             for number, shapes in _runs(rows):
-                _raster.paint(index, _raster.areas(shapes, frame, touched=False), number)
+                raster.paint(index, raster.areas(shapes, frame, touched=False), number)
         table = np.array(list(COLOURS.values()), np.uint8)
         left, bottom = frame.origin
         top = round(bottom + frame.height * resolution, 9)
@@ -553,8 +553,8 @@ def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArra
     same = owner[1:] == owner[:-1]
     edges = np.concatenate([np.stack([at[:-1], at[1:]], axis=1)[same], np.stack([at, at], axis=1)])
     number = np.concatenate([owner[:-1][same], owner])
-    for spans in _raster.lines(edges, frame):
-        index, row, column = _raster.expand_spans(spans)
+    for spans in raster.lines(edges, frame):
+        index, row, column = raster.expand_spans(spans)
         near = away[row, column] <= radius / grid.resolution + 1e-4
         good[number[index[near]]] = False
     return good

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._select_grids import grey_warning, grid_label, select_grids
 from app.errors import CannotGenerate
 from app.generate import MAX_CELLS, RandomSource, _evidence, _wfc, generates
 from app.generate._site import invalid_option_error
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey
 from app.model.layers import Layers, Part, PartKey
+from app.model.selection import grey_warning, grid_label, select_grids
 from app.parameters import parameter
 
 U8 = NDArray[np.uint8]

@@ -37,8 +37,8 @@ from app.errors import (
     Problem,
     Unavailable,
 )
-from app.formats import Limits
 from app.ingest.prepare import open_store
+from app.limits import Limits
 from app.model.geodesy import WGS84, between
 from app.model.imagery import GeoImage
 from app.model.layers import Layers, PartKey

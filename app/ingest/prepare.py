@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from app import formats, upload_reader
 from app.errors import Damaged, Invalid, Problem
-from app.formats import Limits
 from app.ingest.match import OWN_IDS, match_ids
+from app.limits import Limits
 from app.model.features import Features, merge_documents
 from app.model.frame import Datum, Level
 from app.model.grid import UNKNOWN, OccupancyGrid

@@ -16,8 +16,8 @@ from typing import Any, Protocol
 
 from app import upload_reader
 from app.errors import Damaged, FleetMapError, NotFound
-from app.formats import Limits
 from app.ingest.prepare import open_store, operation_for, read_fence
+from app.limits import Limits
 from app.model.layers import PartKey
 from app.store.changes import Put
 from app.store.prepare import compose_operation

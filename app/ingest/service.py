@@ -14,7 +14,6 @@ import orjson
 from app import formats, parameters
 from app import generate as generators
 from app.errors import CannotDerive, Conflict, Invalid, Problem, StaleParent, UnreadableFile
-from app.formats import Limits
 from app.ingest import online
 from app.ingest.alignment import AlignmentRequest, AlignmentResult, prepare_alignment, previous_alignment
 from app.ingest.derivation import DerivationRequest, input_line, prepare_derivation
@@ -23,6 +22,7 @@ from app.ingest.edits import edit_changes
 from app.ingest.generation import GenerationRequest, prepare_generation
 from app.ingest.prepare import Mode, PreparedUpload, datum_moved_warnings, prepare_changes, prepare_upload
 from app.ingest.templates import TemplateUpdate
+from app.limits import Limits
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layer
 from app.pool import WorkerDied

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from app.config import Settings, is_loopback
-from app.formats import Limits
+from app.limits import Limits
 
 
 @pytest.fixture(autouse=True)

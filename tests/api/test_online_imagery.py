@@ -21,9 +21,9 @@ import pytest
 from PIL import Image
 
 from app.errors import CannotDerive, Invalid, Unavailable
-from app.formats import Limits
 from app.ingest import online
 from app.ingest.online import Fetcher, Provider, assemble_image, plan_mosaic
+from app.limits import Limits
 from app.model.geodesy import WGS84, between
 from app.model.imagery import GeoImage, pixel_positions
 from tests.api.conftest import Api, running, settings_for

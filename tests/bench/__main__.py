@@ -17,7 +17,7 @@ from rich.table import Table
 
 from app import upload_reader
 from app.convert.files import offline
-from app.formats import Limits
+from app.limits import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
 from app.upload_reader import UploadHints

@@ -26,7 +26,6 @@ import zenoh
 from zenoh import ext
 
 from app.agent.agent import Agent, AgentOptions
-from app.derive import _native
 from app.events import messages
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
@@ -69,7 +68,7 @@ def network(moved: float = 0.0, count: int = 100) -> bytes:
 def served(folder: Path, port: int, zenoh_port: int, **more: str) -> Iterator[httpx.Client]:
     """A server with an environment of one network, and a client of it."""
     native = Path(tempfile.gettempdir()) / f"fleetmap-bench-native-{os.getuid()}"
-    _native.fill(native)  # what a server compiles in its first minute ever is no part of this
+    native.fill(native)  # what a server compiles in its first minute ever is no part of this
     env = {
         "NUMBA_CACHE_DIR": str(native),
         "FLEETMAP_DATA_DIR": str(folder),

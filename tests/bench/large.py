@@ -19,7 +19,7 @@ import numpy as np
 
 from app import formats
 from app.convert.files import offline_paths
-from app.formats import Limits
+from app.limits import Limits
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.model.voxels import LOG_ODDS, VoxelMap, morton

@@ -13,7 +13,7 @@ from PIL import Image
 from app import formats, upload_reader
 from app.convert import files as direct
 from app.convert import worker
-from app.formats import Limits
+from app.limits import Limits
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.worlds import CRATE, WALLS, house
 

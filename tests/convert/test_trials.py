@@ -14,7 +14,7 @@ from app.convert import trials
 from app.convert.maps import Maps
 from app.convert.recipe import ChainFailure, DerivationChain
 from app.convert.trials import Trials
-from app.formats import Limits
+from app.limits import Limits
 from app.pool import WorkerDied
 from tests.api import samples
 from tests.api.conftest import Api

@@ -21,7 +21,7 @@ from app.derive.objects_to_occupancy import objects_to_occupancy
 from app.derive.resources_to_imagery import Parameters as Drawings
 from app.derive.resources_to_imagery import resources_to_imagery
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingDatum, MissingLayer, NotFound
-from app.formats import Limits
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.geodesy import local_frame

@@ -20,7 +20,7 @@ from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.derive.objects_to_voxels import Parameters as VoxelParameters
 from app.derive.objects_to_voxels import objects_to_voxels
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
-from app.formats import Limits
+from app.limits import Limits
 from app.model import obstacles
 from app.model.features import Features, features
 from app.model.frame import Datum, Level

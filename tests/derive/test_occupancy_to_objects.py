@@ -21,7 +21,7 @@ from app.derive.objects_to_occupancy import Parameters as GridParameters
 from app.derive.objects_to_occupancy import objects_to_occupancy
 from app.derive.occupancy_to_objects import CONTEXTS, NAME, Parameters, occupancy_to_objects
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound
-from app.formats import Limits
+from app.limits import Limits
 from app.model import solids
 from app.model.features import Features
 from app.model.frame import Level

@@ -20,8 +20,9 @@ from app import derive, formats, parameters
 from app.derive import DerivationNotes, occupancy_to_imagery, occupancy_to_voxels, voxels_to_occupancy
 from app.derive.occupancy_to_topology import Parameters, network, occupancy_to_topology
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound
-from app.formats import Limits, ReadContext, WriteContext
+from app.formats import ReadContext, WriteContext
 from app.generate import RandomSource, complete_grid
+from app.limits import Limits
 from app.model.features import Features
 from app.model.frame import GROUND, Level
 from app.model.grid import (

@@ -309,10 +309,10 @@ def test_compiled_code_is_read_from_a_folder_that_cannot_be_written(tmp_path: Pa
     assert process.stdout.split() == ["0"]
     fill = (  # of one module, as of all of them
         "from pathlib import Path\n"
-        "from app.derive import _native\n"
-        "assert 'app.derive._kernels_roadmap' in _native._modules()\n"
-        "_native._modules = lambda: ['app.derive._kernels_roadmap']\n"
-        f"_native.fill(Path({str(tmp_path / 'native')!r}))"
+        "from app import native\n"
+        "assert 'app.derive._kernels_roadmap' in native._modules()\n"
+        "native._modules = lambda: ['app.derive._kernels_roadmap']\n"
+        f"native.fill(Path({str(tmp_path / 'native')!r}))"
     )
     subprocess.run([sys.executable, "-c", fill], env=env, check=True)
     before = sorted(p.name for p in (tmp_path / "native").rglob("*"))

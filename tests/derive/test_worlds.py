@@ -18,7 +18,7 @@ from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.derive.objects_to_voxels import Parameters as VoxelParameters
 from app.derive.objects_to_voxels import objects_to_voxels
 from app.errors import Invalid
-from app.formats import Limits
+from app.limits import Limits
 from app.model.alignment import Fit, align_grids
 from app.model.features import features
 from app.model.grid import OccupancyGrid

@@ -184,7 +184,7 @@ def test_a_status_comes_through() -> None:
 class Deaf:
     """A bus that is always there."""
 
-    where, opened, connected = "nowhere", 1, True
+    endpoints, opened, connected = "nowhere", 1, True
     state: ClassVar = {"state": "connected"}
 
     def __init__(self) -> None:

@@ -15,11 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.errors import BadUpload, TooLarge, UnreadableFile, UnsafeArchive
-from app.formats import Limits, _archive, all_formats
+from app.formats import all_formats
+from app.limits import Limits
 from app.model.names import name_problem
+from app.syntax import archives
 
 FILES = {"doc.kml": b"<kml/>" * 50, "images/é.png": bytes(range(256)), "empty.txt": b"", "inner.zip": b""}
-FILES["inner.zip"] = _archive.pack({"a.txt": b"inside"})
+FILES["inner.zip"] = archives.pack({"a.txt": b"inside"})
 
 
 def zipped(*members: tuple[str | zipfile.ZipInfo, bytes]) -> bytes:
@@ -68,10 +70,10 @@ def renamed(name: bytes) -> bytes:
 
 
 def test_what_is_packed_comes_out_and_the_same_files_give_the_same_bytes():
-    data = _archive.pack(FILES, "doc.kml")
-    assert _archive.unpack(data, Limits()) == FILES
-    assert list(_archive.unpack(data, Limits())) == ["doc.kml", "empty.txt", "images/é.png", "inner.zip"]
-    assert data == _archive.pack(dict(reversed(FILES.items())), "doc.kml")
+    data = archives.pack(FILES, "doc.kml")
+    assert archives.unpack(data, Limits()) == FILES
+    assert list(archives.unpack(data, Limits())) == ["doc.kml", "empty.txt", "images/é.png", "inner.zip"]
+    assert data == archives.pack(dict(reversed(FILES.items())), "doc.kml")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert archive.testzip() is None
         assert archive.namelist()[0] == "doc.kml"
@@ -86,16 +88,16 @@ def test_archives_of_other_packers_are_read():
         with archive.open("folder/b.txt", "w", force_zip64=True) as member:
             member.write(b"b" * 10)
         archive.comment = b"a comment with PK\x05\x06 in it"
-    assert _archive.unpack(bytes(pipe.body), Limits()) == {"a.txt": b"a" * 1000, "folder/b.txt": b"b" * 10}
-    assert _archive.unpack(zipped(), Limits()) == {}
+    assert archives.unpack(bytes(pipe.body), Limits()) == {"a.txt": b"a" * 1000, "folder/b.txt": b"b" * 10}
+    assert archives.unpack(zipped(), Limits()) == {}
 
 
 def test_a_name_without_a_flag_is_utf8_from_unix_and_cp437_from_dos():
     raw = "é.txt".encode()
     unix = renamed(raw)
-    assert list(_archive.unpack(unix, Limits())) == ["é.txt"]
+    assert list(archives.unpack(unix, Limits())) == ["é.txt"]
     dos = patched(unix, CENTRAL, 5, b"\x00")
-    assert list(_archive.unpack(dos, Limits())) == [raw.decode("cp437")]
+    assert list(archives.unpack(dos, Limits())) == [raw.decode("cp437")]
 
 
 @pytest.mark.parametrize(
@@ -135,14 +137,14 @@ def test_a_name_without_a_flag_is_utf8_from_unix_and_cp437_from_dos():
 )
 def test_unsafe_archives_are_refused(why: str, data: bytes):
     with pytest.raises(UnsafeArchive) as caught:
-        _archive.unpack(data, Limits())
+        archives.unpack(data, Limits())
     assert caught.value.problems, why
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_a_name_twice_is_refused():
     with pytest.raises(UnsafeArchive, match="another member has too"):
-        _archive.unpack(zipped(("a", b"1"), ("a", b"2")), Limits())
+        archives.unpack(zipped(("a", b"1"), ("a", b"2")), Limits())
 
 
 def test_members_that_overlap_are_refused():
@@ -160,7 +162,7 @@ def test_members_that_overlap_are_refused():
     directory = outer[start : outer.rindex(b"PK\x05\x06")] + entry
     end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 2, 2, len(directory), start, 0)
     with pytest.raises(UnsafeArchive, match="shares its bytes"):
-        _archive.unpack(outer[:start] + directory + end, Limits())
+        archives.unpack(outer[:start] + directory + end, Limits())
 
 
 def lying(declared: int) -> bytes:
@@ -172,15 +174,15 @@ def lying(declared: int) -> bytes:
 
 def test_real_output_is_counted():
     with pytest.raises(UnsafeArchive, match="more than the 1000 bytes"):
-        _archive.unpack(lying(1000), Limits())
+        archives.unpack(lying(1000), Limits())
     with pytest.raises(UnsafeArchive, match="another size"):
-        _archive.unpack(lying(2_000_000), Limits())
+        archives.unpack(lying(2_000_000), Limits())
     with pytest.raises(TooLarge):
-        _archive.unpack(lying(0xFFFFFFFE), Limits())
+        archives.unpack(lying(0xFFFFFFFE), Limits())
     with pytest.raises(TooLarge):
-        _archive.unpack(zipped(("a", bytes(1001))), Limits(unpacked_bytes=1000))
+        archives.unpack(zipped(("a", bytes(1001))), Limits(unpacked_bytes=1000))
     with pytest.raises(TooLarge, match="members"):
-        _archive.unpack(zipped(("a", b""), ("b", b"")), Limits(files=1))
+        archives.unpack(zipped(("a", b""), ("b", b"")), Limits(files=1))
 
 
 def test_ten_gigabytes_declared_in_a_kilobyte_are_refused_at_once():
@@ -191,7 +193,7 @@ def test_ten_gigabytes_declared_in_a_kilobyte_are_refused_at_once():
     entry = entry[:24] + b"\xff\xff\xff\xff" + entry[28:30] + struct.pack("<H", len(extra)) + entry[32:] + extra
     tail = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 1, 1, len(entry), at, 0)
     with pytest.raises(TooLarge, match=str(10 * 2**30)):
-        _archive.unpack(data[:at] + entry + tail, Limits())
+        archives.unpack(data[:at] + entry + tail, Limits())
 
 
 @pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
@@ -200,31 +202,31 @@ def test_other_compressions_are_refused_with_a_reason(kind: int):
     with zipfile.ZipFile(out, "w", kind) as archive:
         archive.writestr("a", b"1" * 100)
     with pytest.raises(UnreadableFile, match="method"):
-        _archive.unpack(out.getvalue(), Limits())
+        archives.unpack(out.getvalue(), Limits())
 
 
 def test_a_wrong_checksum_is_damage():
     data = zipped(("a", b"1" * 99))
     wrong = struct.pack("<L", zlib.crc32(b"2"))
     with pytest.raises(UnreadableFile, match="checksum"):
-        _archive.unpack(patched(patched(data, LOCAL, 14, wrong), CENTRAL, 16, wrong), Limits())
+        archives.unpack(patched(patched(data, LOCAL, 14, wrong), CENTRAL, 16, wrong), Limits())
 
 
 def test_every_truncation_is_refused():
-    data = _archive.pack(FILES, "doc.kml")
+    data = archives.pack(FILES, "doc.kml")
     for length in range(len(data)):
         with pytest.raises(BadUpload):
-            _archive.unpack(data[:length], Limits())
+            archives.unpack(data[:length], Limits())
 
 
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_no_change_of_bytes_does_anything_but_a_refusal_or_the_same_files(data):
-    body = bytearray(_archive.pack(FILES, "doc.kml"))
+    body = bytearray(archives.pack(FILES, "doc.kml"))
     for _ in range(data.draw(st.integers(1, 4))):
         body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
     try:
-        out = _archive.unpack(bytes(body), Limits(unpacked_bytes=10**6))
+        out = archives.unpack(bytes(body), Limits(unpacked_bytes=10**6))
     except BadUpload:
         return
     assert sum(map(len, out.values())) <= 10**6
@@ -234,13 +236,13 @@ def test_no_change_of_bytes_does_anything_but_a_refusal_or_the_same_files(data):
 @pytest.mark.parametrize("name", ["../a", "/a", "a\\b", "a/", "", "a\nb"])
 def test_unusable_names_are_not_packed(name: str):
     with pytest.raises(ValueError, match="cannot be a name"):
-        _archive.pack({name: b""})
+        archives.pack({name: b""})
 
 
 def test_large_members_stay_whole():
     """More than one piece in and out, also where the packed data ends long before its output does."""
     files = {"zeros": bytes(5_000_000), "noise": bytes(range(256)) * 20_000, "ones": b"1" * (2**20)}
-    assert _archive.unpack(_archive.pack(files), Limits()) == files
+    assert archives.unpack(archives.pack(files), Limits()) == files
 
 
 BINARY = (".zip", ".kmz", ".gz", ".bz2", ".pbf", ".bt", ".ot", ".las", ".laz", ".pcd", ".ply")
@@ -248,11 +250,11 @@ BINARY = (".zip", ".kmz", ".gz", ".bz2", ".pbf", ".bt", ".ot", ".las", ".laz", "
 
 def test_texts_of_all_formats_are_bound_as_texts():
     endings = {end for fmt in all_formats().values() for end in fmt.extensions}
-    texts = sorted(end for end in endings if not end.endswith((*BINARY, *_archive._IMAGES)))
+    texts = sorted(end for end in endings if not end.endswith((*BINARY, *archives._IMAGES)))
     assert ".site.ron" in texts
     for end in texts:
         with pytest.raises(TooLarge, match="for a text of"):
-            _archive.unpack(zipped((f"map{end}", bytes(17 * 2**20))), Limits())
+            archives.unpack(zipped((f"map{end}", bytes(17 * 2**20))), Limits())
 
 
 BUILDERS: list[Callable[[], bytes]] = [lambda: b"", lambda: b"PK", lambda: b"PK\x05\x06" + bytes(17), lambda: b"<kml/>"]
@@ -261,25 +263,25 @@ BUILDERS: list[Callable[[], bytes]] = [lambda: b"", lambda: b"PK", lambda: b"PK\
 @pytest.mark.parametrize("build", BUILDERS)
 def test_what_is_no_archive_is_unreadable(build: Callable[[], bytes]):
     with pytest.raises(UnreadableFile):
-        _archive.unpack(build(), Limits())
+        archives.unpack(build(), Limits())
 
 
 def test_what_is_packed_is_accepted_however_uniform_it_is(monkeypatch: pytest.MonkeyPatch):
     array, text = "config/fleet_map/0.bin", "config/fleet_map/content.json"
-    packed = _archive.pack({array: bytes(20_000_000)})
+    packed = archives.pack({array: bytes(20_000_000)})
     assert len(packed) < 100_000
-    assert len(_archive.unpack(packed, Limits())[array]) == 20_000_000
+    assert len(archives.unpack(packed, Limits())[array]) == 20_000_000
     with pytest.raises(TooLarge):
-        _archive.unpack(zipped(("elsewhere/0.bin", bytes(20_000_000))), Limits())
+        archives.unpack(zipped(("elsewhere/0.bin", bytes(20_000_000))), Limits())
     for files in (
         {text: b'{"kind":"wall"},' * 1_200_000},
         {f"{k}.osm": bytes(6_000_000) for k in range(4)},
         {array: bytes(9_000_000), text: bytes(9_000_000), "map.dae": bytes(9_000_000)},
     ):
-        assert _archive.unpack(_archive.pack(files), Limits()) == files
+        assert archives.unpack(archives.pack(files), Limits()) == files
     few = Limits(pixels=2**20)
-    monkeypatch.setattr(_archive, "_LIMITS", few)
+    monkeypatch.setattr(archives, "_LIMITS", few)
     grids = {f"{k}.pgm": bytes(400_000) for k in range(4)}
-    packed = _archive.pack(grids)
-    assert _archive.unpack(packed, few) == grids
+    packed = archives.pack(grids)
+    assert archives.unpack(packed, few) == grids
     assert len(packed) < 1_300_000

@@ -22,8 +22,9 @@ from app.convert import recipe
 from app.convert import worker as making
 from app.convert.files import offline
 from app.errors import BadUpload, CannotConvert, MissingLayer
-from app.formats import Limits, WriteContext, _archive, _shell, get_format
+from app.formats import WriteContext, get_format
 from app.formats.environment import MAIN, detect
+from app.limits import Limits
 from app.model.features import Features, features, from_columns
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
@@ -33,6 +34,7 @@ from app.model.templates import NO_TEMPLATES
 from app.model.voxels import VoxelMap
 from app.store import parts as store_parts
 from app.store.tree import ChunkStage
+from app.syntax import archives, shell
 from app.upload_reader import Bundle, EnvironmentContext, UploadHints
 
 FORMAT = get_format("environment")
@@ -84,14 +86,14 @@ VARIABLES = PartKey("objects", "ground", "environment")
 
 
 def sourced(files: dict[str, bytes], root: Path) -> dict[str, str]:
-    """What a robot has after ``source config/environment.sh``: every exported variable, from a clean shell."""
+    """What a robot has after ``source config/environment.sh``: every exported variable, from a clean bash."""
     for name, data in files.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_bytes(data)
     script = 'cd / && source "$1" && env -0'
-    shell = ["env", "-i", "PATH=/usr/bin:/bin", "bash", "--noprofile", "--norc", "-euo", "pipefail", "-c", script, "-"]
+    bash = ["env", "-i", "PATH=/usr/bin:/bin", "bash", "--noprofile", "--norc", "-euo", "pipefail", "-c", script, "-"]
     done = subprocess.run(
-        [*shell, str(root / "config/environment.sh")],
+        [*bash, str(root / "config/environment.sh")],
         capture_output=True,
         check=True,
         timeout=60,
@@ -151,7 +153,7 @@ def test_real_environments_come_back_and_their_scripts_work(
 def test_the_archive_means_what_the_folder_means(shared: Path) -> None:
     name = TEMPLATES[-1]
     files = folder(shared, name)
-    archive = _archive.pack({n: d for n, d in files.items() if d})
+    archive = archives.pack({n: d for n, d in files.items() if d})
     loose = read_upload(files)
     for upload in ({"a.zip": archive}, {"a.zip": archive, "LICENSE": b"free"}):
         for format_name in (None, "environment"):
@@ -188,7 +190,7 @@ def test_the_paths_of_the_archive_are_the_template_s(shared: Path) -> None:
 def test_the_sample_is_detected_read_and_written_whole() -> None:
     assert detect("yard.zip", SAMPLE)
     assert not detect("yard.kmz", SAMPLE)
-    assert not detect("a.zip", _archive.pack({"doc.kml": b"<kml/>"}))
+    assert not detect("a.zip", archives.pack({"doc.kml": b"<kml/>"}))
     first = read_upload({"yard.zip": SAMPLE}, "environment")
     converted = offline({"yard.zip": SAMPLE}, "environment", hints=UploadHints("environment"))
     second = read_upload(maps_of(unzipped(converted.files[MAIN])), "environment")
@@ -322,7 +324,7 @@ def test_maps_that_would_have_one_path_get_paths_of_their_own() -> None:
     assert {k: p.ids for k in drawn if isinstance(p := maps.parts[k], Features)} == {
         k: p.ids for k, p in drawn.items() if isinstance(p, Features)
     }
-    assert hashes(read_upload({"a.zip": _archive.pack(inner)}).parts) == hashes(parts)
+    assert hashes(read_upload({"a.zip": archives.pack(inner)}).parts) == hashes(parts)
 
 
 def test_worlds_of_one_name_get_files_of_their_own() -> None:
@@ -428,7 +430,7 @@ def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.Mo
 
 def test_bad_packages_are_refused_with_file_and_reason() -> None:
     inside = {"config/location/datum.yaml": b"datum_latitude: north\n"}
-    for upload in ({"a.zip": _archive.pack(inside)}, {"a.bin": _archive.pack(inside)}):
+    for upload in ({"a.zip": archives.pack(inside)}, {"a.bin": archives.pack(inside)}):
         with pytest.raises(BadUpload) as caught:
             read_upload(upload, "environment")
         assert caught.value.problems
@@ -436,7 +438,7 @@ def test_bad_packages_are_refused_with_file_and_reason() -> None:
     with pytest.raises(BadUpload):
         read_upload({"a.bin": b"no archive"}, "environment")
     with pytest.raises(BadUpload):
-        read_upload({"a.zip": _archive.pack({"readme.txt": b"hello"})}, "environment")
+        read_upload({"a.zip": archives.pack({"readme.txt": b"hello"})}, "environment")
 
 
 def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> None:
@@ -453,7 +455,7 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
     }
     layers = Layers(parts, DATUM, (Level(), Level("2", 3.1)))
     files = written(layers)[0]
-    package = _archive.pack(files)
+    package = archives.pack(files)
     again = read_upload({"a.zip": package})
     assert again.warnings == []
     assert (again.datum, again.levels) == (layers.datum, layers.levels)
@@ -557,16 +559,16 @@ def hashes(parts: Mapping[PartKey, Part]) -> dict[PartKey, bytes]:
 
 
 def test_packages_in_packages_are_opened_once() -> None:
-    middle = _archive.pack({"config/inner.pkg": SAMPLE, "config/properties.sh": b"export A='1'\n"})
+    middle = archives.pack({"config/inner.pkg": SAMPLE, "config/properties.sh": b"export A='1'\n"})
     once = read_upload({"a.zip": middle})
     assert PartKey("topology", "ground", "network") in once.parts
-    outer = _archive.pack({"config/metric/x/deep.pkg": middle})
+    outer = archives.pack({"config/metric/x/deep.pkg": middle})
     with pytest.raises(BadUpload, match="inside another one"):
-        read_upload({"a.pkg": _archive.pack({"config/metric/x/deep.pkg": outer})}, "environment")
+        read_upload({"a.pkg": archives.pack({"config/metric/x/deep.pkg": outer})}, "environment")
 
 
 def test_of_files_are_the_variables_that_the_script_sets() -> None:
     inner = unzipped(offline({"yard.zip": SAMPLE}, "environment").files[MAIN])
     lines = inner["config/environment.sh"].decode().splitlines()
     set_here = {line.removeprefix("export ").partition("=")[0] for line in lines if "=" in line}
-    assert set_here - {"ENVIRONMENT_COMMON_LATEST_RELEASE"} <= _shell.OF_FILES
+    assert set_here - {"ENVIRONMENT_COMMON_LATEST_RELEASE"} <= shell.OF_FILES

@@ -13,7 +13,7 @@ from app import formats
 from app.convert.files import offline
 from app.convert.worker import from_layers
 from app.errors import BadUpload, CannotConvert, Invalid, MissingLayer
-from app.formats import Limits
+from app.limits import Limits
 from app.model.features import features
 from app.model.frame import Datum
 from app.model.layers import LAYERS, Layers, PartKey

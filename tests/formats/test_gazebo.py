@@ -23,8 +23,9 @@ from lxml import etree
 from app import formats
 from app.convert.files import offline
 from app.errors import Ambiguous, BadUpload, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
-from app.formats import Limits, WriteContext, _sdf, _sdf_bodies, gazebo, get_format
+from app.formats import WriteContext, _sdf, _sdf_bodies, gazebo, get_format
 from app.formats.gazebo import WriteOptions
+from app.limits import Limits
 from app.model import solids
 from app.model.features import Features, features
 from app.model.frame import Datum, Level

@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 
 from app import formats
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, WriteContext, geojson
+from app.formats import FileGroup, ReadContext, WriteContext, geojson
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame

@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats import Limits, _image
+from app.limits import Limits
 from app.model.grid import OccupancyGrid
+from app.syntax import images
 
 LIMITS = Limits()
 RANDOM = np.random.default_rng(7)
@@ -34,7 +35,7 @@ def saved(image: Image.Image, kind: str, **options: Any) -> bytes:
 
 
 def grey(data: bytes) -> np.ndarray:
-    return _image.read_grey(data, LIMITS).pixels()[0]
+    return images.read_grey(data, LIMITS).pixels()[0]
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:
@@ -43,7 +44,7 @@ def chunk(kind: bytes, body: bytes) -> bytes:
 
 def png(width: int, height: int, packed: bytes, depth: int = 8, colour: int = 0, extra: bytes = b"") -> bytes:
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0))
-    return _image.PNG_MAGIC + header + extra + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+    return images.PNG_MAGIC + header + extra + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
 
 
 def pictures() -> dict[str, bytes]:
@@ -80,7 +81,7 @@ def pictures() -> dict[str, bytes]:
 @pytest.mark.parametrize("name", pictures())
 def test_every_kind_reads_as_an_independent_reader_sees_it(name: str, facts: Any) -> None:
     data = pictures()[name]
-    shades, opaque = _image.read_grey(data, LIMITS).pixels()
+    shades, opaque = images.read_grey(data, LIMITS).pixels()
     expected, alpha = facts.grey(Image.open(io.BytesIO(data)))
     # Ties of a coloured pixel's weighted sum fall on either side.
     assert np.abs(shades.astype(int) - expected).max() <= (1 if alpha is not None else 0)
@@ -97,7 +98,7 @@ def test_deep_grey_png_with_a_transparent_value() -> None:
     rows = np.array([[0, 257, 65535]], ">u2")
     packed = zlib.compress(b"\0" + rows.tobytes())
     data = png(3, 1, packed, depth=16, extra=chunk(b"tRNS", struct.pack(">H", 257)))
-    shades, opaque = _image.read_grey(data, LIMITS).pixels()
+    shades, opaque = images.read_grey(data, LIMITS).pixels()
     assert shades.tolist() == [[0, 1, 255]]
     assert opaque is not None
     assert opaque.tolist() == [[True, False, True]]
@@ -186,7 +187,7 @@ def test_ten_gigabytes_in_a_kilobyte_are_refused_before_decoding(data: bytes) ->
     tracemalloc.start()
     try:
         with pytest.raises(TooLarge, match="limit is"):
-            _image.read_grey(data, LIMITS).pixels()
+            images.read_grey(data, LIMITS).pixels()
         assert tracemalloc.get_traced_memory()[1] < 10 * 2**20
     finally:
         tracemalloc.stop()
@@ -203,7 +204,7 @@ def test_a_bomb_unfolds_no_further_than_its_declared_size() -> None:
     assert len(packed) < 600_000
     assert grey(png(10, 10, packed)).tolist() == [[0] * 10] * 10  # what follows the last row is never unfolded
     with pytest.raises(TooLarge):
-        _image.read_grey(png(23_875, 25_000, packed), LIMITS)
+        images.read_grey(png(23_875, 25_000, packed), LIMITS)
 
 
 def test_text_and_profile_bombs_are_left_aside() -> None:
@@ -224,17 +225,17 @@ def test_an_unknown_critical_chunk_and_a_late_header_are_refused() -> None:
     with pytest.raises(UnreadableFile, match="unknown chunk"):
         grey(png(1, 1, zlib.compress(b"\0\7"), extra=chunk(b"ABCD", b"")))
     with pytest.raises(UnreadableFile, match="begin with its header"):
-        grey(_image.PNG_MAGIC + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
+        grey(images.PNG_MAGIC + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
 
 
 @pytest.mark.parametrize("name", pictures())
 def test_a_cut_picture_is_refused_or_whole(name: str) -> None:
     data = pictures()[name]
-    original, opaque = _image.read_grey(data, LIMITS).pixels()
+    original, opaque = images.read_grey(data, LIMITS).pixels()
     refused = 0
     for end in sorted({*range(0, len(data), max(1, len(data) // 60)), *range(max(0, len(data) - 20), len(data))}):
         try:
-            cut, clear = _image.read_grey(data[:end], LIMITS).pixels()
+            cut, clear = images.read_grey(data[:end], LIMITS).pixels()
         except BadUpload:
             refused += 1
         else:
@@ -261,12 +262,12 @@ def test_a_flipped_bit_never_crashes_and_a_png_never_lies(name: str) -> None:
 
 @given(
     st.binary(max_size=300),
-    st.sampled_from([b"", b"P5 ", b"P2 ", b"P5 3 3 255\n", _image.PNG_MAGIC, b"BM", b"\xff\xd8\xff"]),
+    st.sampled_from([b"", b"P5 ", b"P2 ", b"P5 3 3 255\n", images.PNG_MAGIC, b"BM", b"\xff\xd8\xff"]),
 )
 @settings(max_examples=300, deadline=None)
 def test_any_bytes_are_refused_or_read(body: bytes, head: bytes) -> None:
     try:
-        image = _image.read_grey(head + body, Limits(pixels=10_000))
+        image = images.read_grey(head + body, Limits(pixels=10_000))
         shades, _ = image.pixels()
     except BadUpload:
         return
@@ -279,31 +280,31 @@ def test_any_bytes_are_refused_or_read(body: bytes, head: bytes) -> None:
 def test_written_png_reads_back(bands: int, flip: bool, shape: tuple[int, int]) -> None:
     pixels = RANDOM.integers(0, 256, (*shape, bands), np.uint8)
     pixels = pixels[..., 0] if bands == 1 else pixels
-    data = _image.encode_png(pixels, flip=flip)
-    assert data == _image.encode_png(pixels.copy(), flip=flip)
+    data = images.encode_png(pixels, flip=flip)
+    assert data == images.encode_png(pixels.copy(), flip=flip)
     image = Image.open(io.BytesIO(data))
     assert image.mode == {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[bands]
     assert (np.asarray(image) == (pixels[::-1] if flip else pixels)).all()
-    assert (np.asarray(_image.read_image(data, LIMITS)) == np.asarray(image)).all()
+    assert (np.asarray(images.read_image(data, LIMITS)) == np.asarray(image)).all()
 
 
 def test_a_table_is_looked_up_while_writing() -> None:
     table = bytes(255 - v for v in range(256))
-    data = _image.encode_png(SHADES, table=table)
+    data = images.encode_png(SHADES, table=table)
     assert (np.asarray(Image.open(io.BytesIO(data))) == 255 - SHADES).all()
-    assert (_image.apply_table(SHADES, table) == 255 - SHADES).all()
+    assert (images.apply_table(SHADES, table) == 255 - SHADES).all()
 
 
 def test_png_of_cells_has_the_top_row_on_top() -> None:
     cells = np.array([[0, 100, 255], [1, 2, 3]], np.uint8)
-    image = Image.open(io.BytesIO(_image.cells_to_png(cells)))
+    image = Image.open(io.BytesIO(images.cells_to_png(cells)))
     assert image.mode == "L"
     assert np.asarray(image).tolist() == [[1, 2, 3], [0, 100, 255]]
 
 
 def test_overlay_is_black_white_and_clear() -> None:
     grid = OccupancyGrid(np.array([[0, 100, 255], [50, 0, 0]], np.uint8), 0.05)
-    image = Image.open(io.BytesIO(_image.overlay_png(grid))).convert("RGBA")
+    image = Image.open(io.BytesIO(images.overlay_png(grid))).convert("RGBA")
     assert np.asarray(image).tolist() == [
         [[128, 128, 128, 255], [255, 255, 255, 255], [255, 255, 255, 255]],
         [[255, 255, 255, 255], [0, 0, 0, 255], [0, 0, 0, 0]],
@@ -315,7 +316,7 @@ def test_memory_of_writing_stays_near_the_output() -> None:
     cells.flags.writeable = False
     tracemalloc.start()
     try:
-        _image.cells_to_png(cells)
+        images.cells_to_png(cells)
         assert tracemalloc.get_traced_memory()[1] < cells.nbytes
     finally:
         tracemalloc.stop()
@@ -323,10 +324,10 @@ def test_memory_of_writing_stays_near_the_output() -> None:
 
 @pytest.mark.parametrize("make", [lambda d: d, bytes.lower])
 def test_kind_is_judged_by_content(make: Callable[[bytes], bytes]) -> None:
-    kinds = {name: _image.detect_kind(data) for name, data in pictures().items()}
+    kinds = {name: images.detect_kind(data) for name, data in pictures().items()}
     ends = {"png": "png", "pgm": "pgm", "ppm": "pgm", "pbm": "pgm", "bmp": "bmp", "jpg": "jpeg"}
     assert all(kind == ends[name.rpartition(".")[2]] for name, kind in kinds.items())
-    assert _image.detect_kind(make(b"Plain text")) is None
+    assert images.detect_kind(make(b"Plain text")) is None
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA"])
@@ -336,7 +337,7 @@ def test_a_coloured_png_in_strips_is_what_pillow_decodes_in_one(mode: str, shape
     hills = np.add.outer(np.arange(shape[0]), np.arange(shape[1]))[..., None] // 3 + np.arange(len(mode)) * 40
     pixels = (hills + dice.integers(0, 3, hills.shape)).astype(np.uint8)  # so that Pillow takes each of PNG's filters
     data = saved(Image.fromarray(pixels, mode), "png")
-    decoded_pixels = _image.png_pixels(data, LIMITS)
+    decoded_pixels = images.png_pixels(data, LIMITS)
     assert decoded_pixels is not None
     assert decoded_pixels.dtype == np.uint8
     assert np.array_equal(decoded_pixels, pixels)
@@ -355,7 +356,7 @@ def test_each_filter_of_a_png_and_many_small_chunks() -> None:
     packed = zlib.compress(b"".join(rows))
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, len(rows), 8, 2, 0, 0, 0))
     small = b"".join(chunk(b"IDAT", packed[k : k + 3]) for k in range(0, len(packed), 3))
-    decoded_pixels = _image.png_pixels(_image.PNG_MAGIC + header + small + chunk(b"IEND", b""), LIMITS)
+    decoded_pixels = images.png_pixels(images.PNG_MAGIC + header + small + chunk(b"IEND", b""), LIMITS)
     assert decoded_pixels is not None
     assert decoded_pixels.reshape(len(rows), width * bands).tolist() == [
         [1, 2, 3, 4, 5, 6],
@@ -370,23 +371,23 @@ def test_each_filter_of_a_png_and_many_small_chunks() -> None:
 def test_other_pictures_are_left_to_pillow(name: str) -> None:
     makers = {"L.png": "L", "P.png": "P", "1.png": "1", "I;16.png": "I;16", "RGB clear.png": "RGB"}
     more = {"transparency": (1, 2, 3)} if "clear" in name else {}
-    assert _image.png_pixels(saved(Image.new(makers[name], (5, 4)), "png", **more), LIMITS) is None
+    assert images.png_pixels(saved(Image.new(makers[name], (5, 4)), "png", **more), LIMITS) is None
 
 
 def test_a_coloured_png_that_ends_too_soon_is_refused() -> None:
     short = png(2, 3, zlib.compress(b"\0" * 14), colour=2)  # 21 bytes are three rows
     with pytest.raises(UnreadableFile, match="before their end"):
-        _image.png_pixels(short, LIMITS)
+        images.png_pixels(short, LIMITS)
     with pytest.raises(UnreadableFile, match="damaged"):
-        _image.png_pixels(png(2, 3, b"no zlib at all", colour=2), LIMITS)
+        images.png_pixels(png(2, 3, b"no zlib at all", colour=2), LIMITS)
     with pytest.raises(UnreadableFile, match="damaged"):
-        _image.png_pixels(png(2, 3, zlib.compress(b"\x09" * 21), colour=2), LIMITS)
+        images.png_pixels(png(2, 3, zlib.compress(b"\x09" * 21), colour=2), LIMITS)
 
 
 def test_long_packed_pixels_stand_in_several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = _image.encode_png(COLOURS)
-    monkeypatch.setattr(_image._IdatWriter, "MOST", 1000)
-    parted = _image.encode_png(COLOURS)
+    original = images.encode_png(COLOURS)
+    monkeypatch.setattr(images._IdatWriter, "MOST", 1000)
+    parted = images.encode_png(COLOURS)
     assert parted.count(b"IDAT") == -(-original.index(b"IEND") // 1000) > original.count(b"IDAT") == 1
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(parted))), COLOURS)
 
@@ -395,7 +396,7 @@ def test_memory_of_reading_a_coloured_png_stays_near_its_pixels() -> None:
     data = saved(Image.fromarray(RANDOM.integers(0, 256, (3000, 2000, 3), np.uint8)), "png")
     tracemalloc.start()
     try:
-        decoded_pixels = _image.png_pixels(data, LIMITS)
+        decoded_pixels = images.png_pixels(data, LIMITS)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -18,23 +18,14 @@ from lxml import etree
 
 from app.convert.files import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats import (
-    FileGroup,
-    Limits,
-    ReadContext,
-    WriteContext,
-    _archive,
-    get_format,
-    group,
-    read,
-    write,
-    write_options,
-)
+from app.formats import FileGroup, ReadContext, WriteContext, get_format, group, read, write, write_options
+from app.limits import Limits
 from app.model.features import Features
 from app.model.frame import GROUND, Datum, Level
 from app.model.grid import OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import MAP, Layers, PartKey, Resources
+from app.syntax import archives
 
 SAMPLES = Path(__file__).parents[1] / "samples" / "kmz"
 OBJECTS = PartKey("objects", GROUND, "kml")
@@ -102,8 +93,8 @@ def test_our_sample(same):
     assert [p["kind"] for p in part.properties] == ["overlay", "note", "poi"]
     once = save(layers)
     assert same("kmz", {"a.kmz": data}, {"b.kmz": once}) == []
-    again = _archive.unpack(once, Limits())
-    before = _archive.unpack(data, Limits())
+    again = archives.unpack(once, Limits())
+    before = archives.unpack(data, Limits())
     assert next(iter(again)) == "site/yard.kml"
     assert {n: b for n, b in again.items() if n != "site/yard.kml"} == {
         n: b for n, b in before.items() if n != "site/yard.kml"
@@ -114,7 +105,7 @@ def test_the_drawing_of_an_archive_can_be_had_as_kml(same):
     layers = load((SAMPLES / "yard.kmz").read_bytes())
     context = WriteContext()
     out = write(get_format("kml"), layers, context)
-    original = _archive.unpack((SAMPLES / "yard.kmz").read_bytes(), Limits())["site/yard.kml"]
+    original = archives.unpack((SAMPLES / "yard.kmz").read_bytes(), Limits())["site/yard.kml"]
     assert same("kml", {"a.kml": original}, out) == []
     assert context.dropped == [
         {"what": "resources", "count": 2, "why": "images and further files of a drawing travel in KMZ only"}
@@ -132,7 +123,7 @@ def grids() -> Layers:
 def test_grids_travel_whole():
     layers = grids()
     data = save(layers)
-    assert sorted(_archive.unpack(data, Limits())) == ["doc.kml", "map.png", "upper-keep_out.png"]
+    assert sorted(archives.unpack(data, Limits())) == ["doc.kml", "map.png", "upper-keep_out.png"]
     again = load(data)
     assert again.datum == DATUM
     assert set(again.parts) == set(layers.parts)
@@ -153,12 +144,12 @@ def test_a_grid_beside_a_picture_of_the_same_name():
 
 
 def test_a_grid_whose_picture_was_repainted_is_refused():
-    files = _archive.unpack(save(grids()), Limits())
-    from app.formats import _image
+    files = archives.unpack(save(grids()), Limits())
+    from app.syntax import images
 
-    files["map.png"] = _image.encode_png(np.zeros((30, 41, 3), np.uint8))
+    files["map.png"] = images.encode_png(np.zeros((30, 41, 3), np.uint8))
     with pytest.raises(UnreadableFile, match="colours"):
-        load(_archive.pack(files, "doc.kml"))
+        load(archives.pack(files, "doc.kml"))
 
 
 def test_the_first_kml_in_the_archive_is_the_main_document():
@@ -172,12 +163,12 @@ def test_the_first_kml_in_the_archive_is_the_main_document():
     assert isinstance(part, Features)
     assert part.ids == ("A",)
     assert sorted(layers.resources()) == ["b.txt", "doc.kml"]
-    assert next(iter(_archive.unpack(save(layers), Limits()))) == "z/Main.KML"
+    assert next(iter(archives.unpack(save(layers), Limits()))) == "z/Main.KML"
 
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"<kml/>", _archive.pack({}), _archive.pack({"a.txt": b"1"}), _archive.pack({"doc.kml": b"<kml>"})],
+    [b"", b"<kml/>", archives.pack({}), archives.pack({"a.txt": b"1"}), archives.pack({"doc.kml": b"<kml>"})],
     ids=["empty", "no archive", "nothing in it", "no kml", "broken kml"],
 )
 def test_bad_archives_are_refused(data):
@@ -190,9 +181,9 @@ def test_bad_archives_are_refused(data):
     ("name", "data", "answer"),
     [
         ("a.kmz", b"damaged", True),
-        ("upload", _archive.pack({"doc.kml": DOCUMENT}), True),
-        ("folder.zip", _archive.pack({"doc.kml": DOCUMENT}), False),
-        ("folder", _archive.pack({"map.yaml": b""}), False),
+        ("upload", archives.pack({"doc.kml": DOCUMENT}), True),
+        ("folder.zip", archives.pack({"doc.kml": DOCUMENT}), False),
+        ("folder", archives.pack({"map.yaml": b""}), False),
         ("a.kml", DOCUMENT, False),
     ],
 )
@@ -207,7 +198,7 @@ def test_another_reader_reads_what_we_write(tmp_path):
             pytest.fail("ogrinfo is absent")
         pytest.skip("ogrinfo is absent")
     path = tmp_path / "map.kmz"
-    path.write_bytes(save(Layers({**load(_archive.pack({"doc.kml": DRAWING})).parts, **grids().parts}, DATUM)))
+    path.write_bytes(save(Layers({**load(archives.pack({"doc.kml": DRAWING})).parts, **grids().parts}, DATUM)))
     done = subprocess.run([tool, "-ro", "-al", str(path)], capture_output=True, text=True, check=True)
     assert "ERROR" not in done.stdout + done.stderr
     assert "Yard" in done.stdout
@@ -240,7 +231,7 @@ def test_pictures_come_back_from_kmz_at_the_same_place(bands: int, place: dict[s
 
 def test_a_picture_s_overlay_lies_where_pyproj_says() -> None:
     picture = a_picture(**EARTH)
-    files = _archive.unpack(save(Layers({PartKey("imagery", name="aerial"): picture})), Limits())
+    files = archives.unpack(save(Layers({PartKey("imagery", name="aerial"): picture})), Limits())
     root = etree.fromstring(files["doc.kml"])
     assert root.findtext(".//{*}Icon/{*}href") == "aerial.png"
     quad = [tuple(map(float, t.split(","))) for t in root.findtext(".//{*}LatLonQuad/{*}coordinates").split()]
@@ -287,7 +278,7 @@ def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
 def test_pictures_without_a_place_are_dropped_and_told(picture: GeoImage, datum: Datum | None, reason: str) -> None:
     context = WriteContext()
     data = write(get_format("kmz"), Layers({PartKey("imagery", name="p"): picture}, datum), context)["map.kmz"]
-    assert list(_archive.unpack(data, Limits())) == ["doc.kml"]
+    assert list(archives.unpack(data, Limits())) == ["doc.kml"]
     (line,) = context.dropped
     assert (line["what"], line["count"]) == ("imagery ground/p", 1)
     assert line["why"].startswith("it cannot be placed: ")
@@ -307,7 +298,7 @@ def test_values_that_an_overlay_cannot_show_are_told() -> None:
 def test_images_beside_a_kml_are_those_of_the_files() -> None:
     room = SAMPLES.parent / "occupancy_grid" / "room"
     files = {p.name: p.read_bytes() for p in room.iterdir()}
-    kmz = _archive.unpack(offline(files, "kmz", datum=DATUM).files["map.kmz"], Limits())
+    kmz = archives.unpack(offline(files, "kmz", datum=DATUM).files["map.kmz"], Limits())
     output = offline(files, "kml", datum=DATUM, options={"pictures": "true"}).files
     assert output["room.png"] == kmz["room.png"]
     assert list(offline(files, "kml", datum=DATUM).files) == ["map.kml"]

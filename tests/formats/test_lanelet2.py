@@ -20,8 +20,9 @@ from lxml import etree
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, WriteContext, _osm, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, _osm, get_format
 from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, is_two_way, parse_speed
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey

@@ -18,7 +18,8 @@ from pyproj import CRS, Transformer
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, get_format
+from app.formats import FileGroup, ReadContext, get_format
+from app.limits import Limits
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, PartKey

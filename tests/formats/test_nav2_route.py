@@ -15,7 +15,8 @@ import shapely
 from app import formats
 from app.convert.files import offline
 from app.errors import CannotConvert, MissingDatum, TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey

@@ -18,10 +18,11 @@ from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, UnreadableFile
 from app.formats import FileGroup, ReadContext, WriteContext, get_format
-from app.formats._yaml import Tagged, load
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey
+from app.syntax.yaml import Tagged, load
 from app.upload_reader import UploadHints
 
 FORMAT = get_format("navgraph")
@@ -497,7 +498,7 @@ def test_large_graphs_are_quick_and_scribbles_end() -> None:
 
 
 def test_yaml_tags_are_for_formats_that_name_them() -> None:
-    limits = formats.Limits()
+    limits = Limits()
     data = b"%TAG ! tag:x,2024:\n---\na: !t [1, no]\n"
     with pytest.raises(UnreadableFile):
         load(data, limits)

@@ -21,7 +21,8 @@ from PIL import Image
 
 from app import formats
 from app.errors import Ambiguous, BadUpload, Invalid, MissingLayer, NotFound, TooLarge, UnreadableFile
-from app.formats import Limits, ReadContext, WriteContext, occupancy_grid
+from app.formats import ReadContext, WriteContext, occupancy_grid
+from app.limits import Limits
 from app.model.grid import UNKNOWN_GREY, OccupancyGrid
 from app.model.layers import Layers, PartKey
 

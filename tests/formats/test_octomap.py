@@ -20,8 +20,9 @@ from hypothesis import strategies as st
 
 from app import formats
 from app.errors import Ambiguous, BadUpload, Invalid, MissingLayer, NotFound, TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, WriteContext, get_format, octomap
+from app.formats import FileGroup, ReadContext, WriteContext, get_format, octomap
 from app.formats.octomap import WriteOptions
+from app.limits import Limits
 from app.model.layers import Layers, PartKey
 from app.model.voxels import DEPTH, HALF, VoxelMap, coarser, cut, morton, prune
 

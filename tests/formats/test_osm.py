@@ -22,7 +22,8 @@ from lxml import etree
 
 from app import formats
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, WriteContext, _osm, osm
+from app.formats import FileGroup, ReadContext, WriteContext, _osm, osm
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame

@@ -14,10 +14,12 @@ import pytest
 from app import formats
 from app.convert.files import offline
 from app.errors import Invalid, TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, _lzf, get_format
+from app.formats import FileGroup, ReadContext, get_format
 from app.formats._pcd import parse
+from app.limits import Limits
 from app.model.layers import Layers, PartKey
 from app.model.voxels import HALF, VoxelMap
+from app.syntax import lzf
 from tests.formats import clouds
 
 FORMAT = get_format("pcd")
@@ -145,7 +147,7 @@ def test_colours_as_floats_survive_as_text() -> None:
     assert voxels.colour.tolist() == [[0x10, 0x20, 0x30]]
 
 
-@pytest.mark.parametrize("size", [0, 1, 5, 1000, 40_000, _lzf.MAX_INTERPRETED_BYTES // 16 + 7])
+@pytest.mark.parametrize("size", [0, 1, 5, 1000, 40_000, lzf.MAX_INTERPRETED_BYTES // 16 + 7])
 @pytest.mark.parametrize("kind", ["zeros", "noise", "text", "repeats"])
 def test_compression_unfolds_to_the_same(size: int, kind: str) -> None:
     dice = random.Random(size)
@@ -155,22 +157,22 @@ def test_compression_unfolds_to_the_same(size: int, kind: str) -> None:
         "text": b" ".join(b"%d.%d" % (k % 97, k % 13) for k in range(size))[:size],
         "repeats": (dice.randbytes(300) * (size // 300 + 1))[:size],
     }[kind]
-    packed = _lzf.squeeze(data)
+    packed = lzf.squeeze(data)
     assert clouds.lzf(packed) == data, "by a reader that is not ours"
-    assert _lzf.expand(packed, len(data)) == data
+    assert lzf.expand(packed, len(data)) == data
     if size > 1000 and kind != "noise":
         assert len(packed) < 0.7 * size
 
 
 def test_native_and_plain_loops_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     data = bytes(random.Random(3).choices(range(7), k=30_000))
-    plain = _lzf.squeeze(data)
-    monkeypatch.setattr(_lzf, "MAX_INTERPRETED_BYTES", 0)
-    assert _lzf.squeeze(data) == plain
-    assert _lzf.expand(plain, len(data)) == data
+    plain = lzf.squeeze(data)
+    monkeypatch.setattr(lzf, "MAX_INTERPRETED_BYTES", 0)
+    assert lzf.squeeze(data) == plain
+    assert lzf.expand(plain, len(data)) == data
     for broken in (plain[:-1], plain + b"\x40\xff", b"\xe0\xff\xff" + plain, plain[: len(plain) // 2]):
         with pytest.raises(ValueError, match="compressed data"):
-            _lzf.expand(broken, len(data))
+            lzf.expand(broken, len(data))
 
 
 @pytest.mark.parametrize(

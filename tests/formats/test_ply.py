@@ -15,8 +15,9 @@ import trimesh
 from app import formats
 from app.convert.files import offline
 from app.errors import TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, get_format
+from app.formats import FileGroup, ReadContext, get_format
 from app.formats._ply import parse
+from app.limits import Limits
 from app.model.layers import PartKey
 from app.model.voxels import VoxelMap
 from tests.formats import clouds

@@ -15,9 +15,10 @@ import pytest
 from app import formats
 from app.convert.files import offline
 from app.errors import Ambiguous, Invalid, MissingLayer, NotFound
-from app.formats import FileGroup, ReadContext, WriteContext, _lzf, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.model.layers import Layers, PartKey
 from app.model.voxels import VoxelMap, coarser, cut, expand_leaves, morton
+from app.syntax import lzf
 from tests.api.conftest import Api, api  # noqa: F401  fixture
 from tests.formats import clouds
 
@@ -202,7 +203,7 @@ def big_text(megabytes: int) -> bytes:
 def test_memory_of_a_large_text() -> None:
     data = big_text(8)
     assert len(data) > 7_000_000
-    _lzf.squeeze(bytes(_lzf.MAX_INTERPRETED_BYTES))  # compiled before anything is traced: that would take long
+    lzf.squeeze(bytes(lzf.MAX_INTERPRETED_BYTES))  # compiled before anything is traced: that would take long
     for options in ({}, {"crs": "EPSG:32630", "origin": "0,0,0"}):
         tracemalloc.start()
         layers_of("map.pcd", data, **({} if not options else {"resolution": "1"}))

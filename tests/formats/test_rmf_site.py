@@ -17,11 +17,13 @@ import yaml
 from app import formats
 from app.convert.files import offline
 from app.errors import MissingLayer, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, WriteContext, _ron, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
 from app.model.layers import Layers, Part, PartKey
+from app.syntax import ron
 from app.upload_reader import UploadHints
 
 FORMAT = get_format("rmf_site")
@@ -57,7 +59,7 @@ def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], dict[str, byt
     context = WriteContext(options=formats.write_options(FORMAT, options))
     files = formats.write(FORMAT, layers, context)
     main = next(iter(files))
-    site = json.loads(files[main]) if main.endswith(".json") else _ron.load(files[main], Limits())
+    site = json.loads(files[main]) if main.endswith(".json") else ron.load(files[main], Limits())
     return site, files, context
 
 

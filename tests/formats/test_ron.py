@@ -10,13 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.errors import TooLarge, UnreadableFile
-from app.formats import Limits, _rmf_site, _ron
+from app.formats import _rmf_site
+from app.limits import Limits
+from app.syntax import ron
 
 LIMITS = Limits()
 
 
 def load(text: str, limits: Limits = LIMITS) -> Any:
-    return _ron.load(text.encode(), limits)
+    return ron.load(text.encode(), limits)
 
 
 @pytest.mark.parametrize(
@@ -100,4 +102,4 @@ VALUES = st.recursive(
 @settings(max_examples=80, deadline=None)
 @given(VALUES)
 def test_what_is_written_reads_as_the_same(value: Any) -> None:
-    assert _ron.load(_ron.dump(value, _rmf_site.SHAPE), LIMITS) == value
+    assert ron.load(ron.dump(value, _rmf_site.SHAPE), LIMITS) == value

@@ -24,7 +24,8 @@ from app.convert import worker
 from app.convert.files import offline
 from app.convert.recipe import DerivationChain
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, Limits, WriteContext
+from app.formats import Files, Format, LayerRequirements, WriteContext
+from app.limits import Limits
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
 from app.upload_reader import UploadHints, unpack

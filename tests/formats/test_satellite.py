@@ -20,13 +20,15 @@ from PIL import Image
 
 from app import formats, upload_reader
 from app.errors import Ambiguous, Invalid, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, WriteContext, _raster, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.formats.satellite import ReadOptions, WriteOptions, detect, options_from_filename
+from app.limits import Limits
 from app.model.frame import Datum
 from app.model.geodesy import crs_bounds
 from app.model.imagery import GeoImage, pixel_positions
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resample
+from app.syntax import geotiff
 from app.upload_reader import EnvironmentContext, UploadHints
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "satellite"
@@ -287,8 +289,8 @@ def test_a_tiff_without_a_crs_takes_the_option() -> None:
 
 def without_tag(data: bytes) -> bytes:
     """Our own tag, which says local, under another name of the same length."""
-    assert _raster.OWN_TAG.encode() in data
-    return data.replace(_raster.OWN_TAG.encode(), b"X" * len(_raster.OWN_TAG))
+    assert geotiff.OWN_TAG.encode() in data
+    return data.replace(geotiff.OWN_TAG.encode(), b"X" * len(geotiff.OWN_TAG))
 
 
 def test_ground_control_points_place_a_tiff() -> None:
@@ -390,7 +392,7 @@ def test_a_world_file_without_its_picture_says_what_to_add() -> None:
 
 
 def test_a_crs_stands_beside_the_picture() -> None:
-    wkt = _raster.crs_to_wkt(UTM).encode()
+    wkt = geotiff.crs_to_wkt(UTM).encode()
     world = b"2 0 0 -2 665000 5905000"
     for name, body in (("a.prj", wkt), ("a.png.aux.xml", b"<PAMDataset><SRS>" + wkt + b"</SRS></PAMDataset>")):
         files = {"a.png": image(), "a.pgw": world, name: body}

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.errors import TooLarge, UnreadableFile
-from app.formats import _shell
+from app.syntax import shell
 
 TEMPLATE = b"""#!/bin/bash
 # HEADER: export HIDDEN='no'
@@ -44,11 +44,11 @@ export FIELD_ID=p1
 
 
 def values(text: str | bytes) -> dict[str, str]:
-    return _shell.assignments(text.encode() if isinstance(text, str) else text)[0]
+    return shell.assignments(text.encode() if isinstance(text, str) else text)[0]
 
 
 def test_only_what_is_literal_on_every_run() -> None:
-    variables, warnings = _shell.assignments(TEMPLATE)
+    variables, warnings = shell.assignments(TEMPLATE)
     assert variables == {"COMMON_RELEASE": "v1.0.1", "FIELD_NAME": 'east "path"', "FIELD_ID": "p1"}
     text = "\n".join(warnings)
     for name in ("DATUM_FILE", "LOOPED", "INSIDE", "CASED", "PROPERTIES_FILE", "__dirname"):
@@ -120,7 +120,7 @@ def test_only_what_is_literal_on_every_run() -> None:
     ],
 )
 def test_lines(text: str, expected: dict[str, str]) -> None:
-    variables, warnings = _shell.assignments(text.encode())
+    variables, warnings = shell.assignments(text.encode())
     assert variables == expected
     assert all("line" in w for w in warnings)
 
@@ -129,32 +129,32 @@ def test_lines(text: str, expected: dict[str, str]) -> None:
     "text", [t for (t,) in [(m,) for m in ("A=$(id)", "A=1; id", "id", "A='\x1b'", "PATH=x", "return\nA=1")]]
 )
 def test_what_is_left_out_is_told(text: str) -> None:
-    assert _shell.assignments(text.encode())[1]
+    assert shell.assignments(text.encode())[1]
 
 
 def test_literals_alone_need_no_warning() -> None:
-    assert _shell.assignments(b"#!/bin/sh\n\nexport A='1'\nexport B=\"2\" # two\n")[1] == []
+    assert shell.assignments(b"#!/bin/sh\n\nexport A='1'\nexport B=\"2\" # two\n")[1] == []
 
 
 def test_real_property_files(shared: Path, facts_json: dict[str, Any]) -> None:
     entries = {n: f for n, f in facts_json.items() if f["kind"] == "environment_variables"}
     assert len(entries) == 3
     for name, entry in entries.items():
-        read, warnings = _shell.assignments((shared / "data" / name).read_bytes())
+        read, warnings = shell.assignments((shared / "data" / name).read_bytes())
         assert read == entry["facts"]["literal_assignments"], name
         assert warnings == []
 
 
 def test_bounds() -> None:
     with pytest.raises(TooLarge):
-        _shell.assignments(b"#" * (_shell.MAX_BYTES + 1))
+        shell.assignments(b"#" * (shell.MAX_BYTES + 1))
     with pytest.raises(UnreadableFile, match="not UTF-8"):
-        _shell.assignments(b"A='\xff'")
+        shell.assignments(b"A='\xff'")
     many = "".join(f"A{i}=1\n" for i in range(3000))
-    variables, warnings = _shell.assignments(many.encode())
-    assert len(variables) == _shell.MAX_VARIABLES
-    assert len(warnings) == _shell.MAX_WARNINGS + 1
-    assert values(f"A={'x' * (_shell.MAX_VALUE + 1)}") == {}
+    variables, warnings = shell.assignments(many.encode())
+    assert len(variables) == shell.MAX_VARIABLES
+    assert len(warnings) == shell.MAX_WARNINGS + 1
+    assert values(f"A={'x' * (shell.MAX_VALUE + 1)}") == {}
 
 
 HOSTILE = [
@@ -179,7 +179,7 @@ HOSTILE = [
 @pytest.mark.parametrize("piece", HOSTILE)
 def test_hostile_repetition_is_quick(piece: str) -> None:
     started = time.process_time()
-    _shell.assignments((piece * (2**20 // len(piece))).encode())
+    shell.assignments((piece * (2**20 // len(piece))).encode())
     assert time.process_time() - started < 20  # a quadratic scan of a mebibyte takes hours
 
 
@@ -187,7 +187,7 @@ def test_hostile_repetition_is_quick(piece: str) -> None:
 @settings(max_examples=300, deadline=None)
 def test_any_bytes(data: bytes) -> None:
     try:
-        variables, _ = _shell.assignments(data)
+        variables, _ = shell.assignments(data)
     except UnreadableFile:
         return
     assert all(name.isidentifier() for name in variables)
@@ -208,8 +208,8 @@ def test_a_real_shell_ends_with_the_same_values(tmp_path: Path) -> None:
     for number, script in enumerate(scripts[:250]):
         file = tmp_path / f"{number}.sh"
         file.write_text(script)
-        shell = [BASH, "--norc", "-c", f". {file} >/dev/null 2>&1; {report}"]
-        ran = subprocess.run(shell, capture_output=True, check=False, env={"LC_ALL": "C.UTF-8", "PATH": "/nonexistent"})
+        bash = [BASH, "--norc", "-c", f". {file} >/dev/null 2>&1; {report}"]
+        ran = subprocess.run(bash, capture_output=True, check=False, env={"LC_ALL": "C.UTF-8", "PATH": "/nonexistent"})
         a, b, *_ = ran.stdout.decode("utf-8", "replace").split("\0")
         for name, value in values(script).items():
             if name in "AB" and {"A": a, "B": b}[name] != "unset":
@@ -226,13 +226,13 @@ def test_a_real_shell_ends_with_the_same_values(tmp_path: Path) -> None:
 @settings(deadline=None)
 def test_exports_read_back(wanted: dict[str, str]) -> None:
     text = {name: value for name, value in wanted.items() if value.isprintable()}
-    assert _shell.assignments(_shell.exports(text)) == (text, [])
+    assert shell.assignments(shell.exports(text)) == (text, [])
 
 
 @pytest.mark.skipif(not BASH, reason="bash is absent")
 def test_exports_are_what_a_shell_reads() -> None:
     value = 'it\'s $HOME `id` "x" \\ ; é #'
-    script = _shell.exports({"A": value}).decode() + 'printf %s "$A"'
+    script = shell.exports({"A": value}).decode() + 'printf %s "$A"'
     ran = subprocess.run([BASH, "--norc", "-c", script], capture_output=True, check=True)
     assert ran.stdout.decode() == value
 
@@ -242,4 +242,4 @@ def test_exports_are_what_a_shell_reads() -> None:
 )
 def test_exports_refuses(name: str, value: str) -> None:
     with pytest.raises(ValueError, match="cannot be exported"):
-        _shell.exports({name: value})
+        shell.exports({name: value})

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 
 from app import formats
 from app.errors import BadUpload, Invalid, MissingDatum, UnreadableFile
-from app.formats import FileGroup, Limits, ReadContext, WriteContext, _tmap, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, _tmap, get_format
+from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, PartKey

@@ -17,7 +17,7 @@ from app.convert import worker
 from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotConvert
-from app.formats import Limits
+from app.limits import Limits
 from app.model import osm_areas
 from app.model.frame import Datum
 from app.model.grid import OCCUPIED, OccupancyGrid

@@ -11,19 +11,20 @@ from typing import Any
 import orjson
 import pytest
 import ryml
-import yaml
+import yaml as pyyaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats import Limits, _yaml
 from app.formats._rmf import Flow
+from app.limits import Limits
+from app.syntax import yaml
 
 LIMITS = Limits()
 
 
 def load(text: str | bytes) -> Any:
-    return _yaml.load(text.encode() if isinstance(text, str) else text, LIMITS)
+    return yaml.load(text.encode() if isinstance(text, str) else text, LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -205,17 +206,17 @@ def test_long_lines_take_time_in_proportion(start: str, filling: str) -> None:
 
 def test_limits_on_nodes_and_bytes() -> None:
     with pytest.raises(TooLarge, match="nodes") as caught:
-        _yaml.load(b"a:\n" + b"- 1\n" * 100, Limits(yaml_nodes=50))
+        yaml.load(b"a:\n" + b"- 1\n" * 100, Limits(yaml_nodes=50))
     assert caught.value.problems[0].line == 49  # a mapping, its key, a list and 48 items
     with pytest.raises(TooLarge, match="bytes"):
-        _yaml.load(b"a: 1\n" * 100, Limits(text_bytes=50))
+        yaml.load(b"a: 1\n" * 100, Limits(text_bytes=50))
 
 
 def quick(text: str) -> Any:
     """What the quick way makes of it, or a mark that it leaves it to the reference."""
     try:
-        return _yaml._load_lines(text, LIMITS)
-    except _yaml._NotSimpleError:
+        return yaml._load_lines(text, LIMITS)
+    except yaml._NotSimpleError:
         return NotImplemented
 
 
@@ -227,10 +228,10 @@ def test_both_ways_agree_on_all_real_files(shared: Path) -> None:
         text = path.read_text()
         if path.parts[-3] == "navgraph":
             with pytest.raises(UnreadableFile, match="%TAG"):  # Fawkes' own tags
-                _yaml._load_events(text, LIMITS)
+                yaml._load_events(text, LIMITS)
             continue
-        reference = _yaml._load_events(text, LIMITS)
-        assert reference == yaml.load(text, yaml.CSafeLoader) or "graphs" in text, path
+        reference = yaml._load_events(text, LIMITS)
+        assert reference == pyyaml.load(text, pyyaml.CSafeLoader) or "graphs" in text, path
         value = quick(text)
         if value is not NotImplemented:
             simple.add(path.name)
@@ -266,7 +267,7 @@ def test_both_ways_agree_on_whatever_the_quick_way_takes(rows: list[Any], end: s
     text = end.join(" " * indent + dash + glue.join(words) for indent, dash, words, glue in rows)
     value = quick(text)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(text, LIMITS)), text
+        assert orjson.dumps(value) == orjson.dumps(yaml._load_events(text, LIMITS)), text
 
 
 FLOWING = [
@@ -294,7 +295,7 @@ def test_both_ways_agree_on_collections_in_flow_style(rows: list[Any]) -> None:
     text = "\n".join(indent + start + "".join(words) for indent, start, words in rows)
     value = quick(text)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(text, LIMITS)), text
+        assert orjson.dumps(value) == orjson.dumps(yaml._load_events(text, LIMITS)), text
 
 
 floats = st.floats(allow_nan=False, allow_infinity=False)
@@ -311,7 +312,7 @@ flowing = st.recursive(
 @given(st.lists(st.lists(flowing, min_size=1, max_size=5), min_size=1, max_size=5))
 def test_rows_in_flow_style_are_taken_the_quick_way(rows: list[Any]) -> None:
     text = "rows:\n" + "".join(f"  - {Flow()(row)}\n" for row in rows)
-    reference = _yaml._load_events(text, LIMITS)
+    reference = yaml._load_events(text, LIMITS)
     assert orjson.dumps(reference) == orjson.dumps({"rows": rows}, option=orjson.OPT_SORT_KEYS)
     value = quick(text)
     assert value is not NotImplemented, text
@@ -320,15 +321,15 @@ def test_rows_in_flow_style_are_taken_the_quick_way(rows: list[Any]) -> None:
 
 def test_limits_hold_for_collections_in_flow_style() -> None:
     rows = b"- [1, 2, {a: [4, true], b: [1, '']}]\n" * 10  # 12 nodes a row
-    assert len(_yaml.load(rows, Limits(yaml_nodes=121))) == 10
+    assert len(yaml.load(rows, Limits(yaml_nodes=121))) == 10
     with pytest.raises(TooLarge, match="nodes") as caught:
-        _yaml.load(rows, Limits(yaml_nodes=110))
+        yaml.load(rows, Limits(yaml_nodes=110))
     assert caught.value.problems[0].line == 10
     with pytest.raises(UnreadableFile, match="nested deeper"):
-        _yaml.load(b"a:\n" + rows, Limits(yaml_depth=4))
+        yaml.load(b"a:\n" + rows, Limits(yaml_depth=4))
     with pytest.raises(UnreadableFile, match="nested deeper"):
         load("a: " + "[" * 60 + "]" * 60)
-    assert _yaml.load(b"a:\n" + rows, Limits(yaml_depth=5))["a"][9] == [1, 2, {"a": [4, True], "b": [1, ""]}]
+    assert yaml.load(b"a:\n" + rows, Limits(yaml_depth=5))["a"][9] == [1, 2, {"a": [4, True], "b": [1, ""]}]
 
 
 @settings(max_examples=500, deadline=None)
@@ -336,7 +337,7 @@ def test_limits_hold_for_collections_in_flow_style() -> None:
 def test_both_ways_agree_on_any_text(said: str) -> None:
     value = quick(said)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+        assert orjson.dumps(value) == orjson.dumps(yaml._load_events(said, LIMITS)), said
 
 
 @settings(max_examples=300, deadline=None)
@@ -371,16 +372,16 @@ values = st.recursive(
 @settings(max_examples=500, deadline=None)
 @given(st.dictionaries(texts, values, min_size=1, max_size=5))
 def test_what_is_written_is_read_back_by_us_and_by_pyyaml(value: dict[str, Any]) -> None:
-    text = _yaml.mapping(value, 0)
+    text = yaml.mapping(value, 0)
     assert orjson.dumps(load(text), option=orjson.OPT_SORT_KEYS) == orjson.dumps(value, option=orjson.OPT_SORT_KEYS)
-    assert yaml.safe_load(text) == value
-    assert _yaml.mapping(dict(reversed(value.items())), 0) == text
+    assert pyyaml.safe_load(text) == value
+    assert yaml.mapping(dict(reversed(value.items())), 0) == text
 
 
 @settings(max_examples=600, deadline=None)
 @given(st.dictionaries(texts, values, min_size=1, max_size=5), st.randoms(use_true_random=False))
 def test_both_ways_agree_on_damaged_documents(value: dict[str, Any], random: Any) -> None:
-    lines = _yaml.mapping(value, 0).split("\n")
+    lines = yaml.mapping(value, 0).split("\n")
     for _ in range(random.randrange(4)):
         k = random.randrange(len(lines))
         change = random.randrange(6)
@@ -400,7 +401,7 @@ def test_both_ways_agree_on_damaged_documents(value: dict[str, Any], random: Any
     text = "\n".join(lines)
     taken = quick(text)
     if taken is not NotImplemented:
-        assert orjson.dumps(taken) == orjson.dumps(_yaml._load_events(text, LIMITS)), text
+        assert orjson.dumps(taken) == orjson.dumps(yaml._load_events(text, LIMITS)), text
 
 
 plain = st.text(st.characters(categories=["L", "N", "P", "Zs"], max_codepoint=0x2000), max_size=12).filter(
@@ -414,5 +415,5 @@ plain = st.text(st.characters(categories=["L", "N", "P", "Zs"], max_codepoint=0x
     st.dictionaries(plain, plain | st.booleans() | st.integers(-1000, 1000) | st.lists(plain, max_size=3), min_size=1)
 )
 def test_what_is_written_is_the_same_for_a_reader_of_yaml_1_2(value: dict[str, Any]) -> None:
-    tree = ryml.parse_in_arena(_yaml.mapping(value, 0).encode())
+    tree = ryml.parse_in_arena(yaml.mapping(value, 0).encode())
     assert orjson.loads(ryml.emit_json(tree)) == value

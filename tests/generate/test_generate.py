@@ -13,9 +13,9 @@ import shapely
 from app import generate
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Conflict, Invalid, MissingLayer, NotFound
-from app.formats import Limits
 from app.generate import RandomSource, generates
 from app.ingest import GenerationRequest, Ingest
+from app.limits import Limits
 from app.model.features import Features
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layers, PartKey

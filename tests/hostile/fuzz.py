@@ -24,7 +24,8 @@ import orjson
 
 from app import formats, upload_reader
 from app.errors import BadUpload, FleetMapError, Invalid
-from app.formats import Limits, WriteContext
+from app.formats import WriteContext
+from app.limits import Limits
 from app.model.frame import Datum
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import sample_maps

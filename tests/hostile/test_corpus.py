@@ -11,8 +11,8 @@ import pytest
 
 from app import upload_reader
 from app.errors import BadUpload, Invalid, TooLarge
-from app.formats import Limits
-from app.formats._text import numbers
+from app.limits import Limits
+from app.syntax.decimals import numbers
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import ACCORDING_TO_KIND, Case, cases, damaged, sample_maps, zipped
 

@@ -12,7 +12,8 @@ import pytest
 
 from app import upload_reader
 from app.errors import BadUpload, Problem
-from app.formats import Limits, group_warnings
+from app.formats import group_warnings
+from app.limits import Limits
 from app.model.frame import Datum
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import KML, SAMPLES

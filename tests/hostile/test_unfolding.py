@@ -16,7 +16,8 @@ import pytest
 
 from app import upload_reader
 from app.errors import BadUpload, TooLarge
-from app.formats import UNPACKED_FREE_BYTES, Limits, ReadContext, get_format
+from app.formats import ReadContext, get_format
+from app.limits import UNPACKED_FREE_BYTES, Limits
 from app.pool import Pool
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import KML, ROOM, SAMPLES, zipped

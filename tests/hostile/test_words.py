@@ -22,7 +22,7 @@ from app import formats, upload_reader
 from app.convert.recipe import AvailableLayers, plan_chain
 from app.convert.worker import write
 from app.errors import FleetMapError
-from app.formats import Limits
+from app.limits import Limits
 from app.model.features import NO_GEOMETRY, Features
 from app.model.frame import Datum
 from app.model.layers import Layers

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import shapely
 
-from app.derive import _raster
-from app.model import obstacles
+from app.model import obstacles, raster
 from app.model.grid import FREE, OCCUPIED, UNKNOWN
 
 POINT, LINE, AREA = shapely.Point(0, 0), shapely.LineString([(0, 0), (4, 0)]), shapely.box(0, 0, 4, 2)
@@ -91,7 +90,7 @@ def test_flood_reaches_what_is_joined_to_the_border() -> None:
     cells = np.zeros((9, 12), np.uint8)
     cells[2:7, 2:7], cells[3:6, 3:6] = OCCUPIED, FREE
     cells[2:7, 8], cells[4, 8] = OCCUPIED, FREE
-    _raster.flood(cells, FREE, UNKNOWN)
+    raster.flood(cells, FREE, UNKNOWN)
     assert (cells[3:6, 3:6] == FREE).all()
     assert np.count_nonzero(cells == FREE) == 9
     assert np.count_nonzero(cells == OCCUPIED) == 16 + 4

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Limits
+from app.limits import Limits
 
 MAX_DEPTH = 96
 """Nested values; sites have about fifteen."""

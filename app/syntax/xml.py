@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Set
+from collections.abc import Callable, Set
 
 from lxml import etree
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Limits, ReadContext
+from app.limits import Limits
 from app.model.names import did_you_mean
 from app.model.xml_prolog import check_prolog
 
@@ -56,7 +56,7 @@ _ACTIVE: tuple[tuple[str, re.Pattern[bytes]], ...] = (
 _ACTIVE_WORDS = (b"<?", b"/2001/xinclude", b"/xsl/transform", b"script")
 
 
-def report_active_content(data: bytes, context: ReadContext, *, has_scripts: bool = False) -> None:
+def report_active_content(data: bytes, warn: Callable[..., None], *, has_scripts: bool = False) -> None:
     """Report what some viewer of an XML file may run or fetch, and this server does not: each kind by name, once.
 
     has_scripts: the format's own elements are called so (SDFormat's materials).
@@ -73,14 +73,14 @@ def report_active_content(data: bytes, context: ReadContext, *, has_scripts: boo
             name = "" if shown is None else f" {shown.group()[:60].decode('latin-1').strip()!r}"
             often = f" ({len(positions)} times)" if len(positions) > 1 else ""
             line = low.count(b"\n", 0, positions[0]) + 1
-            context.warn(f"{noun}{name}{often}: it is not run or followed here; a viewer may do so", line=line)
+            warn(f"{noun}{name}{often}: it is not run or followed here; a viewer may do so", line=line)
 
 
 def report_unknown_elements(
     data: bytes,
     root: etree._Element,
     format_names: Set[str],
-    context: ReadContext,
+    warn: Callable[..., None],
     *,
     free: Set[str],
     namespace: str = "",
@@ -111,7 +111,7 @@ def report_unknown_elements(
         for name, elements in list(elements_by_name.items())[:_SHOWN]
     ]
     texts += [f"and {len(elements_by_name) - _SHOWN} more"] if len(elements_by_name) > _SHOWN else []
-    context.warn(f"unknown elements, kept without effect: {', '.join(texts)}", line=first.sourceline)
+    warn(f"unknown elements, kept without effect: {', '.join(texts)}", line=first.sourceline)
 
 
 _TAG = re.compile(rb"<([^\s<>/!?=\"']+)")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.errors import TooLarge, UnreadableFile
-from app.formats import Limits
+from app.limits import Limits
 from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
 Bytes = NDArray[np.uint8]

@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from app.errors import Problem, TooLarge, UnreadableFile, UnsafeArchive
-from app.formats import UNPACKED_FREE_BYTES, Limits
+from app.limits import UNPACKED_FREE_BYTES, Limits
 from app.model.names import name_problem
 
 _END = struct.Struct("<4s4H2LH")

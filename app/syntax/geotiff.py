@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import BadUpload, Problem, TooLarge, UnreadableFile
-from app.formats import Limits
+from app.limits import Limits
 from app.model.frame import MAX_METRES
 from app.model.gdal import CACHE, DATA_TYPES, buffer_bytes, gdal, native, open_memory_dataset
 from app.model.geodesy import crs_bounds

@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Limits
+from app.limits import Limits
 
 TAG = "tag:yaml.org,2002:"
 CONSTANTS: dict[str, Any] = {

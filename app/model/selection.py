@@ -1,16 +1,43 @@
-"""Which of the stored occupancy grids a derivation looks at."""
+"""Which of several stored parts of a layer a step looks at: one for each level."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive import DerivationNotes
-from app.derive._select import parts_with_name, select_per_level
-from app.errors import MissingLayer
+from app.errors import Ambiguous, MissingLayer, NotFound
 from app.model import masks
 from app.model.grid import OccupancyGrid, unknown_grey, unknown_grey_as_unknown
 from app.model.layers import MAP, Layers, PartKey
+from app.model.names import did_you_mean
+
+P = TypeVar("P")
+
+
+def parts_with_name(parts: Mapping[PartKey, P], name: str, label: str) -> dict[PartKey, P]:
+    """The parts of this name. what: what errors call one. Raises NotFound with the names that there are."""
+    matches = {key: part for key, part in parts.items() if key.name == name}
+    if not matches:
+        names = sorted({key.name for key in parts})
+        listing = ", ".join(names) or "none"
+        raise NotFound(f"there is no {label} {name!r}{did_you_mean(name, names)}; there are: {listing}")
+    return matches
+
+
+def select_per_level(parts: Mapping[PartKey, P], usual: str, label: str, option: str) -> dict[PartKey, P]:
+    """For each level the part of the usual name, else the only one. Ambiguous says which option names one."""
+    out: dict[PartKey, P] = {}
+    for level in dict.fromkeys(key.level for key in parts):
+        level_parts = {key: part for key, part in parts.items() if key.level == level}
+        chosen = {key: part for key, part in level_parts.items() if key.name == usual} or level_parts
+        if len(chosen) > 1:
+            listing = ", ".join(key.name for key in chosen)
+            raise Ambiguous(f"level {level!r} has several {label}s ({listing}): name one with {option}=")
+        out.update(chosen)
+    return out
 
 
 def select_grids(layers: Layers, name: str | None, label: str) -> dict[PartKey, OccupancyGrid]:
@@ -27,11 +54,11 @@ def select_grids(layers: Layers, name: str | None, label: str) -> dict[PartKey, 
     return select_per_level(maps, MAP, "occupancy grid", "grid")
 
 
-def as_planned(grid: OccupancyGrid, name: str, notes: DerivationNotes) -> OccupancyGrid:
+def as_planned(grid: OccupancyGrid, name: str, warn: Callable[[str], None]) -> OccupancyGrid:
     """The grid with free cells of unknown's grey as unknown, and a warning where there are such cells."""
     grey = unknown_grey(grid)
     if grey is not None:
-        notes.warn(grey_warning(grid, grey, name, "they are taken as unknown"))
+        warn(grey_warning(grid, grey, name, "they are taken as unknown"))
     return unknown_grey_as_unknown(grid)
 
 

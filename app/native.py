@@ -96,7 +96,7 @@ def _modules() -> list[str]:
 
 def _files() -> list[Path]:
     """The modules that hold kernels."""
-    app = Path(__file__).parents[1]
+    app = Path(__file__).parent
     return sorted(file for package in _PACKAGES for file in (app / package).glob(f"{_KERNELS}*.py"))
 
 

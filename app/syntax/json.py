@@ -10,7 +10,7 @@ import numpy as np
 import orjson
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Limits
+from app.limits import Limits
 
 MAX_DEPTH = 128
 """Nested arrays and objects. Real files have about ten; interpreters that recurse fail near a thousand."""
