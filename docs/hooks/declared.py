@@ -10,13 +10,14 @@ import ast
 import functools
 import importlib
 import inspect
+import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 PACKAGE = "app.formats"
-LEVELS = {"refused": "error", "doubted": "warning"}
+LEVELS = {"error_finding": "error", "warning_finding": "warning"}
 NAMES = frozenset({"drop", "fill", "lose", *LEVELS})
 
 
@@ -37,10 +38,11 @@ def _units(name: str) -> tuple[dict[str, Unit], dict[str, tuple[str, str]]]:
     for node in ast.parse(inspect.getsource(module)).body:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
             units[node.name] = Unit(module, node)
-        elif isinstance(node, ast.ImportFrom) and node.module == PACKAGE:
-            imported |= {a.asname or a.name: (f"{PACKAGE}.{a.name}", "") for a in node.names if a.name.startswith("_")}
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{PACKAGE}._"):
-            imported |= {a.asname or a.name: (str(node.module), a.name) for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(f"{PACKAGE}."):
+            for alias in node.names:
+                value = getattr(importlib.import_module(str(node.module)), alias.name, None)
+                target = (value.__name__, "") if isinstance(value, ModuleType) else (str(node.module), alias.name)
+                imported[alias.asname or alias.name] = target
     return units, imported
 
 
@@ -128,7 +130,7 @@ def _marks(unit: Unit) -> list[tuple[ast.AST, ast.AST]]:
     while todo:
         scope, node = todo.pop()
         is_call = isinstance(node, ast.Call) and _called(node) in NAMES and bool(node.args)
-        if is_call or (isinstance(node, ast.Subscript) and "lost" in ast.unparse(node.value)):
+        if is_call or (isinstance(node, ast.Subscript) and re.search("lost|dropped", ast.unparse(node.value))):
             out.append((scope, node))
         inner = node if isinstance(node, ast.FunctionDef) else scope
         todo += [(inner, child) for child in ast.iter_child_nodes(node)]

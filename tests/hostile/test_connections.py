@@ -35,7 +35,7 @@ class FakeConnection:
         self.closed = False
         self.is_idle = False
 
-    def give_way(self) -> None:
+    def close_idle(self) -> None:
         self.closed = True
 
 

@@ -27,8 +27,8 @@ def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> No
 def test_another_process_sees_it(tmp_path: Path) -> None:
     counter = CommitCounter(tmp_path)
     before = counter()
-    code = "from pathlib import Path; from app.store.commit_counter import Generation; "
-    code += f"Generation(Path({str(tmp_path)!r})).change()"
+    code = "from pathlib import Path; from app.store.commit_counter import CommitCounter; "
+    code += f"CommitCounter(Path({str(tmp_path)!r})).change()"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert counter() != before
     counter.close()
