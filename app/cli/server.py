@@ -78,11 +78,13 @@ def serve(*, demo: bool = False, **values: Any) -> None:
 
         preload_in_background()
     gc.disable()  # until the application is made: what is loaded by then stays
+    from app import main
+
     try:
         address = local_address(listener, secure=settings.tls_certificate is not None)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         check(settings)
-        _main().check_bus(settings)
+        main.check_bus(settings)
         os.environ.update(settings.as_environment())  # what worker processes read
         _compile(settings.data_dir / "native")
         output.print_result(f"Fleet Map Server: {address} · documentation: {address}/docs")
@@ -164,7 +166,9 @@ def application() -> Any:
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_stop_with_parent, args=(parent,), daemon=True).start()
-    server_app = _main().create_app(load_settings({}, warn=False))  # the process that started it has warned
+    from app.main import create_app
+
+    server_app = create_app(load_settings({}, warn=False))  # the process that started it has warned
     gc.freeze()
     gc.unfreeze()  # all of it counts as old now, without a look at any of it
     gc.enable()
@@ -296,7 +300,9 @@ def check(settings: Settings) -> None:
     """Whether the server could start, told before it does; Unavailable with what to do about it."""
     with _store(settings) as store:
         if settings.database.startswith("sqlite"):
-            with _main().alone(settings.data_dir):
+            from app.main import startup_lock
+
+            with startup_lock(settings.data_dir):
                 store.migrate()
         store.check()
         try:
@@ -341,18 +347,13 @@ def _without_password(url: str) -> str:
     return make_url(url).render_as_string(hide_password=True)
 
 
-def _main() -> Any:
-    """``app.main``, when it is needed: other commands need no web server and start faster without."""
-    from app import main
-
-    return main
-
-
 def _run(settings: Settings, listener: socket.socket) -> None:
     import uvicorn
     from uvicorn.supervisors import Multiprocess
 
-    config = _main().server_config(settings, "app.cli.server:application")
+    from app.main import server_config
+
+    config = server_config(settings, "app.cli.server:application")
     # Uvicorn raises the signal again once it has shut down; after a clean stop the exit status shall be 0.
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: None)
