@@ -39,11 +39,14 @@ def _units(name: str) -> tuple[dict[str, Unit], dict[str, tuple[str, str]]]:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
             units[node.name] = Unit(module, node)
         elif isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(f"{PACKAGE}."):
-            for alias in node.names:
-                value = getattr(importlib.import_module(str(node.module)), alias.name, None)
-                target = (value.__name__, "") if isinstance(value, ModuleType) else (str(node.module), alias.name)
-                imported[alias.asname or alias.name] = target
+            imported |= {a.asname or a.name: _target(str(node.module), a.name) for a in node.names}
     return units, imported
+
+
+def _target(module: str, name: str) -> tuple[str, str]:
+    """What ``from module import name`` names: (module, name or empty)."""
+    is_module = isinstance(getattr(importlib.import_module(module), name, None), ModuleType)
+    return (f"{module}.{name}", "") if is_module else (module, name)
 
 
 @functools.cache

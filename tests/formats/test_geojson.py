@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from app import formats
 from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats import FileGroup, ReadContext, WriteContext, geojson
+from app.formats.geojson import words
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
@@ -232,7 +233,7 @@ def test_all_layers_survive(anchor: Any, datum: Datum | None) -> None:
 def test_metres_never_pass_as_degrees() -> None:
     layers = everything()
     served = orjson.loads(write(layers))
-    assert served["coordRefSys"] == geojson.LOCAL_3D
+    assert served["coordRefSys"] == words.LOCAL_3D
     assert served["conformsTo"] == ["http://www.opengis.net/spec/json-fg-1/1.0/conf/core"]
     assert all(f["geometry"] is None for f in served["features"])
     assert sum(f["place"] is not None for f in served["features"]) == 6
@@ -269,7 +270,7 @@ def test_the_apis_topology_is_one_again() -> None:
     local = collection(
         *[{**n, "geometry": None, "place": n["geometry"]} for n in nodes],
         {**feature(None, edge, id="a_b"), "place": line},
-        coordRefSys=geojson.LOCAL_2D,
+        coordRefSys=words.LOCAL_2D,
     )
     assert part(read(local), TOPOLOGY).local.all()
 
@@ -293,13 +294,13 @@ def test_local_objects_of_an_upload_stay_local() -> None:
         {**feature(None, {"name": "x"}), "place": point(100.5, 2000.25)},
         {**feature(None, {}), "place": {"type": "LineString", "coordinates": [[0, 0, 0], [5, 5, 0]]}},
         feature(point(7, 50), {}),
-        coordRefSys={"type": "Reference", "href": geojson.LOCAL_2D},
+        coordRefSys={"type": "Reference", "href": words.LOCAL_2D},
     )
     layers = read(top)
     assert part(layers, HOME).local.tolist() == [True, True, False]
     served = orjson.loads(write(layers))
     assert [f.get("place") for f in served["features"]] == [f.get("place") for f in top["features"]]
-    assert served["coordRefSys"] == geojson.LOCAL_2D
+    assert served["coordRefSys"] == words.LOCAL_2D
     context = ReadContext()
     foreign = collection({**feature(None, {}), "place": point(500_000, 5_000_000)}, coordRefSys="x/EPSG/0/32630")
     layers = read(foreign, context)
@@ -366,7 +367,7 @@ def test_ogr_reads_it(tmp_path: Path) -> None:
         (collection(feature(point(181, 0))), "longitude, latitude"),
         (collection(feature(point(0, 90.5))), "longitude, latitude"),
         (collection(feature(point(500_000, 5_000_000))), "EPSG:4326"),
-        (collection({**feature(None), "place": point(1e9, 0)}, coordRefSys=geojson.LOCAL_2D), "beyond"),
+        (collection({**feature(None), "place": point(1e9, 0)}, coordRefSys=words.LOCAL_2D), "beyond"),
         (collection(feature(point(1, 2)), crs={"type": "name", "properties": {"name": "EPSG:3857"}}), "EPSG:3857"),
         (collection(feature(point(1, 2), [1])), "properties"),
         (collection(feature(point(1, 2), {}), fleet_map={"datum": {"latitude": 99, "longitude": 0}}), "latitude"),

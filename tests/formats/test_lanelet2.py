@@ -20,8 +20,9 @@ from lxml import etree
 from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
-from app.formats import FileGroup, ReadContext, WriteContext, _osm, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, is_two_way, parse_speed
+from app.formats.osm import parsing
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
@@ -713,7 +714,7 @@ def test_members_as_autoware_writes_them_are_read_the_quick_way() -> None:
     ]
     members = "".join(f"    <member {row}/>\n" for row in rows)
     data = f'{head}  <relation id="7">\n{members}    <tag k="type" v="lanelet"/>\n  </relation>\n</osm>\n'.encode()
-    quick, careful = _osm._scan(data, Limits(), False), _osm._events(data, Limits())
+    quick, careful = parsing._scan(data, Limits(), False), parsing._events(data, Limits())
     assert quick is not None
     assert quick.relations == careful.relations
     assert quick.relations[0].members == [("way", -5, "left"), ("way", 6, "right & more"), ("node", 1, "")]

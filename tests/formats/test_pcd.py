@@ -15,7 +15,7 @@ from app import formats
 from app.convert.files import offline
 from app.errors import Invalid, TooLarge, UnreadableFile
 from app.formats import FileGroup, ReadContext, get_format
-from app.formats._pcd import parse
+from app.formats.clouds.pcd_codec import parse
 from app.limits import Limits
 from app.model.layers import Layers, PartKey
 from app.model.voxels import HALF, VoxelMap

@@ -16,7 +16,7 @@ from app import formats
 from app.convert.files import offline
 from app.errors import TooLarge, UnreadableFile
 from app.formats import FileGroup, ReadContext, get_format
-from app.formats._ply import parse
+from app.formats.clouds.ply_codec import parse
 from app.limits import Limits
 from app.model.layers import PartKey
 from app.model.voxels import VoxelMap

@@ -35,10 +35,10 @@ from app.formats import (
     WriteContext,
     _fields,
     _masks,
-    _occupancy_grid_rules,
     register,
 )
 from app.formats._select import file_stem, select_part
+from app.formats.occupancy_grid import rules as _occupancy_grid_rules
 from app.limits import Limits
 from app.model.frame import MAX_METRES
 from app.model.grid import (

@@ -1,4 +1,4 @@
-"""Writing KML: the drawings that were uploaded as they were, and everything else in our own words (see ``_kml``)."""
+"""Writing KML: the drawings that were uploaded as they were, and everything else in our own words (see ``reading``)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from app.errors import Invalid
 from app.formats import LayerRequirements, WriteContext
-from app.formats._kml import (
+from app.formats.kml.reading import (
     COORDINATES,
     DEFAULT_PART,
     END,
@@ -170,7 +170,7 @@ def _data(name: str, value: Any) -> str:
 @dataclass(frozen=True, slots=True)
 class _Texts:
     """The coordinate lists of n geometries as text: those of geometry k are texts[start[k]:start[k + 1]], in the order
-    of its parts and rings; shape[k] is the geometry in the letters of ``_kml``.
+    of its parts and rings; shape[k] is the geometry in the letters of ``reading``.
     """
 
     texts: list[str]

@@ -1,8 +1,8 @@
 """KML: drawings from Google Earth and the like, and any map of ours to look at there.
 
 Positions are longitude, latitude[, altitude], degrees WGS 84. A placemark or overlay is one object; whatever the file
-says beyond the canonical words is kept and comes back (``_kml`` tells how). Nothing that a file refers to is fetched.
-Source: OGC 12-007r2 (KML 2.3), Google's ``gx`` extension.
+says beyond the canonical words is kept and comes back (``kml.reading`` tells how). Nothing that a file refers to is
+fetched. Source: OGC 12-007r2 (KML 2.3), Google's ``gx`` extension.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import unescape
 
-from app.formats import Files, Format, ReadContext, WriteContext, _kml_rules, register
-from app.formats._kml import FAMILY, MAIN, read_kml
-from app.formats._kml_writing import NEEDS, write_kml
+from app.formats import Files, Format, ReadContext, WriteContext, register
+from app.formats.kml import rules as _kml_rules
+from app.formats.kml.reading import FAMILY, MAIN, read_kml
+from app.formats.kml.writing import NEEDS, write_kml
 from app.model.layers import Layers
 from app.parameters import parameter
 from app.syntax.archives import is_archive

@@ -50,14 +50,14 @@ from app.formats import (
     ReadContext,
     WriteContext,
     _fields,
-    _lanes,
-    _osm_text,
     register,
 )
-from app.formats._lanes import Arm, Array, Border
 from app.formats._network import CROSS_PART_PROPERTIES, Edge, MergedNetwork, get_source_properties, merge_networks
-from app.formats._osm import INT64, Data, Tags, Way, parse
-from app.formats._osm_text import NO_ATTRIBUTES, as_texts, attribute_text, element_id, integers
+from app.formats.lanelet2 import lane_geometry
+from app.formats.lanelet2.lane_geometry import Arm, Array, Border
+from app.formats.osm import xml_text
+from app.formats.osm.parsing import INT64, Data, Tags, Way, parse
+from app.formats.osm.xml_text import NO_ATTRIBUTES, as_texts, attribute_text, element_id, integers
 from app.model.features import NO_GEOMETRY, Features, Properties, SharedKeyDicts, from_columns, unique_ids
 from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Anchor, Datum
 from app.model.geodesy import local_frame
@@ -175,8 +175,10 @@ def network(lanes: Sequence[Lane], places: PointTable, document: Properties) -> 
     properties: list[Properties] = []
     if lanes:
         xy = places.metres()
-        left, right = (_lanes.runs([[places.row[r] for r in side] for side in sides]) for sides in _bounds(lanes))
-        left, right = _lanes.align_bounds(left, right, xy)
+        left, right = (
+            lane_geometry.runs([[places.row[r] for r in side] for side in sides]) for sides in _bounds(lanes)
+        )
+        left, right = lane_geometry.align_bounds(left, right, xy)
         lines, widths = _middles(lanes, left, right, places, xy)
         node_ids = {row: i for i, row in places.row.items()}
         begins = [
@@ -244,12 +246,12 @@ def _bounds(lanes: Sequence[Lane]) -> tuple[list[list[int]], list[list[int]]]:
 
 
 def _middles(
-    lanes: Sequence[Lane], left: _lanes.LineSet, right: _lanes.LineSet, places: PointTable, xy: Array
+    lanes: Sequence[Lane], left: lane_geometry.LineSet, right: lane_geometry.LineSet, places: PointTable, xy: Array
 ) -> tuple[list[Any], list[float | None]]:
     """Of each lane its middle as a line, and its width in metres, None where the bounds touch."""
     high = ~np.isnan(places.xyz[:, 2])
     values = np.where(np.isnan(places.xyz), 0.0, places.xyz)
-    points, owner = _lanes.middles(left, right, xy, values)
+    points, owner = lane_geometry.middles(left, right, xy, values)
     points = np.round(points, 12 if places.anchor == "wgs84" else 9)
     deep = np.zeros(len(lanes), bool)
     for side in (left, right):
@@ -1105,7 +1107,7 @@ class _Writer:
         for node, node_arms in sorted(arms.items()):
             at = net.nodes[node]
             stored = self.read_border(net, node)
-            border = stored[0] if stored else _lanes.border((at.x, at.y), node_arms)
+            border = stored[0] if stored else lane_geometry.border((at.x, at.y), node_arms)
             if border is None:
                 continue
             borders[node] = border
@@ -1134,13 +1136,14 @@ class _Writer:
             self.emit(net, lane, sides, centres)
         if narrow:
             self.context.warn(f"{narrow} lanes are narrower than their edges say, so that their bounds do not cross")
-        possible = sum(map(_lanes.count_ways, arms.values()))
+        possible = sum(map(lane_geometry.count_ways, arms.values()))
         connection_count = 0
         for node, node_arms in arms.items():
             across = [
-                _lanes.crossing_cosine(arm, borders[node]) if (arm.lane, arm.far) in joins else 0.0 for arm in node_arms
+                lane_geometry.crossing_cosine(arm, borders[node]) if (arm.lane, arm.far) in joins else 0.0
+                for arm in node_arms
             ]
-            connection_count += _lanes.count_through(node_arms, across)
+            connection_count += lane_geometry.count_through(node_arms, across)
         if breaks := possible - connection_count:
             self.context.warn(
                 f"{breaks} of {possible} ways from one lane into the next are no connection in Lanelet2's sense: their "
@@ -1180,9 +1183,9 @@ class _Writer:
         if not shapely.LineString(lane.middle[:, :2]).is_simple:  # it crosses itself, however narrow it is
             for far in (False, True):
                 joins.pop((k, far), None)
-            return *_lanes.offset_bounds(lane.middle[:, :2], half), False
+            return *lane_geometry.offset_bounds(lane.middle[:, :2], half), False
         for attempt in range(8):
-            left, right = _lanes.offset_bounds(lane.middle[:, :2], half)
+            left, right = lane_geometry.offset_bounds(lane.middle[:, :2], half)
             for far_ends in ((False, True), (True,), (False,), ()):
                 a, b = left.copy(), right.copy()
                 for far in far_ends:
@@ -1191,14 +1194,14 @@ class _Writer:
                         border = borders[node]
                         ends = (border.left, border.right) if straight else (border.right, border.left)
                         a[-1 if far else 0], b[-1 if far else 0] = ends
-                if _lanes.is_sound(a, b):
+                if lane_geometry.is_sound(a, b):
                     for far in {False, True} - set(far_ends):
                         joins.pop((k, far), None)
                     return a, b, attempt > 0
             half /= 2.0
         for far in (False, True):
             joins.pop((k, far), None)
-        return *_lanes.offset_bounds(lane.middle[:, :2], half), True
+        return *lane_geometry.offset_bounds(lane.middle[:, :2], half), True
 
     def emit(
         self, net: MergedNetwork, lane: _NewLanelet, sides: Sequence[list[int]], centres: Mapping[int, int]
@@ -1248,9 +1251,9 @@ class _Writer:
             self.context.drop(item, times, "a Lanelet2 map has no place for them")
         if self.layers.datum is not None:
             self.context.drop("datum", 1, "a Lanelet2 map stands on earth and has no local frame of its own")
-        return _osm_text.document(self.head(), nodes, self.ways, self.relations, self.children)
+        return xml_text.document(self.head(), nodes, self.ways, self.relations, self.children)
 
-    def nodes_in_degrees(self) -> dict[int, _osm_text.Node]:
+    def nodes_in_degrees(self) -> dict[int, xml_text.Node]:
         """All points in degrees with their tags."""
         todo = [i for i, p in self.points.items() if p.local and not (self.metric or math.isnan(p.xyz[0]))]
         degrees: dict[int, tuple[float, float]] = {}
@@ -1264,7 +1267,7 @@ class _Writer:
                 lon, lat = point.xyz[:2]
             else:
                 lon, lat = degrees.get(i) or point.at or (math.nan, math.nan)
-            out[i] = _osm_text.Node(lon, lat, self.tags(point), point.attributes)
+            out[i] = xml_text.Node(lon, lat, self.tags(point), point.attributes)
         return out
 
     def tags(self, point: _Point) -> Mapping[str, str]:
@@ -1292,7 +1295,7 @@ class _Writer:
             root["attribution"] = "; ".join(self.context.attribution)
         lines = [f"<osm{attribute_text(root, frozenset())}>"]
         for one in self.documents:
-            lines += _osm_text.element_lines(one.get("elements"))
+            lines += xml_text.element_lines(one.get("elements"))
             boxes = one.get("bounds")
             lines += [f" <bounds{attribute_text(as_texts(b), frozenset())}/>" for b in boxes or [] if as_texts(b)]
         return lines
@@ -1347,7 +1350,7 @@ def _metres_per_second(properties: Properties) -> float | None:
 
 def _kmh(speed: float) -> str:
     """As Autoware reads it: kilometres an hour without a unit."""
-    return _osm_text.plain(repr(round(speed * 3.6, 9) + 0.0)).removesuffix(".0")
+    return xml_text.plain(repr(round(speed * 3.6, 9) + 0.0)).removesuffix(".0")
 
 
 def _is_same_road(a: Edge, b: Edge) -> bool:

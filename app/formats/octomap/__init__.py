@@ -26,8 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import NotFound, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, WriteContext, _octomap_rules, register
+from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, WriteContext, register
 from app.formats._select import file_stem, select_part
+from app.formats.octomap import rules as _octomap_rules
 from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
 from app.model.voxels import DEPTH, LOG_ODDS, UNSET, VoxelMap, coarser, cut, merge_to_parents, prune

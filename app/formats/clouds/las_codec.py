@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from app.errors import UnreadableFile
 from app.formats import ReadContext, WriteContext
-from app.formats._points import AXES, RGB, Cloud, check_count, unreadable_error
+from app.formats.clouds.points import AXES, RGB, Cloud, check_count, unreadable_error
 
 MAGIC = b"LASF"
 SCALE = 0.001

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from app.errors import TooLarge
 from app.formats import ReadContext
-from app.formats._pcd import text_rows
-from app.formats._points import Cloud, check_columns, check_count, table, unreadable_error
+from app.formats.clouds.pcd_codec import text_rows
+from app.formats.clouds.points import Cloud, check_columns, check_count, table, unreadable_error
 
 Data = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 KINDS: tuple[Data, ...] = get_args(Data)

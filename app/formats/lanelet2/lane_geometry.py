@@ -1,8 +1,7 @@
 """Lanes as pairs of bounds: which way bounds run, the middle between them, and bounds beside a middle.
 
 Flat arrays: n lines are one array of places in a table of points, and where each begins (``LineSet``). Directions
-follow
-Lanelet2: looking along a lane, the left bound is on the left, and both run along it.
+follow Lanelet2: looking along a lane, the left bound is on the left, and both run along it.
 """
 
 from __future__ import annotations

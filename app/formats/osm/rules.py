@@ -16,8 +16,9 @@ from itertools import pairwise
 from lxml import etree
 
 from app.errors import Problem
-from app.formats import Files, _osm
+from app.formats import Files
 from app.formats._rules import HEAD_BYTES, LIMITS, duplicates, error_finding, is_brief, names, warning_finding
+from app.formats.osm import parsing
 from app.syntax import xml
 
 KINDS = ("node", "way", "relation")
@@ -28,13 +29,13 @@ MAX_WAY_NODES = 2000
 def check(files: Files) -> Iterator[Problem]:
     """An XML file (also packed) as its readers take it; a .pbf has its own strict layout and is left alone."""
     main = next(iter(files))
-    if _osm.is_pbf(files[main]):
+    if parsing.is_pbf(files[main]):
         return
     if is_brief(files[main]):
         if not re.search(rb"""<osm\b[^>]*\bversion=["']0\.6["']""", files[main][:HEAD_BYTES]):
             yield error_finding("must be 0.6", main, where="version")
         return
-    root = xml.parse(_osm.unpack(files[main], LIMITS), LIMITS)
+    root = xml.parse(parsing.unpack(files[main], LIMITS), LIMITS)
     if root.tag not in ("osm", "osmChange"):
         yield error_finding(f"the root is <{root.tag}>, not <osm>", main, line=root.sourceline)
         return

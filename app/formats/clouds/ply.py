@@ -1,7 +1,7 @@
-"""PCD point clouds (Point Cloud Library) ↔ voxels.
+"""PLY point clouds (and meshes, of which the vertices count) ↔ voxels.
 
-Read: the voxels that the points lie in, and the file beside them (see ``_points``). Written: the very file that the
-voxels were made of; the points of another cloud format's; else the centres of the occupied voxels, as float32.
+Read: the voxels that the vertices lie in, and the file beside them (see ``clouds.points``). Written: the very file that
+the voxels were made of; the points of another cloud format's; else the centres of the occupied voxels, as float32.
 """
 
 from __future__ import annotations
@@ -10,12 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _pcd, _points, register
-from app.formats._clouds import PARSERS
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
+from app.formats.clouds import ply_codec as _ply
+from app.formats.clouds import points as _points
+from app.formats.clouds.parsers import PARSERS
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
 
-NAME = "pcd"
+NAME = "ply"
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,19 +26,19 @@ class WriteOptions:
 
     name: str | None = parameter(None, _points.NAME_DOC)
     level: str | None = parameter(None, _points.LEVEL_DOC)
-    data: Literal["ascii", "binary", "binary_compressed"] | None = parameter(
-        None, "how points are encoded; default: as uploaded, else binary"
+    data: Literal["ascii", "binary_little_endian", "binary_big_endian"] | None = parameter(
+        None, "how points are encoded; default: as uploaded, else binary_little_endian"
     )
     frame: Literal["source", "local"] | None = parameter(None, _points.FRAME_DOC)
 
 
 def read(files: Files, context: ReadContext) -> Layers:
     """One voxel map and its cloud. Raises UnreadableFile (with line and word, or the reason) or TooLarge."""
-    return _points.read(files, context, NAME, _pcd.parse)
+    return _points.read(files, context, NAME, _ply.parse)
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.pcd`` (``<name>.pcd`` where a name is asked for). Raises MissingLayer, NotFound, Ambiguous or Invalid."""
+    """``map.ply`` (``<name>.ply`` where a name is asked for). Raises MissingLayer, NotFound, Ambiguous or Invalid."""
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
     source = _points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
     name = _points.file_name(options.name, NAME)
@@ -44,10 +46,15 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         return {name: source.data}
     cloud = source.cloud()
     if source.form != NAME:
-        cloud = replace(cloud, columns=_pcd.add_padding(_points.plain(cloud)), comments=())
-        for noun, count in cloud.further.items():
-            context.drop(noun, count, "a PCD has points only")
-    return {name: _pcd.pack(cloud, options.data or "binary")}
+        if cloud.height > 1:
+            context.drop("rows and columns of the cloud", 1, "a PLY's vertices are one list: ask for pcd")
+        context.drop(
+            "viewpoint", int(cloud.viewpoint != _points.IDENTITY_VIEWPOINT), "PLY has no place for it: ask for pcd"
+        )
+        cloud = replace(cloud, columns=_points.plain(cloud), comments=())
+    for noun, count in cloud.further.items():
+        context.drop(noun, count, "written again, a PLY has vertices only: leave out data= and frame= to keep it")
+    return {name: _ply.pack(cloud, options.data or "binary_little_endian")}
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
@@ -58,17 +65,17 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
 register(
     Format(
         name=NAME,
-        title="PCD point cloud",
-        files=("map.pcd",),
+        title="PLY point cloud",
+        files=("map.ply",),
         media_types=("application/octet-stream",),
         layers=frozenset({"voxels", "resources"}),
-        detect=_pcd.detect,
+        detect=_ply.detect,
         read=read,
         write=write,
         needs=LayerRequirements((frozenset({"voxels"}),), also=frozenset({"resources"})),
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
-        extensions=(".pcd",),
+        extensions=(".ply",),
         select_parts=choose,
         options_from_filename=_points.options_from_filename((NAME,)),
         parts=_points.PARTS,

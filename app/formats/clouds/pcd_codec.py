@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from app.errors import TooLarge
 from app.formats import ReadContext
-from app.formats._points import IDENTITY_VIEWPOINT, RGB, Cloud, check_columns, check_count, table, unreadable_error
+from app.formats.clouds.points import (
+    IDENTITY_VIEWPOINT,
+    RGB,
+    Cloud,
+    check_columns,
+    check_count,
+    table,
+    unreadable_error,
+)
 from app.syntax.lzf import expand, squeeze
 
 Data = Literal["ascii", "binary", "binary_compressed"]

@@ -46,9 +46,11 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _osm_rules, _osm_text, register
-from app.formats._osm import INT64, Data, Tags, Way, is_pbf, parse, unpack
-from app.formats._osm_text import NO_ATTRIBUTES, Node, as_texts, attribute_text, element_id, integers, plain
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
+from app.formats.osm import rules as _osm_rules
+from app.formats.osm import xml_text
+from app.formats.osm.parsing import INT64, Data, Tags, Way, is_pbf, parse, unpack
+from app.formats.osm.xml_text import NO_ATTRIBUTES, Node, as_texts, attribute_text, element_id, integers, plain
 from app.limits import Limits
 from app.model import osm_tags
 from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, points, segments, shared_key_dict
@@ -1101,7 +1103,7 @@ class _Writer:
     def text(self) -> bytes:
         for item, times in sorted(self.lost.items()):
             self.context.drop(item, times, "OSM has no place for them")
-        return _osm_text.document(self.head(), self.nodes, self.ways, self.relations, self.children)
+        return xml_text.document(self.head(), self.nodes, self.ways, self.relations, self.children)
 
     def head(self) -> list[str]:
         documents = [p.document for p in self.layers.parts.values() if isinstance(p, Features)]
@@ -1114,7 +1116,7 @@ class _Writer:
             root["attribution"] = "; ".join(self.context.attribution)
         lines = [f"<osm{attribute_text(root, frozenset())}>"]
         for one in source_documents:
-            lines += _osm_text.element_lines(one.get("elements"))
+            lines += xml_text.element_lines(one.get("elements"))
         boxes = [d["bounds"] for d in documents if _is_box(d.get("bounds"))]
         if not boxes:
             boxes = self.fence()

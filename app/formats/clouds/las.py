@@ -1,6 +1,6 @@
 """LAS and LAZ point clouds ↔ voxels.
 
-Read: the voxels that the points lie in, and the file beside them (see ``_points``); the file's CRS places them.
+Read: the voxels that the points lie in, and the file beside them (see ``clouds.points``); the file's CRS places them.
 Written: the very file that the voxels were made of; the points of another cloud format's; else the centres of the
 occupied voxels. What is written anew is LAS 1.4 in steps of a millimetre.
 """
@@ -11,8 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _las, _points, register
-from app.formats._clouds import PARSERS
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
+from app.formats.clouds import las_codec as _las
+from app.formats.clouds import points as _points
+from app.formats.clouds.parsers import PARSERS
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
 

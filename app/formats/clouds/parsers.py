@@ -1,0 +1,15 @@
+"""How each kind of cloud file is read, by its ending: any of them may be what a wanted cloud is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from app.formats.clouds import las_codec, pcd_codec, ply_codec
+from app.formats.clouds.points import Parse
+
+PARSERS: Mapping[str, Parse] = {
+    "pcd": pcd_codec.parse,
+    "ply": ply_codec.parse,
+    "las": las_codec.parse,
+    "laz": las_codec.parse,
+}

@@ -1,0 +1,349 @@
+"""Reading GeoJSON and JSON-FG: features as parts of layers, in degrees or in metres."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, NoReturn, cast
+
+import numpy as np
+import orjson
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import Problem, TooLarge, UnreadableFile
+from app.formats import Files, ReadContext
+from app.formats.geojson.geometry import parse_geometries
+from app.formats.geojson.words import FAMILY, GEOMETRIES, LOCAL_2D, OWN_MEMBER
+from app.model.features import MAX_ID, Features, Properties, unique_ids
+from app.model.frame import MAX_METRES, Datum, Level
+from app.model.layers import NETWORK, VECTOR_LAYERS, Layer, Layers, Part, PartKey
+from app.syntax import json
+
+_EARTH = re.compile(r"(?i)(?:.*\b(?:CRS84h?|WGS ?84)|.*EPSG(?::|/)[^/]*(?::|/)?(?:4326|4979)\b)")
+_METRES = {"Engineering2D", "Engineering3D"}
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """Objects, and the layers that our own words tell of.
+
+    Raises UnreadableFile (with a line where there is one) for what is not GeoJSON, for numbers that are not finite, for
+    places that are not on earth and for coordinate systems other than WGS 84; TooLarge beyond the limits.
+    """
+    data = files[context.main].removeprefix(b"\xef\xbb\xbf")
+    top = json.load(data, context.limits)
+    return _Reader(data, top, context).layers()
+
+
+def _has_own_members(p: Any) -> bool:
+    """Whether these properties carry our own words."""
+    return (
+        isinstance(p, dict)
+        and "part" in p
+        and isinstance(p.get("layer"), str)
+        and p["layer"] in VECTOR_LAYERS
+        and isinstance(p.get("level"), str)
+        and isinstance(p["part"], str)
+    )
+
+
+def _raise_unreadable(reason: str, line: int | None = None, location: str | None = None) -> NoReturn:
+    raise UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, line=line, where=location)])
+
+
+def _is_box(box: Any) -> bool:
+    """Whether these are four or six numbers, corner after corner, within the earth's longitudes and latitudes."""
+    if not isinstance(box, list) or len(box) not in (4, 6):
+        return False
+    numbers = [float(v) for v in box if isinstance(v, (int, float)) and not isinstance(v, bool)]
+    if len(numbers) < len(box):
+        return False
+    half = len(numbers) // 2
+    west, south, east, north = numbers[0], numbers[1], numbers[half], numbers[half + 1]
+    return max(abs(west), abs(east)) <= 180.0 and -90.0 <= south <= north <= 90.0
+
+
+class _Reader:
+    def __init__(self, data: bytes, top: Any, context: ReadContext) -> None:
+        self.data = data
+        self.context = context
+        if not isinstance(top, dict):
+            _raise_unreadable("GeoJSON is one object with a type", 1)
+        self.top = top
+        self.root = str(top.get("type"))
+        self.rows = self._rows()
+        self.marks = [_has_own_members(row.get("properties")) for row in self.rows]
+        if len(self.rows) > context.limits.features:
+            raise TooLarge(f"{context.main} has {len(self.rows)} features; the limit is {context.limits.features}")
+        self.local = self._is_local(top.get("coordRefSys"))
+        self._check_crs(top.get("crs"), None)
+
+    def _rows(self) -> list[dict[str, Any]]:
+        if self.root == "FeatureCollection":
+            rows = self.top.get("features")
+            if not isinstance(rows, list):
+                _raise_unreadable("a FeatureCollection needs an array called features", 1)
+            for k, row in enumerate(rows):
+                if not isinstance(row, dict) or row.get("type") != "Feature":
+                    _raise_unreadable(
+                        "every member of features must be an object of type Feature", self.line(k), f"features[{k}]"
+                    )
+            return rows
+        if self.root == "Feature":
+            return [self.top]
+        if self.root in GEOMETRIES:
+            return [{"type": "Feature", "geometry": self.top, "properties": None}]
+        _raise_unreadable(
+            f"{self.root[:40]!r} is no GeoJSON type: FeatureCollection, Feature or a geometry is needed", 1
+        )
+
+    def line(self, k: int) -> int | None:
+        """The line where feature k begins, as far as the text tells: features seldom hold features."""
+        line_number = None
+        for n, match in enumerate(re.finditer(rb'"type"\s*:\s*"Feature"', self.data)):
+            if n == k:
+                line_number = self.data.count(b"\n", 0, match.start()) + 1
+        return line_number
+
+    def _is_local(self, reference: Any) -> bool:
+        """Whether ``coordRefSys`` names a local engineering frame."""
+        if isinstance(reference, dict):
+            reference = reference.get("href")
+        return isinstance(reference, str) and reference.rstrip("/").rpartition("/")[2] in _METRES
+
+    def _check_crs(self, crs: Any, location: str | None) -> None:
+        """The ``crs`` of the 2008 specification: WGS 84 in longitude, latitude or nothing."""
+        if crs is None:
+            return
+        properties = crs.get("properties") if isinstance(crs, dict) else None
+        name = properties.get("name") if isinstance(properties, dict) else None
+        name = name if isinstance(name, str) else orjson.dumps(crs).decode()
+        if not _EARTH.match(name) or "UTM" in name.upper():
+            _raise_unreadable(
+                f"its coordinates are in {name[:80]}, but GeoJSON means degrees (WGS 84 longitude, latitude): export "
+                "it again in EPSG:4326 (a Nav2 route graph is the format nav2_route)",
+                1,
+                location or "crs",
+            )
+
+    # --- features ---
+
+    def report_missing_members(self) -> None:
+        """Report features without the members that every feature has, and a CRS of places that is not known."""
+        for member in ("geometry", "properties"):
+            lacking = [
+                k
+                for k, row in enumerate(self.rows)
+                if member not in row and not (member == "geometry" and "place" in row)
+            ]
+            if lacking:
+                reason = (
+                    f"{len(lacking)} features have no member {member!r}: each must have one, null where there is none"
+                )
+                self.context.warn(reason, line=self.line(lacking[0]), where=self.name(lacking[0]))
+        crs = self.top.get("coordRefSys")
+        if crs is not None and not self.local:
+            text = crs if isinstance(crs, str) else orjson.dumps(crs).decode()
+            if not _EARTH.match(text):
+                reason = f"{text[:80]} is unsupported: only `geometry` (WGS 84) is read, `place` is ignored"
+                self.context.warn(reason, where="coordRefSys")
+        box = self.top.get("bbox")
+        if box is not None and not _is_box(box):
+            self.context.warn("is no box [west, south, east, north] in degrees; it is kept", where="bbox")
+
+    def layers(self) -> Layers:
+        self.report_missing_members()
+        extension = self.top.get(OWN_MEMBER)
+        extension = extension if isinstance(extension, dict) else {}
+        network = self._network()
+        keys = [self._key(k, network) for k in range(len(self.rows))]
+        raw = [self._read_geometry(k, row) for k, row in enumerate(self.rows)]
+        local = np.array([is_local for is_local, _ in raw], bool)
+        shapes, odd = parse_geometries(
+            [g for _, g in raw], lambda k, reason: _raise_unreadable(reason, self.line(k), self.name(k))
+        )
+        self._check_places(shapes, local)
+        groups: dict[PartKey, list[int]] = {}
+        for k, key in enumerate(keys):
+            groups.setdefault(key, []).append(k)
+        documents = self._documents(extension)
+        parts: dict[PartKey, Part] = {}
+        home = PartKey("objects", self.context.level, FAMILY)
+        for key in dict.fromkeys([*groups, *documents]):
+            places = groups.get(key, [])
+            document = documents.get(key, {})
+            if key == home:
+                document = {**document, **self._document()}
+            file_ids = [self._requested_id(k, self.rows[k]) for k in places]
+            ids = unique_ids(file_ids)
+            repeats = [a for a, b in zip(ids, file_ids, strict=True) if a != b]
+            if repeats:
+                self.context.warn(f"{len(repeats)} ids stand more than once; later ones got #2, #3 …", where=repeats[0])
+            rows = [
+                self._properties(
+                    k,
+                    i,
+                    foreign=not self.marks[k] and key == home,
+                    odd=odd.get(k),
+                    at=(shapes[k], bool(local[k])),
+                )
+                for k, i in zip(places, ids, strict=True)
+            ]
+            parts[key] = Features(tuple(ids), shapes[places], tuple(rows), local[places], document)
+        if home not in parts and not parts:
+            parts[home] = Features((), np.empty(0, object), (), np.empty(0, bool), self._document())
+        datum = extension.get("datum")
+        levels = extension.get("levels")
+        return Layers(
+            parts,
+            Datum(**datum) if isinstance(datum, dict) else None,
+            tuple(Level(**v) for v in levels) if isinstance(levels, list) else (Level(),),
+        )
+
+    def name(self, k: int) -> str:
+        row = self.rows[k]
+        return f"feature {row['id']!r}" if row.get("id") is not None else f"features[{k}]"
+
+    def _key(self, k: int, network: bool) -> PartKey:
+        row = self.rows[k]
+        if self.marks[k]:
+            p = row["properties"]
+            return PartKey(cast(Layer, p["layer"]), p["level"], p["part"])
+        if network and row["properties"].get("kind") in ("node", "edge"):
+            return PartKey("topology", self.context.level, NETWORK)
+        return PartKey("objects", self.context.level, FAMILY)
+
+    def _network(self) -> bool:
+        """Whether the unmarked features are a topology: edges whose ends are all there."""
+        nodes, ends = set(), []
+        for row, mark in zip(self.rows, self.marks, strict=True):
+            p = row.get("properties")
+            if mark:
+                continue
+            if not isinstance(p, dict) or not isinstance(row.get("id"), str) or p.get("kind") not in ("node", "edge"):
+                return False
+            if p["kind"] == "node":
+                nodes.add(row["id"])
+            else:
+                ends += [p.get("source"), p.get("target")]
+        if not ends:
+            return False
+        stubs = [e for e in ends if not isinstance(e, str) or e not in nodes]
+        if stubs:
+            self.context.warn(
+                f"{len(stubs)} edges begin or end at nodes that are not there ({str(stubs[0])[:80]}): the features are "
+                "kept as objects, not as a network"
+            )
+        return not stubs
+
+    def _read_geometry(self, k: int, row: dict[str, Any]) -> tuple[bool, Any]:
+        """(whether it is in metres, the GeoJSON geometry or None)."""
+        place = row.get("place")
+        if "crs" in row:
+            self._check_crs(row["crs"], self.name(k))
+        if isinstance(place, dict):
+            crs = place.get("coordRefSys", row.get("coordRefSys"))
+            if self.local if crs is None else self._is_local(crs):
+                return True, place
+            if row.get("geometry") is None:
+                self.context.warn(
+                    "its place is in a coordinate system that is not known here; it is kept without a geometry",
+                    line=self.line(k),
+                    where=self.name(k),
+                )
+        geometry = row.get("geometry")
+        if geometry is None and self.local and place is None and "place" in row:
+            return True, None
+        if geometry is not None and not isinstance(geometry, dict):
+            _raise_unreadable("a geometry must be an object or null", self.line(k), self.name(k))
+        return False, geometry
+
+    def _check_places(self, shapes: NDArray[np.object_], local: NDArray[np.bool_]) -> None:
+        coordinates, owner = shapely.get_coordinates(shapes, return_index=True)
+        bound = np.where(local[owner][:, None], MAX_METRES, np.array([180.0, 90.0]))
+        bad = np.flatnonzero((np.abs(coordinates) > bound).any(axis=1))
+        if len(bad):
+            k = int(owner[bad[0]])
+            x, y = coordinates[bad[0]].tolist()
+            reason = (
+                f"({x:g}, {y:g}) is beyond ±1e7 metres"
+                if local[k]
+                else f"({x:g}, {y:g}) is no longitude, latitude in degrees: metres belong into JSON-FG's place, with "
+                f"coordRefSys {LOCAL_2D}, or the file must be exported in EPSG:4326"
+            )
+            _raise_unreadable(reason, self.line(k), self.name(k))
+
+    def _requested_id(self, k: int, row: dict[str, Any]) -> str:
+        raw_id = row.get("id")
+        if raw_id is None and isinstance(row.get("properties"), dict):
+            raw_id = row["properties"].get("name")
+            raw_id = raw_id if isinstance(raw_id, str) else None
+        text = str(raw_id) if isinstance(raw_id, str | int | float) and not isinstance(raw_id, bool) else ""
+        return text if text and len(text) <= MAX_ID and text.isprintable() else f"feature/{k}"
+
+    def _properties(self, k: int, i: str, *, foreign: bool, odd: Any, at: tuple[Any, bool]) -> Properties:
+        shape, metres = at
+        row = self.rows[k]
+        file_properties = row.get("properties")
+        if file_properties is not None and not isinstance(file_properties, dict):
+            _raise_unreadable("properties must be an object or null", self.line(k), self.name(k))
+        out: dict[str, Any] = dict(file_properties or {})
+        if not foreign:
+            if not self.marks[k]:
+                return out
+            more = out.pop("more", None)
+            for key in ("layer", "level", "part"):
+                del out[key]
+            return {**out, **more} if isinstance(more, dict) else out
+        source_properties: dict[str, Any] = {}
+        misfits = {}
+        for key, fits in (("kind", str), ("name", str), (FAMILY, ())):
+            if key in out and not isinstance(out[key], fits):
+                misfits[key] = out.pop(key)
+        if "kind" not in out:
+            out["kind"] = ("note", "poi", "path", "region")[int(shapely.get_dimensions(shape)) + 1]
+            source_properties["added"] = ["kind"]
+        if misfits:
+            source_properties["kept"] = misfits
+        if row.get("id") != i or isinstance(row.get("id"), bool):
+            source_properties["id"] = row.get("id")
+        if file_properties is None:
+            source_properties["properties"] = None
+        members = {k: v for k, v in row.items() if k not in ("type", "id", "geometry", "properties")}
+        if metres:
+            # Written again from the canonical coordinates.
+            del members["place"]
+            members.pop("coordRefSys", None)
+        if self.root != "FeatureCollection":
+            members = {k: v for k, v in members.items() if k != OWN_MEMBER}
+        if members:
+            source_properties["members"] = members
+        if odd is not None:
+            source_properties["geometry"] = odd
+        if source_properties:
+            out[FAMILY] = source_properties
+        return out
+
+    def _document(self) -> dict[str, Any]:
+        handled = {"type", "features", OWN_MEMBER} if self.root == "FeatureCollection" else set(self.top)
+        document: dict[str, Any] = {"type": self.root if self.root in ("FeatureCollection", "Feature") else "Geometry"}
+        members = {k: v for k, v in self.top.items() if k not in handled}
+        if self.top.get("coordRefSys") is not None and self.local:
+            members.pop("coordRefSys", None)
+            members.pop("conformsTo", None)
+        if members:
+            document["members"] = members
+        texts = [self.top[k] for k in ("attribution", "license", "copyright") if isinstance(self.top.get(k), str)]
+        return {FAMILY: document, "attribution": texts} if texts else {FAMILY: document}
+
+    def _documents(self, extension: dict[str, Any]) -> dict[PartKey, dict[str, Any]]:
+        out: dict[PartKey, dict[str, Any]] = {}
+        rows = extension.get("documents")
+        for row in rows if isinstance(rows, list) else []:
+            if (
+                isinstance(row, dict)
+                and str(row.get("layer")) in VECTOR_LAYERS
+                and isinstance(row.get("document"), dict)
+            ):
+                key = PartKey(cast(Layer, row["layer"]), str(row.get("level")), str(row.get("part")))
+                out[key] = row["document"]
+        return out
