@@ -37,11 +37,15 @@ def _units(name: str) -> tuple[dict[str, Unit], dict[str, tuple[str, str]]]:
     for node in ast.parse(inspect.getsource(module)).body:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
             units[node.name] = Unit(module, node)
-        elif isinstance(node, ast.ImportFrom) and node.module == PACKAGE:
-            imported |= {a.asname or a.name: (f"{PACKAGE}.{a.name}", "") for a in node.names if a.name.startswith("_")}
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{PACKAGE}._"):
-            imported |= {a.asname or a.name: (str(node.module), a.name) for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(f"{PACKAGE}."):
+            imported |= {a.asname or a.name: _target(str(node.module), a.name) for a in node.names}
     return units, imported
+
+
+def _target(module: str, name: str) -> tuple[str, str]:
+    """What ``from module import name`` names: (module, name or empty)."""
+    is_module = isinstance(getattr(importlib.import_module(module), name, None), ModuleType)
+    return (f"{module}.{name}", "") if is_module else (module, name)
 
 
 @functools.cache

@@ -216,8 +216,7 @@ def formats_table() -> str:
 
 def format_page(known: Format) -> str:
     """The page of one format."""
-    module = sys.modules[(known.read or known.write or known.detect).__module__]
-    module = sys.modules.get(f"app.formats.{known.name}", module)
+    module = _module(known)
     said = re.sub(rf"\A{known.name}(\.yaml)?: (?=(.))", "", inspect.getdoc(module) or known.title)
     text, further = _helpers(said[0].upper() + said[1:])
     out = [f"# {known.name}: {plain(known.title)}\n", prose(text), _facts(known)]
@@ -231,12 +230,20 @@ def format_page(known: Format) -> str:
             parameters(known.write_options),
         ]
     for name, doc in further:
-        out += [f"## {name.lstrip('_')}\n", prose(doc)]
+        out += [f"## {name}\n", prose(doc)]
     if known.write:
         out += _losses(known)
     if known.check:
         out += _rules(known)
     return "\n".join(out)
+
+
+def _module(known: Format) -> types.ModuleType:
+    """The module that is the format's: by its name, in the package of its family or in ``app.formats``."""
+    function = known.detect.__module__
+    family = ".".join(function.split(".")[:3])
+    names = (f"{family}.{known.name}", f"app.formats.{known.name}", function)
+    return next(sys.modules[name] for name in names if name in sys.modules)
 
 
 def _helpers(doc: str) -> tuple[str, list[tuple[str, str]]]:
@@ -248,12 +255,13 @@ def _helpers(doc: str) -> tuple[str, list[tuple[str, str]]]:
             module = importlib.import_module(f"app.formats.{found[1]}")
         except ModuleNotFoundError:
             return found[0]
-        further[found[1]] = inspect.getdoc(module) or ""
-        return f"[{found[1].lstrip('_')}](#{found[1].strip('_')})"
+        name = found[1].rpartition(".")[2].lstrip("_")
+        further[name] = inspect.getdoc(module) or ""
+        return f"[{name}](#{name})"
 
-    pattern = re.compile(r"``(?:app\.formats\.)?(_[a-z0-9_]+)``")
+    pattern = re.compile(r"``(?:app\.formats\.)?(_[a-z0-9_]+|[a-z0-9_]+\.[a-z0-9_]+)``")
     text = pattern.sub(link, doc)
-    return text, [(name, pattern.sub(r"[\1](#\1)", said).replace("(#_", "(#")) for name, said in further.items()]
+    return text, list(further.items())
 
 
 def _facts(known: Format) -> str:
