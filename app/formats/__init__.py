@@ -1,7 +1,8 @@
 """The registry of formats, the read boundary and its limits.
 
-A format is one module of this package that ends in ``register(Format(...))``; nothing else is edited. Modules whose
-name starts with ``_`` are tools that readers share. A map is a bundle of named bytes in and out: no paths, no network.
+A format is one module of this package that ends in ``register(Format(...))``; nothing else is edited. A large format
+is a package, and so is a family: it imports its formats' modules. Modules whose name starts with ``_`` are tools that
+readers share. A map is a bundle of named bytes in and out: no paths, no network.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.errors import TooLarge, UnreadableFile
-from app.formats import _rmf_site
+from app.formats.rmf.site import vocabulary
 from app.limits import Limits
 from app.syntax import ron
 
@@ -102,4 +102,4 @@ VALUES = st.recursive(
 @settings(max_examples=80, deadline=None)
 @given(VALUES)
 def test_what_is_written_reads_as_the_same(value: Any) -> None:
-    assert ron.load(ron.dump(value, _rmf_site.SHAPE), LIMITS) == value
+    assert ron.load(ron.dump(value, vocabulary.SHAPE), LIMITS) == value

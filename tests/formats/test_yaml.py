@@ -16,7 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats._rmf import Flow
+from app.formats.rmf.common import Flow
 from app.limits import Limits
 from app.syntax import yaml
 

@@ -19,7 +19,7 @@ import numpy as np
 import orjson
 
 from app.formats._network import number
-from app.formats._rmf import CABIN_HEIGHT, mapping, parameter_value, raise_unreadable
+from app.formats.rmf.common import CABIN_HEIGHT, mapping, parameter_value, raise_unreadable
 from app.model.frame import MAX_METRES
 from app.syntax import ron
 

@@ -38,13 +38,13 @@ from app.formats import (
     ReadContext,
     WriteContext,
     _fields,
-    _rmf,
-    _rmf_nav_graph_rules,
     register,
 )
 from app.formats._fields import ANGLE, ANY, COORDINATE, SPEED, WIDTH, Number, OneOf, record
 from app.formats._network import get_source_properties
-from app.formats._rmf import (
+from app.formats.rmf import common
+from app.formats.rmf import common as _rmf
+from app.formats.rmf.common import (
     BUILDING,
     CABIN_HEIGHT,
     MAX_GRAPHS,
@@ -58,6 +58,7 @@ from app.formats._rmf import (
     parameter_value,
     raise_unreadable,
 )
+from app.formats.rmf.nav_graph import rules as _rmf_nav_graph_rules
 from app.model.features import (
     Features,
     Properties,
@@ -197,7 +198,7 @@ def _stem(name: str) -> str:
 def _level(level: _Level, graph: int, members: Mapping[str, Any], location: str, context: ReadContext) -> None:
     rows = listing(members.get("vertices"), f"{location}.vertices")
     places: list[int] = []
-    for k, (row, (x, y)) in enumerate(zip(rows, _rmf.places(rows, f"{location}.vertices").tolist(), strict=True)):
+    for k, (row, (x, y)) in enumerate(zip(rows, common.places(rows, f"{location}.vertices").tolist(), strict=True)):
         parameters = mapping(row[2] if len(row) > 2 else None, f"{location}.vertices[{k}][2]")
         # A graph may list twins; of other graphs each vertex is found again by what it says.
         key = orjson.dumps((x, y, parameters, row[3:]), option=orjson.OPT_SORT_KEYS).decode()
@@ -262,13 +263,13 @@ def _door(levels: Mapping[str, _Level], name: str, members: Any, source_properti
     ends = listing(one.pop("endpoints", None), f"{location}.endpoints")
     if len(ends) != 2:
         raise_unreadable("must be two points", f"{location}.endpoints")
-    at = _rmf.places(ends, f"{location}.endpoints")
+    at = common.places(ends, f"{location}.endpoints")
     level = one.pop("map", None)
     if level not in levels:
         one["map"] = level
         level = next(iter(levels))
     properties = {"kind": "door", "name": name, NAME: {**source_properties, "says": one}}
-    levels[str(level)].objects.append((f"{level}/door/{_rmf.short(name)}", shapely.LineString(at), properties))
+    levels[str(level)].objects.append((f"{level}/door/{common.short(name)}", shapely.LineString(at), properties))
 
 
 def _lift(levels: Mapping[str, _Level], name: str, members: Any, source_properties: dict[str, Any]) -> None:
@@ -283,7 +284,7 @@ def _lift(levels: Mapping[str, _Level], name: str, members: Any, source_properti
     level = next(iter(levels))
     properties: dict[str, Any] = {"kind": "lift", "name": name, "pose": [x, y, 0.0, 0.0, 0.0, yaw], "size": size}
     row = (
-        f"{level}/lift/{_rmf.short(name)}",
+        f"{level}/lift/{common.short(name)}",
         shapely.Point(x, y),
         {**properties, NAME: {**source_properties, "says": one}},
     )
@@ -304,12 +305,12 @@ def _network(name: str, level: _Level, taken: set[str]) -> Features:
                 key: value for key, value in source_properties["parameters"].items() if key != "name"
             }
         properties.append(compact({**item_properties, NAME: compact(source_properties)}))
-        names.append(_rmf.short(called) if "name" in item_properties else f"{_rmf.short(name, 200)}/{k}")
+        names.append(common.short(called) if "name" in item_properties else f"{common.short(name, 200)}/{k}")
     ids = unique_ids(names, taken)
     taken.update(ids)
     at = np.array(level.at, np.float64).reshape(-1, 2)
     sources, targets = [i for i, _, _ in level.edges], [j for _, j, _ in level.edges]
-    edges = [_rmf.short(f"{ids[i]}_{ids[j]}", 490) for i, j in zip(sources, targets, strict=True)]
+    edges = [common.short(f"{ids[i]}_{ids[j]}", 490) for i, j in zip(sources, targets, strict=True)]
     edges = unique_ids(edges, taken)
     taken.update(edges)
     for i, j, source_properties in level.edges:
@@ -404,10 +405,10 @@ class _Writer:
         self.lost: Counter[str] = Counter()
         self.building, self.tops = self._documents()
         self.doors, self.lifts = self._doors(), self._lifts()
-        self.options = context.options if isinstance(context.options, _rmf.WriteOptions) else _rmf.WriteOptions()
+        self.options = context.options if isinstance(context.options, common.WriteOptions) else common.WriteOptions()
         self.storeys = self._storeys()
         nodes = ((s.name, i, p) for s in self.storeys for i, p in zip(s.ids, s.nodes, strict=True))
-        self.robots = _rmf.Robots(self.options, nodes)
+        self.robots = common.Robots(self.options, nodes)
         self.new_lanes = 0
 
     def _documents(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -486,7 +487,7 @@ class _Writer:
             names.add(name)
             source_members = get_source_properties(p, NAME)
             inside = source_members.get("graphs") if isinstance(source_members.get("graphs"), list) else None
-            out.append(_Door(name, level, _rmf.ends(g), inside, mapping(source_members.get("says"), "says")))
+            out.append(_Door(name, level, common.ends(g), inside, mapping(source_members.get("says"), "says")))
         return out
 
     def _lifts(self) -> list[_Lift]:
@@ -499,7 +500,7 @@ class _Writer:
                 continue
             names.add(name)
             lift_members = mapping(get_source_properties(p, BUILDING).get("says"), "says")
-            pose, size = _rmf.object_pose(p), _rmf.object_size(p) or (1.0, 1.0)
+            pose, size = common.object_pose(p), common.object_size(p) or (1.0, 1.0)
             yaw = pose[5] if pose else lift_members.get("yaw", 0.0)
             yaw = float(yaw) if isinstance(yaw, (int, float)) else 0.0
             source_members = get_source_properties(p, NAME)
@@ -698,7 +699,7 @@ class _Writer:
         return options
 
     def _lane(self, storey: _LevelWriter, e: _Edge, door: str | None) -> dict[str, Any]:
-        limit = _rmf.limit(e.p)
+        limit = common.limit(e.p)
         if NAME in e.p:
             options = dict(mapping(get_source_properties(e.p, NAME).get("parameters"), "parameters"))
             if _limit(options) != limit:
@@ -718,7 +719,7 @@ class _Writer:
         parameters = source_members.get("parameters")
         orientation = parameter_value(parameters, "orientation")
         if orientation:
-            turned = _rmf.reverse_orientation(orientation) if orientation in ("forward", "backward") else ""
+            turned = common.reverse_orientation(orientation) if orientation in ("forward", "backward") else ""
             options["orientation_constraint"] = turned if source_members.get("reverse") is True else orientation
         for key in LANE_WORDS:
             if parameter_value(parameters, key):

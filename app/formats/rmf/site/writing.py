@@ -18,11 +18,13 @@ import orjson
 import shapely
 
 from app.errors import MissingLayer
-from app.formats import WriteContext, _rmf, _rmf_site
+from app.formats import WriteContext
 from app.formats._network import get_source_properties
-from app.formats._rmf import BUILDING, NAV_GRAPH, Storey, mapping, parameter_value
-from app.formats._rmf_images import find_stored_image
-from app.formats._rmf_site import NAME, SAME_METRES, VERSION, Cabin, metres, place
+from app.formats.rmf import common
+from app.formats.rmf.common import BUILDING, NAV_GRAPH, Storey, mapping, parameter_value
+from app.formats.rmf.images import find_stored_image
+from app.formats.rmf.site import vocabulary
+from app.formats.rmf.site.vocabulary import NAME, SAME_METRES, VERSION, Cabin, metres, place
 from app.model.features import Features, Properties
 from app.model.layers import Layers, Resources
 from app.parameters import parameter
@@ -38,7 +40,9 @@ TAGS: Mapping[str, str] = {
     "is_holding_point": "HoldingPoint",
 }
 ORIENTATIONS: Mapping[Any, str] = {"forward": "Forwards", "backward": "Backwards"}
-WRITTEN_ELSEWHERE = frozenset({"name", "lift", "lift_cabin", "mutex", "dock_name", _rmf.ROBOT, _rmf.ROBOT_TYPE, *TAGS})
+WRITTEN_ELSEWHERE = frozenset(
+    {"name", "lift", "lift_cabin", "mutex", "dock_name", common.ROBOT, common.ROBOT_TYPE, *TAGS}
+)
 """What vertices say that a site says of its locations, lanes, lifts and models."""
 
 COLOURS = ([1.0, 0.5, 0.3], [0.6, 1.0, 0.5], [0.6, 0.8, 1.0], [0.6, 0.2, 0.3])
@@ -46,7 +50,7 @@ COLOURS = ([1.0, 0.5, 0.3], [0.6, 1.0, 0.5], [0.6, 0.8, 1.0], [0.6, 0.2, 0.3])
 
 
 @dataclass(frozen=True, slots=True)
-class WriteOptions(_rmf.WriteOptions):
+class WriteOptions(common.WriteOptions):
     """What a site says where no source does, and how it is written."""
 
     encoding: Literal["json", "ron"] = parameter("json", "json, or ron as older releases of the editor read it")
@@ -57,13 +61,13 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
     Raises MissingLayer where there is neither a network nor anything that came from Open-RMF.
     """
-    storeys = _rmf.storeys(layers)
+    storeys = common.storeys(layers)
     if not storeys:
         raise MissingLayer("rmf_site needs a network: upload a site.json, building.yaml, tmap2 or OSM file")
     writer = _Writer(layers, context, storeys)
-    site = _rmf_site.sort_members(writer.site())
+    site = vocabulary.sort_members(writer.site())
     if writer.options.encoding == "ron":
-        main = {FILE_RON: ron.dump(site, _rmf_site.SHAPE)}
+        main = {FILE_RON: ron.dump(site, vocabulary.SHAPE)}
     else:
         main = {FILE: orjson.dumps(site, option=orjson.OPT_INDENT_2 | orjson.OPT_APPEND_NEWLINE)}
     return {**main, **dict(sorted(writer.used.items()))}
@@ -118,7 +122,7 @@ class _Writer:
     def __init__(self, layers: Layers, context: WriteContext, storeys: Sequence[Storey]) -> None:
         self.layers, self.context = layers, context
         self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-        self.robots = _rmf.Robots(self.options, _iterate_nodes(storeys))
+        self.robots = common.Robots(self.options, _iterate_nodes(storeys))
         self.dropped: Counter[str] = Counter()
         self.made: Counter[str] = Counter()
         self.used: dict[str, bytes] = {}
@@ -140,7 +144,7 @@ class _Writer:
         self.guided = dict(guided)
         self.graphs: dict[str, Any] = dict(mapping(guided.get("graphs"), "graphs"))
         ranking = [str(i) for i in guided.get("ranking") or []]
-        self.numbers = {n: i for i, n in _rmf_site.graph_numbers(self.graphs.items(), ranking).items()}
+        self.numbers = {n: i for i, n in vocabulary.graph_numbers(self.graphs.items(), ranking).items()}
         self.mutexes: dict[str, Any] = dict(mapping(guided.get("mutex_groups"), "mutex_groups"))
         self.textures: dict[str, Any] = dict(mapping(self.known.get("textures"), "textures"))
         self.texture_ids = {_key(group): i for i, group in self.textures.items()}
@@ -343,7 +347,7 @@ class _Writer:
     def _anchor_or_source(self, xyz: Sequence[float], source_anchor: Any) -> dict[str, Any]:
         if source_anchor is None and abs(xyz[2]) > SAME_METRES:
             self.dropped["heights of nodes above their level"] += 1
-        return _rmf_site.anchor_or_source(xyz if source_anchor is not None else [*xyz[:2], 0.0], source_anchor)
+        return vocabulary.anchor_or_source(xyz if source_anchor is not None else [*xyz[:2], 0.0], source_anchor)
 
     def _location(self, anchor: str, name: str, parameters: Mapping[str, Any], locations: Mapping[str, Any]) -> None:
         """A node's locations; a new one where it has a name, a tag or a mutex group."""
@@ -356,7 +360,7 @@ class _Writer:
                 self.locations[self._claim()] = one
             return
         spoken = [str(one.get("name") or "") for one in locations.values()]
-        same_name = name in spoken or (not name and set(spoken) <= {"", _rmf_site.UNNAMED})
+        same_name = name in spoken or (not name and set(spoken) <= {"", vocabulary.UNNAMED})
         source_tags = {tag for one in locations.values() for tag in one.get("tags") or [] if isinstance(tag, str)}
         for k, (i, one) in enumerate(locations.items()):
             if self.locations.get(i, {}).get("anchor") == int(anchor):
@@ -433,7 +437,7 @@ class _Writer:
     def _find_way(self, floor: _Floor, p: Properties, anchors: tuple[str, str], ends: Sequence[str]) -> _Way:
         members, parameters = self._source_members(floor, p), _plain_parameters(p)
         lane = mapping(members.get("says"), "lane")
-        limit = _rmf.limit(p)
+        limit = common.limit(p)
         if members:
             reverse = members.get("reverse") is True
             back = lane.get("reverse")
@@ -450,7 +454,7 @@ class _Writer:
             limit = limit or self.options.speed_limit
         reverse = get_source_properties(p, BUILDING).get("reverse") is True
         orientation = parameters.get("orientation", parameters.get("orientation_constraint"))
-        orientation = _rmf.reverse_orientation(orientation) if reverse else orientation
+        orientation = common.reverse_orientation(orientation) if reverse else orientation
         motion = {"orientation_constraint": ORIENTATIONS[orientation]} if orientation in ORIENTATIONS else {}
         motion |= {"speed_limit": limit} if limit else {}
         dock = parameters.get("dock_name") or self.docks.get((floor.storey.name, ends[1]))
@@ -562,7 +566,7 @@ class _Writer:
         if (existing := floor.by_place.get(spot)) is not None and form is None:
             return int(existing)
         anchor = self._claim(hint)
-        floor.anchors[anchor] = form or _rmf_site.anchor_or_source([*xy, 0.0], None)
+        floor.anchors[anchor] = form or vocabulary.anchor_or_source([*xy, 0.0], None)
         floor.by_place.setdefault(spot, anchor)
         return int(anchor)
 
@@ -573,12 +577,12 @@ class _Writer:
             element["name"] = str(p.get("name") or parameter_value(parameters, "name") or "")
             was = str(parameter_value(parameters, "type", "hinged"))
             self.dropped["telescope doors, written as sliding ones"] += was.endswith("telescope")
-            element["kind"] = _rmf_site.door_kind(parameters, element.get("kind"))
-        elif "texture" not in element and (group := _rmf_site.texture_group(parameters, kind)) is not None:
+            element["kind"] = vocabulary.door_kind(parameters, element.get("kind"))
+        elif "texture" not in element and (group := vocabulary.texture_group(parameters, kind)) is not None:
             element["texture"] = int(self._texture(group))
         for key, member in (("height", "top"), ("base", "bottom")):
             now, source_value = p.get(key), element.get(member)
-            fixed = _rmf_site.height(source_value, member)
+            fixed = vocabulary.height(source_value, member)
             if isinstance(now, (int, float)) and not isinstance(now, bool) and now > 0 and now != fixed:
                 element[member] = {"fixed": float(now)}
 
@@ -599,7 +603,7 @@ class _Writer:
                 "anchors": self._corner_anchors(floor, p, ring, "floor"),
             }
             parameters = mapping(get_source_properties(p, BUILDING).get("parameters"), "parameters")
-            if "texture" not in element and (group := _rmf_site.texture_group(parameters, "floor")) is not None:
+            if "texture" not in element and (group := vocabulary.texture_group(parameters, "floor")) is not None:
                 element["texture"] = int(self._texture(group))
             floor.said.setdefault("floors", {})[self._claim(None if k else members.get("id"))] = element
 
@@ -623,7 +627,7 @@ class _Writer:
             and len(turn) == 4
             and turn[0] > 0
         ):
-            pose = _rmf_site.pose_or_source([turn[2], turn[3], 0.0, 0.0, 0.0, turn[1]], None)
+            pose = vocabulary.pose_or_source([turn[2], turn[3], 0.0, 0.0, 0.0, turn[1]], None)
             properties = {"name": PurePosixPath(file).stem, "source": {"Local": file}, "pose": pose}
             properties["pixels_per_meter"] = 1.0 / turn[0]
             i = self._claim()
@@ -638,7 +642,7 @@ class _Writer:
             drawing.pop("transform", None)
             location = f"levels.{floor.id}.drawings.{i}.properties.source"
             properties = mapping(drawing.get("properties"), location)
-            kind, name = _rmf_site.asset(properties.get("source"), location)
+            kind, name = vocabulary.asset(properties.get("source"), location)
             if not name or kind not in ("Local", "Remote"):
                 continue
             file = find_stored_image(name, self.resources)
@@ -706,7 +710,7 @@ class _Writer:
     def _model(self, floor: _Floor, kind: str, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
         element = mapping(members.get("says"), "model")
         building = mapping(get_source_properties(p, BUILDING).get("says"), "model")
-        pose = _rmf.object_pose(p) or [0.0, 0.0, floor.elevation, 0.0, 0.0, float(building.get("yaw") or 0.0)]
+        pose = common.object_pose(p) or [0.0, 0.0, floor.elevation, 0.0, 0.0, float(building.get("yaw") or 0.0)]
         now = [geometry.x, geometry.y, metres(pose[2] - floor.elevation), *pose[3:]]
         name = str(p.get("name") or "")
         static = building.get("static") is True
@@ -732,7 +736,7 @@ class _Writer:
             is_static = element.get("is_static", static) is True
             description = self._description(source, is_static, element.get("scale"), model, robot=kind == "robot")
         i = self._claim(hint)
-        pose = _rmf_site.pose_or_source(now, element.get("pose"))
+        pose = vocabulary.pose_or_source(now, element.get("pose"))
         older = ("source", "is_static", "scale")
         self.instances[i] = {
             **{k: v for k, v in element.items() if k not in older},
@@ -759,7 +763,7 @@ class _Writer:
         self, floor: _Floor, parameters: Mapping[str, Any], members: Mapping[str, Any], xyz: Sequence[float]
     ) -> None:
         """The robot that starts at a node."""
-        name, model = parameters.get(_rmf.ROBOT), parameters.get(_rmf.ROBOT_TYPE)
+        name, model = parameters.get(common.ROBOT), parameters.get(common.ROBOT_TYPE)
         if not name or not model:
             self.dropped["robots without a name or a type"] += bool(name or model)
             return
@@ -767,7 +771,7 @@ class _Writer:
         element = mapping(robot.get("says"), "robot") if robot.get("name") == name else {}
         now = [xyz[0], xyz[1], 0.0, 0.0, 0.0, 0.0]
         if element:
-            was = _rmf_site.pose(element.get("pose"), "robot.pose")
+            was = vocabulary.pose(element.get("pose"), "robot.pose")
             near = math.dist(was[:2], xyz[:2]) <= 1e-3
             now = was if near else [*xyz[:2], *was[2:]]
         self._instance(floor, str(name), now, element, robot.get("id") if element else None, str(model), False, "robot")
@@ -817,16 +821,16 @@ class _Writer:
     def _lift(self, floor: _Floor, p: Properties, geometry: Any, i: str) -> _Lift:
         members = self._source_members(floor, p)
         building = mapping(get_source_properties(p, BUILDING).get("says"), "lift")
-        pose = _rmf.object_pose(p)
+        pose = common.object_pose(p)
         yaw = pose[5] if pose is not None else float(building.get("yaw") or 0.0)
-        depth, width = _rmf.object_size(p) or (1.0, 1.0)
+        depth, width = common.object_size(p) or (1.0, 1.0)
         lift = dict(mapping(members.get("says"), "lift"))
         was = members.get("was")
         now = [geometry.x, geometry.y, yaw, depth, width]
         self.claimed.update(_element_ids(lift))
         cabin_anchors: dict[str, Any] = dict(mapping(lift.get("cabin_anchors"), "cabin_anchors"))
         properties = dict(mapping(lift.get("properties"), "properties"))
-        rect = dict(_rmf_site.rectangle(properties, "cabin")) if lift else {}
+        rect = dict(vocabulary.rectangle(properties, "cabin")) if lift else {}
         rect |= {"depth": depth, "width": width}
         cabin_doors = lift.get("cabin_doors")
         if not lift:
@@ -836,13 +840,13 @@ class _Writer:
             properties |= {} if start is None else {"initial_level": int(start.id)}
             self.made["lifts"] += BUILDING not in p
         properties |= {"name": str(p.get("name") or i), "cabin": {"Rect": rect}}
-        cabin = Cabin(geometry.x, geometry.y, yaw, depth, width, _rmf_site.cabin_offset(rect, "cabin"))
+        cabin = Cabin(geometry.x, geometry.y, yaw, depth, width, vocabulary.cabin_offset(rect, "cabin"))
         if not isinstance(was, list) or not np.allclose(was, now, rtol=0, atol=SAME_METRES):
             old = properties.get("reference_anchors")
             old = old if isinstance(old, list) and len(old) == 2 else [None, None]
             keys = [str(o) if str(o) in self.anchors else self._claim() for o in old]
             for key, at in zip(keys, cabin.ends(), strict=True):
-                self.anchors[key] = _rmf_site.anchor_or_source(at, None)
+                self.anchors[key] = vocabulary.anchor_or_source(at, None)
             properties["reference_anchors"] = [int(key) for key in keys]
         element = {**lift, "cabin_doors": cabin_doors, "properties": properties, "id": self._claim(members.get("id"))}
         return _Lift(cabin, element, cabin_anchors)
@@ -854,14 +858,14 @@ class _Writer:
         out: dict[str, Any] = {}
         served = mapping(building.get("level_doors"), "level_doors")
         for name, door in mapping(building.get("doors"), "doors").items():
-            face, placement = _rmf_site.door_placement(mapping(door, "door"), rect, f"doors.{name}")
+            face, placement = vocabulary.door_placement(mapping(door, "door"), rect, f"doors.{name}")
             if face in rect:
                 self.dropped["further doors on one face of a lift's cabin"] += 1
                 continue
             i = self._claim()
             rect[face] = {"door": int(i), **placement}
             ids = [self._claim(), self._claim()]
-            anchors |= dict(zip(ids, _rmf_site.door_anchors(rect, face), strict=True))
+            anchors |= dict(zip(ids, vocabulary.door_anchors(rect, face), strict=True))
             visits = [int(f.id) for f in self.floors if name in (served.get(f.storey.name) or ())]
             kind: dict[str, Any] = {"DoubleSliding": {"left_right_ratio": 1.0}}
             if door.get("door_type") == 1:

@@ -5,7 +5,7 @@ have anchors of their own; models; and, for all levels together, the navigation 
 Releases of the editor up to 2024 wrote RON, later ones write JSON; both are read, and members that only the older
 ones have. ``geographic_offset`` is the latitude and longitude of (0, 0), whose +y axis the editor takes as UTM's north.
 
-Canonical: as a building (``app.formats.openrmf``), in its words, so that either format is written from the other, and
+Canonical: as a building (``openrmf``), in its words, so that either format is written from the other, and
 navigation graphs from both. An anchor is a node unless only walls, doors or floors stand on it, called by its location,
 else ``<level>/<id>``; an anchor in a lift's cabin is a node on each level from which a lane leads to it. A lane is an
 edge there and, unless its reverse is disabled, one back. What only a site says of an item stands in its
@@ -26,11 +26,14 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, _rmf, _rmf_site, _rmf_site_rules, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, register
 from app.formats._network import number
-from app.formats._rmf import BUILDING, NAV_GRAPH, Array, mapping, raise_unreadable
-from app.formats._rmf_images import companion_hook, images
-from app.formats._rmf_site import (
+from app.formats.rmf import common
+from app.formats.rmf.common import BUILDING, NAV_GRAPH, Array, mapping, raise_unreadable
+from app.formats.rmf.images import companion_hook, images
+from app.formats.rmf.site import rules as _rmf_site_rules
+from app.formats.rmf.site import vocabulary
+from app.formats.rmf.site.vocabulary import (
     NAME,
     UNNAMED,
     Cabin,
@@ -43,7 +46,7 @@ from app.formats._rmf_site import (
     unknown,
     variant,
 )
-from app.formats._rmf_site_writing import FILE, FILE_RON, WriteOptions, write
+from app.formats.rmf.site.writing import FILE, FILE_RON, WriteOptions, write
 from app.model.features import Features, Properties, features, points, segments, unique_ids
 from app.model.frame import GROUND, Datum, Level
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
@@ -133,7 +136,7 @@ class _Reader:
         self.lanes = elements(guided.get("lanes"), f"{location}.lanes")
         self.locations = elements(guided.get("locations"), f"{location}.locations")
         graphs = elements(guided.get("graphs"), f"{location}.graphs")
-        self.graphs = _rmf_site.graph_numbers(graphs, references(guided.get("ranking") or [], f"{location}.ranking"))
+        self.graphs = vocabulary.graph_numbers(graphs, references(guided.get("ranking") or [], f"{location}.ranking"))
         self.mutexes = {
             i: text(element.get("name"), f"{location}.mutex_groups.{i}.name")
             for i, element in elements(guided.get("mutex_groups"), f"{location}.mutex_groups")
@@ -190,7 +193,7 @@ class _Reader:
         for (i, level), p in zip(listed, properties, strict=True):
             self._count_unknown_members(level, "levels")
             self._count_unknown_members(p, "levels.properties")
-            level_names.append(_rmf.short(text(p.get("name"), f"levels.{i}.properties.name")) or f"level {i}")
+            level_names.append(common.short(text(p.get("name"), f"levels.{i}.properties.name")) or f"level {i}")
         names = unique_ids(level_names)
         if twice := sorted({a for a, b in zip(level_names, names, strict=True) if a != b}):
             self.context.warn(f"levels have the same name: {', '.join(twice[:5])}; they get a number", where="levels")
@@ -212,7 +215,7 @@ class _Reader:
         location = "properties.geographic_offset"
         if offset is None:
             return None
-        latitude, longitude = _rmf_site.vector(mapping(offset, location).get("anchor"), 2, f"{location}.anchor")
+        latitude, longitude = vocabulary.vector(mapping(offset, location).get("anchor"), 2, f"{location}.anchor")
         datum = self.context.frame.datum if self.context.frame is not None else None
         if datum is None:
             return Datum(latitude, longitude)
@@ -236,12 +239,12 @@ class _Reader:
             if raw is None:
                 raise_unreadable(f"there is no anchor {anchor} of the site", f"{location}.properties.reference_anchors")
             at.append(place(raw, "Lift", f"anchors.{anchor}"))
-        name = _rmf.short(text(properties.get("name"), f"{location}.properties.name")) or f"lift {i}"
+        name = common.short(text(properties.get("name"), f"{location}.properties.name")) or f"lift {i}"
         visits: list[str] = []
         for key, door in elements(lift.get("cabin_doors"), f"{location}.cabin_doors"):
             visits += references(door.get("visits", []), f"{location}.cabin_doors.{key}.visits")
         served = [level for level in self.levels if level in visits]
-        cabin = _rmf_site.parse_cabin(properties, at[0], at[1], f"{location}.properties")
+        cabin = vocabulary.parse_cabin(properties, at[0], at[1], f"{location}.properties")
         return _Lift(i, name, lift, cabin, served)
 
     # the parts
@@ -268,7 +271,7 @@ class _Reader:
             site["models"] = sorted(int(i) for listed in self.placed.values() for i, _ in listed)
         if self.dangling:
             site["dangling"] = self.dangling
-        digest = _rmf_site.digest(site)
+        digest = vocabulary.digest(site)
         for i, level in self.levels.items():
             document = {BUILDING: building[i], NAME: {"of": digest, **self._document(level)}}
             if not level.order:
@@ -325,7 +328,7 @@ class _Reader:
                 p = self._node(level, anchor, k, locations.get(anchor, []), docks.get((i, anchor)))
                 if (robot := robots.get((i, anchor))) is not None:
                     parameters = p[BUILDING].setdefault("parameters", {})
-                    parameters[_rmf.ROBOT], parameters[_rmf.ROBOT_TYPE] = (
+                    parameters[common.ROBOT], parameters[common.ROBOT_TYPE] = (
                         [1, robot["name"]],
                         [1, robot.pop("model_name")],
                     )
@@ -379,7 +382,7 @@ class _Reader:
             for anchor in names:
                 name = text(locations[anchor][0][1].get("name"), "locations") if anchor in locations else ""
                 name = "" if name == UNNAMED else name
-                node_names.append(_rmf.short(name) or f"{_rmf.short(level.name, 200)}/{anchor}")
+                node_names.append(common.short(name) or f"{common.short(level.name, 200)}/{anchor}")
             ids = unique_ids(node_names, taken)
             taken.update(ids)
             level.nodes = dict(zip(names, ids, strict=True))
@@ -459,7 +462,7 @@ class _Reader:
             if target is not level or xyz[:, 2].any():
                 xyz[:, 2] += [home.elevation for home in homes]
             line = xyz if target is not level or xyz[:, 2].any() else xyz[:, :2]
-            graph, graphs = _rmf_site.parse_graphs(element.get("graphs"), self.graphs, f"{location}.graphs")
+            graph, graphs = vocabulary.parse_graphs(element.get("graphs"), self.graphs, f"{location}.graphs")
             several += graphs > 1
             for both, motion, backward in self._motions(element, location):
                 mirrored = both and backward
@@ -471,7 +474,7 @@ class _Reader:
                 parameters: dict[str, Any] = {
                     "bidirectional": [4, both],
                     "graph_idx": [2, graph],
-                    "orientation": [1, _rmf.reverse_orientation(orientation) if mirrored else orientation],
+                    "orientation": [1, common.reverse_orientation(orientation) if mirrored else orientation],
                     **({} if mutex is None else {"mutex": [1, mutex]}),
                     **({"speed_limit": [3, limit]} if limit else {}),
                 }
@@ -486,7 +489,7 @@ class _Reader:
                 p[NAME] = {"lane": int(i), "says": {k: v for k, v in element.items() if k != "anchors"}}
                 if backward:
                     p[NAME]["reverse"] = True
-                edges.append((level.id, _rmf.short(f"{source}_{end}", 490), segments(line[[a]], line[[b]])[0], p))
+                edges.append((level.id, common.short(f"{source}_{end}", 490), segments(line[[a]], line[[b]])[0], p))
         names = unique_ids((name for _, name, _, _ in edges), taken)
         taken.update(names)
         for name, (home, _, geometry, edge) in zip(names, edges, strict=True):
@@ -506,7 +509,7 @@ class _Reader:
             raise_unreadable(f"must be Same, Disable or Different, is {name[:40]!r}", f"{location}.reverse")
         back = forward if name == "Same" else mapping(content, f"{location}.reverse")
         forth_words, back_words = (motion_properties(motion, location) for motion in (forward, back))
-        both = name != "Disable" and back_words == (_rmf.reverse_orientation(forth_words[0]), forth_words[1])
+        both = name != "Disable" and back_words == (common.reverse_orientation(forth_words[0]), forth_words[1])
         yield both, forward, False
         if name != "Disable":
             yield both, back, True
@@ -558,7 +561,7 @@ class _Reader:
         return [*rows, *self._read_drawn(level), *self._models(level)]
 
     def _id(self, level: _Level, kind: str, i: str) -> str:
-        return f"{_rmf.short(level.name, 200)}/{kind}/{i}"
+        return f"{common.short(level.name, 200)}/{kind}/{i}"
 
     def _solid(self, kind: str, k: int, element: Mapping[str, Any], location: str) -> dict[str, Any]:
         p: dict[str, Any] = {"kind": kind}
@@ -567,14 +570,14 @@ class _Reader:
             name = text(element.get("name"), f"{location}.name")
             if name:
                 p["name"] = name
-            parameters = _rmf_site.door_parameters(element.get("kind"), f"{location}.kind")
+            parameters = vocabulary.door_parameters(element.get("kind"), f"{location}.kind")
             parameters["name"] = [1, name]
         elif element.get("texture") is not None:
             group = self.textures.get(reference(element["texture"], f"{location}.texture"))
-            parameters = _rmf_site.texture_parameters(group, kind) if group is not None else {}
+            parameters = vocabulary.texture_parameters(group, kind) if group is not None else {}
         if kind != "floor":
             for key, member in (("height", "top"), ("base", "bottom")):
-                height = _rmf_site.height(element.get(member), f"{location}.{member}")
+                height = vocabulary.height(element.get(member), f"{location}.{member}")
                 if height is not None and height > 0:
                     p[key] = height
         p[BUILDING] = {"index": k, "parameters": parameters}
@@ -585,7 +588,7 @@ class _Reader:
         for level in self.levels.values():
             for i, drawing in elements(level.said.get("drawings"), f"{level.location}.drawings"):
                 location = f"{level.location}.drawings.{i}.properties.source"
-                kind, name = _rmf_site.asset(mapping(drawing.get("properties"), location).get("source"), location)
+                kind, name = vocabulary.asset(mapping(drawing.get("properties"), location).get("source"), location)
                 if name and kind in ("Local", "Remote"):
                     yield location, name
 
@@ -605,7 +608,7 @@ class _Reader:
         pixels = number(p.get("pixels_per_meter", 100.0), f"{location}.properties.pixels_per_meter")
         if not 1e-6 <= pixels <= 1e9:
             raise_unreadable("must be between 1e-6 and 1e9", f"{location}.properties.pixels_per_meter")
-        x, y, _, _, _, yaw = _rmf_site.pose(p.get("pose"), f"{location}.properties.pose")
+        x, y, _, _, _, yaw = vocabulary.pose(p.get("pose"), f"{location}.properties.pose")
         anchors = self._anchors(drawing.get("anchors"), f"{location}.anchors")
         scales = []
         for k, m in elements(drawing.get("measurements"), f"{location}.measurements"):
@@ -616,7 +619,7 @@ class _Reader:
                     number(m["distance"], f"{location}.measurements.{k}.distance") / length if length else 0.0
                 )
         mean = sum(scales) / len(scales) if scales else 0.0
-        scale = mean if abs(mean * pixels - 1.0) < _rmf_site.SINGLE_PRECISION else 1.0 / pixels
+        scale = mean if abs(mean * pixels - 1.0) < vocabulary.SINGLE_PRECISION else 1.0 / pixels
         return [scale, yaw, x, y]
 
     def _read_drawn(self, level: _Level) -> list[tuple[str, Any, Properties]]:
@@ -693,7 +696,7 @@ class _Reader:
             for i, element, description in self._instances(level):
                 if str(element.get("description")) not in self.robots:
                     continue
-                now = _rmf_site.pose(element.get("pose"), f"model_instances.{i}.pose")
+                now = vocabulary.pose(element.get("pose"), f"model_instances.{i}.pose")
                 near = tree.query_nearest(shapely.Point(now[:2]), max_distance=SAME_PLACE, all_matches=False)
                 anchor = listed[int(near[0])] if len(near) else None
                 name = text(element.get("name"), f"model_instances.{i}.name")
@@ -712,7 +715,7 @@ class _Reader:
                 continue
             location = f"model_instances.{i}"
             self._count_unknown_members(element, "model_instances")
-            x, y, z, *turn = _rmf_site.pose(element.get("pose"), f"{location}.pose")
+            x, y, z, *turn = vocabulary.pose(element.get("pose"), f"{location}.pose")
             name = text(element.get("name"), f"{location}.name")
             p: dict[str, Any] = {
                 "kind": "robot" if str(element.get("description")) in self.robots else "model",
@@ -736,7 +739,7 @@ class _Reader:
         """(level, row) of a lift; it stands on its initial level, else on the lowest that it visits."""
         properties = mapping(lift.said.get("properties"), f"lifts.{lift.id}.properties")
         location = f"lifts.{lift.id}"
-        rect = _rmf_site.rectangle(properties, location)
+        rect = vocabulary.rectangle(properties, location)
         initial = properties.get("initial_level")
         home = None if initial is None else reference(initial, f"{location}.properties.initial_level")
         floors = sorted(lift.visits or self.levels, key=lambda i: self.levels[i].elevation)
@@ -744,8 +747,8 @@ class _Reader:
         doors: dict[str, Any] = {}
         served: dict[str, list[str]] = {self.levels[i].name: [] for i in lift.visits}
         door_elements = dict(elements(lift.said.get("cabin_doors"), f"{location}.cabin_doors"))
-        for face in _rmf_site.FACES:
-            door = _rmf_site.cabin_door(rect, face, f"{location}.properties.cabin.{face}")
+        for face in vocabulary.FACES:
+            door = vocabulary.cabin_door(rect, face, f"{location}.properties.cabin.{face}")
             if door is None:
                 continue
             doors[face] = door
@@ -774,7 +777,7 @@ class _Reader:
         p = {
             "kind": "lift",
             "name": lift.name,
-            "size": _rmf_site.cabin_size(cabin),
+            "size": vocabulary.cabin_size(cabin),
             "pose": [cabin.x, cabin.y, level.elevation, 0.0, 0.0, cabin.yaw],
             BUILDING: {"index": k, "says": says},
             NAME: {"id": int(lift.id), "says": members, "was": [*cabin.pose, cabin.depth, cabin.width]},
@@ -793,7 +796,7 @@ class _Reader:
                 continue
             members = mapping(level.said["drawings"], "drawings")[primary]
             location = f"{level.location}.drawings.{primary}"
-            _, file = _rmf_site.asset(mapping(members.get("properties"), location).get("source"), location)
+            _, file = vocabulary.asset(mapping(members.get("properties"), location).get("source"), location)
             drawings[i] = self._transform(members, location), file
         drawn = len(drawings) == len(self.levels)
         system = "reference_image" if drawn else "cartesian_meters"
@@ -815,7 +818,7 @@ def motion_properties(motion: Mapping[str, Any], location: str) -> tuple[str, fl
     """(orientation in a building's words, speed limit or 0) of a motion along a lane."""
     name, content = variant(motion.get("orientation_constraint") or "None", f"{location}.orientation_constraint")
     if name in ("RelativeYaw", "AbsoluteYaw"):
-        _rmf_site.angle(content, f"{location}.orientation_constraint")
+        vocabulary.angle(content, f"{location}.orientation_constraint")
     elif name not in _ORIENTATIONS and name != "None":
         raise_unreadable(f"unknown orientation constraint {name[:40]!r}", location)
     limit = motion.get("speed_limit")
@@ -841,7 +844,7 @@ def _model_name(description: Mapping[str, Any], location: str) -> str:
     """The name that a building would find the model by."""
     if "source" not in description:
         return ""
-    kind, name = _rmf_site.asset(description["source"], f"{location}.source")
+    kind, name = vocabulary.asset(description["source"], f"{location}.source")
     if kind == "Search":
         return name
     parts = [part for part in name.split("/") if part and "." not in part]

@@ -45,13 +45,14 @@ from app.formats import (
     ReadContext,
     WriteContext,
     _fields,
-    _openrmf_rules,
-    _rmf,
     register,
 )
 from app.formats._fields import ANGLE, ANY, COORDINATE, LENGTH, NOT_NEGATIVE, SPEED, Number, OneOf, Typed, record
 from app.formats._network import get_source_properties
-from app.formats._rmf import (
+from app.formats.rmf import common
+from app.formats.rmf import common as _rmf
+from app.formats.rmf.building import rules as _openrmf_rules
+from app.formats.rmf.common import (
     BUILDING,
     NAV_GRAPH,
     Array,
@@ -64,7 +65,7 @@ from app.formats._rmf import (
     parameter_value,
     raise_unreadable,
 )
-from app.formats._rmf_images import companion_hook, find_stored_image, images
+from app.formats.rmf.images import companion_hook, find_stored_image, images
 from app.model.features import (
     Features,
     Properties,
@@ -422,7 +423,7 @@ def _level(name: str, order: int, members: Any) -> _Level:
     location = f"levels.{name}"
     one = dict(mapping(members, location))
     rows = listing(one.pop("vertices", None), f"{location}.vertices")
-    raw = _rmf.places(rows, f"{location}.vertices")
+    raw = common.places(rows, f"{location}.vertices")
     elevation = number(one.get("elevation", 0.0) or 0.0, f"{location}.elevation")
     return _Level(name, order, one, raw, rows, elevation)
 
@@ -445,7 +446,7 @@ def _scaling(level: _Level) -> Scaling:
             metres = number(parameter_value(parameters, "distance"), f"{level.location_of('measurements', k)}.distance")
             measurements.append((math.dist(level.raw[i], level.raw[j]), metres))
     rows = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
-    at = _rmf.places(rows, f"levels.{level.name}.fiducials")
+    at = common.places(rows, f"levels.{level.name}.fiducials")
     names = [_text(row[2]) if len(row) > 2 else "" for row in rows]
     return Scaling(measurements, [(name, x, -y) for name, (x, y) in zip(names, at.tolist(), strict=True)])
 
@@ -468,7 +469,7 @@ def _node_ids(level: _Level, taken: set[str]) -> list[str]:
         name = row[3] if len(row) > 3 else ""
         if isinstance(name, (list, dict)):
             raise_unreadable("the name of a vertex must be a text", f"{level.location_of('vertices', k)}[3]")
-        names.append(_rmf.short(_text(name)) or f"{_rmf.short(level.name, 200)}/{k}")
+        names.append(common.short(_text(name)) or f"{common.short(level.name, 200)}/{k}")
     return unique_ids(names, taken)
 
 
@@ -529,7 +530,9 @@ class _Reader:
         if high.any():
             geometry[high] = points(np.column_stack([level.at[high], heights[high] + level.elevation]))
         level.rows = []
-        edge_names = (_rmf.short(f"{level.ids[i]}_{level.ids[j]}", 490) for i, j in zip(sources, targets, strict=True))
+        edge_names = (
+            common.short(f"{level.ids[i]}_{level.ids[j]}", 490) for i, j in zip(sources, targets, strict=True)
+        )
         ids = [*level.ids, *unique_ids(edge_names, taken)]
         taken.update(islice(ids, len(level.ids), None))
         properties += lanes
@@ -603,7 +606,7 @@ class _Reader:
     def objects(self, level: _Level, lifts: list[tuple[str, Any, Properties]]) -> Features:
         """Everything but vertices and lanes."""
         rows: list[tuple[str, Any, Properties]] = []
-        prefix = _rmf.short(level.name, 200)
+        prefix = common.short(level.name, 200)
         template = shared_key_dict("index", "parameters", "vertices")
         for section, kind in LINES.items():
             for k, i, j, parameters, more in self._between(level, section):
@@ -635,7 +638,7 @@ class _Reader:
                 rows.append((f"{prefix}/{kind}/{k}", _ring(level.at[ring]), {"kind": kind, NAME: source_properties}))
         rows += self._models(level, prefix)
         marks = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
-        at = self._level_position(_rmf.places(marks, f"levels.{level.name}.fiducials"), level)
+        at = self._level_position(common.places(marks, f"levels.{level.name}.fiducials"), level)
         for k, row in enumerate(marks):
             properties = {"kind": "fiducial", NAME: {"index": k, **({"more": row[3:]} if len(row) > 3 else {})}}
             if len(row) > 2:
@@ -682,13 +685,13 @@ class _Reader:
             yaw = number(members.get("yaw", 0.0), f"{location}.yaw")
             width, depth = (number(members.pop(key, None), f"{location}.{key}") for key in ("width", "depth"))
             at = self._level_position(np.array([[x, y]]), self.levels[floor])[0].tolist()
-            properties: dict[str, Any] = {"kind": "lift", "name": name, "size": [width, depth, _rmf.CABIN_HEIGHT]}
+            properties: dict[str, Any] = {"kind": "lift", "name": name, "size": [width, depth, common.CABIN_HEIGHT]}
             if not self.degrees:
                 # The tools take a lift's yaw as it stands, on whatever floor plan it was drawn.
                 properties["pose"] = [*at, self.levels[floor].elevation, 0.0, 0.0, yaw]
                 members.pop("yaw", None)
             properties[NAME] = {"index": k, "says": members}
-            row = (f"{_rmf.short(floor, 200)}/lift/{_rmf.short(name)}", shapely.Point(at), properties)
+            row = (f"{common.short(floor, 200)}/lift/{common.short(name)}", shapely.Point(at), properties)
             out.setdefault(floor, []).append(row)
         return out
 
@@ -733,7 +736,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
     Raises MissingLayer where there is neither a network nor anything that came from a building.
     """
-    storeys = _rmf.storeys(layers)
+    storeys = common.storeys(layers)
     if not storeys:
         raise MissingLayer("openrmf needs a network: upload a building.yaml, tmap2 or OSM file")
     resources: dict[str, bytes] = {}
@@ -810,8 +813,8 @@ class _Writer:
         why: str,
     ) -> None:
         self.layers, self.context, self.storeys, self.system = layers, context, storeys, system
-        self.options = context.options if isinstance(context.options, _rmf.WriteOptions) else _rmf.WriteOptions()
-        self.robots = _rmf.Robots(self.options, _iterate_nodes(storeys))
+        self.options = context.options if isinstance(context.options, common.WriteOptions) else common.WriteOptions()
+        self.robots = common.Robots(self.options, _iterate_nodes(storeys))
         self.building = dict(building)
         self.resources = resources
         self.why = why
@@ -998,13 +1001,16 @@ class _Writer:
             name = title if isinstance(title, str) and (title or NAV_GRAPH in p) else "" if NAV_GRAPH in p else i
             graph = mapping(get_source_properties(p, NAV_GRAPH).get("parameters"), "parameters")
             parameters = {
-                key: _rmf.typed_parameter(value) for key, value in graph.items() if key not in ("name", "lift")
+                key: common.typed_parameter(value) for key, value in graph.items() if key not in ("name", "lift")
             }
             self.dropped["nodes' attributes of other formats"] += any(
                 isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
             )
         if further:
-            parameters = {**(parameters or {}), **{key: _rmf.typed_parameter(value) for key, value in further.items()}}
+            parameters = {
+                **(parameters or {}),
+                **{key: common.typed_parameter(value) for key, value in further.items()},
+            }
         self.dropped["nodes' orientations"] += p.get("orientation") is not None
         row = f"[{position[0]}, {position[1]}, {yaml.text(round(z, METRES) + 0.0)}, {yaml.text(name)}"
         if parameters or source_members.get("more"):
@@ -1045,7 +1051,7 @@ class _Writer:
                 self.dropped["edges' attributes of other formats"] += any(
                     isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
                 )
-            limit = _rmf.limit(p) or (self.options.speed_limit if NAME not in p and NAV_GRAPH not in p else 0.0)
+            limit = common.limit(p) or (self.options.speed_limit if NAME not in p and NAV_GRAPH not in p else 0.0)
             yield _Lane.from_edge(limit, source_members, source, target, self.flow)
 
     def _dangling(self, storey: Storey, vertices: _Vertices, sections: Sections) -> None:
@@ -1143,7 +1149,7 @@ class _Writer:
 
     def _model(self, p: Properties, position: tuple[str, str], storey: Storey) -> str:
         members = dict(mapping(get_source_properties(p, NAME).get("says"), "says"))
-        pose = _rmf.object_pose(p)
+        pose = common.object_pose(p)
         if pose is not None and not self.degrees:
             z = round(pose[2] - float(self._elevation(storey)), METRES) + 0.0
             if z or "z" not in members:
@@ -1173,9 +1179,9 @@ class _Writer:
                     raw, _ = self._coordinates(part, np.array([k]), floor)
                     (x, y) = self._texts(raw)[0]
                     members["x"], members["y"] = float(x), float(y)
-                    size = _rmf.object_size(p) or (1.0, 1.0)
+                    size = common.object_size(p) or (1.0, 1.0)
                     members["width"], members["depth"] = size
-                    pose = _rmf.object_pose(p)
+                    pose = common.object_pose(p)
                     if pose is not None and not self.degrees:
                         members["yaw"] = round(pose[5], DEGREES) + 0.0
                     members.setdefault("yaw", 0.0)
@@ -1254,7 +1260,7 @@ def _iterate_nodes(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Proper
                     yield storey.name, i, p
 
 
-def _lane_parameters(p: Properties, options: _rmf.WriteOptions) -> dict[str, Any]:
+def _lane_parameters(p: Properties, options: common.WriteOptions) -> dict[str, Any]:
     """The parameters of a lane that comes from another format."""
     out = {key: list(value) for key, value in LANE_TEMPLATE.items()}
     if NAV_GRAPH not in p:
@@ -1267,7 +1273,7 @@ def _lane_parameters(p: Properties, options: _rmf.WriteOptions) -> dict[str, Any
         if key == "orientation_constraint":
             out["orientation"] = [1, value]
         elif key not in ("door_name", "speed_limit", "is_bidirectional", "dock_name", "undock_name"):
-            out[key] = _rmf.typed_parameter(value)
+            out[key] = common.typed_parameter(value)
     return out
 
 
@@ -1310,7 +1316,7 @@ class _Lane:
 
     def partner(self) -> Any:
         """What the edge back says, if both are one two-way lane."""
-        direction = _rmf.reverse_orientation(self._orientation()) if self.was is None else not self.reverse
+        direction = common.reverse_orientation(self._orientation()) if self.was is None else not self.reverse
         return (self.target, self.source, self.limit, self.signature, direction)
 
     def row(self, flow: Flow) -> str:
@@ -1319,7 +1325,7 @@ class _Lane:
         if self.both or parameter_value(parameters, "bidirectional") is True or self.was is None:
             parameters = {**parameters, "bidirectional": [4, self.both]}
         if self.reverse and "orientation" in parameters:
-            parameters = {**parameters, "orientation": [1, _rmf.reverse_orientation(self._orientation())]}
+            parameters = {**parameters, "orientation": [1, common.reverse_orientation(self._orientation())]}
         more = "".join(f", {flow(v)}" for v in self.more)
         return f"[{self.source}, {self.target}, {flow(parameters)}{more}]"
 
