@@ -31,7 +31,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
+from app.formats import Claims, Files, Format, LayerRequirements, ReadContext, Traits, WriteContext, register
 from app.model.features import MAX_ID, NO_GEOMETRY, Features, Properties, unique_ids
 from app.model.frame import GROUND, MAX_METRES, Datum, Level
 from app.model.layers import NETWORK, VECTOR_LAYERS, Layer, Layers, Part, PartKey
@@ -747,17 +747,14 @@ register(
     Format(
         name="geojson",
         title="GeoJSON",
-        files=("map.geojson",),
-        media_types=("application/geo+json",),
+        files={"map.geojson": "application/geo+json"},
         layers=frozenset(VECTOR_LAYERS),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
-        family=FAMILY,
-        marks_blocked=True,
-        is_drawing=True,
-        priority=5,
         extensions=(".geojson", ".json"),
+        claims=Claims(priority=5),
+        traits=Traits(is_drawing=True, marks_blocked=True),
     )
 )

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _las, _points, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, Selection, WriteContext, _las, _points, register
 from app.formats._clouds import PARSERS
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
@@ -77,8 +77,7 @@ register(
     Format(
         name=NAME,
         title="LAS and LAZ point cloud",
-        files=("map.las", "map.laz"),
-        media_types=("application/vnd.las", "application/vnd.laszip"),
+        files={"map.las": "application/vnd.las", "map.laz": "application/vnd.laszip"},
         layers=frozenset({"voxels", "resources"}),
         detect=_las.detect,
         read=read,
@@ -87,8 +86,6 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".las", ".laz"),
-        select_parts=choose,
-        options_from_filename=options_from_filename,
-        parts=_points.PARTS,
+        selection=Selection(choose, options_from_filename, _points.PARTS),
     )
 )

@@ -46,7 +46,18 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _osm_rules, _osm_text, register
+from app.formats import (
+    Claims,
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    Traits,
+    WriteContext,
+    _osm_rules,
+    _osm_text,
+    register,
+)
 from app.formats._osm import INT64, Data, Tags, Way, is_pbf, parse, unpack
 from app.formats._osm_text import NO_ATTRIBUTES, Node, as_texts, attribute_text, element_id, integers, plain
 from app.limits import Limits
@@ -1228,17 +1239,16 @@ register(
     Format(
         name="osm",
         title="OpenStreetMap",
-        files=("map.osm",),
-        media_types=("application/vnd.openstreetmap.data+xml",),
+        files={"map.osm": "application/vnd.openstreetmap.data+xml"},
         layers=CARRIES,
         detect=detect,
         read=read,
         check=_osm_rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
-        family=FAMILY,
-        priority=20,
         version=3,
         extensions=(".osm", "osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
+        claims=Claims(priority=20),
+        traits=Traits(own_ids=True, own_network=True),
     )
 )

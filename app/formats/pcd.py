@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _pcd, _points, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, Selection, WriteContext, _pcd, _points, register
 from app.formats._clouds import PARSERS
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
@@ -59,8 +59,7 @@ register(
     Format(
         name=NAME,
         title="PCD point cloud",
-        files=("map.pcd",),
-        media_types=("application/octet-stream",),
+        files={"map.pcd": "application/octet-stream"},
         layers=frozenset({"voxels", "resources"}),
         detect=_pcd.detect,
         read=read,
@@ -69,8 +68,6 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".pcd",),
-        select_parts=choose,
-        options_from_filename=_points.options_from_filename((NAME,)),
-        parts=_points.PARTS,
+        selection=Selection(choose, _points.options_from_filename((NAME,)), _points.PARTS),
     )
 )

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _ply, _points, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, Selection, WriteContext, _ply, _points, register
 from app.formats._clouds import PARSERS
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
@@ -64,8 +64,7 @@ register(
     Format(
         name=NAME,
         title="PLY point cloud",
-        files=("map.ply",),
-        media_types=("application/octet-stream",),
+        files={"map.ply": "application/octet-stream"},
         layers=frozenset({"voxels", "resources"}),
         detect=_ply.detect,
         read=read,
@@ -74,8 +73,6 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".ply",),
-        select_parts=choose,
-        options_from_filename=_points.options_from_filename((NAME,)),
-        parts=_points.PARTS,
+        selection=Selection(choose, _points.options_from_filename((NAME,)), _points.PARTS),
     )
 )
