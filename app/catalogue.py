@@ -19,7 +19,7 @@ def describe_format(fmt: Format) -> dict[str, Any]:
         "id": fmt.name,
         "title": fmt.title,
         "files": list(fmt.files),
-        "media_types": list(fmt.media_types),
+        "media_types": list(fmt.files.values()),
         "read": fmt.read is not None,
         "write": fmt.write is not None,
         "options": _options(fmt),
@@ -58,7 +58,7 @@ def _options(fmt: Format) -> list[dict[str, Any]]:
 
 
 def _information(fmt: Format, layer: Layer) -> str:
-    carried = fmt.layers - ({"occupancy"} if fmt.outlines else frozenset())  # where a grid lies is no grid
+    carried = fmt.layers - ({"occupancy"} if fmt.traits.outlines else frozenset())  # where a grid lies is no grid
     if layer in carried:
         return "raw"
     return "derived" if derive.plan(carried, frozenset({layer})) is not None else "-"

@@ -184,7 +184,7 @@ def read(
         if _read_exact_content(files, content, hints, limits, bundle):
             return bundle
         files = {name: data for name, data in files.items() if name not in _content.content_files(files, content)}
-    if hints.format is not None and formats.get_format(hints.format).is_container:
+    if hints.format is not None and formats.get_format(hints.format).traits.is_container:
         # A folder of other formats' maps is what any upload may be: each file is found out by its content.
         template_files = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
         if template_files:
@@ -198,7 +198,7 @@ def read(
     problems: list[Problem] = []
     details: list[str] = []
     errors: list[type[BadUpload]] = []
-    for group in sorted(taken, key=lambda g: (-g.format.priority, g.main)):
+    for group in sorted(taken, key=lambda g: (-g.format.claims.priority, g.main)):
         try:
             parsed_parts += _read_group(group, hints, context, limits, bundle)
         except BadUpload as error:
@@ -338,7 +338,7 @@ def _group(files: Files, hints: UploadHints) -> tuple[list[FileGroup], list[str]
         raise UnreadableFile("all files are empty", [Problem("the file is empty", name) for name in sorted(files)])
     groups, rest = formats.group(present, hints.format)
     for fmt in formats.all_formats().values():
-        if hints.format in (None, fmt.name) and fmt.completing_options & hints.options.keys():
+        if hints.format in (None, fmt.name) and fmt.claims.completing_options & hints.options.keys():
             completed = _complete_group(fmt, groups, rest, present, hints.options.get("file"))
             if completed is not None:
                 groups = [*(g for g in groups if g.main not in completed.files), completed]
@@ -350,8 +350,8 @@ def _complete_group(
     fmt: Format, groups: list[FileGroup], rest: list[str], files: Files, main_name: str | None
 ) -> FileGroup | None:
     """The file that options of the upload make a map, where it says too little by itself: a picture and its place."""
-    lone = {g.main for g in groups if g.format is fmt and fmt.missing_metadata(g.main, g.files[g.main])}
-    names = sorted(n for n in {*rest, *lone} if fmt.missing_metadata(n, files[n]))
+    lone = {g.main for g in groups if g.format is fmt and fmt.claims.missing_metadata(g.main, g.files[g.main])}
+    names = sorted(n for n in {*rest, *lone} if fmt.claims.missing_metadata(n, files[n]))
     if main_name is not None:
         names = [n for n in names if n == main_name or n.rpartition("/")[2] == main_name]
         if not names:
@@ -364,13 +364,15 @@ def _complete_group(
     if not names:
         return None
     main = names[0]
-    others = [n for n in fmt.companions(main, files[main], sorted(files)) if n in files]
+    others = [n for n in fmt.claims.companions(main, files[main], sorted(files)) if n in files]
     return FileGroup(fmt, main, {n: files[n] for n in [main, *others]})
 
 
 def _missing_metadata(name: str, data: bytes) -> str:
     """What a file would need to be a map, where a format knows it."""
-    return next((text for f in formats.all_formats().values() if data and (text := f.missing_metadata(name, data))), "")
+    if not data:
+        return ""
+    return next((text for f in formats.all_formats().values() if (text := f.claims.missing_metadata(name, data))), "")
 
 
 def _read_variables(files: Files, bundle: Bundle) -> set[str]:
@@ -405,7 +407,7 @@ def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]
         if sibling in mains and mains[sibling].format is group.format:
             reason = f"{sibling} is used instead of what was generated"
         elif (
-            (group.format.is_drawing or group.format.name == "prm")
+            (group.format.traits.is_drawing or group.format.name == "prm")
             and folder == "topological"
             and not _is_regions(name)
         ):
@@ -413,7 +415,7 @@ def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]
             if richer is not None:
                 reason = f"the network comes from the richer {richer} file"
         elif (
-            group.format.is_drawing
+            group.format.traits.is_drawing
             and folder == "location"
             and PurePosixPath(name).name.startswith("fence_autogen.")
             and ("datum", "location") in kinds
@@ -466,7 +468,7 @@ def _read_group(
         grid=grid,
         layer=layer,
         options=formats.read_options(group.format, _applicable_options(group, hints)),
-        requested_layers=None if group.format.is_drawing else upload_context.wanted,
+        requested_layers=None if group.format.traits.is_drawing else upload_context.wanted,
         decode_cells=upload_context.cells,
         keep_source_properties=upload_context.whole,
         folder=_folder_reader(hints, upload_context, limits, bundle),
@@ -478,7 +480,7 @@ def _read_group(
     for site in layers.vector("location").values():
         bundle.fence = bundle.fence or (site.geometry[0] if len(site) else None)
     parts = dict(layers.parts)
-    if group.format.is_drawing and layer not in (None, "objects"):
+    if group.format.traits.is_drawing and layer not in (None, "objects"):
         parts = _assign(parts, layer, hints.level, upload_context, layers.datum, group.main, bundle)
     if layers.datum is not None:
         if bundle.datum is None:
@@ -627,7 +629,7 @@ def _merge_fence_style(winners: list[ParsedPart], loser: ParsedPart) -> bool:
 
 def _priority(one: ParsedPart) -> tuple[object, ...]:
     name = PurePosixPath(one.group.main).name
-    return (-one.group.format.priority, name.startswith("."), "_autogen" in name, len(name), one.group.main)
+    return (-one.group.format.claims.priority, name.startswith("."), "_autogen" in name, len(name), one.group.main)
 
 
 def _join(candidates: list[ParsedPart], renamed: dict[str, dict[str, str]]) -> Part:

@@ -42,11 +42,11 @@ def _companions(main: str, beside: _FilesBeside) -> list[str]:
     fmt = formats.detect(main, beside[main])
     if fmt is None:
         return []
-    if fmt.sort is not None:
-        companion_names = fmt.sort(beside, [main]).get(main, ())
+    if fmt.claims.sort is not None:
+        companion_names = fmt.claims.sort(beside, [main]).get(main, ())
     else:
         names = list(beside)
-        companion_names = [*fmt.companions(main, beside[main], names), *fmt.related_files(main, names)]
+        companion_names = [*fmt.claims.companions(main, beside[main], names), *fmt.claims.related_files(main, names)]
     return [name for name in companion_names if name in beside and name != main]
 
 

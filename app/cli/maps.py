@@ -307,14 +307,14 @@ def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
     """Describe a format: files, the layers that it keeps and drops, what a map of it needs, and its parameters."""
     carried_layers = [layer for layer in described["information"] if layer in fmt.layers]
     dropped = [layer for layer in described["information"] if layer not in fmt.layers]
-    dropped += ["blocked edges"] if "topology" in fmt.layers and not fmt.marks_blocked else []
+    dropped += ["blocked edges"] if "topology" in fmt.layers and not fmt.traits.marks_blocked else []
     derived = [layer for layer, how in described["information"].items() if how == "derived"]
     output.show_members(
         {
             "format": f"{fmt.name}: {fmt.title}",
             "uploads": "yes, detected from the content" if fmt.read else "not read",
             "maps": ", ".join(fmt.files) if fmt.write else "not written",
-            "media types": ", ".join(dict.fromkeys(fmt.media_types)) if fmt.write else "",
+            "media types": ", ".join(dict.fromkeys(fmt.files.values())) if fmt.write else "",
             "a map needs": _requirements_text(fmt.needs) if fmt.write else "",
             "keeps": ", ".join(carried_layers),
             "derived from it": ", ".join(derived) if fmt.read else "",

@@ -103,8 +103,8 @@ def ingredients(version: Version, fmt: Format, keys: Collection[PartKey]) -> dic
     closures = version.closures
     if closures is None:
         return {}
-    network = fmt.is_container or "topology" in fmt.layers
-    masked = fmt.is_container or any(key.layer == "occupancy" and key.name == KEEPOUT for key in keys)
+    network = fmt.traits.is_container or "topology" in fmt.layers
+    masked = fmt.traits.is_container or any(key.layer == "occupancy" and key.name == KEEPOUT for key in keys)
     out: dict[str, Any] = {}
     if closures.items and (network or masked):
         out["closures"] = closures.digest
@@ -228,7 +228,7 @@ def close(
     """
     report = ClosureReport()
     mode: ClosureMode = "apply" if closures is None else closures.mode
-    mark = mark or mode == "mark" or fmt.marks_blocked
+    mark = mark or mode == "mark" or fmt.traits.marks_blocked
     items = () if closures is None else closures.items
     effects: dict[str, _Effect] = {closure.id: _Effect() for closure in items}
     zones = {zone_id(closure.id): closure.id for closure in items}
@@ -246,7 +246,7 @@ def close(
         elif isinstance(part, Features) and key.layer == "zones":
             for overlay_id in (zones[i] for i in part.ids if i in zones):
                 effects[overlay_id].zone = True
-    if mark and not fmt.marks_blocked:
+    if mark and not fmt.traits.marks_blocked:
         report.kept = sum(
             _is_blocked(p) for part in parts.values() if isinstance(part, Features) for p in part.properties
         )

@@ -68,9 +68,9 @@ def _offline(
     required_layers = None if "objects" in needed else needed  # whatever can be read can be an object
     if site.selects_all(fmt, option_values):
         required_layers = None  # further parts may be derived from any layer
-    cells = bool(option_values) or not fmt.outlines  # an option may ask for the images, too
+    cells = bool(option_values) or not fmt.traits.outlines  # an option may ask for the images, too
     complete = required_layers is None and cells
-    knowing = EnvironmentContext(datum, None, required_layers, cells, fmt.is_drawing or fmt.is_container)
+    knowing = EnvironmentContext(datum, None, required_layers, cells, fmt.traits.is_drawing or fmt.traits.is_container)
     upload_bundle = upload_reader.read(upload_reader.unpack(load(), limits), hints, knowing, limits)
     try:
         written = _convert_layers(fmt, upload_bundle, datum, option_values, derived=derived and complete)

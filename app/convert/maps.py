@@ -103,12 +103,12 @@ class Maps:
         fmt = formats.get_format(name)
         values = values or {}
         filled = templates.resolve(version.templates, fmt)
-        hints = fmt.options_from_filename(file.rpartition("/")[2]) if file is not None else {}
+        hints = fmt.selection.from_filename(file.rpartition("/")[2]) if file is not None else {}
 
         def plan(without: frozenset[str]) -> Recipe:
-            if fmt.parts is not None:
+            if (parts := fmt.selection.parts) is not None:
                 if file is not None:
-                    by_name = {fmt.parts.level, fmt.parts.name, *hints}  # the file's name overrides templates
+                    by_name = {parts.level, parts.name, *hints}  # the file's name overrides templates
                     option_values = {**{n: v for n, v in filled.values.items() if n not in by_name}, **values}
                     recipe = site.file_recipe(version, fmt, option_values, file, derived=derive, without=without)
                     if recipe is not None:
@@ -289,7 +289,7 @@ class Maps:
         """Warnings of edges that lead through obstacles which the map itself does not hold."""
         version, fmt, keys = recipe.version, recipe.format, recipe.chain.keys
         network = [k for k in keys if k.layer == "topology"]
-        if recipe.steps or fmt.is_container or not network or "topology" not in fmt.layers:
+        if recipe.steps or fmt.traits.is_container or not network or "topology" not in fmt.layers:
             return []
         beside = [(e.key, e.hash) for e in version.parts if e.key.layer in ("occupancy", "objects")]
         key = ("crossings", recipe.key, version.datum, tuple(beside))
@@ -309,7 +309,7 @@ class Maps:
 
     def _unused_templates(self, recipe: Recipe) -> list[str]:
         """What the environment's templates say and this release cannot use."""
-        used = formats.all_formats().values() if recipe.format.is_container else [recipe.format]
+        used = formats.all_formats().values() if recipe.format.traits.is_container else [recipe.format]
         reasons = [reason for fmt in used for reason in templates.resolve(recipe.version.templates, fmt).ignored]
         return list(dict.fromkeys(reasons))
 
@@ -383,7 +383,7 @@ class Maps:
 
     def _check_content(self, version: Version, fmt: formats.Format, chain: recipes.DerivationChain) -> None:
         """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
-        if fmt.missing_content is None:
+        if fmt.needs.missing_content is None:
             return
         failure = self._find_failure(
             _trial_key(version, chain, fmt), chain, making.find_missing_content, version, fmt.name, chain

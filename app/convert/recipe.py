@@ -59,7 +59,7 @@ class AvailableLayers:
 
     def for_format(self, fmt: Format) -> AvailableLayers:
         """The same with the blank parts that came from this format; a folder of maps holds all of them."""
-        if fmt.is_container:
+        if fmt.traits.is_container:
             return replace(self, keys=self.keys | self.empty_parts, empty_parts=frozenset())
         format_keys = {
             k for k in self.empty_parts if k.name == fmt.family or (k.layer == "voxels" and k.layer in fmt.layers)
@@ -233,7 +233,7 @@ def plan_chain(
     keys = sorted(k for k in available.keys if k.layer in carried)
     chosen: Sequence[PartKey] = [k for k in keys if k.layer in fmt.layers]
     if not any(step.gives in fmt.layers for step in best.steps):  # else it is chosen once all parts are there
-        chosen = fmt.select_parts(chosen, options)
+        chosen = fmt.selection.choose(chosen, options)
     needed = {layer for step in best.steps for layer in step.needs}
     if not _has_complete_map(fmt, available):
         _check_anchor(fmt, available, sorted({*chosen, *(k for k in keys if k.layer in needed)}))
@@ -248,7 +248,7 @@ def _chain_to_named_part(
     fmt: Format, available: AvailableLayers, options: Any, option_values: Mapping[str, str], without: frozenset[str]
 ) -> DerivationChain | None:
     """The way to a part that is asked for by name and not stored, where a derivation makes parts of that name."""
-    parts = fmt.parts
+    parts = fmt.selection.parts
     if parts is None or (name := getattr(options, parts.name)) is None:
         return None
     layer, level = parts.layer, getattr(options, parts.level)
@@ -435,11 +435,11 @@ def _key(
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
     ingredients |= applied_closures.ingredients(version, fmt, chain.keys)
-    if fmt.has_title or fmt.is_container:
+    if fmt.traits.has_title or fmt.traits.is_container:
         ingredients["title"] = version.environment
     if spread is not None:
         ingredients["spread"] = dataclasses.asdict(spread)
-    if fmt.is_container:  # its bytes are those of other writers and, where they lack a layer, of derivations
+    if fmt.traits.is_container:  # its bytes are those of other writers and, where they lack a layer, of derivations
         ingredients["formats"] = [[f.name, f.version] for f in formats.all_formats().values()]
         ingredients["derivations"] = [[d.name, d.version] for d in derive.all_derivations().values()]
         format_defaults = {

@@ -67,17 +67,20 @@ def level_of_folder(folder: str, levels: Iterable[str]) -> str | None:
 
 def selects_all(fmt: Format, values: Mapping[str, Any]) -> bool:
     """Whether several parts are selected."""
-    return fmt.parts is not None and ALL in (values.get(fmt.parts.name), values.get(fmt.parts.level))
+    parts = fmt.selection.parts
+    return parts is not None and ALL in (values.get(parts.name), values.get(parts.level))
 
 
 def whole_site_options(fmt: Format) -> dict[str, str]:
     """Build the options that select the whole site; none where one map is of all levels anyway."""
-    return {} if fmt.parts is None else {fmt.parts.level: ALL, fmt.parts.name: ALL}
+    parts = fmt.selection.parts
+    return {} if parts is None else {parts.level: ALL, parts.name: ALL}
 
 
 def single_part_options(fmt: Format, values: Mapping[str, Any]) -> dict[str, Any]:
     """Take the options that select one part; those that are ``*`` are left to the default."""
-    selectors = () if fmt.parts is None else (fmt.parts.name, fmt.parts.level)
+    parts = fmt.selection.parts
+    selectors = () if parts is None else (parts.name, parts.level)
     return {option: value for option, value in values.items() if option not in selectors or value != ALL}
 
 
@@ -127,13 +130,14 @@ class _Site:
 
 def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: bool, without: frozenset[str]) -> _Site:
     """Find out what is stored and what can be derived. values: without the options that select parts."""
-    assert fmt.parts is not None
+    parts = fmt.selection.parts
+    assert parts is not None
     available = recipes.available_layers(version).for_format(fmt)
-    stored = tuple(sorted(key for key in available.keys if key.layer == fmt.parts.layer))
+    stored = tuple(sorted(key for key in available.keys if key.layer == parts.layer))
     makers = tuple(
         d
         for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name))
-        if derived and d.part_names and d.gives == fmt.parts.layer and d.needs <= available.layers
+        if derived and d.part_names and d.gives == parts.layer and d.needs <= available.layers
     )
     option_names = {f.name for f in dataclasses.fields(fmt.write_options)}
     only_makers = frozenset().union(*(derive.parameter_names(d.name) for d in makers)) - option_names
@@ -152,7 +156,7 @@ def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: 
     needs = frozenset().union(*(maker.needs for maker in makers))
     keys = stored or (main.keys if main is not None else [key for key in available.keys if key.layer in needs])
     default = _default_level(version, keys)
-    return _Site(version, fmt, fmt.parts, available, stored, main, lacking, makers, default, values, own_values)
+    return _Site(version, fmt, parts, available, stored, main, lacking, makers, default, values, own_values)
 
 
 def _default_level(version: Version, keys: Iterable[PartKey]) -> str:
@@ -179,7 +183,7 @@ def recipe(
     values: one of the options that select parts is ``*``. A level that is not given is the default one; a name that is
     not given is each level's default part. archive: whether a zip of the files is wanted.
     """
-    parts = fmt.parts
+    parts = fmt.selection.parts
     assert parts is not None
     level, name = values.get(parts.level), values.get(parts.name)
     rest = {option: value for option, value in values.items() if option not in (parts.level, parts.name)}
@@ -322,7 +326,7 @@ def file_recipe(
     values: of the request; a level or a name in them that is not ``*`` must agree with the file's. NotFound where the
     file's folder is no level.
     """
-    parts = fmt.parts
+    parts = fmt.selection.parts
     assert parts is not None
     rest = {option: value for option, value in values.items() if option not in (parts.level, parts.name)}
     level, name = (None if values.get(o) == ALL else values.get(o) for o in (parts.level, parts.name))
@@ -334,7 +338,7 @@ def file_recipe(
     if of_file is None or (level is not None and level != of_file):
         levels = ", ".join(sorted(site.levels))
         raise NotFound(f"{fmt.name} has no file {file!r}: no level has this folder; there are the levels {levels}")
-    hints = dict(fmt.options_from_filename(base))
+    hints = dict(fmt.selection.from_filename(base))
     if name is None and parts.name in hints:
         name = _part_with_stem(site, of_file, hints[parts.name])
     kinds = {o: v for o, v in hints.items() if o != parts.name and _default_kinds(fmt).get(o) != v}
@@ -355,7 +359,7 @@ def file_recipe(
 
 def _default_kinds(fmt: Format) -> dict[str, str]:
     """Collect the options that the names of the format's default files imply, where they agree: PGM is the default."""
-    hints = [dict(fmt.options_from_filename(name)) for name in fmt.files]
+    hints = [dict(fmt.selection.from_filename(name)) for name in fmt.files]
     values = {option: {one[option] for one in hints if option in one} for one in hints for option in one}
     return {option: next(iter(choices)) for option, choices in values.items() if len(choices) == 1}
 
@@ -383,8 +387,9 @@ def select(files: Iterable[Any], member: Member) -> list[Any]:
     out = []
     for level in dict.fromkeys(f.place[0] for f in candidates):
         level_files = [f for f in candidates if f.place[0] == level]
-        assert member.recipe.format.parts is not None
-        default = default_name(member.recipe.format.parts, list(dict.fromkeys(f.place[1] for f in level_files)))
+        parts = member.recipe.format.selection.parts
+        assert parts is not None
+        default = default_name(parts, list(dict.fromkeys(f.place[1] for f in level_files)))
         out += [f for f in level_files if f.place[1] == default]
     return out
 

@@ -92,7 +92,7 @@ def stored_crossings(
     fmt = formats.get_format(name)
     seen = [e.key for e in version.parts if e.key.layer in ("occupancy", "objects") and e.key not in keys]
     layers = applied_closures.load(open_store(database_url, blob_dir), version, [*keys, *seen])
-    chosen = fmt.select_parts(sorted(k for k in keys if k.layer in fmt.layers), formats.write_options(fmt, {}))
+    chosen = fmt.selection.choose(sorted(k for k in keys if k.layer in fmt.layers), formats.write_options(fmt, {}))
     used = replace(layers, parts={k: layers.parts[k] for k in chosen})
     return crossing_edges(fmt, applied_closures.close(fmt, used, version.closures)[0], layers)
 
@@ -107,7 +107,7 @@ def find_missing_content(
         derived_layers = derive.run(chain.steps, layers)
     except FleetMapError as error:
         return ChainFailure("", error.detail)
-    reason = fmt.missing_content(derived_layers) if fmt.missing_content is not None else None
+    reason = fmt.needs.missing_content(derived_layers) if fmt.needs.missing_content is not None else None
     return None if reason is None else ChainFailure("", f"{name}: {reason}")
 
 
@@ -167,7 +167,7 @@ def _write_each(
     fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.DerivationNotes, spread: Spread
 ) -> WrittenMap:
     """One map of every part that was derived, each written as it would be by itself."""
-    parts = fmt.parts
+    parts = fmt.selection.parts
     if parts is None:
         raise AssertionError(f"{fmt.name} declares no parts")
     keys = [
@@ -209,12 +209,12 @@ def _write_one(
     context = WriteContext(source.title, options, stored=None if closures is not None and closures.items else noted)
     inner: list[dict[str, Any]] = []
     inner_closures: list[list[dict[str, Any]]] = []
-    if fmt.is_container:
+    if fmt.traits.is_container:
         context.make = partial(_inner, source, inner, inner_closures)
-    chosen = fmt.select_parts(sorted(k for k in derived_layers.parts if k.layer in fmt.layers), context.options)
+    chosen = fmt.selection.choose(sorted(k for k in derived_layers.parts if k.layer in fmt.layers), context.options)
     used = Layers({k: derived_layers.parts[k] for k in chosen}, derived_layers.datum, derived_layers.levels)
     closed = applied_closures.ClosureReport()
-    if not fmt.is_container:  # a folder's inner maps apply closures themselves
+    if not fmt.traits.is_container:  # a folder's inner maps apply closures themselves
         drawn = derived_layers.parts.keys() - layers.parts.keys()
         applied, closed = applied_closures.close(fmt, used, closures, drawn)
         if closed.emptied and _has_no_edges(fmt, applied):
@@ -224,7 +224,7 @@ def _write_one(
     context.attribution = tuple(sorted(report_credits(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(fmt, used, context)
     _report_blocked_edges(fmt, closed, context)
-    if not fmt.is_container:  # as above
+    if not fmt.traits.is_container:  # as above
         context.warnings += crossing_edges(
             fmt, used, replace(derived_layers, parts={**source.around.parts, **derived_layers.parts})
         )
@@ -245,12 +245,12 @@ def _write_one(
 
 def crossing_edges(fmt: Format, written: Layers, around: Layers) -> list[Problem]:
     """Warn of edges that lead through obstacles in a map of these layers. around: layers with grids and objects."""
-    return crossings(written, around, shape_of=fmt.name if fmt.keeps_bends == "foreign" else None)
+    return crossings(written, around, shape_of=fmt.name if fmt.traits.keeps_bends == "foreign" else None)
 
 
 def _has_no_edges(fmt: Format, layers: Layers) -> bool:
     """Whether the format cannot be written without an edge."""
-    return fmt.missing_content is not None and fmt.missing_content(layers) is not None
+    return fmt.needs.missing_content is not None and fmt.needs.missing_content(layers) is not None
 
 
 def _report_blocked_edges(fmt: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
@@ -415,7 +415,7 @@ def _inner(
 def media_type(fmt: Format, name: str) -> str:
     """The media type of one of a format's files, by its ending."""
     end = name.rpartition(".")[2]
-    for pattern, declared in zip(fmt.files, fmt.media_types, strict=False):
+    for pattern, declared in fmt.files.items():
         if pattern.rpartition(".")[2] == end:
             return declared
     return mimetypes.guess_type(name)[0] or "application/octet-stream"

@@ -15,225 +15,63 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 from lxml import etree
 
 from app import parameters
 from app.errors import BadUpload, FleetMapError, Invalid, NotFound, Problem, TooLarge, UnreadableFile
-from app.limits import Limits
+from app.formats._format import (
+    UNTITLED as UNTITLED,
+)
+from app.formats._format import (
+    Bends as Bends,
+)
+from app.formats._format import (
+    Claims as Claims,
+)
+from app.formats._format import (
+    Files as Files,
+)
+from app.formats._format import (
+    Format as Format,
+)
+from app.formats._format import (
+    LayerRequirements as LayerRequirements,
+)
+from app.formats._format import (
+    NestedMap as NestedMap,
+)
+from app.formats._format import (
+    NoOptions as NoOptions,
+)
+from app.formats._format import (
+    Parts as Parts,
+)
+from app.formats._format import (
+    ReadContext as ReadContext,
+)
+from app.formats._format import (
+    Selection as Selection,
+)
+from app.formats._format import (
+    Traits as Traits,
+)
+from app.formats._format import (
+    WriteContext as WriteContext,
+)
+from app.formats._format import (
+    one_map_per_folder as one_map_per_folder,
+)
 from app.model import bends
 from app.model.features import Features
-from app.model.frame import GROUND, Anchor
-from app.model.geodesy import LocalFrame
-from app.model.layers import MAP, Layer, Layers, PartKey
+from app.model.layers import Layers
 from app.model.names import did_you_mean
-
-Files = Mapping[str, bytes]
-"""A map as named files: relative path with forward slashes -> content."""
-
-
-@dataclass(slots=True)
-class ReadContext:
-    """What a reader is told, and where it leaves its warnings.
-
-    frame: the environment's, where it has a datum. level: where the map belongs. grid: the name for a grid, else None.
-    layer: what the lines and polygons of a drawing are meant for, else None. options: the format's own read options.
-    requested_layers: the layers that will be used (None: all); a reader may leave others out. decode_cells: whether
-        anybody will look at
-    the cells of grids; if not, a reader checks an image's header only. keep_source_properties: whether anybody will ask
-    for this format
-    (or its family) back; if not, a reader may leave out what only it knows (``properties.<format>``, the document).
-    main: the file that was detected. folder: reads files that hold other formats' maps, as a folder of an upload is
-    read, for the formats that are such folders in one file; None inside one.
-    """
-
-    limits: Limits = field(default_factory=Limits)
-    frame: LocalFrame | None = None
-    level: str = GROUND
-    grid: str | None = None
-    layer: Layer | None = None
-    options: Any = None
-    requested_layers: frozenset[Layer] | None = None
-    decode_cells: bool = True
-    keep_source_properties: bool = True
-    main: str = ""
-    folder: Callable[[Files], Layers] | None = None
-    warnings: list[Problem] = field(default_factory=list)
-
-    def warn(self, problem: str, *, file: str | None = None, line: int | None = None, where: str | None = None) -> None:
-        """Something doubtful that is stored all the same."""
-        if len(self.warnings) < MAX_RAW_WARNINGS:
-            self.warnings.append(Problem(problem, file or self.main or None, line, where))
-
-    def wants(self, layer: Layer) -> bool:
-        """Whether anybody will use this layer."""
-        return self.requested_layers is None or layer in self.requested_layers
-
-
-@dataclass(frozen=True, slots=True)
-class NestedMap:
-    """A map inside another one: its files, main file first, and what its writer declared (see ``WriteContext``).
-
-    layers: what the report says of each layer in it.
-    """
-
-    files: dict[str, bytes]
-    layers: tuple[Mapping[str, Any], ...] = ()
-    dropped: tuple[Mapping[str, Any], ...] = ()
-    template: tuple[Mapping[str, Any], ...] = ()
-    warnings: tuple[Problem, ...] = ()
-
-
-UNTITLED = "map"
-"""What a map is called that is made for no environment."""
-
-
-@dataclass(slots=True)
-class WriteContext:
-    """What a writer is told, and where it declares what it lost or made up (loss is data).
-
-    title: the environment's name, for formats with a place for one. options: the format's own write options.
-    attribution: licences and credits of the sources, for formats with a place for them. make: for formats that hold
-    others: a map of the named format from these layers, with these of its options, its missing layers derived or not;
-    it raises NotFound for a format that is not there, and what planning and writing raise. stored: the
-    licences and credits of each part, where the layers are what is stored; None where a closure has changed them.
-    """
-
-    title: str = UNTITLED
-    options: Any = None
-    attribution: tuple[str, ...] = ()
-    make: Callable[[str, Layers, Mapping[str, Any], bool], NestedMap] | None = None
-    stored: Mapping[PartKey, Sequence[str]] | None = None
-    dropped: list[dict[str, Any]] = field(default_factory=list)
-    template: list[dict[str, Any]] = field(default_factory=list)
-    warnings: list[Problem] = field(default_factory=list)
-
-    def drop(self, item: str, count: int, why: str) -> None:
-        """This much of the stored information has no place in the format."""
-        if count:
-            self.dropped.append({"what": item, "count": int(count), "why": why})  # also of NumPy's integers
-
-    def fill(self, item: str, value: Any, why: str, option: str | None = None) -> None:
-        """The format asks for this and no layer has it: a default was filled in. option: the parameter that says it."""
-        option_entry = {} if option is None else {"option": option}
-        self.template.append({"what": item, "value": value, "why": why, **option_entry})
-
-    def warn(self, problem: str, *, file: str | None = None, where: str | None = None) -> None:
-        """The map was written, but its consumer may not like it."""
-        self.warnings.append(Problem(problem, file, None, where))
-
-
-@dataclass(frozen=True, slots=True)
-class LayerRequirements:
-    """What a writer needs: one of these sets of layers, and a datum or not.
-
-    one_of: alternatives, the first that is complete is enough; every carried layer that is there is written.
-    anchor: the coordinates the format speaks, so that items anchored otherwise need a datum. datum: needed always.
-    also: layers of which the writer uses a part where they are there, and does without where they are not. own: objects
-    of the format's own family are a whole map: with them nothing else is needed, no datum either.
-    """
-
-    one_of: tuple[frozenset[Layer], ...]
-    anchor: Anchor | None = None
-    datum: bool = False
-    also: frozenset[Layer] = frozenset()
-    own: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class NoOptions:
-    """For formats without options of their own."""
-
-
-@dataclass(frozen=True, slots=True)
-class Parts:
-    """For formats whose files hold one part of a layer each: the write options that select the part.
-
-    name: the option with the part's name. stem: a part's name -> that of its files, without the ending. level: the
-    option with its level. default: the name of the part that is written where no name is given. So ``*`` for either
-    option gives every part (``app.convert.site``).
-    """
-
-    layer: Layer
-    name: str
-    stem: Callable[[str], str]
-    level: str = "level"
-    default: str = MAP
-
-
-Bends = Literal["shape", "nodes", "foreign"]
-"""What becomes of an edge's bends: the format has shapes; or its edges are straight, so that bends become nodes
-(``app.model.bends``), which become bends again when it is read; or it has shapes that its consumers ignore, so that
-bends of edges from elsewhere become nodes, and stay ones."""
-
-
-@dataclass(frozen=True, slots=True)
-class Format:
-    """A file format. Only what is declared here is known of it elsewhere.
-
-    name: its id. files: the names it is served as. media_types: of the served files, in that order.
-    layers: layers it can hold. needs: what writing takes. detect: is this file (name, content) the main file of such
-    a map; sure formats first (``priority``). companions: further files of the upload that belong to a main file.
-    family: format family of its objects (``osm``, ``kml`` …). is_drawing: its lines and polygons may be meant for any
-    layer (the upload's ``layer`` says which). priority: of two files that tell the same network, the higher one wins.
-    version: raise it when the same layers give other bytes (it is part of every ETag). select_parts: of the parts that
-    it carries, those that these options ask for. options_from_filename: the options that a wanted file's name says.
-    outlines: it writes
-    where grids lie, not their cells. one_map_per_folder: its main files of one folder are one map (graphs 0.yaml,
-    1.yaml …).
-    check: the loader rules of the map's consumers, looked at in a map's files (main file first) without our reader
-    or writer; ``app.formats.check`` says what it gives and what it may cost. missing_content: what such layers must
-    hold besides being there (an edge), and do not: what to supply, or None.
-    is_sidecar: a main file of this name only speaks for others (a world file for its picture), so it is none where one
-        of
-    those is a main file itself. missing_metadata: what a file needs that may be such a map but does not say enough by
-    itself (a picture without a place); empty for other files. completing_options: the read options that say it.
-    related_files: files of other maps of the upload that it looks into. parts: the options that select a stored part,
-        for
-    formats whose files hold one part each. is_container: it is a folder of other formats' maps. marks_blocked: it can
-    express a blocked edge, so that such an edge stays in it; other formats leave it out. keeps_bends: see ``Bends``.
-    titled: it names the environment (``WriteContext.title``), so its bytes depend on that name.
-    """
-
-    name: str
-    title: str
-    files: tuple[str, ...]
-    media_types: tuple[str, ...]
-    layers: frozenset[Layer]
-    detect: Callable[[str, bytes], bool]
-    read: Callable[[Files, ReadContext], Layers] | None = None
-    write: Callable[[Layers, WriteContext], dict[str, bytes]] | None = None
-    needs: LayerRequirements = field(default_factory=lambda: LayerRequirements(()))
-    companions: Callable[[str, bytes, Sequence[str]], Iterable[str]] = lambda main, data, names: ()
-    related_files: Callable[[str, Sequence[str]], Iterable[str]] = lambda main, names: ()
-    read_options: type[Any] = NoOptions
-    write_options: type[Any] = NoOptions
-    family: str = ""
-    is_drawing: bool = False
-    priority: int = 0
-    version: int = 1
-    extensions: tuple[str, ...] = ()
-    select_parts: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
-    options_from_filename: Callable[[str], Mapping[str, str]] = lambda name: {}
-    parts: Parts | None = None
-    outlines: bool = False
-    one_map_per_folder: bool = False
-    sort: Callable[[Files, Sequence[str]], Mapping[str, Iterable[str]]] | None = None
-    is_container: bool = False
-    check: Callable[[Files], Iterable[Problem]] | None = None
-    missing_content: Callable[[Layers], str | None] | None = None
-    is_sidecar: Callable[[str], bool] = lambda name: False
-    missing_metadata: Callable[[str, bytes], str] = lambda name, data: ""
-    completing_options: frozenset[str] = frozenset()
-    marks_blocked: bool = False
-    keeps_bends: Bends = "shape"
-    has_title: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,7 +121,7 @@ def get_format(name: str) -> Format:
 
 def detect(name: str, data: bytes) -> Format | None:
     """The format whose main file this is, judged by content; the highest rank wins."""
-    readable = sorted((f for f in all_formats().values() if f.read), key=lambda f: (-f.priority, f.name))
+    readable = sorted((f for f in all_formats().values() if f.read), key=lambda f: (-f.claims.priority, f.name))
     return next((f for f in readable if f.detect(name, data)), None)
 
 
@@ -315,32 +153,23 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[FileGroup]
     out = []
     mains = {main for _, main in groups}
     names = tuple(sorted(files))
-    speaking = tuple(sorted(main for fmt, main in groups if fmt.is_sidecar(main)))
-    speakers = {fmt.name for fmt, main in groups if fmt.is_sidecar(main)}
+    speaking = tuple(sorted(main for fmt, main in groups if fmt.claims.is_sidecar(main)))
+    speakers = {fmt.name for fmt, main in groups if fmt.claims.is_sidecar(main)}
     yielding = {
         other
         for fmt, main in groups
-        if fmt.name in speakers and not fmt.is_sidecar(main)
-        for other in fmt.companions(main, files[main], speaking)
-        if fmt.is_sidecar(other)
+        if fmt.name in speakers and not fmt.claims.is_sidecar(main)
+        for other in fmt.claims.companions(main, files[main], speaking)
+        if fmt.claims.is_sidecar(other)
     }
     groups = [(fmt, main) for fmt, main in groups if main not in yielding]
     mains -= yielding
-    joined: dict[tuple[str, str], list[str]] = {}
     for fmt, main in groups:
-        if fmt.one_map_per_folder:
-            joined.setdefault((fmt.name, main.rpartition("/")[0]), []).append(main)
-    for fmt, main in groups:
-        more = belong[main] if main in belong else fmt.companions(main, files[main], names)
+        more = belong[main] if main in belong else fmt.claims.companions(main, files[main], names)
         companions = [n for n in more if n in files and n not in mains]
-        if fmt.one_map_per_folder:
-            first, *further = joined[fmt.name, main.rpartition("/")[0]]
-            if main != first:
-                continue
-            companions += further
         used.update([main, *companions])
         own_files = {n: files[n] for n in [main, *companions]}
-        seen = {n: files[n] for n in fmt.related_files(main, names) if n in files and n not in own_files}
+        seen = {n: files[n] for n in fmt.claims.related_files(main, names) if n in files and n not in own_files}
         out.append(FileGroup(fmt, main, own_files, seen))
     return out, sorted(set(files) - used)
 
@@ -351,10 +180,10 @@ def _sort_files(
     """The main files that stay ones, and what belongs to those of formats that look into the files."""
     belong: dict[str, Iterable[str]] = {}
     for fmt in dict.fromkeys(fmt for fmt, _ in groups):
-        if fmt.sort is not None:
-            belong |= {m: list(o) for m, o in fmt.sort(files, [m for k, m in groups if k is fmt]).items()}
+        if fmt.claims.sort is not None:
+            belong |= {m: list(o) for m, o in fmt.claims.sort(files, [m for k, m in groups if k is fmt]).items()}
     claimed = {name for companions in belong.values() for name in companions}
-    remaining = [(k, m) for k, m in groups if (m in belong if k.sort is not None else m not in claimed)]
+    remaining = [(k, m) for k, m in groups if (m in belong if k.claims.sort is not None else m not in claimed)]
     return remaining, belong
 
 
@@ -411,7 +240,7 @@ def read(item: FileGroup, context: ReadContext) -> Layers:
         line, reason = describe_parse_error(error)
         detail = f"{item.main} cannot be read as {fmt.title}: {reason}"
         raise UnreadableFile(detail, [Problem(reason, item.main, line)]) from error
-    if fmt.keeps_bends == "nodes":
+    if fmt.traits.keeps_bends == "nodes":
         layers = bends.join(layers)
     count = sum(len(p) for p in layers.parts.values() if isinstance(p, Features))
     if count > context.limits.features:
@@ -446,9 +275,6 @@ def group_warnings(warnings: Sequence[Problem], limit: int) -> list[Problem]:
 MAX_ALIKE_WARNINGS = 3
 """Warnings of one kind that a file reports one by one."""
 
-MAX_RAW_WARNINGS = 100_000
-"""Warnings that are kept until they are grouped."""
-
 _VARIABLE = re.compile(r"""'[^']*'|"[^"]*"|\w+://\S+|\S*\d\S*|(?<=edge )\S+|^\S+(?= is not in the upload)""")
 
 
@@ -480,9 +306,9 @@ def _straighten(fmt: Format, layers: Layers, context: WriteContext) -> Layers:
 
 def straighten(fmt: Format, layers: Layers) -> tuple[Layers, bends.Split]:
     """The layers as a format's consumers drive them: networks with straight edges only where shapes do not count."""
-    if fmt.keeps_bends == "shape":
+    if fmt.traits.keeps_bends == "shape":
         return layers, bends.Split()
-    return bends.split(layers, fmt.name if fmt.keeps_bends == "foreign" else None)
+    return bends.split(layers, fmt.name if fmt.traits.keeps_bends == "foreign" else None)
 
 
 MAX_FINDINGS = 50

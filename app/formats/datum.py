@@ -23,7 +23,17 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _datum_rules, _fields, register
+from app.formats import (
+    Claims,
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    WriteContext,
+    _datum_rules,
+    _fields,
+    register,
+)
 from app.formats._fields import ANGLE, COORDINATE, LATITUDE, LONGITUDE, Number, OneOf, record
 from app.model.features import Features, features
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
@@ -413,8 +423,7 @@ register(
     Format(
         name=NAME,
         title="Datum and GNSS fence (environment_template)",
-        files=("datum.yaml",),
-        media_types=("application/yaml",),
+        files={"datum.yaml": "application/yaml"},
         layers=frozenset({"location"}),
         detect=detect,
         read=read,
@@ -422,8 +431,7 @@ register(
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"location"}),), anchor="wgs84", datum=True),
         write_options=WriteOptions,
-        family=NAME,
-        priority=60,
         extensions=(".yaml", ".yml"),
+        claims=Claims(priority=60, leads_folder="location"),
     )
 )

@@ -27,7 +27,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.errors import CannotConvert, FleetMapError, MissingLayer, Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, NestedMap, ReadContext, WriteContext, _content, register
+from app.formats import (
+    Claims,
+    Files,
+    Format,
+    LayerRequirements,
+    NestedMap,
+    ReadContext,
+    Traits,
+    WriteContext,
+    _content,
+    register,
+)
 from app.formats._network import shorten_list
 from app.limits import Limits
 from app.model.features import Features
@@ -490,18 +501,16 @@ register(
     Format(
         name=NAME,
         title="environment_template package (all maps of a place)",
-        files=(MAIN,),
-        media_types=("application/zip",),
+        files={MAIN: "application/zip"},
         layers=frozenset(LAYERS),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(tuple(frozenset({layer}) for layer in STORED_LAYERS)),
         write_options=WriteOptions,
-        family=NAME,
-        priority=70,
         version=3,
         extensions=(".zip",),
-        is_container=True,
+        claims=Claims(priority=70),
+        traits=Traits(is_container=True),
     )
 )

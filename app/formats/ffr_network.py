@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, register
+from app.formats import Claims, Files, Format, LayerRequirements, ReadContext, Traits, WriteContext, _fields, register
 from app.formats._fields import COORDINATE, WIDTH, record
 from app.formats._network import (
     Array,
@@ -235,17 +235,15 @@ register(
     Format(
         name=NAME,
         title="FFR network (environment_common)",
-        files=(FILE,),
-        media_types=("application/yaml",),
+        files={FILE: "application/yaml"},
         layers=frozenset({"topology"}),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
-        family=NAME,
-        priority=34,
         extensions=(".ffr.yaml", ".yaml", ".yml"),
-        keeps_bends="nodes",
         version=2,
+        claims=Claims(priority=34),
+        traits=Traits(keeps_bends="nodes"),
     )
 )

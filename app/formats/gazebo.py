@@ -33,10 +33,13 @@ from lxml import etree
 
 from app.errors import BadUpload, Invalid, MissingLayer, NotFound, TooLarge
 from app.formats import (
+    Claims,
     Files,
     Format,
     LayerRequirements,
     ReadContext,
+    Selection,
+    Traits,
     WriteContext,
     _sdf,
     _sdf_bodies,
@@ -762,24 +765,21 @@ register(
     Format(
         name=NAME,
         title="Gazebo world (SDFormat)",
-        files=(MAIN,),
-        media_types=("application/xml",),
+        files={MAIN: "application/xml"},
         extensions=(".world", ".world.xml", ".sdf"),
         layers=frozenset({"objects", "occupancy", "resources"}),
         detect=detect,
-        sort=sort,
         read=read,
         write=write,
         write_options=WriteOptions,
-        select_parts=choose,
         needs=LayerRequirements(
             one_of=(frozenset({"objects"}), frozenset({"occupancy"})),
             anchor="local",
             also=frozenset({"resources", "occupancy"}),
         ),
-        family=NAME,
-        has_title=True,
-        priority=10,
         version=2,
+        selection=Selection(choose),
+        claims=Claims(priority=10, sort=sort),
+        traits=Traits(has_title=True),
     )
 )

@@ -28,7 +28,19 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, _lif_rules, register
+from app.formats import (
+    Claims,
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    Selection,
+    Traits,
+    WriteContext,
+    _fields,
+    _lif_rules,
+    register,
+)
 from app.formats._fields import ANGLE, COORDINATE, NOT_NEGATIVE, SPEED, Number, OneOf, record
 from app.formats._network import (
     CROSS_PART_PROPERTIES,
@@ -816,20 +828,17 @@ register(
     Format(
         name=NAME,
         title="Layout Interchange Format (VDMA LIF)",
-        files=("layout.lif.json",),
-        media_types=("application/json",),
+        files={"layout.lif.json": "application/json"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
         check=_lif_rules.check,
-        missing_content=lacks,
         write=write,
-        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", missing_content=lacks),
         write_options=WriteOptions,
-        family=NAME,
-        has_title=True,
-        priority=37,
         extensions=(".lif.json", ".lif", ".json"),
-        select_parts=choose,
+        selection=Selection(choose),
+        claims=Claims(priority=37),
+        traits=Traits(has_title=True),
     )
 )

@@ -31,10 +31,12 @@ from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
 from app.formats import (
+    Claims,
     Files,
     Format,
     LayerRequirements,
     ReadContext,
+    Traits,
     WriteContext,
     _fields,
     _nav2_route_rules,
@@ -601,21 +603,17 @@ register(
     Format(
         name=NAME,
         title="Route graph (Nav2 route server)",
-        files=("graph.geojson",),
-        media_types=("application/geo+json",),
+        files={"graph.geojson": "application/geo+json"},
         layers=frozenset({"topology"}),
         detect=detect,
         read=read,
         write=write,
-        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
+        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", missing_content=lacks),
         write_options=WriteOptions,
-        family=NAME,
         check=_nav2_route_rules.check,
-        missing_content=lacks,
-        has_title=True,
-        priority=36,
         extensions=(".geojson", ".json"),
-        keeps_bends="foreign",
         version=2,
+        claims=Claims(priority=36),
+        traits=Traits(keeps_bends="foreign", has_title=True),
     )
 )

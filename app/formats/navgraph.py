@@ -27,7 +27,18 @@ import numpy as np
 import shapely
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, _navgraph_rules, register
+from app.formats import (
+    Claims,
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    Traits,
+    WriteContext,
+    _fields,
+    _navgraph_rules,
+    register,
+)
 from app.formats._fields import ANGLE, COORDINATE, Number, Record, record
 from app.formats._network import (
     CROSS_PART_PROPERTIES,
@@ -620,8 +631,7 @@ register(
     Format(
         name=NAME,
         title="Navigation graph (Fawkes)",
-        files=("navgraph.yaml",),
-        media_types=("application/yaml",),
+        files={"navgraph.yaml": "application/yaml"},
         layers=frozenset({"topology"}),
         detect=detect,
         read=read,
@@ -629,11 +639,9 @@ register(
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,
-        family=NAME,
-        has_title=True,
-        priority=35,
         extensions=(".yaml", ".yml"),
-        keeps_bends="nodes",
         version=2,
+        claims=Claims(priority=35),
+        traits=Traits(keeps_bends="nodes", has_title=True),
     )
 )

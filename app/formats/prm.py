@@ -28,7 +28,19 @@ from typing import Any
 import numpy as np
 
 from app.errors import FleetMapError, Problem, UnreadableFile
-from app.formats import BAD_INPUT, Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, register
+from app.formats import (
+    BAD_INPUT,
+    Claims,
+    Files,
+    Format,
+    LayerRequirements,
+    ReadContext,
+    Selection,
+    Traits,
+    WriteContext,
+    _fields,
+    register,
+)
 from app.formats._fields import NOT_NEGATIVE, Number, record
 from app.formats._network import (
     Array,
@@ -458,22 +470,18 @@ register(
     Format(
         name=NAME,
         title="Probabilistic roadmap (environment_common)",
-        files=(FILE,),
-        media_types=("application/yaml",),
+        files={FILE: "application/yaml"},
         layers=frozenset({"topology", "occupancy"}),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"occupancy"})),
-        related_files=related_files,
         read_options=ReadOptions,
         write_options=WriteOptions,
-        family=NAME,
-        priority=3,
         extensions=(".yaml", ".yml"),
-        select_parts=choose,
-        outlines=True,
-        keeps_bends="nodes",
         version=2,
+        selection=Selection(choose),
+        claims=Claims(priority=3, related_files=related_files, gives_way=True),
+        traits=Traits(outlines=True, keeps_bends="nodes"),
     )
 )

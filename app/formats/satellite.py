@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, WriteContext, register
+from app.formats import Claims, Files, Format, LayerRequirements, Parts, ReadContext, Selection, WriteContext, register
 from app.formats._select import file_stem, select_part
 from app.limits import Limits
 from app.model.frame import MAX_METRES, is_writable
@@ -524,22 +524,23 @@ register(
     Format(
         name=NAME,
         title="Georeferenced picture (GeoTIFF, or PNG and JPEG with a world file)",
-        files=("satellite.tif", "satellite.png", "satellite.pgw"),
-        media_types=("image/tiff", "image/png", "text/plain"),
+        files={"satellite.tif": "image/tiff", "satellite.png": "image/png", "satellite.pgw": "text/plain"},
         layers=frozenset({"imagery"}),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements((frozenset({"imagery"}),)),
-        companions=companions,
         read_options=ReadOptions,
         write_options=WriteOptions,
         extensions=IMAGE_ENDS,
-        select_parts=choose,
-        options_from_filename=options_from_filename,
-        parts=Parts("imagery", "picture", partial(file_stem, default=NAME), default=NAME),
-        is_sidecar=yields,
-        missing_metadata=lacking,
-        completing_options=frozenset({"corners", "metres_per_pixel"}),
+        selection=Selection(
+            choose, options_from_filename, Parts("imagery", "picture", partial(file_stem, default=NAME), default=NAME)
+        ),
+        claims=Claims(
+            companions=companions,
+            is_sidecar=yields,
+            missing_metadata=lacking,
+            completing_options=frozenset({"corners", "metres_per_pixel"}),
+        ),
     )
 )

@@ -8,7 +8,7 @@ of an edge: ``edge_id``, ``node``, ``action``, ``top_vel``, ``map_2d``, ``inflat
 
 from __future__ import annotations
 
-from app.formats import Format, LayerRequirements, WriteContext, _tmap, register
+from app.formats import Claims, Format, LayerRequirements, Selection, Traits, WriteContext, _tmap, register
 from app.model.layers import Layers
 
 FILE = "map.tmap"
@@ -29,20 +29,17 @@ register(
     Format(
         name="tmap",
         title="Topological map, the older list (strands_navigation)",
-        files=(FILE,),
-        media_types=("application/yaml",),
+        files={FILE: "application/yaml"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=_tmap.read,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=_tmap.ListOptions,
-        family=_tmap.NAME,
-        has_title=True,
-        priority=49,
         extensions=(".tmap",),
-        select_parts=_tmap.choose,
-        keeps_bends="nodes",
         version=2,
+        selection=Selection(_tmap.choose),
+        claims=Claims(priority=49, leads_folder="topological"),
+        traits=Traits(family=_tmap.NAME, keeps_bends="nodes", has_title=True),
     )
 )

@@ -5,7 +5,17 @@ See ``app.formats._tmap``. The older list (``tmap``) is read too where a sender 
 
 from __future__ import annotations
 
-from app.formats import Format, LayerRequirements, WriteContext, _tmap, _tmap2_rules, register
+from app.formats import (
+    Claims,
+    Format,
+    LayerRequirements,
+    Selection,
+    Traits,
+    WriteContext,
+    _tmap,
+    _tmap2_rules,
+    register,
+)
 from app.model.layers import Layers
 
 FILE = "network.tmap2.yaml"
@@ -31,8 +41,7 @@ register(
     Format(
         name=_tmap.NAME,
         title="Topological map (topological_navigation)",
-        files=(FILE,),
-        media_types=("application/yaml",),
+        files={FILE: "application/yaml"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=_tmap.read,
@@ -40,12 +49,10 @@ register(
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=_tmap.WriteOptions,
-        family=_tmap.NAME,
-        has_title=True,
-        priority=50,
         extensions=(*NAMES, ".tmap"),
-        select_parts=_tmap.choose,
-        keeps_bends="nodes",
         version=2,
+        selection=Selection(_tmap.choose),
+        claims=Claims(priority=50, leads_folder="topological"),
+        traits=Traits(keeps_bends="nodes", has_title=True),
     )
 )

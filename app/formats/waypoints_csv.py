@@ -154,14 +154,12 @@ register(
     Format(
         name=NAME,
         title="Waypoints (CSV)",
-        files=("waypoints.csv",),
-        media_types=("text/csv",),
+        files={"waypoints.csv": "text/csv"},
         layers=frozenset({"topology"}),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),)),
-        family=NAME,
         extensions=(".csv",),
     )
 )

@@ -181,7 +181,7 @@ class _Session:
 
         Drawing formats write the line and leave out what was made from it; that holds only while both say the same.
         """
-        families = {f.family for f in formats.all_formats().values() if f.is_drawing}
+        families = {f.family for f in formats.all_formats().values() if f.traits.is_drawing}
         touched: dict[str, set[str]] = defaultdict(set)
         for key, draft in list(self._drafts.items()):
             if key.layer == "objects" and key.name in families:

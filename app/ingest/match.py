@@ -15,9 +15,6 @@ from app.model.layers import PartKey
 from app.store.store import Store
 from app.store.values import Version
 
-OWN_IDS = frozenset({"osm"})
-"""Formats whose ids are the world's, not the file's: another id is another thing, and comes back as it was sent."""
-
 
 def match_ids(store: Store, base: Version, key: PartKey, new: Features) -> Features:
     """The new collection with the head's ids where a feature stands at the very place of one whose id has gone.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from app import formats, upload_reader
 from app.errors import Damaged, Invalid, Problem
-from app.ingest.match import OWN_IDS, match_ids
+from app.ingest.match import match_ids
 from app.limits import Limits
 from app.model.features import Features, merge_documents
 from app.model.frame import Datum, Level
@@ -112,7 +112,7 @@ def _stale_clouds(base: Version, upload_bundle: Bundle) -> list[Drop]:
 def _unused_hints(hints: UploadHints, upload_bundle: Bundle) -> list[Problem]:
     """What the sender said and nothing came of, so that a misunderstanding is noticed."""
     out = []
-    drawings = {f.name for f in formats.all_formats().values() if f.is_drawing}
+    drawings = {f.name for f in formats.all_formats().values() if f.traits.is_drawing}
     if hints.layer is not None and not any(use.format in drawings for use in upload_bundle.files.values()):
         told_for = ", ".join(sorted(drawings))
         out.append(Problem(f"it is for drawings ({told_for}), and there is none in the upload", where="layer"))
@@ -210,10 +210,12 @@ def operation_for(
         digest.update(hashlib.sha256(files[name]).digest())
     provenance = Provenance("raw", origin, names, digest.hexdigest(), attribution=upload_bundle.credit(key))
     is_stored = any(e.key == key for e in base.parts)
+    fmt = formats.all_formats().get(origin)
+    own_ids = fmt is not None and fmt.traits.own_ids
     if isinstance(part, Features):
         if key.layer == "topology" and key.level in renamed:
             part = _rename_drawn_from(part, renamed[key.level])
-        if is_stored and key.layer in ("topology", "objects", "zones") and origin not in OWN_IDS:
+        if is_stored and key.layer in ("topology", "objects", "zones") and not own_ids:
             ids = part.ids
             with contextlib.suppress(Damaged):  # then nothing is there to compare with, and the upload's ids stay
                 part = match_ids(store, base, key, part)

@@ -265,21 +265,21 @@ def _helpers(doc: str) -> tuple[str, list[tuple[str, str]]]:
 
 
 def _facts(known: Format) -> str:
-    needs = known.needs
+    needs, parts = known.needs, known.selection.parts
     wants = " or ".join(" and ".join(sorted(layers)) for layers in needs.one_of if layers)
     rows = [
         ("Files", codes(known.files)),
-        ("Media types", codes(dict.fromkeys(known.media_types))),
+        ("Media types", codes(dict.fromkeys(known.files.values()))),
         ("Uploads end in", codes(known.extensions)),
-        ("Layers", ", ".join(sorted(known.layers)) + (" (of a grid only its place)" if known.outlines else "")),
+        ("Layers", ", ".join(sorted(known.layers)) + (" (of a grid only its place)" if known.traits.outlines else "")),
         ("A map needs", wants + (", and a datum" if needs.datum else "")),
         ("A map also uses", ", ".join(sorted(needs.also))),
         ("Coordinates", ANCHORS.get(needs.anchor or "", "")),
-        ("Bends of edges", BENDS.get(known.keeps_bends, "")),
-        ("Blocked edges", "stay in a map, with a mark" if known.marks_blocked else ""),
+        ("Bends of edges", BENDS.get(known.traits.keeps_bends, "")),
+        ("Blocked edges", "stay in a map, with a mark" if known.traits.marks_blocked else ""),
         (
             "Parts",
-            f"one at a time, by `{known.parts.level}` and `{known.parts.name}`; `*` gives all" if known.parts else "",
+            f"one at a time, by `{parts.level}` and `{parts.name}`; `*` gives all" if parts else "",
         ),
         ("Direction", "read only" if known.write is None else "written only" if known.read is None else ""),
     ]

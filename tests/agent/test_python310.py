@@ -55,7 +55,9 @@ def test_the_install_has_all_a_robot_needs(python310: Path, tmp_path: Path) -> N
     ended = fleetmap(python310, "agent", "--ros-package", str(tmp_path))
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "fleetmap_ros" / "resource" / "fleetmap_ros").is_file(), "it is part of the wheel"
-    script = "from app.agent import hooks; print(*hooks.bundled_hooks()); import app.agent.agent, sys; print(*sys.modules)"
+    script = (
+        "from app.agent import hooks; print(*hooks.bundled_hooks()); import app.agent.agent, sys; print(*sys.modules)"
+    )
     listed = subprocess.run([python310, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
     ready, loaded = listed.stdout.splitlines()
     assert ready.split() == ["nav2", "topological"]

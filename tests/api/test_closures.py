@@ -193,7 +193,7 @@ def test_marked_edges_say_until_when(api: Api, farm: str) -> None:
 
 
 NETWORKS = sorted(
-    f.name for f in formats.all_formats().values() if f.write and "topology" in f.layers and not f.marks_blocked
+    f.name for f in formats.all_formats().values() if f.write and "topology" in f.layers and not f.traits.marks_blocked
 )
 
 

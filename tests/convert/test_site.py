@@ -158,10 +158,10 @@ def test_whole_site_without_a_part_that_fits_is_not_found() -> None:
 
 def test_formats_with_parts_declare_their_own_options() -> None:
     for fmt in formats.all_formats().values():
-        if fmt.parts is not None:
+        if (parts := fmt.selection.parts) is not None:
             options = fmt.write_options()
-            assert getattr(options, fmt.parts.name) is None, fmt.name
-            assert getattr(options, fmt.parts.level) is None, fmt.name
-            assert fmt.parts.layer in fmt.layers
-            assert site.whole_site_options(fmt) == {fmt.parts.level: "*", fmt.parts.name: "*"}
+            assert getattr(options, parts.name) is None, fmt.name
+            assert getattr(options, parts.level) is None, fmt.name
+            assert parts.layer in fmt.layers
+            assert site.whole_site_options(fmt) == {parts.level: "*", parts.name: "*"}
     assert site.whole_site_options(formats.get_format("tmap2")) == {}

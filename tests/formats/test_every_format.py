@@ -54,7 +54,7 @@ def test_a_format_says_all_that_is_asked_of_it(name: str) -> None:
     fmt = formats.get_format(name)
     assert fmt.title
     assert fmt.layers <= set(LAYERS)
-    assert len(fmt.media_types) == len(fmt.files) > 0
+    assert fmt.files
     assert fmt.read is None or fmt.extensions, "a reader needs extensions, so that a named format finds its file"
     assert fmt.write is None or fmt.needs.one_of, "a writer says what it needs"
 
@@ -168,4 +168,4 @@ def test_a_format_that_names_the_environment_says_so(name: str) -> None:
         one, two = (from_layers(fmt, layers, {}, derived=True, title=title).files for title in ("one", "two"))
     except CannotConvert:
         pytest.skip("it needs other layers, and none of them has a name")
-    assert (one != two) == (fmt.has_title or fmt.is_container)
+    assert (one != two) == (fmt.traits.has_title or fmt.traits.is_container)

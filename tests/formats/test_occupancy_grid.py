@@ -101,7 +101,7 @@ def test_real_maps_have_the_counted_cells_and_come_back(shared: Path, facts_json
         bottom_left = int(grid.cells[0, 0])
         assert (-1 if bottom_left == 255 else bottom_left) == facts["bottom_left_cell"], name
         assert bool(context.warnings) == (not facts["image_reference_resolves"]), name
-        picture = next(iter(FORMAT.companions(main, files[main], sorted(files))))
+        picture = next(iter(FORMAT.claims.companions(main, files[main], sorted(files))))
         original = {main: files[main], picture: files[picture]}
         for kind in ("pgm", "png"):
             served, write_context = write(layers, file_type=kind)
@@ -747,7 +747,7 @@ def test_cuts_and_flips_are_refused_or_read(name: str) -> None:
 def test_any_bytes_are_refused_or_read(data: bytes, after: bool) -> None:
     files = {"map.yaml": YAML + data if after else data, "map.pgm": PGM}
     FORMAT.detect("map.yaml", files["map.yaml"])
-    list(FORMAT.companions("map.yaml", files["map.yaml"], sorted(files)))
+    list(FORMAT.claims.companions("map.yaml", files["map.yaml"], sorted(files)))
     context = ReadContext(limits=Limits(pixels=1000))
     group = formats.FileGroup(FORMAT, "map.yaml", files)
     try:

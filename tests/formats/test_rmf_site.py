@@ -119,9 +119,9 @@ def test_a_site_comes_back_the_same_in_json_and_ron() -> None:
         '"Power Source": {',
     ):
         assert piece in text
-    assert FORMAT.options_from_filename("map.site.ron") == {"encoding": "ron"}
-    assert FORMAT.options_from_filename("map.site.json") == {"encoding": "json"}
-    assert FORMAT.options_from_filename("map.zip") == {}
+    assert FORMAT.selection.from_filename("map.site.ron") == {"encoding": "ron"}
+    assert FORMAT.selection.from_filename("map.site.json") == {"encoding": "json"}
+    assert FORMAT.selection.from_filename("map.zip") == {}
 
 
 def test_what_stands_where_by_hand() -> None:

@@ -45,7 +45,7 @@ def test_what_is_served_would_be_loaded_where_the_sample_would(name: str, files:
     """Samples with dangling edges and the like come back with them, and with an error."""
     served = offline(files, name, hints=UploadHints(name), datum=HERE)
     groups, _ = formats.group(files, name)
-    if formats.get_format(name).is_container:  # its parts are checked by their own formats' rules
+    if formats.get_format(name).traits.is_container:  # its parts are checked by their own formats' rules
         inside, _ = formats.group(unpack(files, Limits()))
         groups += inside
     bad = any(p.level == ERROR for g in groups for p in formats.check(g.format, g.files))
@@ -55,7 +55,7 @@ def test_what_is_served_would_be_loaded_where_the_sample_would(name: str, files:
 
 # --- the runner ---------------------------------------------------------------------------------------------------
 def with_check(check: Any) -> Format:
-    return Format("x", "X", ("x",), ("text/plain",), frozenset(), lambda n, d: True, check=check)
+    return Format("x", "X", {"x": "text/plain"}, frozenset(), lambda n, d: True, check=check)
 
 
 def test_a_check_tells_errors_first_each_once_and_how_many_more() -> None:
@@ -344,7 +344,7 @@ def test_a_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> Non
     def parse(*_: Any) -> Any:
         raise AssertionError
 
-    monkeypatch.setattr(_tmap2_rules._yaml, "load", parse)
+    monkeypatch.setattr(_tmap2_rules.yaml, "load", parse)
     block = yaml.dump(tmap2(), default_flow_style=False).encode()
     assert findings_of("tmap2", {"a.tmap2.yaml": block}) == set()
 

@@ -620,14 +620,14 @@ def test_which_picture() -> None:
     fmt = get_format("satellite")
     keys = [PartKey("imagery", name="a"), PartKey("imagery", name="b")]
     with pytest.raises(MissingLayer, match="GeoTIFF"):
-        fmt.select_parts([], WriteOptions())
+        fmt.selection.choose([], WriteOptions())
     with pytest.raises(Ambiguous, match="picture=…: a, b"):
-        fmt.select_parts(keys, WriteOptions())
-    assert fmt.select_parts(keys, WriteOptions(picture="b")) == keys[1:]
+        fmt.selection.choose(keys, WriteOptions())
+    assert fmt.selection.choose(keys, WriteOptions(picture="b")) == keys[1:]
     usual = PartKey("imagery", name="satellite")
-    assert fmt.select_parts([*keys, usual], WriteOptions()) == [usual]
+    assert fmt.selection.choose([*keys, usual], WriteOptions()) == [usual]
     with pytest.raises(NotFound):
-        fmt.select_parts(keys, WriteOptions(picture="c"))
+        fmt.selection.choose(keys, WriteOptions(picture="c"))
     assert options_from_filename("satellite.tif") == {"file_type": "tif"}
     assert (
         options_from_filename("satellite.pgw") == options_from_filename("satellite.png.aux.xml") == {"file_type": "png"}

@@ -127,7 +127,7 @@ def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
         errors = [w for w in written_map.report["warnings"] if w.get("level") == "error"]
         assert not errors, (name, errors)
         out[name] = written_map.report["dropped"]
-        if "topology" in fmt.layers and not fmt.is_container:
+        if "topology" in fmt.layers and not fmt.traits.is_container:
             clear_of_obstacles(layers, fmt, written_map.files)
     return out
 
@@ -135,7 +135,7 @@ def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
 def clear_of_obstacles(layers: Layers, fmt: formats.Format, files: dict[str, bytes]) -> None:
     """No edge of what was written leads through an occupied cell: as its shape in formats that have some, else straight
     from node to node. Cells are looked up along each line, so that the server's own check is not asked."""
-    shaped = fmt.keeps_bends == "shape"
+    shaped = fmt.traits.keeps_bends == "shape"
     grids = {k.level: g for k, g in layers.grids().items()}
     for group in formats.group(files, fmt.name)[0]:
         assert fmt.read is not None

@@ -148,7 +148,7 @@ def _again(upload_bundle: upload_reader.Bundle) -> str:
     layers = upload_bundle.layers(HERE)
     for name in sorted({use.format for use in upload_bundle.files.values() if use.used and use.format}):
         fmt = formats.all_formats().get(name)
-        if fmt is None or fmt.write is None or fmt.is_container:
+        if fmt is None or fmt.write is None or fmt.traits.is_container:
             continue
         try:
             written = formats.write(fmt, layers, WriteContext())

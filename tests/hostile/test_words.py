@@ -98,7 +98,7 @@ def changed(part: Features, dice: random.Random) -> Features:
 def bases() -> Iterator[tuple[str, Layers]]:
     for name, files in sample_maps():
         for layer in (None, "topology"):
-            if layer and not formats.get_format(name).is_drawing:
+            if layer and not formats.get_format(name).traits.is_drawing:
                 continue
             upload_bundle = upload_reader.read(
                 upload_reader.unpack(files, Limits()),

@@ -19,7 +19,7 @@ KEY = PartKey("topology", GROUND, NETWORK)
 AT = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (10.0, 8.0)}
 DETOUR = [(2.0, 0.0), (2.0, 6.0), (7.0, 6.0), (10.0, 0.0)]
 HOUSE = shapely.box(3, -2, 6, 5)
-STRAIGHT = sorted(name for name, known in formats.all_formats().items() if known.keeps_bends != "shape")
+STRAIGHT = sorted(name for name, known in formats.all_formats().items() if known.traits.keeps_bends != "shape")
 
 
 def network(*edges: tuple[str, str, str, list[tuple[float, float]]], **properties: Any) -> Layers:
@@ -171,7 +171,7 @@ def test_no_written_edge_leads_through_a_house(name: str) -> None:
     assert formats.write(fmt, again, WriteContext()) == files
 
 
-NAMED = [name for name in STRAIGHT if name != "prm" and formats.get_format(name).keeps_bends == "nodes"]
+NAMED = [name for name in STRAIGHT if name != "prm" and formats.get_format(name).traits.keeps_bends == "nodes"]
 """Formats with names of nodes, which bends have; prm has none."""
 
 

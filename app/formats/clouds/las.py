@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, Selection, WriteContext, register
 from app.formats.clouds import las_codec as _las
 from app.formats.clouds import points as _points
 from app.formats.clouds.parsers import PARSERS
@@ -79,8 +79,7 @@ register(
     Format(
         name=NAME,
         title="LAS and LAZ point cloud",
-        files=("map.las", "map.laz"),
-        media_types=("application/vnd.las", "application/vnd.laszip"),
+        files={"map.las": "application/vnd.las", "map.laz": "application/vnd.laszip"},
         layers=frozenset({"voxels", "resources"}),
         detect=_las.detect,
         read=read,
@@ -89,8 +88,6 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".las", ".laz"),
-        select_parts=choose,
-        options_from_filename=options_from_filename,
-        parts=_points.PARTS,
+        selection=Selection(choose, options_from_filename, _points.PARTS),
     )
 )

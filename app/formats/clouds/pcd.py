@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, Selection, WriteContext, register
 from app.formats.clouds import pcd_codec as _pcd
 from app.formats.clouds import points as _points
 from app.formats.clouds.parsers import PARSERS
@@ -61,8 +61,7 @@ register(
     Format(
         name=NAME,
         title="PCD point cloud",
-        files=("map.pcd",),
-        media_types=("application/octet-stream",),
+        files={"map.pcd": "application/octet-stream"},
         layers=frozenset({"voxels", "resources"}),
         detect=_pcd.detect,
         read=read,
@@ -71,8 +70,6 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".pcd",),
-        select_parts=choose,
-        options_from_filename=_points.options_from_filename((NAME,)),
-        parts=_points.PARTS,
+        selection=Selection(choose, _points.options_from_filename((NAME,)), _points.PARTS),
     )
 )

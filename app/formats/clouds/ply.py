@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, Selection, WriteContext, register
 from app.formats.clouds import ply_codec as _ply
 from app.formats.clouds import points as _points
 from app.formats.clouds.parsers import PARSERS
@@ -66,8 +66,7 @@ register(
     Format(
         name=NAME,
         title="PLY point cloud",
-        files=("map.ply",),
-        media_types=("application/octet-stream",),
+        files={"map.ply": "application/octet-stream"},
         layers=frozenset({"voxels", "resources"}),
         detect=_ply.detect,
         read=read,
@@ -76,8 +75,6 @@ register(
         read_options=_points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".ply",),
-        select_parts=choose,
-        options_from_filename=_points.options_from_filename((NAME,)),
-        parts=_points.PARTS,
+        selection=Selection(choose, _points.options_from_filename((NAME,)), _points.PARTS),
     )
 )

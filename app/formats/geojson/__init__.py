@@ -23,7 +23,7 @@ import re
 
 import orjson
 
-from app.formats import Format, LayerRequirements, register
+from app.formats import Claims, Format, LayerRequirements, Traits, register
 from app.formats.geojson.reading import read
 from app.formats.geojson.words import FAMILY, GEOMETRIES
 from app.formats.geojson.writing import write
@@ -56,17 +56,14 @@ register(
     Format(
         name="geojson",
         title="GeoJSON",
-        files=("map.geojson",),
-        media_types=("application/geo+json",),
+        files={"map.geojson": "application/geo+json"},
         layers=frozenset(VECTOR_LAYERS),
         detect=detect,
         read=read,
         write=write,
         needs=LayerRequirements(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
-        family=FAMILY,
-        marks_blocked=True,
-        is_drawing=True,
-        priority=5,
         extensions=(".geojson", ".json"),
+        claims=Claims(priority=5),
+        traits=Traits(is_drawing=True, marks_blocked=True),
     )
 )

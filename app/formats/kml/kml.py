@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import unescape
 
-from app.formats import Files, Format, ReadContext, WriteContext, register
+from app.formats import Claims, Files, Format, ReadContext, Traits, WriteContext, register
 from app.formats.kml import rules as _kml_rules
-from app.formats.kml.reading import FAMILY, MAIN, read_kml
+from app.formats.kml.reading import MAIN, read_kml
 from app.formats.kml.writing import NEEDS, write_kml
 from app.model.layers import Layers
 from app.parameters import parameter
@@ -71,23 +71,17 @@ register(
     Format(
         name="kml",
         title="KML",
-        files=(MAIN,),
-        media_types=("application/vnd.google-earth.kml+xml",),
+        files={MAIN: "application/vnd.google-earth.kml+xml"},
         layers=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery"}),
         detect=detect,
         read=read,
         check=_kml_rules.check,
         write=write,
         needs=NEEDS,
-        family=FAMILY,
-        marks_blocked=True,
-        is_drawing=True,
-        outlines=True,
-        has_title=True,
         version=2,
         write_options=WriteOptions,
-        companions=companions,
-        priority=10,
         extensions=(".kml",),
+        claims=Claims(priority=10, companions=companions),
+        traits=Traits(is_drawing=True, outlines=True, marks_blocked=True, has_title=True),
     )
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, ReadContext, WriteContext, register
+from app.formats import Claims, Files, Format, ReadContext, Traits, WriteContext, register
 from app.formats.kml import rules as _kml_rules
 from app.formats.kml.reading import FAMILY, read_kml
 from app.formats.kml.writing import NEEDS, write_kml
@@ -78,20 +78,16 @@ register(
     Format(
         name="kmz",
         title="KMZ (KML with its images)",
-        files=(MAIN,),
-        media_types=("application/vnd.google-earth.kmz",),
+        files={MAIN: "application/vnd.google-earth.kmz"},
         layers=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery", "resources"}),
         detect=detect,
         read=read,
         check=_kml_rules.check_archive,
         write=write,
         needs=replace(NEEDS, one_of=(*NEEDS.one_of, frozenset({"imagery"}))),
-        family=FAMILY,
-        marks_blocked=True,
-        is_drawing=True,
-        has_title=True,
         version=2,
-        priority=11,
         extensions=(".kmz",),
+        claims=Claims(priority=11),
+        traits=Traits(family=FAMILY, is_drawing=True, marks_blocked=True, has_title=True),
     )
 )

@@ -44,10 +44,12 @@ import shapely
 
 from app.errors import Invalid, MissingDatum, Problem, TooLarge, UnreadableFile
 from app.formats import (
+    Claims,
     Files,
     Format,
     LayerRequirements,
     ReadContext,
+    Selection,
     WriteContext,
     _fields,
     register,
@@ -1387,8 +1389,7 @@ register(
     Format(
         name=NAME,
         title="Lanelet2 (also Autoware's)",
-        files=(MAIN,),
-        media_types=("application/vnd.openstreetmap.data+xml",),
+        files={MAIN: "application/vnd.openstreetmap.data+xml"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
@@ -1396,12 +1397,10 @@ register(
         needs=LayerRequirements(
             one_of=(frozenset({"topology"}),), anchor="wgs84", also=frozenset({"objects"}), own=True
         ),
-        companions=companions,
         write_options=WriteOptions,
-        family=NAME,
-        priority=36,
         version=2,
         extensions=(".osm",),
-        select_parts=choose,
+        selection=Selection(choose),
+        claims=Claims(priority=36, companions=companions),
     )
 )

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import NotFound, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, WriteContext, register
+from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, Selection, WriteContext, register
 from app.formats._select import file_stem, select_part
 from app.formats.octomap import rules as _octomap_rules
 from app.model.frame import is_writable
@@ -532,8 +532,7 @@ register(
     Format(
         name=NAME,
         title="OctoMap (.bt, .ot)",
-        files=("map.bt", "map.ot"),
-        media_types=("application/octet-stream", "application/octet-stream"),
+        files={"map.bt": "application/octet-stream", "map.ot": "application/octet-stream"},
         layers=frozenset({"voxels"}),
         detect=detect,
         read=read,
@@ -542,8 +541,6 @@ register(
         needs=LayerRequirements((frozenset({"voxels"}),)),
         write_options=WriteOptions,
         extensions=(".bt", ".ot"),
-        select_parts=choose,
-        options_from_filename=options_from_filename,
-        parts=Parts("voxels", "name", file_stem),
+        selection=Selection(choose, options_from_filename, Parts("voxels", "name", file_stem)),
     )
 )

@@ -46,7 +46,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, register
+from app.formats import Claims, Files, Format, LayerRequirements, ReadContext, Traits, WriteContext, register
 from app.formats.osm import rules as _osm_rules
 from app.formats.osm import xml_text
 from app.formats.osm.parsing import INT64, Data, Tags, Way, is_pbf, parse, unpack
@@ -1230,17 +1230,16 @@ register(
     Format(
         name="osm",
         title="OpenStreetMap",
-        files=("map.osm",),
-        media_types=("application/vnd.openstreetmap.data+xml",),
+        files={"map.osm": "application/vnd.openstreetmap.data+xml"},
         layers=CARRIES,
         detect=detect,
         read=read,
         check=_osm_rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
-        family=FAMILY,
-        priority=20,
         version=3,
         extensions=(".osm", "osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
+        claims=Claims(priority=20),
+        traits=Traits(own_ids=True, own_network=True),
     )
 )

@@ -39,10 +39,13 @@ from numpy.typing import NDArray
 
 from app.errors import Invalid, MissingLayer
 from app.formats import (
+    Claims,
     Files,
     Format,
     LayerRequirements,
     ReadContext,
+    Selection,
+    Traits,
     WriteContext,
     _fields,
     register,
@@ -1366,22 +1369,18 @@ register(
     Format(
         name=NAME,
         title="Building (Open-RMF traffic editor)",
-        files=(FILE,),
-        media_types=("application/yaml",),
+        files={FILE: "application/yaml"},
         layers=frozenset({"topology", "objects", "resources"}),
         detect=detect,
         read=read,
         check=_openrmf_rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
-        companions=companion_hook(_FILENAME),
-        family=NAME,
-        has_title=True,
-        priority=40,
         write_options=_rmf.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),
-        select_parts=choose,
-        keeps_bends="nodes",
         version=2,
+        selection=Selection(choose),
+        claims=Claims(priority=40, companions=companion_hook(_FILENAME)),
+        traits=Traits(keeps_bends="nodes", has_title=True),
     )
 )

@@ -32,12 +32,16 @@ from numpy.typing import NDArray
 
 from app.errors import MissingLayer
 from app.formats import (
+    Claims,
     Files,
     Format,
     LayerRequirements,
     ReadContext,
+    Selection,
+    Traits,
     WriteContext,
     _fields,
+    one_map_per_folder,
     register,
 )
 from app.formats._fields import ANGLE, ANY, COORDINATE, SPEED, WIDTH, Number, OneOf, record
@@ -856,23 +860,20 @@ register(
     Format(
         name=NAME,
         title="Navigation graphs (Open-RMF)",
-        files=("0.yaml",),
-        media_types=("application/yaml",),
+        files={"0.yaml": "application/yaml"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
         check=_rmf_nav_graph_rules.check,
-        missing_content=lacks,
         write=write,
-        needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
-        family=NAME,
-        has_title=True,
-        priority=30,
+        needs=LayerRequirements(
+            one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"}), missing_content=lacks
+        ),
         write_options=_rmf.WriteOptions,
         extensions=(".yaml", ".yml"),
-        select_parts=choose,
-        one_map_per_folder=True,
-        keeps_bends="nodes",
         version=2,
+        selection=Selection(choose),
+        claims=Claims(priority=30, sort=one_map_per_folder),
+        traits=Traits(keeps_bends="nodes", has_title=True),
     )
 )

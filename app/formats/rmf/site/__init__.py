@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, register
+from app.formats import Claims, Files, Format, LayerRequirements, ReadContext, Selection, Traits, register
 from app.formats._network import number
 from app.formats.rmf import common
 from app.formats.rmf.common import BUILDING, NAV_GRAPH, Array, mapping, raise_unreadable
@@ -886,22 +886,19 @@ register(
     Format(
         name=NAME,
         title="Site (Open-RMF site editor)",
-        files=(FILE, FILE_RON),
-        media_types=("application/json", "text/plain"),
+        files={FILE: "application/json", FILE_RON: "text/plain"},
         layers=frozenset({"topology", "objects", "resources"}),
         detect=detect,
         read=read,
         check=_rmf_site_rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
-        companions=companion_hook(re.compile(rb'\b(?:Local|Remote)"?\s*[:(]\s*"([^"\n]{1,500})"')),
-        family=BUILDING,
-        priority=45,
         write_options=WriteOptions,
         extensions=(".site.json", ".site.ron", ".json", ".ron"),
-        select_parts=choose,
-        options_from_filename=options_from_filename,
-        has_title=True,
-        keeps_bends="nodes",
+        selection=Selection(choose=choose, from_filename=options_from_filename),
+        claims=Claims(
+            priority=45, companions=companion_hook(re.compile(rb'\b(?:Local|Remote)"?\s*[:(]\s*"([^"\n]{1,500})"'))
+        ),
+        traits=Traits(family=BUILDING, keeps_bends="nodes", has_title=True),
     )
 )
