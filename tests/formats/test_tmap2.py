@@ -670,7 +670,7 @@ def test_limits_hold() -> None:
 
 
 def test_layers_nobody_wants_are_not_read() -> None:
-    assert read(b"not yaml: [", wanted=frozenset({"location"}))[0].parts == {}
+    assert read(b"not yaml: [", requested_layers=frozenset({"location"}))[0].parts == {}
 
 
 @pytest.mark.parametrize(

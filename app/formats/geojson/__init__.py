@@ -25,7 +25,7 @@ import orjson
 
 from app.formats import Claims, Format, LayerRequirements, Traits, register
 from app.formats.geojson.reading import read
-from app.formats.geojson.words import FAMILY, GEOMETRIES
+from app.formats.geojson.words import GEOMETRIES
 from app.formats.geojson.writing import write
 from app.model.layers import VECTOR_LAYERS
 
