@@ -7,9 +7,9 @@ import math
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from app.api.auth import Editor
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, json_response
+from app.api.http.auth import Editor
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, json_response
 from app.api.schemas import (
     AlignmentBody,
     AlignmentOut,

@@ -7,9 +7,9 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
-from app.api.auth import ServerAdmin
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, page_response
+from app.api.http.auth import ServerAdmin
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, page_response
 from app.api.schemas import AuditOut, Limit, problem_responses
 from app.errors import Invalid
 from app.store.audit import AuditEntry

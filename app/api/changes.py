@@ -12,12 +12,12 @@ from fastapi import APIRouter, Query, Request
 from numpy.typing import NDArray
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.caching import none_match
-from app.api.dependencies import Services, ServicesDep
+from app.api.http.auth import Viewer
+from app.api.http.caching import none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_bytes, json_response
 from app.api.layers import Crs, feature_collection
 from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_bytes, json_response
 from app.api.schemas import VERSION, DeltaOut, EnvironmentPath, VersionPath, problem_responses
 from app.errors import MissingDatum
 from app.model.features import Features

@@ -12,10 +12,10 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import fleet
-from app.api.auth import Editor, Viewer
-from app.api.caching import none_match
-from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, json_bytes, json_response
+from app.api.http.auth import Editor, Viewer
+from app.api.http.caching import none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_bytes, json_response
 from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, problem_responses
 from app.errors import Invalid, Problem
 from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339

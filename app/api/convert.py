@@ -12,14 +12,14 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats, parameters
-from app.api.auth import Editor
-from app.api.caching import content_disposition
-from app.api.dependencies import Services, ServicesDep
 from app.api.environments import numbers, parse_datum
-from app.api.problems import UnsupportedMedia
-from app.api.responses import StrictRoute, json_response
+from app.api.http.auth import Editor
+from app.api.http.caching import content_disposition
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.problems import UnsupportedMedia
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.uploads import UploadForm
 from app.api.schemas import DatumBody, problem_responses
-from app.api.uploads import UploadForm
 from app.api.versions import check_names, parse_format_name, truth
 from app.convert.files import Converted
 from app.convert.worker import media_type, zip_files

@@ -8,9 +8,9 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from app import derive, parameters
-from app.api.auth import Editor, Viewer
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, json_response
+from app.api.http.auth import Editor, Viewer
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, json_response
 from app.api.schemas import (
     DerivationBody,
     DerivationOut,

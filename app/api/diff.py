@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.dependencies import Services, ServicesDep
+from app.api.http.auth import Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_response
 from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_response
 from app.api.schemas import VERSION, DiffOut, EnvironmentPath, problem_responses
 from app.errors import Invalid
 from app.model.features import Features, features

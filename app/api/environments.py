@@ -7,9 +7,9 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
-from app.api.auth import Admin, Editor, Principal, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, api_path, json_response, page_response
+from app.api.http.auth import Admin, Editor, Principal, Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, api_path, json_response, page_response
 from app.api.schemas import (
     RESERVED,
     Cursor,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.responses import StrictRoute, json_response
+from app.api.http.auth import Viewer
+from app.api.http.responses import StrictRoute, json_response
 from app.api.schemas import FormatOut, problem_responses
 from app.catalogue import describe_formats
 

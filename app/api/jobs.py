@@ -16,10 +16,10 @@ from fastapi import APIRouter, Query
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api import problems
-from app.api.auth import Principal, Viewer
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, api_path, json_response
+from app.api.http import problems
+from app.api.http.auth import Principal, Viewer
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, api_path, json_response
 from app.api.schemas import JobOut, JobPath, Limit, problem_responses
 from app.convert.cache import CachedMap
 from app.convert.maps import Maps

@@ -9,13 +9,13 @@ from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.auth import Principal, Viewer
-from app.api.dependencies import Services, ServicesDep
+from app.api.http.auth import Principal, Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import API, StrictRoute, json_response
+from app.api.http.signed import Grant
 from app.api.jobs import JobStarted, job_started_response
 from app.api.maps import MapRequest, convert_at_address, parse_version_ref
-from app.api.responses import API, StrictRoute, json_response
 from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, problem_responses
-from app.api.signed import Grant
 from app.convert.cache import CachedFile
 from app.convert.maps import select_file
 from app.store.audit import set_audit_target

@@ -16,12 +16,12 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats
-from app.api.auth import ServerAdmin, Viewer
-from app.api.caching import none_match
-from app.api.dependencies import Services, ServicesDep
+from app.api.http.auth import ServerAdmin, Viewer
+from app.api.http.caching import none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_bytes, json_response
 from app.api.jobs import JobStarted, job_started_response
 from app.api.maps import parse_options, parse_version_ref, request_address
-from app.api.responses import StrictRoute, json_bytes, json_response
 from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, problem_responses
 from app.convert import site
 from app.convert.cache import CachedMap

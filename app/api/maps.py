@@ -25,18 +25,18 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from app.api import deltas
-from app.api.auth import Authenticator, Principal, Viewer
-from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
-from app.api.dependencies import Services, ServicesDep
+from app.api.http import deltas
+from app.api.http.auth import Authenticator, Principal, Viewer
+from app.api.http.caching import Unsatisfiable, byte_range, content_disposition, none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.metrics import Metrics
+from app.api.http.middleware import is_local_origin
+from app.api.http.protocol import PROVE
+from app.api.http.responses import API, StrictRoute, api_path, json_response
+from app.api.http.signed import LINK
+from app.api.http.single_flight import SingleFlight
 from app.api.jobs import JobStarted, job_started_response
-from app.api.metrics import Metrics
-from app.api.middleware import is_local_origin
-from app.api.protocol import PROVE
-from app.api.responses import API, StrictRoute, api_path, json_response
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, problem_responses
-from app.api.signed import LINK
-from app.api.single_flight import SingleFlight
 from app.convert.cache import CachedFile, CachedMap, LostMap
 from app.convert.maps import select_file
 from app.convert.recipe import Recipe
@@ -636,7 +636,7 @@ def stream_file(
 
 
 def add_routes(app: FastAPI) -> None:
-    """The plain routes of maps; documented in ``app.api.openapi``."""
+    """The plain routes of maps; documented in ``app.api.http.openapi``."""
     base = f"{API}/environments/{{env}}/versions/{{v}}/maps/{{format}}"
     for path in (base, base + "/{file:path}", "/maps/{env}/{format}", "/maps/{env}/{format}/{file:path}"):
         app.router.add_route(path, partial(download, path), methods=["GET"], include_in_schema=False)

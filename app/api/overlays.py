@@ -13,11 +13,11 @@ from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.auth import Editor, Principal, RobotRole, Viewer
-from app.api.dependencies import Services, ServicesDep
+from app.api.http.auth import Editor, Principal, RobotRole, Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_response
 from app.api.jobs import JobStarted, job_started_response
 from app.api.maps import convert_plan, request_address
-from app.api.responses import StrictRoute, json_response
 from app.api.schemas import (
     DynamicEdgesOut,
     EnvironmentPath,

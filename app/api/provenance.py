@@ -9,10 +9,10 @@ from xml.sax.saxutils import escape
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.dependencies import ServicesDep
+from app.api.http.auth import Viewer
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, json_response
 from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_response
 from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, problem_responses
 from app.convert.maps import Maps
 from app.store.values import Version

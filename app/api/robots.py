@@ -12,9 +12,9 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import fleet
-from app.api.auth import Editor, Principal, RobotRole, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, json_response, page_response
+from app.api.http.auth import Editor, Principal, RobotRole, Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_response, page_response
 from app.api.schemas import (
     CHANNEL,
     NAME,

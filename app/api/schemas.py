@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from fastapi import Header, Path, Query
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
-from app.api.problems import MEDIA_TYPE
+from app.api.http.problems import MEDIA_TYPE
 from app.model.closures import ClosureMode
 from app.model.frame import MAX_DATUM_LATITUDE
 

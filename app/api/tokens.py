@@ -8,9 +8,9 @@ from typing import Any
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from app.api.auth import ServerAdmin
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, json_response
+from app.api.http.auth import ServerAdmin
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, json_response
 from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, problem_responses
 from app.errors import Conflict, Invalid, NotFound, Problem
 from app.events.messages import ROBOT_NAME

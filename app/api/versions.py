@@ -11,12 +11,13 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from app import formats
-from app.api.auth import Editor, Principal, Viewer
-from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
-from app.api.dependencies import Services, ServicesDep
+from app.api.http.auth import Editor, Principal, Viewer
+from app.api.http.caching import Unsatisfiable, byte_range, content_disposition, none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.problems import UnsupportedMedia
+from app.api.http.responses import StrictRoute, api_path, json_response, page_response
+from app.api.http.uploads import UploadForm
 from app.api.maps import IN_MEMORY, parse_version_ref, stream_file
-from app.api.problems import UnsupportedMedia
-from app.api.responses import StrictRoute, api_path, json_response, page_response
 from app.api.schemas import (
     VERSION,
     Cursor,
@@ -31,7 +32,6 @@ from app.api.schemas import (
     VersionPath,
     problem_responses,
 )
-from app.api.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
 from app.ingest import CommitResult, SpooledFile, Upload
 from app.ingest.service import name_problem
@@ -349,7 +349,7 @@ def _revert(
 async def _revert_body(request: Request) -> RevertBody:
     from fastapi.exceptions import RequestValidationError
 
-    from app.api.problems import MalformedBody
+    from app.api.http.problems import MalformedBody
 
     try:
         value = await request.json()

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from app.api import channels, maps
-from app.api.auth import Authenticator
-from app.api.single_flight import SingleFlight
+from app.api.http.auth import Authenticator
+from app.api.http.single_flight import SingleFlight
 from app.errors import NotFound, Unavailable
 from app.store.database import Database
 from app.store.store import Store

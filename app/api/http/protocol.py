@@ -18,8 +18,8 @@ from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.protocols.utils import get_remote_addr
 
-from app.api.connections import Connections
-from app.api.problems import MEDIA_TYPE, RETRY_SECONDS, document
+from app.api.http.connections import Connections
+from app.api.http.problems import MEDIA_TYPE, RETRY_SECONDS, document
 
 MAX_HEAD = 64 * 2**10
 """Bytes of a request line and headers."""

@@ -17,14 +17,14 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api import problems
-from app.api.auth import MAX_SOURCES, Principal, client_source, environment_in_path, is_open
-from app.api.dependencies import Services
-from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
-from app.api.protocol import PROVE
-from app.api.responses import API
-from app.api.signed import LINK, request_link
-from app.api.single_flight import SingleFlight
+from app.api.http import problems
+from app.api.http.auth import MAX_SOURCES, Principal, client_source, environment_in_path, is_open
+from app.api.http.dependencies import Services
+from app.api.http.problems import MalformedBody, SlowBody, UnsupportedMedia
+from app.api.http.protocol import PROVE
+from app.api.http.responses import API
+from app.api.http.signed import LINK, request_link
+from app.api.http.single_flight import SingleFlight
 from app.errors import Denied, FleetMapError, TooLarge
 from app.logs import REQUEST_ID, log_request
 from app.store.audit import CALLER, Caller

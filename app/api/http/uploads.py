@@ -24,8 +24,8 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
-from app.api.middleware import multipart_boundary
-from app.api.problems import MalformedBody
+from app.api.http.middleware import multipart_boundary
+from app.api.http.problems import MalformedBody
 from app.errors import DISK_FULL_ERRNOS, Invalid, NoRoom, Problem, TooLarge, Unavailable
 from app.ingest import SpooledFile
 from app.limits import Limits

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Depends, Request
 
-from app.api.problems import Throttled
+from app.api.http.problems import Throttled
 from app.errors import Denied, Unauthenticated
 from app.store.values import Role, Token
 

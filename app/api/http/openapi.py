@@ -12,9 +12,9 @@ from pydantic import BaseModel
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from app import formats, parameters
-from app.api.auth import is_open
-from app.api.problems import MEDIA_TYPE
-from app.api.responses import API
+from app.api.http.auth import is_open
+from app.api.http.problems import MEDIA_TYPE
+from app.api.http.responses import API
 from app.api.schemas import ProblemOut, RevertBody, problem_responses
 from app.derive import all_derivations
 from app.errors import NotFound
