@@ -57,16 +57,16 @@ from app.api import (
 from app.api.http import openapi, problems
 from app.api.http.auth import Authenticator
 from app.api.http.connections import ConnectionLimits, Connections, fit_open_files
+from app.api.http.conversions import HEARTBEAT_SECONDS, ConversionJobs
 from app.api.http.deltas import Deltas
 from app.api.http.dependencies import ApiOptions, Services, Writability
 from app.api.http.metrics import Metrics
 from app.api.http.middleware import Guard
 from app.api.http.protocol import BoundedProtocol, tls_context
+from app.api.http.response_cache import FleetMapApp, ResponseCache
 from app.api.http.responses import API
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
-from app.api.jobs import HEARTBEAT_SECONDS, ConversionJobs
-from app.api.maps import FleetMapApp, ResponseCache
 from app.config import Settings
 from app.convert.maps import Maps
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable

@@ -1,6 +1,6 @@
 """The HTTP interface: one module for each noun.
 
 ``http`` has all that is below the nouns: ``http.middleware`` stands in front (token, bodies, errors),
-``maps.FleetMapApp`` before it (repeated requests from memory); ``http.problems`` knows the status of every error,
+``http.response_cache`` before it (repeated requests from memory); ``http.problems`` knows the status of every error,
 ``schemas`` the shapes and examples.
 """

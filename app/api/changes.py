@@ -15,9 +15,9 @@ from starlette.responses import Response
 from app.api.http.auth import Viewer
 from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import StrictRoute, json_bytes, json_response
 from app.api.layers import Crs, feature_collection
-from app.api.maps import parse_version_ref
 from app.api.schemas import VERSION, DeltaOut, EnvironmentPath, VersionPath, problem_responses
 from app.errors import MissingDatum
 from app.model.features import Features

@@ -12,10 +12,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats, parameters
-from app.api.environments import numbers, parse_datum
+from app.api.environments import parse_datum
 from app.api.http.auth import Editor
 from app.api.http.caching import content_disposition
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import numbers
 from app.api.http.problems import UnsupportedMedia
 from app.api.http.responses import StrictRoute, json_response
 from app.api.http.uploads import UploadForm

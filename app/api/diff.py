@@ -15,8 +15,8 @@ from starlette.responses import Response
 
 from app.api.http.auth import Viewer
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import StrictRoute, json_response
-from app.api.maps import parse_version_ref
 from app.api.schemas import VERSION, DiffOut, EnvironmentPath, problem_responses
 from app.errors import Invalid
 from app.model.features import Features, features

@@ -9,6 +9,7 @@ from starlette.responses import Response
 
 from app.api.http.auth import Admin, Editor, Principal, Viewer
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_box, parse_position
 from app.api.http.responses import StrictRoute, api_path, json_response, page_response
 from app.api.schemas import (
     RESERVED,
@@ -27,7 +28,7 @@ from app.ingest.service import check_if_match
 from app.model.frame import Datum
 from app.store.area import DATUM_METRES, MARGIN_METRES, NEIGHBOURHOOD_METRES
 from app.store.audit import set_audit_target
-from app.store.values import Box, Environment, Match, rfc3339
+from app.store.values import Environment, Match, rfc3339
 
 CONTAINS: Final = f"""\
 `LAT,LON` in degrees: the environments that this position is in (which map am I on?).
@@ -59,42 +60,6 @@ def as_dict(environment: Environment, match: Match | None = None) -> dict[str, A
         "deleted": rfc3339(environment.deleted) if environment.deleted else None,
     }
     return members if match is None else {**members, "match": match.as_dict()}
-
-
-def numbers(text: str, parameter: str, names: str) -> tuple[float, ...]:
-    """Numbers separated by commas; Invalid unless there is one for each of ``names`` (``LAT,LON``)."""
-    count = names.count(",") + 1
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count or not all(abs(v) <= 1e9 for v in values):
-        raise Invalid(
-            f"{parameter} must be {names}: {count} numbers separated by commas", [Problem(names, where=parameter)]
-        )
-    return values
-
-
-def parse_box(text: str, parameter: str = "bbox") -> Box:
-    """West, south, east, north in degrees; west > east crosses the antimeridian."""
-    west, south, east, north = numbers(text, parameter, "W,S,E,N")
-    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
-        raise Invalid(
-            f"{parameter} must be west, south, east, north in degrees, with south ≤ north",
-            [Problem("W,S,E,N", where=parameter)],
-        )
-    return west, south, east, north
-
-
-def parse_position(text: str, parameter: str = "contains") -> tuple[float, float]:
-    """Latitude and longitude in degrees."""
-    latitude, longitude = numbers(text, parameter, "LAT,LON")
-    if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
-        raise Invalid(
-            f"{parameter} must be LAT,LON in degrees: the latitude comes first, within ±90",
-            [Problem("LAT,LON", where=parameter)],
-        )
-    return latitude, longitude
 
 
 def parse_datum(body: DatumBody) -> Datum:

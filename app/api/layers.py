@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from starlette.responses import Response
 
-from app.api.environments import numbers, parse_box
 from app.api.http.auth import Viewer
 from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import numbers, parse_box, parse_version_ref
 from app.api.http.problems import NotAcceptable
 from app.api.http.responses import StrictRoute, json_bytes, json_response
-from app.api.maps import parse_version_ref
 from app.api.schemas import EnvironmentPath, LayerOut, LayerPath, VersionPath, problem_responses
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
 from app.model.features import Features

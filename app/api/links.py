@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
+from app.api.http.addresses import MapRequest, resolve_recipe
 from app.api.http.auth import Principal, Viewer
+from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
-from app.api.http.responses import API, StrictRoute, json_response
+from app.api.http.parameters import parse_options, parse_version_ref
+from app.api.http.responses import API, StrictRoute, api_path, json_response
 from app.api.http.signed import Grant
-from app.api.jobs import JobStarted, job_started_response
-from app.api.maps import MapRequest, convert_at_address, parse_version_ref
 from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, problem_responses
 from app.convert.cache import CachedFile
 from app.convert.maps import select_file
@@ -92,8 +94,11 @@ async def link_to(
 
     Raises what converting raises; NotFound for a file that the map does not have.
     """
-    map_request = MapRequest(version.environment, str(version.number), format, file)
-    outcome = await convert_at_address(services, map_request, urlencode(sorted(values.items())).encode(), principal)
+    query = urlencode(sorted(values.items()))
+    wanted = MapRequest(version.environment, str(version.number), format, file, *parse_options(query))
+    address = api_path("environments", version.environment, "versions", version.number, "maps", format)
+    plan = partial(resolve_recipe, services, wanted)
+    outcome = await services.jobs.convert(plan, principal, f"{address}?{query}" if query else address)
     if isinstance(outcome, JobStarted):
         return outcome
     map_file = select_file(*outcome, file)
@@ -102,7 +107,6 @@ async def link_to(
 
     base = str(request.base_url).rstrip("/")
     if not signed:
-        query = urlencode(sorted(values.items()))
         return LinkedFile(base + quote(path, safe="/") + (f"?{query}" if query else ""), None, map_file)
 
     def sign() -> Grant:

@@ -16,12 +16,13 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats
+from app.api.http.addresses import request_address
 from app.api.http.auth import ServerAdmin, Viewer
 from app.api.http.caching import none_match
+from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_options, parse_version_ref
 from app.api.http.responses import StrictRoute, json_bytes, json_response
-from app.api.jobs import JobStarted, job_started_response
-from app.api.maps import parse_options, parse_version_ref, request_address
 from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, problem_responses
 from app.convert import site
 from app.convert.cache import CachedMap

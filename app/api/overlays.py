@@ -13,11 +13,11 @@ from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
+from app.api.http.addresses import request_address
 from app.api.http.auth import Editor, Principal, RobotRole, Viewer
+from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import StrictRoute, json_response
-from app.api.jobs import JobStarted, job_started_response
-from app.api.maps import convert_plan, request_address
 from app.api.schemas import (
     DynamicEdgesOut,
     EnvironmentPath,
@@ -322,7 +322,7 @@ async def _files_with_marks(
     out = []
     for closures in (shown.closures, Closures(tuple(o.closure for o in ended), "mark")):
         plan = partial(services.maps.recipe, live.with_closures(shown, closures), name)
-        outcome = await convert_plan(services, plan, request_address(request), principal)
+        outcome = await services.jobs.convert(plan, principal, request_address(request))
         if isinstance(outcome, JobStarted):
             return outcome
         out.append(await run_in_threadpool(_files, outcome[1]))

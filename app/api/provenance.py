@@ -11,8 +11,8 @@ from starlette.responses import Response
 
 from app.api.http.auth import Viewer
 from app.api.http.dependencies import ServicesDep
+from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import StrictRoute, json_response
-from app.api.maps import parse_version_ref
 from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, problem_responses
 from app.convert.maps import Maps
 from app.store.values import Version

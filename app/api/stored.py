@@ -10,7 +10,7 @@ from starlette.responses import Response
 from app.api.http.auth import ServerAdmin
 from app.api.http.dependencies import ServicesDep
 from app.api.http.responses import StrictRoute
-from app.api.maps import IN_MEMORY, stream_file
+from app.api.http.streams import IN_MEMORY, stream_file
 from app.api.schemas import problem_responses
 from app.errors import Damaged, NotFound
 

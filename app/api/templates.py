@@ -10,8 +10,8 @@ from starlette.responses import Response
 from app import formats, templates
 from app.api.http.auth import Editor, Principal, Viewer
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import StrictRoute, json_response
-from app.api.maps import parse_version_ref
 from app.api.schemas import (
     MAX_TEXT,
     VERSION,

@@ -8,11 +8,10 @@ import numpy as np
 from fastapi import APIRouter, Query
 from starlette.responses import Response
 
-from app.api.environments import numbers
 from app.api.http.auth import Viewer
 from app.api.http.dependencies import ServicesDep
+from app.api.http.parameters import numbers, parse_version_ref
 from app.api.http.responses import StrictRoute, json_response
-from app.api.maps import parse_version_ref
 from app.api.schemas import VERSION, EnvironmentPath, TransformOut, problem_responses
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES

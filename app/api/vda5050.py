@@ -12,11 +12,11 @@ from starlette.responses import Response
 
 from app import formats
 from app.api.http.auth import Principal, RobotRole, Viewer
+from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import StrictRoute, json_response
-from app.api.jobs import JobStarted, job_started_response
 from app.api.links import LinkedFile, link_to
-from app.api.maps import parse_version_ref
 from app.api.robots import require_report_permission, store_report
 from app.api.schemas import (
     CHANNEL,

@@ -7,17 +7,17 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from app import formats
 from app.api.http.auth import Editor, Principal, Viewer
-from app.api.http.caching import Unsatisfiable, byte_range, content_disposition, none_match
+from app.api.http.caching import content_disposition, none_match
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
 from app.api.http.problems import UnsupportedMedia
 from app.api.http.responses import StrictRoute, api_path, json_response, page_response
+from app.api.http.streams import IN_MEMORY, range_headers, raw_response, requested_range, stream_file
 from app.api.http.uploads import UploadForm
-from app.api.maps import IN_MEMORY, parse_version_ref, stream_file
 from app.api.schemas import (
     VERSION,
     Cursor,
@@ -227,23 +227,14 @@ def get_source(
         (b"etag", etag.encode()),
     ]
     if none_match(request.headers.get("if-none-match"), etag):
-        response = Response(status_code=304)
-        response.raw_headers = [(n, v) for n, v in headers if n in (b"etag", b"cache-control")]
-        return response
-    part = byte_range(request.headers.get("range"), request.headers.get("if-range"), etag, source.size)
-    if isinstance(part, Unsatisfiable):
-        detail = f"the file has {source.size} bytes"
-        raise HTTPException(416, detail, {"content-range": f"bytes */{source.size}"})
+        return raw_response(304, [(n, v) for n, v in headers if n in (b"etag", b"cache-control")])
+    part = requested_range(request, etag, source.size)
     start, end = part or (0, source.size)
-    headers.insert(0, (b"content-length", str(end - start).encode()))
-    if part:
-        headers.insert(1, (b"content-range", f"bytes {start}-{end - 1}/{source.size}".encode()))
+    headers = [*range_headers(part, source.size), *headers]
     status = 206 if part else 200
     if source.size > IN_MEMORY:
         return stream_file(services.store.blobs.open(source.sha256), start, end, status, headers)
-    response = Response(services.store.blobs.get(source.sha256)[start:end], status)
-    response.raw_headers = headers
-    return response
+    return raw_response(status, headers, services.store.blobs.get(source.sha256)[start:end])
 
 
 def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Source:

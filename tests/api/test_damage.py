@@ -80,7 +80,7 @@ def test_a_large_cached_map_that_is_damaged_is_never_received_whole(
     own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("app.api.maps.IN_MEMORY", 100)
-    monkeypatch.setattr("app.api.maps.CHUNK", 64)
+    monkeypatch.setattr("app.api.http.streams.CHUNK", 64)
     api, folder = own
     farm = environment(api, "large")
     before = set(cached(folder))
