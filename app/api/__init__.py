@@ -2,5 +2,5 @@
 
 ``http`` has all that is below the nouns: ``http.middleware`` stands in front (token, bodies, errors),
 ``http.response_cache`` before it (repeated requests from memory); ``http.problems`` knows the status of every error,
-``schemas`` the shapes and examples.
+``http.schemas`` the shapes that nouns share.
 """

@@ -19,8 +19,8 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import numbers
 from app.api.http.problems import UnsupportedMedia
 from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import DatumBody, problem_responses
 from app.api.http.uploads import UploadForm
-from app.api.schemas import DatumBody, problem_responses
 from app.api.versions import check_names, parse_format_name, truth
 from app.convert.files import Converted
 from app.convert.worker import media_type, zip_files

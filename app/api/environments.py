@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final
+from datetime import datetime
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app.api.http.auth import Admin, Editor, Principal, Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_box, parse_position
 from app.api.http.responses import StrictRoute, api_path, json_response, page_response
-from app.api.schemas import (
-    RESERVED,
+from app.api.http.schemas import (
+    MAX_TEXT,
+    NAME,
     Cursor,
     DatumBody,
-    EnvironmentBody,
-    EnvironmentOut,
-    EnvironmentPatch,
+    DatumOut,
     EnvironmentPath,
     IfMatch,
     Limit,
+    RequestModel,
     problem_responses,
 )
 from app.errors import Conflict, Gone, Invalid, NotFound, Problem
@@ -40,6 +42,85 @@ CONTAINS: Final = f"""\
 
 A datum at exactly 0, 0 counts as none. Fences come first, then the smallest area, then the nearest datum. `match` says
 why: `by`, `area_m2`, and `distance_m` from the position to the datum."""
+
+RESERVED = frozenset({"robots", "server"})
+
+
+class CloneBody(RequestModel):
+    """Whose content a new environment starts with."""
+
+    environment: str = Field(examples=["orchard"])
+    version: int | str = Field("latest", description="Number, channel or `latest`.", examples=["latest"])
+
+
+class EnvironmentBody(RequestModel):
+    """A new environment."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "orchard-2",
+                    "title": "Orchard behind the barn",
+                    "datum": {"latitude": 53.2686, "longitude": -0.5245},
+                    "tags": ["apple"],
+                }
+            ]
+        },
+    )
+
+    name: str = Field(pattern=NAME, description="Lower case letters, digits, `_` and `-`; not `robots` or `server`.")
+    title: str = Field("", max_length=200)
+    description: str = Field("", max_length=MAX_TEXT)
+    datum: DatumBody | None = Field(None, description="Gives version 1; without it the environment starts empty.")
+    tags: list[Annotated[str, Field(min_length=1, max_length=100)]] = Field(default_factory=list, max_length=100)
+    clone: CloneBody | None = Field(None, description="Start with the content of another one (gives version 1).")
+
+
+class EnvironmentPatch(RequestModel):
+    """What is to change; what is left out stays."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"title": "The farm by the river", "tags": ["wheat"]}]},
+    )
+
+    name: str | None = Field(None, pattern=NAME, description="A new name; the old one is free at once.")
+    title: str | None = Field(None, max_length=200)
+    description: str | None = Field(None, max_length=MAX_TEXT)
+    tags: list[Annotated[str, Field(min_length=1, max_length=100)]] | None = Field(None, max_length=100)
+    datum: DatumBody | None = Field(
+        None,
+        description="Makes a version: local items keep their metres, wgs84 items their place on earth, and the answer "
+        "warns.",
+    )
+
+
+class MatchOut(BaseModel):
+    """Why an environment is an answer to a position."""
+
+    by: Literal["fence", "floor", "datum"] = Field(
+        description="`fence`: inside the GNSS fence; `floor`: on mapped floor; `datum`: within 200 m of the datum."
+    )
+    area_m2: float = Field(description="Area of the fence, floor or neighbourhood in square metres.")
+    distance_m: float | None = Field(description="Metres from the position to the datum, null if there is none.")
+
+
+class EnvironmentOut(BaseModel):
+    """An environment as it is now. ``bounds``: west, south, east, north."""
+
+    name: str
+    title: str
+    description: str
+    tags: list[str]
+    version: int
+    root: str
+    datum: DatumOut | None
+    bounds: list[float] | None
+    created: datetime
+    updated: datetime
+    deleted: datetime | None = None
+    match: MatchOut | None = Field(default=None, description="Only in the answer to `contains`.")
+
 
 router = APIRouter(prefix="/environments", tags=["environments"], route_class=StrictRoute)
 

@@ -25,8 +25,8 @@ from app.api.http.parameters import closure_mode, parse_position, parse_version_
 from app.api.http.problems import Throttled
 from app.api.http.protocol import ON_STOP
 from app.api.http.responses import StrictRoute
+from app.api.http.schemas import problem_responses
 from app.api.http.single_flight import SingleFlight
-from app.api.schemas import problem_responses
 from app.convert.cache import CachedFile
 from app.convert.maps import select_file
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable

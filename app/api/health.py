@@ -14,7 +14,7 @@ from app.api.http.auth import ServerViewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.metrics import CONTENT_TYPE
 from app.api.http.responses import StrictRoute, json_response
-from app.api.schemas import problem_responses
+from app.api.http.schemas import problem_responses
 from app.errors import Unavailable
 from app.events import ros2
 from app.events.relay import relay_state

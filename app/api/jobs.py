@@ -3,18 +3,36 @@
 from __future__ import annotations
 
 import itertools
-from typing import Annotated
+from datetime import datetime
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Path, Query
+from pydantic import BaseModel
 from starlette.responses import Response
 
 from app.api.http.auth import Principal, Viewer
 from app.api.http.conversions import job_as_json
 from app.api.http.dependencies import ServicesDep
 from app.api.http.responses import StrictRoute, json_response
-from app.api.schemas import JobOut, JobPath, Limit, problem_responses
+from app.api.http.schemas import Limit, ProblemOut, problem_responses
 from app.errors import NotFound
 from app.store.values import Job, State
+
+
+class JobOut(BaseModel):
+    """Work that takes long."""
+
+    id: str
+    state: Literal["queued", "running", "done", "failed", "cancelled"]
+    progress: float
+    detail: str
+    result: dict[str, Any] | None = None
+    problem: ProblemOut | None = None
+    created: datetime
+    updated: datetime
+
+
+JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=StrictRoute)
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Request
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -16,12 +18,44 @@ from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_options, parse_version_ref
 from app.api.http.responses import API, StrictRoute, api_path, json_response
+from app.api.http.schemas import EnvironmentPath, RequestModel, VersionPath, problem_responses
 from app.api.http.signed import Grant
-from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, problem_responses
 from app.convert.cache import CachedFile
 from app.convert.maps import select_file
 from app.store.audit import set_audit_target
 from app.store.values import Version, rfc3339
+
+
+class LinkBody(RequestModel):
+    """The map, or one file of it, that a signed link gives."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"format": "geojson", "file": "map.geojson", "seconds": 3600}]},
+    )
+
+    format: str = Field(max_length=64, description="A format's id.")
+    file: str | None = Field(
+        None, min_length=1, max_length=1000, description="One file of the map; left out: the file itself or a zip."
+    )
+    parameters: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, max_length=50, description="Parameters of the map, as in its address."
+    )
+    seconds: int | None = Field(
+        None, ge=1, description="Life of the link. Default and maximum: the setting `FLEETMAP_LINK_SECONDS`."
+    )
+
+
+class LinkOut(BaseModel):
+    """A signed link, and the file that it gives."""
+
+    url: str = Field(description="Needs no token until it expires. Whoever has it can read this map.")
+    expires: datetime
+    version: int
+    root: str
+    name: str = Field(description="Of the file.")
+    size: int = Field(description="Bytes.")
+    sha256: str
+
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
 

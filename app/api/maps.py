@@ -7,9 +7,11 @@ import itertools
 import time
 from dataclasses import replace
 from functools import partial
+from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
-from fastapi import APIRouter, FastAPI, Query, Request
+from fastapi import APIRouter, FastAPI, Path, Query, Request
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -29,8 +31,8 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.response_cache import FRESH_SECONDS, CachedResponse, Key, request_key
 from app.api.http.responses import API, StrictRoute, api_path, json_response
+from app.api.http.schemas import EnvironmentPath, ProblemItem, VersionPath, problem_responses
 from app.api.http.streams import IN_MEMORY, Headers, range_headers, raw_response, requested_range, stream_file
-from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, problem_responses
 from app.convert.cache import CachedFile, CachedMap, LostMap
 from app.convert.maps import select_file
 from app.convert.recipe import Recipe
@@ -279,6 +281,38 @@ def add_routes(app: FastAPI) -> None:
     for path in (base, base + "/{file:path}", "/maps/{env}/{format}", "/maps/{env}/{format}/{file:path}"):
         app.router.add_route(path, partial(download, path), methods=["GET"], include_in_schema=False)
 
+
+class CoverageOut(BaseModel):
+    """Whether a format can be had, by which steps, and else what to supply."""
+
+    format: str
+    state: Literal["direct", "derivable", "missing"]
+    chain: list[dict[str, Any]]
+    missing: list[str]
+    choose: str | None = Field(None, description="What the query has to name, where there are several of a kind.")
+
+
+class ReportOut(BaseModel):
+    """What a map is made of and what was lost on the way."""
+
+    format: str
+    version: int
+    layers: list[dict[str, Any]]
+    attribution: list[str] = Field(description="Licences and credits of the sources, to be shown with the map.")
+    template: list[dict[str, Any]] = Field(
+        description="What was filled in: `what`, `value`, `why`, where a parameter says it `option`, and `from`: "
+        "`request`, `environment`, `set NAME` or `default`."
+    )
+    dropped: list[dict[str, Any]]
+    warnings: list[ProblemItem]
+    closures: list[dict[str, Any]] = Field(
+        description="Each closure in force with its `effect` on this map, and the `edges` that it closes."
+    )
+
+
+FormatPath = Annotated[
+    str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["geojson"])
+]
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
 

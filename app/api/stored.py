@@ -10,8 +10,8 @@ from starlette.responses import Response
 from app.api.http.auth import ServerAdmin
 from app.api.http.dependencies import ServicesDep
 from app.api.http.responses import StrictRoute
+from app.api.http.schemas import problem_responses
 from app.api.http.streams import IN_MEMORY, stream_file
-from app.api.schemas import problem_responses
 from app.errors import Damaged, NotFound
 
 TYPE = "application/octet-stream"

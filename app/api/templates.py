@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import formats, templates
@@ -12,17 +13,13 @@ from app.api.http.auth import Editor, Principal, Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import StrictRoute, json_response
-from app.api.schemas import (
+from app.api.http.schemas import (
     MAX_TEXT,
     VERSION,
     EnvironmentPath,
-    FormatTemplatesBody,
-    FormatTemplatesOut,
     IdempotencyKey,
     IfMatch,
-    TemplatesBody,
-    TemplateSetOut,
-    TemplatesOut,
+    RequestModel,
     VersionOut,
     problem_responses,
 )
@@ -31,6 +28,82 @@ from app.formats import Format
 from app.ingest import TemplateUpdate
 from app.model.templates import FormatTemplate, Templates
 from app.store.values import Version
+
+
+class FormatTemplatesBody(RequestModel):
+    """What is filled in where the format asks for more than the layers have."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"values": {"action": "NavigateToPose", "xy_goal_tolerance": 0.4}}]},
+    )
+
+    set: str | None = Field(None, max_length=100, description="Another set than the environment's; see `/templates`.")
+    values: dict[str, Any] = Field(
+        default_factory=dict, max_length=100, description="By parameter of the format, as `/formats` lists them."
+    )
+    message: str = Field("", max_length=MAX_TEXT)
+    dry_run: bool = Field(False, description="Only say what would be.")
+
+
+class OwnTemplatesBody(RequestModel):
+    """One format's templates among others."""
+
+    set: str | None = Field(None, max_length=100)
+    values: dict[str, Any] = Field(default_factory=dict, max_length=100)
+
+
+class TemplatesBody(RequestModel):
+    """The set of an environment, and values for several formats at once."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"set": "outdoor", "formats": {"tmap2": {"values": {"xy_goal_tolerance": 0.4}}}}]
+        },
+    )
+
+    set: str | None = Field(None, max_length=100, description="A set's name; left out: it stays.")
+    formats: dict[str, OwnTemplatesBody] = Field(
+        default_factory=dict, max_length=100, description="What is said of these, instead of all that was."
+    )
+    message: str = Field("", max_length=MAX_TEXT)
+    dry_run: bool = Field(False, description="Only say what would be.")
+
+
+class TemplateSetOut(BaseModel):
+    """A named set of values, by format and parameter."""
+
+    name: str
+    title: str
+    formats: dict[str, dict[str, Any]]
+
+
+class FormatTemplateOut(BaseModel):
+    """One format's templates. ``set``: where it is another than the environment's. ``ignored``: what was kept once and
+    this release cannot use."""
+
+    format: str
+    set: str | None
+    values: dict[str, Any]
+    effective: dict[str, dict[str, Any]]
+    ignored: list[str] | None = None
+
+
+class FormatTemplatesOut(FormatTemplateOut):
+    """A format's templates in a version of an environment."""
+
+    environment: str
+    version: int
+
+
+class TemplatesOut(BaseModel):
+    """A version's templates."""
+
+    environment: str
+    version: int
+    set: str
+    sets: list[str]
+    formats: list[FormatTemplateOut]
+
 
 router = APIRouter(tags=["templates"], route_class=StrictRoute)
 

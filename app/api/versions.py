@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request
-from pydantic import ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -16,22 +16,22 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.problems import UnsupportedMedia
 from app.api.http.responses import StrictRoute, api_path, json_response, page_response
-from app.api.http.streams import IN_MEMORY, range_headers, raw_response, requested_range, stream_file
-from app.api.http.uploads import UploadForm
-from app.api.schemas import (
+from app.api.http.schemas import (
+    MAX_TEXT,
     VERSION,
     Cursor,
-    EditsBody,
     EnvironmentPath,
     IdempotencyKey,
     IfMatch,
     Limit,
-    RevertBody,
+    RequestModel,
     SourceOut,
     VersionOut,
     VersionPath,
     problem_responses,
 )
+from app.api.http.streams import IN_MEMORY, range_headers, raw_response, requested_range, stream_file
+from app.api.http.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
 from app.ingest import CommitResult, SpooledFile, Upload
 from app.ingest.service import name_problem
@@ -39,10 +39,106 @@ from app.model.frame import GROUND, Level
 from app.store.values import Source
 from app.upload_reader import DRAWN_LAYERS, parse_drawn_layer
 
+
+class RevertBody(RequestModel):
+    """A new version with the content of an old one."""
+
+    revert_to: int = Field(ge=0, description="The old version's number.")
+    message: str = Field("", max_length=MAX_TEXT)
+
+
+class PutChange(RequestModel):
+    """Add or replace one feature, by id.
+
+    A feature may be put back as `GET …/layers/{layer}` shows it: what was not edited stays exactly as it is stored. A
+    feature that is there already keeps its anchor (local metres, or a place on earth), whatever `crs` its new place is
+    told in; delete it and put it again to anchor it otherwise. A fence's `properties.datum` sets the environment's
+    datum. Edges that end at a node which is moved move along.
+    """
+
+    op: Literal["put"]
+    layer: Literal["location", "objects", "topology", "zones"]
+    feature: dict[str, Any] = Field(
+        description="GeoJSON Feature with an `id` (a text); `place` instead of `geometry` is local metres. An edge "
+        "without geometry runs straight."
+    )
+    level: str | None = Field(None, max_length=256)
+    name: str | None = Field(None, max_length=256, description="The part's name, where a layer has several.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="What `geometry` is in; default: wgs84 where there is a datum."
+    )
+
+
+class DeleteChange(RequestModel):
+    """Remove one feature, by id."""
+
+    op: Literal["delete"]
+    layer: Literal["location", "objects", "topology", "zones"]
+    id: str = Field(min_length=1, max_length=512)
+    level: str | None = Field(None, max_length=256)
+    name: str | None = Field(None, max_length=256)
+
+
+class CellsChange(RequestModel):
+    """Set the cells of a grid whose centres lie in a polygon."""
+
+    op: Literal["cells"]
+    grid: str | None = Field(None, max_length=256, description="Default: `map`, else the only grid.")
+    level: str | None = Field(None, max_length=256)
+    polygon: dict[str, Any] = Field(description="GeoJSON Polygon or MultiPolygon.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="What the polygon is in; default: wgs84 where there is a datum."
+    )
+    value: int = Field(ge=0, le=255, description="0 free … 100 occupied, 255 unknown.")
+
+
+Change = Annotated[PutChange | DeleteChange | CellsChange, Field(discriminator="op")]
+
+
+class EditsBody(RequestModel):
+    """Changes that make one version together, or none."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "message": "a charging dock by the gate",
+                    "changes": [
+                        {
+                            "op": "put",
+                            "layer": "topology",
+                            "feature": {
+                                "type": "Feature",
+                                "id": "dock",
+                                "geometry": {"type": "Point", "coordinates": [5.6133, 52.4206]},
+                                "properties": {"kind": "node", "name": "dock"},
+                            },
+                        },
+                        {
+                            "op": "put",
+                            "layer": "topology",
+                            "feature": {
+                                "type": "Feature",
+                                "id": "Gate_dock",
+                                "geometry": None,
+                                "properties": {"kind": "edge", "source": "Gate", "target": "dock"},
+                            },
+                        },
+                    ],
+                }
+            ]
+        },
+    )
+
+    message: str = Field("", max_length=MAX_TEXT)
+    changes: list[Change] = Field(min_length=1, max_length=100_000)
+
+
 router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=StrictRoute)
 
 UPLOAD_BODY: dict[str, Any] = {
     "x-free-query": True,
+    "x-schemas": {"RevertBody": RevertBody.model_json_schema()},
     "requestBody": {
         "required": True,
         "content": {
