@@ -226,7 +226,7 @@ def test_a_dictionary_that_comes_late_is_taken() -> None:
     shelf: dict[str, bytes] = {}
 
     class Shelf:
-        def by_hash(self, sha256: str, limit: int) -> bytes | None:
+        def find_by_hash(self, sha256: str, limit: int) -> bytes | None:
             return shelf.get(sha256)
 
     async def ask() -> bytes | None:
