@@ -11,7 +11,7 @@ from starlette.responses import Response
 
 from app.api.http.auth import Editor
 from app.api.http.dependencies import ServicesDep
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import StrictRoute, json_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
     EnvironmentPath,
@@ -128,5 +128,4 @@ def create_alignment(
     version = outcome.version
     if version is None or outcome.status == "unchanged":
         return json_response(outcome.body)
-    headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    return json_response(outcome.body, 201, headers)
+    return json_response(outcome.body, 201, version_headers(version))

@@ -11,7 +11,7 @@ from starlette.responses import Response
 from app import derive, parameters
 from app.api.http.auth import Editor, Viewer
 from app.api.http.dependencies import ServicesDep
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import StrictRoute, commit_response, json_response
 from app.api.http.schemas import (
     MAX_TEXT,
     EnvironmentPath,
@@ -21,7 +21,6 @@ from app.api.http.schemas import (
     VersionOut,
     problem_responses,
 )
-from app.api.versions import commit_response
 from app.catalogue import describe_derivations
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import DerivationRequest, online

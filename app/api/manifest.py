@@ -22,7 +22,7 @@ from app.api.http.auth import ServerAdmin, Viewer
 from app.api.http.caching import none_match
 from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
-from app.api.http.parameters import parse_options, parse_version_ref
+from app.api.http.parameters import parse_options, parse_version_ref, require_format
 from app.api.http.responses import StrictRoute, json_bytes, json_response
 from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
 from app.convert import site
@@ -377,10 +377,7 @@ def _entries(required: str, optional: str) -> list[_Entry]:
 
 def _entry(text: str, location: str, *, required: bool) -> _Entry:
     name, _, query = text.strip().partition("?")
-    try:
-        fmt = formats.get_format(name)
-    except NotFound as error:
-        raise Invalid(error.detail, [Problem("no such format", where=location)]) from None
+    fmt = require_format(name, location)
     if fmt.write is None:
         raise Invalid(f"{name} is not served", [Problem("not served", where=location)])
     try:

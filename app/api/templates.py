@@ -12,7 +12,7 @@ from app import formats, templates
 from app.api.http.auth import Editor, Principal, Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import StrictRoute, commit_response, json_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
     VERSION,
@@ -23,11 +23,9 @@ from app.api.http.schemas import (
     VersionOut,
     problem_responses,
 )
-from app.api.versions import commit_response
 from app.formats import Format
 from app.ingest import TemplateUpdate
 from app.model.templates import FormatTemplate, Templates
-from app.store.values import Version
 
 
 class FormatTemplatesBody(RequestModel):
@@ -155,7 +153,7 @@ def get_templates(
         "sets": list(templates.SETS),
         "formats": [_line(stored_version.templates, one) for one in fmts],
     }
-    return json_response(body, headers=_headers(stored_version))
+    return json_response(body, headers=version_headers(stored_version))
 
 
 @router.put("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Choose a template set")
@@ -201,7 +199,7 @@ def get_format_templates(
     fmt = templates.check_format(format)
     stored_version = services.store.version(env, parse_version_ref(version))
     body = {"environment": env, "version": stored_version.number, **_line(stored_version.templates, fmt)}
-    return json_response(body, headers=_headers(stored_version))
+    return json_response(body, headers=version_headers(stored_version))
 
 
 @router.put(
@@ -275,8 +273,3 @@ def _line(stored_templates: Templates, fmt: Format) -> dict[str, Any]:
         "effective": templates.effective(stored_templates, fmt),
         **({"ignored": list(ignored)} if ignored else {}),
     }
-
-
-def _headers(version: Version) -> dict[str, str]:
-    number = str(version.number)
-    return {"etag": f'"{number}"', "fleetmap-version": number, "fleetmap-root": version.root}

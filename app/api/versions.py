@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request
+from fastapi.exceptions import RequestValidationError
 from pydantic import ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app import formats
-from app.api.http.auth import Editor, Principal, Viewer
+from app.api.http.auth import Editor, Viewer
 from app.api.http.caching import content_disposition, none_match
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.forms import FormFields
 from app.api.http.parameters import parse_version_ref
-from app.api.http.problems import UnsupportedMedia
-from app.api.http.responses import StrictRoute, api_path, json_response, page_response
+from app.api.http.problems import MalformedBody, UnsupportedMedia
+from app.api.http.responses import StrictRoute, commit_response, json_response, page_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
     VERSION,
@@ -33,11 +36,9 @@ from app.api.http.schemas import (
 from app.api.http.streams import IN_MEMORY, range_headers, raw_response, requested_range, stream_file
 from app.api.http.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
-from app.ingest import CommitResult, SpooledFile, Upload
-from app.ingest.service import name_problem
-from app.model.frame import GROUND, Level
+from app.ingest import CommitResult, Upload
 from app.store.values import Source
-from app.upload_reader import DRAWN_LAYERS, parse_drawn_layer
+from app.upload_reader import DRAWN_LAYERS
 
 
 class RevertBody(RequestModel):
@@ -223,12 +224,26 @@ async def create_version(
         async with services.intake.receive(request) as form:
             upload = _upload(form, request)
             outcome = await run_in_threadpool(
-                _count_upload, services, services.ingest.upload, env, upload, principal, if_match, idempotency_key
+                _counted,
+                services,
+                services.ingest.upload,
+                env,
+                upload,
+                author=principal.name,
+                if_match=if_match,
+                idempotency=idempotency_key,
             )
     elif media == "application/json" or media.endswith("+json"):
         _no_query(request)
+        body = await _revert_body(request)
         outcome = await run_in_threadpool(
-            _revert, services, env, await _revert_body(request), principal, if_match, idempotency_key
+            services.ingest.revert,
+            env,
+            body.revert_to,
+            message=body.message,
+            author=principal.name,
+            if_match=if_match,
+            idempotency=idempotency_key,
         )
     else:
         raise UnsupportedMedia("send multipart/form-data with files, or application/json with revert_to")
@@ -254,15 +269,16 @@ def create_edit(
 ) -> Response:
     """Some features put or deleted, some cells set: one version, or none. Edges that would dangle are refused."""
     changes = [change.model_dump(exclude_none=True) for change in body.changes]
-    _count = services.metrics.uploads.labels
-    try:
-        outcome = services.ingest.edit(
-            env, changes, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
-        )
-    except FleetMapError:
-        _count("refused").inc()
-        raise
-    _count(outcome.status).inc()
+    outcome = _counted(
+        services,
+        services.ingest.edit,
+        env,
+        changes,
+        message=body.message,
+        author=principal.name,
+        if_match=if_match,
+        idempotency=idempotency_key,
+    )
     return commit_response(outcome)
 
 
@@ -270,8 +286,7 @@ def create_edit(
 def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """A version by number, by channel, or the newest."""
     version = services.store.version(env, parse_version_ref(v))
-    headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    return json_response(version.as_dict(), headers=headers)
+    return json_response(version.as_dict(), headers=version_headers(version))
 
 
 @router.get(
@@ -341,83 +356,26 @@ def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Sourc
     return next((s for s in fitting if s.used), fitting[0])
 
 
-def commit_response(outcome: CommitResult) -> Response:
-    """The answer for what became of a change: 201 where there is a new version, also when it is told again."""
-    version = outcome.version
-    if version is None:
-        return json_response(outcome.body)
-    headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    location = api_path("environments", version.environment, "versions", version.number)
-    if outcome.status == "unchanged":
-        return json_response(outcome.body, headers={**headers, "content-location": location})
-    return json_response(outcome.body, 201, {**headers, "location": location})
-
-
 def _upload(form: UploadForm, request: Request) -> Upload:
     """What the form and the query say, checked."""
-    fields = dict(form.fields)
-    for name, value in request.query_params.multi_items():
-        if name in fields:
-            raise Invalid(f"{name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
-        fields[name] = value
-    layer = parse_drawn_layer(fields.pop("layer", "") or None)
-    mode = fields.pop("mode", "") or "replace"
+    fields = FormFields(form, request.query_params.multi_items())
+    mode = fields.take("mode") or "replace"
     if mode not in ("replace", "merge"):
         raise Invalid("mode must be replace or merge", [Problem("unknown", where="mode")])
-    level = fields.pop("level", "") or GROUND
-    Level(level)
-    message = fields.pop("message", "")
+    hints, message, dry_run = fields.take_hints(), fields.take("message"), fields.take_flag("dry_run")
     return Upload(
         files=tuple(form.files),
-        format=parse_format_name(fields.pop("format", ""), "format"),
-        layer=layer,
-        level=level,
-        grid=fields.pop("grid", "") or None,
+        hints=replace(hints, options=fields.take_rest()),
         mode=mode,  # type: ignore[arg-type]  # checked above
         message=message,
-        dry_run=truth(fields.pop("dry_run", ""), "dry_run"),
-        options=fields,
+        dry_run=dry_run,
     )
 
 
-def parse_format_name(text: str, location: str) -> str | None:
-    """A format's id as a form says it; empty is none. Invalid, with those there are, where it is not known."""
-    if not text:
-        return None
+def _counted(services: Services, change: Callable[..., CommitResult], *args: Any, **kwargs: Any) -> CommitResult:
+    """Carry out an upload or edit, and count what became of it."""
     try:
-        return formats.get_format(text).name
-    except NotFound as error:
-        raise Invalid(error.detail, [Problem("no such format", where=location)]) from None
-
-
-def check_names(files: list[SpooledFile]) -> None:
-    """Invalid for names that cannot be kept, and where there is no file at all."""
-    if not files:
-        raise Invalid("there is no file: send at least one in the field 'files'", [Problem("missing", where="files")])
-    seen: set[str] = set()
-    for file in files:
-        problem = name_problem(file.name) or ("this name is used twice" if file.name in seen else None)
-        if problem:
-            shown = file.name[:200]
-            raise Invalid(f"the file name {shown!r} cannot be used: {problem}", [Problem(problem, shown)])
-        seen.add(file.name)
-
-
-def truth(text: str, parameter: str) -> bool:
-    """A form's yes or no; empty is no."""
-    values = {"": False, "false": False, "0": False, "no": False, "true": True, "1": True, "yes": True}
-    if text.lower() not in values:
-        raise Invalid(
-            f"{parameter} must be true or false, got {text[:80]!r}", [Problem("true or false", where=parameter)]
-        )
-    return values[text.lower()]
-
-
-def _count_upload(
-    services: Services, take: Any, env: str, upload: Upload, principal: Principal, if_match: str | None, key: str | None
-) -> CommitResult:
-    try:
-        outcome: CommitResult = take(env, upload, author=principal.name, if_match=if_match, idempotency=key)
+        outcome = change(*args, **kwargs)
     except FleetMapError:
         services.metrics.uploads.labels("refused").inc()
         raise
@@ -425,19 +383,7 @@ def _count_upload(
     return outcome
 
 
-def _revert(
-    services: Services, env: str, body: RevertBody, principal: Principal, if_match: str | None, key: str | None
-) -> CommitResult:
-    return services.ingest.revert(
-        env, body.revert_to, message=body.message, author=principal.name, if_match=if_match, idempotency=key
-    )
-
-
 async def _revert_body(request: Request) -> RevertBody:
-    from fastapi.exceptions import RequestValidationError
-
-    from app.api.http.problems import MalformedBody
-
     try:
         value = await request.json()
     except ValueError as error:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from urllib.parse import parse_qsl
 
-from app.errors import Invalid, Problem
+from app import formats
+from app.errors import Invalid, NotFound, Problem
+from app.formats import Format
 from app.model.closures import CLOSURE_MODES, ClosureMode
 from app.store.values import Box
 
@@ -43,6 +45,14 @@ def parse_position(text: str, parameter: str = "contains") -> tuple[float, float
             [Problem("LAT,LON", where=parameter)],
         )
     return latitude, longitude
+
+
+def require_format(name: str, parameter: str) -> Format:
+    """A format by its id. Invalid, with those there are, for an unknown one."""
+    try:
+        return formats.get_format(name)
+    except NotFound as error:
+        raise Invalid(error.detail, [Problem("no such format", where=parameter)]) from None
 
 
 def parse_version_ref(ref: str) -> str | int:
