@@ -1,4 +1,4 @@
-"""The one error tree. It knows no HTTP; ``app.api.problems`` maps a class to a status.
+"""The one error tree. It knows no HTTP; ``app.api.http.problems`` maps a class to a status.
 
 Every error says in ``detail`` what went wrong and what the user can do about it; ``problems`` name the places.
 """

@@ -45,7 +45,7 @@ def log_request(log: logging.Logger, level: int, fields: Mapping[str, Any]) -> N
 
 
 class TextFormatter(logging.Formatter):
-    """``2030-01-31T06:00:00.000Z INFO    4f2c… app.api.middleware: text``."""
+    """``2030-01-31T06:00:00.000Z INFO    4f2c… app.api.http.middleware: text``."""
 
     def format(self, record: logging.LogRecord) -> str:
         """One line, whatever the message has in it; a trace below it."""

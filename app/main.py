@@ -43,9 +43,7 @@ from app.api import (
     links,
     manifest,
     maps,
-    openapi,
     overlays,
-    problems,
     provenance,
     robots,
     ros2,
@@ -56,18 +54,19 @@ from app.api import (
     vda5050,
     versions,
 )
-from app.api.auth import Authenticator
-from app.api.connections import ConnectionLimits, Connections, fit_open_files
-from app.api.deltas import Deltas
-from app.api.dependencies import ApiOptions, Services, Writability
-from app.api.jobs import HEARTBEAT_SECONDS, ConversionJobs
-from app.api.maps import FleetMapApp, ResponseCache
-from app.api.metrics import Metrics
-from app.api.middleware import Guard
-from app.api.protocol import BoundedProtocol, tls_context
-from app.api.responses import API
-from app.api.signed import SignedLinks
-from app.api.uploads import UploadSpool
+from app.api.http import openapi, problems
+from app.api.http.auth import Authenticator
+from app.api.http.connections import ConnectionLimits, Connections, fit_open_files
+from app.api.http.conversions import HEARTBEAT_SECONDS, ConversionJobs
+from app.api.http.deltas import Deltas
+from app.api.http.dependencies import ApiOptions, Services, Writability
+from app.api.http.metrics import Metrics
+from app.api.http.middleware import Guard
+from app.api.http.protocol import BoundedProtocol, tls_context
+from app.api.http.response_cache import FleetMapApp, ResponseCache
+from app.api.http.responses import API
+from app.api.http.signed import SignedLinks
+from app.api.http.uploads import UploadSpool
 from app.config import Settings
 from app.convert.maps import Maps
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable

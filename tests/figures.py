@@ -411,7 +411,7 @@ def wrong_clock(folder: Path, times: int) -> Outcome:
     for number in range(times):
         Shifted.by = timedelta(days=(365, -365, 0)[number % 3])
         with contextlib.ExitStack() as stack:
-            for module in ("app.store.base", "app.api.auth", "app.main"):
+            for module in ("app.store.base", "app.api.http.auth", "app.main"):
                 stack.enter_context(mock.patch(f"{module}.datetime", Shifted))
             stack.enter_context(mock.patch("time.time", shifted))
             start = time.monotonic()

@@ -14,7 +14,7 @@ import pytest
 from typer.main import get_command
 
 from app import derive, generate
-from app.api.problems import STATUS, problem_status
+from app.api.http.problems import STATUS, problem_status
 from app.cli.commands import ALIASES, build
 from app.config import Settings
 from app.event_types import EVENT_TYPES

@@ -1,5 +1,6 @@
 """The HTTP interface: one module for each noun.
 
-``middleware`` stands in front (token, bodies, errors), ``maps.FleetMapApp`` before it (repeated requests from memory);
-``problems`` knows the status of every error, ``schemas`` the shapes and examples.
+``http`` has all that is below the nouns: ``http.middleware`` stands in front (token, bodies, errors),
+``http.response_cache`` before it (repeated requests from memory); ``http.problems`` knows the status of every error,
+``http.schemas`` the shapes that nouns share.
 """

@@ -3,24 +3,82 @@
 from __future__ import annotations
 
 import math
+from typing import Any, Literal
 
 from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
-from app.api.auth import Editor
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import (
-    AlignmentBody,
-    AlignmentOut,
+from app.api.http.auth import Editor
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, json_response, version_headers
+from app.api.http.schemas import (
+    MAX_TEXT,
     EnvironmentPath,
     IdempotencyKey,
     IfMatch,
-    OntoBody,
+    ProblemItem,
+    RequestModel,
+    VersionOut,
     problem_responses,
 )
 from app.errors import Invalid, Problem
 from app.ingest import AlignmentRequest
+
+
+class OntoBody(RequestModel):
+    """The map that a grid is laid onto."""
+
+    layer: Literal["occupancy", "objects", "voxels"] = Field(
+        "occupancy", description="A stored grid, or a layer that a grid is derived from."
+    )
+    level: str = Field("ground", max_length=256)
+    name: str = Field("map", max_length=256, description="Of a stored grid.")
+    parameters: dict[str, Any] = Field(
+        default_factory=dict, description="Of the derivation, where there is one: `height`, `world` …"
+    )
+
+
+Place = tuple[float, float]
+
+
+class AlignmentBody(RequestModel):
+    """A stored grid that does not lie where it should, and what says where that is: another map, or pairs of points."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"pairs": [[[0, 0], [1, 2]], [[10, 0], [11, 2]]], "dry_run": True}],
+        },
+    )
+
+    grid: str = Field("map", max_length=256, description="The name of the grid that is moved.")
+    level: str = Field("ground", max_length=256)
+    onto: OntoBody | None = Field(None, description="The map that it shall lie on.")
+    pairs: list[tuple[Place, Place]] | None = Field(
+        None,
+        min_length=2,
+        max_length=1000,
+        description="Points [[x, y], [x, y]]: where it is, and where it should be, m.",
+    )
+    angle: float = Field(180.0, ge=0, le=180, description="The largest turn that is tried, degrees.")
+    reach: float | None = Field(None, ge=0, le=1e7, description="The farthest that the grid's middle may go, m.")
+    near: float | None = Field(
+        None, gt=0, le=1000, description="What agrees: cells this near to each other (0.1 m), or points (0.5 m)."
+    )
+    least: float = Field(0.5, ge=0, le=1, description="The share that has to agree.")
+    dry_run: bool = Field(False, description="Only tell what was found.")
+    message: str = Field("", max_length=MAX_TEXT)
+
+
+class AlignmentOut(BaseModel):
+    """A motion p -> R(yaw) p + (x, y) in metres and radians, how well it fits, and the version in which it was made."""
+
+    alignment: dict[str, Any] | None = Field(
+        description="`x`, `y`, `yaw`, `residual` (m), `agreement` and `overlap` (shares), `origin` and `before`."
+    )
+    version: VersionOut | None
+    warnings: list[ProblemItem]
+
 
 router = APIRouter(tags=["alignments"], route_class=StrictRoute)
 
@@ -70,5 +128,4 @@ def create_alignment(
     version = outcome.version
     if version is None or outcome.status == "unchanged":
         return json_response(outcome.body)
-    headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    return json_response(outcome.body, 201, headers)
+    return json_response(outcome.body, 201, version_headers(version))

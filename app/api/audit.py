@@ -2,18 +2,44 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel
 from starlette.responses import Response
 
-from app.api.auth import ServerAdmin
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, page_response
-from app.api.schemas import AuditOut, Limit, problem_responses
+from app.api.http.auth import ServerAdmin
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, page_response
+from app.api.http.schemas import Limit, problem_responses
 from app.errors import Invalid
 from app.store.audit import AuditEntry
 from app.store.values import rfc3339
+
+
+class AuditTokenOut(BaseModel):
+    """The token that made a change, as it was called then."""
+
+    id: str
+    name: str
+    role: str
+
+
+class AuditOut(BaseModel):
+    """One change. request: the `X-Request-Id` of its answer, which the server's log has, too. target: what was made,
+    where the path does not name it."""
+
+    id: int
+    time: datetime
+    token: AuditTokenOut
+    address: str
+    request: str
+    method: str
+    path: str
+    environment: str | None
+    target: str | None
+
 
 router = APIRouter(prefix="/audit", tags=["audit"], route_class=StrictRoute)
 

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import orjson
 from fastapi import APIRouter, Query, Request
 from numpy.typing import NDArray
+from pydantic import BaseModel
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.caching import none_match
-from app.api.dependencies import Services, ServicesDep
+from app.api.http.auth import Viewer
+from app.api.http.caching import none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
+from app.api.http.responses import StrictRoute, json_bytes, json_response
+from app.api.http.schemas import VERSION, EnvironmentPath, VersionPath, problem_responses
 from app.api.layers import Crs, feature_collection
-from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_bytes, json_response
-from app.api.schemas import VERSION, DeltaOut, EnvironmentPath, VersionPath, problem_responses
 from app.errors import MissingDatum
 from app.model.features import Features
 from app.model.frame import Anchor
@@ -29,6 +30,22 @@ from app.store.values import ChangedCells, Delta, FeatureDelta, GridDelta, Versi
 
 MAX_CELLS = 4 * 2**20
 """Where more cells of a grid changed, fetching the grid is less work than reading them as JSON."""
+
+
+class DeltaOut(BaseModel):
+    """What turns one version into another."""
+
+    environment: str
+    since: dict[str, Any]
+    version: int
+    root: str
+    crs: Literal["local", "wgs84"]
+    datum: dict[str, Any]
+    levels: dict[str, Any]
+    layers: dict[str, Any]
+    grids: list[dict[str, Any]]
+    other: list[dict[str, str]]
+
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=StrictRoute)
 

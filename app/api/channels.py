@@ -5,23 +5,116 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Path, Query, Request
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import fleet
-from app.api.auth import Editor, Viewer
-from app.api.caching import none_match
-from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, json_bytes, json_response
-from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, problem_responses
+from app.api.http.auth import Editor, Viewer
+from app.api.http.caching import none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_bytes, json_response
+from app.api.http.schemas import CHANNEL, ApiTime, EnvironmentPath, RequestModel, problem_responses
 from app.errors import Invalid, Problem
 from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
 """A time that is past by less may lie ahead by the clock of whoever asks: the channel moves at once."""
+
+
+class RolloutBody(RequestModel):
+    """A move in two stages. At least one of ``ready`` and ``failed``."""
+
+    ready: float | None = Field(
+        None, gt=0, le=1, description="The channel moves when this share of its online robots has the version."
+    )
+    failed: float | None = Field(
+        None, gt=0, le=1, description="It does not move, or moves back, when this share of its robots reports `failed`."
+    )
+    deadline: ApiTime | None = Field(None, description="RFC 3339 time with zone: without enough robots it stays then.")
+    window: float = Field(600.0, ge=1, le=604_800, description="Seconds for which robots are watched after the move.")
+
+
+class ChannelBody(RequestModel):
+    """Where a channel is to stand, and since when."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"version": 1}, {"version": 1, "rollout": {"ready": 0.9, "failed": 0.2}}]},
+    )
+
+    version: int | str = Field(description="Number, channel or `latest`; kept as the number.")
+    activate_at: ApiTime | None = Field(
+        None, description="RFC 3339 time with zone at which the channel moves; left out: now."
+    )
+    rollout: RolloutBody | None = Field(None, description="Let robots fetch it first, and watch them afterwards.")
+
+    @field_validator("version", mode="before")
+    @classmethod
+    def _no_truth(cls, value: Any) -> Any:
+        """To JSON ``true`` is no number."""
+        if isinstance(value, bool):
+            raise ValueError("a version is a number or a channel's name")
+        return value
+
+
+class ChannelRobotsOut(BaseModel):
+    """A channel's robots. ``since``: since when all hold its root and closures; null while any does not."""
+
+    total: int
+    online: int
+    holding: int
+    lagging: int
+    failed: int
+    ready: int = Field(description="Those that have the planned version and count in its roll-out (`vouched`).")
+    since: datetime | None
+
+
+class RolloutOut(BaseModel):
+    """The last roll-out of a channel. ``before``: the version that it moves back to; ``detail``: why it stands so."""
+
+    version: int
+    root: str
+    started: datetime
+    ready: float | None
+    failed: float | None
+    activate_at: datetime | None
+    deadline: datetime | None
+    window: float
+    state: Literal["waiting", "watching", "done", "expired", "failed", "rolled_back", "cancelled"]
+    before: int | None
+    moved: datetime | None
+    detail: str
+
+
+class OverlaysOut(BaseModel):
+    """The closures in force."""
+
+    count: int
+    digest: str = Field(description="Robots with equal roots and equal digests hold the same map.")
+    sequence: int = Field(description="Of the last event that changed them; 0: none did.")
+
+
+class ChannelOut(BaseModel):
+    """A movable name for a version."""
+
+    channel: str
+    version: int | None
+    root: str | None
+    sequence: int
+    overlays: OverlaysOut | None = Field(
+        None, description="The closures in force, the same on all channels. Left out with `robots=false`."
+    )
+    author: str
+    time: datetime
+    planned: dict[str, Any] | None = None
+    rollout: RolloutOut | None = None
+    robots: ChannelRobotsOut | None = Field(None, description="Left out with `robots=false`.")
+
+
+ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="A channel's name.", examples=["production"])]
 
 router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=StrictRoute)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from typing import Any
 
 import orjson
@@ -12,22 +13,23 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats, parameters
-from app.api.auth import Editor
-from app.api.caching import content_disposition
-from app.api.dependencies import Services, ServicesDep
-from app.api.environments import numbers, parse_datum
-from app.api.problems import UnsupportedMedia
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import DatumBody, problem_responses
-from app.api.uploads import UploadForm
-from app.api.versions import check_names, parse_format_name, truth
+from app.api.environments import parse_datum
+from app.api.http.auth import Editor
+from app.api.http.caching import content_disposition
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.forms import FormFields
+from app.api.http.parameters import numbers
+from app.api.http.problems import UnsupportedMedia
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import DatumBody, problem_responses
+from app.api.http.uploads import UploadForm
 from app.convert.files import Converted
 from app.convert.worker import media_type, zip_files
 from app.errors import Invalid, Problem
-from app.ingest.service import check_grid_name
-from app.model.frame import GROUND, Datum, Level
+from app.ingest.service import check_file_names, check_grid_name
+from app.model.frame import Datum
 from app.model.names import did_you_mean
-from app.upload_reader import DRAWN_LAYERS, UploadHints, parse_drawn_layer
+from app.upload_reader import DRAWN_LAYERS
 
 router = APIRouter(tags=["formats"], route_class=StrictRoute)
 
@@ -88,27 +90,26 @@ async def convert(request: Request, services: ServicesDep, _: Editor) -> Respons
 
 
 def _convert(services: Services, form: UploadForm) -> Response:
-    fields = dict(form.fields)
-    to = parse_format_name(fields.pop("to", ""), "to")
+    form_fields = FormFields(form)
+    to = form_fields.take_format("to")
     if to is None:
         raise Invalid("say in the field 'to' which format is wanted", [Problem("missing", where="to")])
     fmt = formats.get_format(to)
-    check_names(form.files)
-    layer = parse_drawn_layer(fields.pop("layer", "") or None)
-    source = parse_format_name(fields.pop("format", ""), "format")
-    level = fields.pop("level", "") or GROUND
-    Level(level)
-    datum = _datum(fields.pop("datum", ""))
-    only_report = truth(fields.pop("report", ""), "report")
-    grid = fields.pop("grid", "") or None
-    check_grid_name(grid)
+    if not form.files:
+        raise Invalid("there is no file: send at least one in the field 'files'", [Problem("missing", where="files")])
+    check_file_names(form.files)
+    hints = form_fields.take_hints()
+    datum = _datum(form_fields.take("datum"))
+    only_report = form_fields.take_flag("report")
+    check_grid_name(hints.grid)
+    fields = form_fields.take_rest()
     written = {p["name"] for p in parameters.describe(fmt.write_options)}
     read = {p["name"] for f in formats.all_formats().values() if f.read for p in parameters.describe(f.read_options)}
     for name in fields.keys() - written - read:
         accepted = ", ".join(sorted(written)) or "none"
         detail = f"{to} has no parameter {name[:80]!r}{did_you_mean(name, written | read)}; accepted: {accepted}"
         raise Invalid(detail, [Problem(f"unknown; accepted: {accepted}", where=name[:80])])
-    hints = UploadHints(source, layer, level, grid, {k: v for k, v in fields.items() if k not in written})
+    hints = replace(hints, options={k: v for k, v in fields.items() if k not in written})
     values = {k: v for k, v in fields.items() if k in written}
     done = services.maps.convert({f.name: f.path for f in form.files}, to, hints=hints, datum=datum, options=values)
     return _answer(done, to, only_report)

@@ -5,25 +5,55 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import derive, parameters
-from app.api.auth import Editor, Viewer
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import (
-    DerivationBody,
-    DerivationOut,
+from app.api.http.auth import Editor, Viewer
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, commit_response, json_response
+from app.api.http.schemas import (
+    MAX_TEXT,
     EnvironmentPath,
     IdempotencyKey,
     IfMatch,
+    RequestModel,
     VersionOut,
     problem_responses,
 )
-from app.api.versions import commit_response
 from app.catalogue import describe_derivations
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import DerivationRequest, online
+
+
+class DerivationBody(RequestModel):
+    """A layer to be computed from others."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"method": "objects_to_topology", "parameters": {"join": 0.5}, "replace": True}]
+        },
+    )
+
+    method: str = Field(max_length=200, description="A derivation's name; see `/api/v1/derivations`.")
+    parameters: dict[str, Any] = Field(
+        default_factory=dict, description="Of the method, and of the derivations that have to come before it."
+    )
+    message: str = Field("", max_length=MAX_TEXT)
+    replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
+
+
+class DerivationOut(BaseModel):
+    """A way to compute a layer from others."""
+
+    id: str
+    title: str
+    gives: str
+    needs: list[str]
+    cost: float
+    version: int
+    parameters: list[dict[str, Any]]
+
 
 router = APIRouter(tags=["derivations"], route_class=StrictRoute)
 

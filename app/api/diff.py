@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import io
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
 from fastapi import APIRouter, Query
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import VERSION, DiffOut, EnvironmentPath, problem_responses
+from app.api.http.auth import Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import VERSION, EnvironmentPath, problem_responses
 from app.errors import Invalid
 from app.model.features import Features, features
 from app.model.frame import Anchor
@@ -25,6 +26,17 @@ from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
 from app.model.layers import PartKey
 from app.store.values import Version
+
+
+class DiffOut(BaseModel):
+    """What differs between two versions."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    from_: int = Field(alias="from")
+    to: int
+    layers: dict[str, Any]
+
 
 router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=StrictRoute)
 

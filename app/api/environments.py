@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final
+from datetime import datetime
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
-from app.api.auth import Admin, Editor, Principal, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, api_path, json_response, page_response
-from app.api.schemas import (
-    RESERVED,
+from app.api.http.auth import Admin, Editor, Principal, Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_box, parse_position
+from app.api.http.responses import StrictRoute, api_path, json_response, page_response
+from app.api.http.schemas import (
+    MAX_TEXT,
+    NAME,
     Cursor,
     DatumBody,
-    EnvironmentBody,
-    EnvironmentOut,
-    EnvironmentPatch,
+    DatumOut,
     EnvironmentPath,
     IfMatch,
     Limit,
+    RequestModel,
     problem_responses,
 )
 from app.errors import Conflict, Gone, Invalid, NotFound, Problem
@@ -27,7 +30,7 @@ from app.ingest.service import check_if_match
 from app.model.frame import Datum
 from app.store.area import DATUM_METRES, MARGIN_METRES, NEIGHBOURHOOD_METRES
 from app.store.audit import set_audit_target
-from app.store.values import Box, Environment, Match, rfc3339
+from app.store.values import Environment, Match, rfc3339
 
 CONTAINS: Final = f"""\
 `LAT,LON` in degrees: the environments that this position is in (which map am I on?).
@@ -39,6 +42,85 @@ CONTAINS: Final = f"""\
 
 A datum at exactly 0, 0 counts as none. Fences come first, then the smallest area, then the nearest datum. `match` says
 why: `by`, `area_m2`, and `distance_m` from the position to the datum."""
+
+RESERVED = frozenset({"robots", "server"})
+
+
+class CloneBody(RequestModel):
+    """Whose content a new environment starts with."""
+
+    environment: str = Field(examples=["orchard"])
+    version: int | str = Field("latest", description="Number, channel or `latest`.", examples=["latest"])
+
+
+class EnvironmentBody(RequestModel):
+    """A new environment."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "orchard-2",
+                    "title": "Orchard behind the barn",
+                    "datum": {"latitude": 53.2686, "longitude": -0.5245},
+                    "tags": ["apple"],
+                }
+            ]
+        },
+    )
+
+    name: str = Field(pattern=NAME, description="Lower case letters, digits, `_` and `-`; not `robots` or `server`.")
+    title: str = Field("", max_length=200)
+    description: str = Field("", max_length=MAX_TEXT)
+    datum: DatumBody | None = Field(None, description="Gives version 1; without it the environment starts empty.")
+    tags: list[Annotated[str, Field(min_length=1, max_length=100)]] = Field(default_factory=list, max_length=100)
+    clone: CloneBody | None = Field(None, description="Start with the content of another one (gives version 1).")
+
+
+class EnvironmentPatch(RequestModel):
+    """What is to change; what is left out stays."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"title": "The farm by the river", "tags": ["wheat"]}]},
+    )
+
+    name: str | None = Field(None, pattern=NAME, description="A new name; the old one is free at once.")
+    title: str | None = Field(None, max_length=200)
+    description: str | None = Field(None, max_length=MAX_TEXT)
+    tags: list[Annotated[str, Field(min_length=1, max_length=100)]] | None = Field(None, max_length=100)
+    datum: DatumBody | None = Field(
+        None,
+        description="Makes a version: local items keep their metres, wgs84 items their place on earth, and the answer "
+        "warns.",
+    )
+
+
+class MatchOut(BaseModel):
+    """Why an environment is an answer to a position."""
+
+    by: Literal["fence", "floor", "datum"] = Field(
+        description="`fence`: inside the GNSS fence; `floor`: on mapped floor; `datum`: within 200 m of the datum."
+    )
+    area_m2: float = Field(description="Area of the fence, floor or neighbourhood in square metres.")
+    distance_m: float | None = Field(description="Metres from the position to the datum, null if there is none.")
+
+
+class EnvironmentOut(BaseModel):
+    """An environment as it is now. ``bounds``: west, south, east, north."""
+
+    name: str
+    title: str
+    description: str
+    tags: list[str]
+    version: int
+    root: str
+    datum: DatumOut | None
+    bounds: list[float] | None
+    created: datetime
+    updated: datetime
+    deleted: datetime | None = None
+    match: MatchOut | None = Field(default=None, description="Only in the answer to `contains`.")
+
 
 router = APIRouter(prefix="/environments", tags=["environments"], route_class=StrictRoute)
 
@@ -59,42 +141,6 @@ def as_dict(environment: Environment, match: Match | None = None) -> dict[str, A
         "deleted": rfc3339(environment.deleted) if environment.deleted else None,
     }
     return members if match is None else {**members, "match": match.as_dict()}
-
-
-def numbers(text: str, parameter: str, names: str) -> tuple[float, ...]:
-    """Numbers separated by commas; Invalid unless there is one for each of ``names`` (``LAT,LON``)."""
-    count = names.count(",") + 1
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count or not all(abs(v) <= 1e9 for v in values):
-        raise Invalid(
-            f"{parameter} must be {names}: {count} numbers separated by commas", [Problem(names, where=parameter)]
-        )
-    return values
-
-
-def parse_box(text: str, parameter: str = "bbox") -> Box:
-    """West, south, east, north in degrees; west > east crosses the antimeridian."""
-    west, south, east, north = numbers(text, parameter, "W,S,E,N")
-    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
-        raise Invalid(
-            f"{parameter} must be west, south, east, north in degrees, with south ≤ north",
-            [Problem("W,S,E,N", where=parameter)],
-        )
-    return west, south, east, north
-
-
-def parse_position(text: str, parameter: str = "contains") -> tuple[float, float]:
-    """Latitude and longitude in degrees."""
-    latitude, longitude = numbers(text, parameter, "LAT,LON")
-    if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
-        raise Invalid(
-            f"{parameter} must be LAT,LON in degrees: the latitude comes first, within ±90",
-            [Problem("LAT,LON", where=parameter)],
-        )
-    return latitude, longitude
 
 
 def parse_datum(body: DatumBody) -> Datum:

@@ -18,15 +18,15 @@ from fastapi import APIRouter, Header, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
-from app.api.auth import Authenticator, Principal, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.environments import as_dict, parse_position
-from app.api.maps import closure_mode, parse_version_ref
-from app.api.problems import Throttled
-from app.api.protocol import ON_STOP
-from app.api.responses import StrictRoute
-from app.api.schemas import problem_responses
-from app.api.single_flight import SingleFlight
+from app.api.environments import as_dict
+from app.api.http.auth import Authenticator, Principal, Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import closure_mode, parse_position, parse_version_ref
+from app.api.http.problems import Throttled
+from app.api.http.protocol import ON_STOP
+from app.api.http.responses import StrictRoute
+from app.api.http.schemas import problem_responses
+from app.api.http.single_flight import SingleFlight
 from app.convert.cache import CachedFile
 from app.convert.maps import select_file
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable

@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from fastapi import APIRouter
+from pydantic import BaseModel
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import FormatOut, problem_responses
+from app.api.http.auth import Viewer
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import problem_responses
 from app.catalogue import describe_formats
+
+
+class FormatOut(BaseModel):
+    """A file format; ``options`` are the parameters of its maps (and of reading it, with ``for: read``)."""
+
+    id: str
+    title: str
+    files: list[str]
+    media_types: list[str]
+    read: bool
+    write: bool
+    options: list[dict[str, Any]]
+    information: dict[str, str]
+
 
 router = APIRouter(prefix="/formats", tags=["formats"], route_class=StrictRoute)
 

@@ -2,25 +2,58 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import generate
-from app.api.auth import Editor, Viewer
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import (
+from app.api.http.auth import Editor, Viewer
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, commit_response, json_response
+from app.api.http.schemas import (
+    MAX_TEXT,
     EnvironmentPath,
-    GenerationBody,
-    GeneratorOut,
     IdempotencyKey,
     IfMatch,
+    RequestModel,
     VersionOut,
     problem_responses,
 )
-from app.api.versions import commit_response
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import GenerationRequest
+
+
+class GenerationBody(RequestModel):
+    """A site to be made up."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"generator": "orchard", "seed": 7, "parameters": {"rows": 6}, "replace": True}]
+        },
+    )
+
+    generator: str = Field(max_length=200, description="A generator's name; see `/api/v1/generators`.")
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="The same seed and parameters give the same site again.")
+    parameters: dict[str, Any] = Field(default_factory=dict, description="Of the generator.")
+    message: str = Field("", max_length=MAX_TEXT)
+    replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
+
+
+class GeneratorOut(BaseModel):
+    """A way to make up a site."""
+
+    id: str
+    title: str
+    gives: list[str]
+    needs: list[str] = Field(description="Layers that it works on.")
+    changes: list[str] = Field(
+        description="Layers that it works on where they are there, one at least. With neither it makes a whole site."
+    )
+    version: int
+    parameters: list[dict[str, Any]]
+
 
 router = APIRouter(tags=["generations"], route_class=StrictRoute)
 

@@ -10,11 +10,11 @@ from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.auth import ServerViewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.metrics import CONTENT_TYPE
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import problem_responses
+from app.api.http.auth import ServerViewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.metrics import CONTENT_TYPE
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import problem_responses
 from app.errors import Unavailable
 from app.events import ros2
 from app.events.relay import relay_state

@@ -1,209 +1,38 @@
-"""Work that may take long: asked for by many, done once, and after a while followed as a job."""
+"""Jobs: conversions that take longer than an answer may."""
 
 from __future__ import annotations
 
-import asyncio
 import itertools
-import logging
-import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any
+from datetime import datetime
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query
-from starlette.concurrency import run_in_threadpool
+from fastapi import APIRouter, Path, Query
+from pydantic import BaseModel
 from starlette.responses import Response
 
-from app.api import problems
-from app.api.auth import Principal, Viewer
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, api_path, json_response
-from app.api.schemas import JobOut, JobPath, Limit, problem_responses
-from app.convert.cache import CachedMap
-from app.convert.maps import Maps
-from app.convert.recipe import Recipe
-from app.errors import FleetMapError, NoRoom, NotFound, Unavailable
-from app.pool import CancelHandle, Cancelled
-from app.store.store import Store
-from app.store.values import Job, State, rfc3339
-
-log = logging.getLogger(__name__)
-
-MAX_CONCURRENT_CONVERSIONS = 32
-MAX_QUEUED_CONVERSIONS = 256
-HEARTBEAT_SECONDS = 5.0
-LOST_AFTER = timedelta(seconds=60)
-"""A job that nobody has touched for this long belonged to a process that is no more."""
+from app.api.http.auth import Principal, Viewer
+from app.api.http.conversions import job_as_json
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import Limit, ProblemOut, problem_responses
+from app.errors import NotFound
+from app.store.values import Job, State
 
 
-@dataclass(frozen=True, slots=True)
-class JobStarted:
-    """The map takes longer than an answer may: follow this job."""
+class JobOut(BaseModel):
+    """Work that takes long."""
 
-    job: Job
-
-
-@dataclass(slots=True)
-class _RunningConversion:
-    """A map in the making. waiters: requests that wait for it. jobs: principal's id -> job id."""
-
-    future: asyncio.Future[CachedMap]
-    stop: CancelHandle
-    waiters: int = 0
-    jobs: dict[str, str] = field(default_factory=dict)
+    id: str
+    state: Literal["queued", "running", "done", "failed", "cancelled"]
+    progress: float
+    detail: str
+    result: dict[str, Any] | None = None
+    problem: ProblemOut | None = None
+    created: datetime
+    updated: datetime
 
 
-class ConversionJobs:
-    """Maps being made in this process, by recipe."""
-
-    def __init__(self, store: Store, maps: Maps, seconds: float, count: Callable[[str, str], None]) -> None:
-        self._store, self._maps, self._seconds, self._count = store, maps, seconds, count
-        self._running: dict[str, _RunningConversion] = {}
-        self._lock = threading.Lock()
-        self._threads = ThreadPoolExecutor(MAX_CONCURRENT_CONVERSIONS, thread_name_prefix="fleetmap-make")
-        self._tasks: set[asyncio.Task[None]] = set()
-
-    async def get_or_start(self, recipe: Recipe, principal: Principal, address: str) -> CachedMap | JobStarted:
-        """The map, or after ``seconds`` the job that will end with it. address: where the finished map is had.
-
-        Raises what making raises; Unavailable where too much is being made.
-        """
-        with self._lock:  # held for a moment only: whoever comes to a map keeps it from being stopped
-            running = self._running.get(recipe.key)
-            if running is None:
-                if len(self._running) >= MAX_CONCURRENT_CONVERSIONS + MAX_QUEUED_CONVERSIONS:
-                    raise Unavailable("too many maps are being made: try again in a few seconds")
-                running = self._start(recipe)
-            running.waiters += 1
-        try:
-            done, _ = await asyncio.wait({running.future}, timeout=self._seconds)
-            if done:
-                return running.future.result()
-            job_id = running.jobs.get(principal.id)
-            if job_id is not None:
-                return JobStarted(await run_in_threadpool(self._store.job, job_id))
-            try:
-                return JobStarted(await self._as_job(recipe, running, principal, address))
-            except NoRoom:  # nowhere to note a job: the answer waits for the map
-                return await asyncio.shield(running.future)
-        finally:
-            with self._lock:
-                running.waiters -= 1
-
-    def cancel(self, job: str) -> bool:
-        """Stop the making that a job waits for, unless others wait for it too: whether it was of this process."""
-        with self._lock:
-            for key, running in self._running.items():
-                owner = next((principal_id for principal_id, job_id in running.jobs.items() if job_id == job), None)
-                if owner is None:
-                    continue
-                del running.jobs[owner]
-                if not running.jobs and not running.waiters:
-                    running.stop()
-                    del self._running[key]  # who asks from now on begins anew
-                return True
-        return False
-
-    def _start(self, recipe: Recipe) -> _RunningConversion:
-        stop = CancelHandle()
-        future = asyncio.get_running_loop().run_in_executor(self._threads, self._maps.get_or_convert, recipe, stop)
-        running = self._running[recipe.key] = _RunningConversion(future, stop)
-        future.add_done_callback(lambda _: self._on_done(recipe, running))
-        return running
-
-    def send_heartbeats(self) -> None:
-        """Show that the jobs of this process are alive, and stop those that were cancelled elsewhere. Blocks."""
-        with self._lock:
-            jobs = [job for running in self._running.values() for job in running.jobs.values()]
-        for job in jobs:
-            self._touch(job)
-
-    def close(self) -> None:
-        """Let threads end; what is being made ends with the pool."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
-
-    async def _as_job(self, recipe: Recipe, running: _RunningConversion, principal: Principal, address: str) -> Job:
-        label = f"{recipe.format.name} of {recipe.version.environment}, version {recipe.version.number}"
-
-        def begin() -> Job:
-            job = self._store.create_job(principal.id, f"making {label}")
-            return self._store.update_job(job.id, state="running")
-
-        job = await run_in_threadpool(begin)
-        running.jobs[principal.id] = job.id
-
-        async def follow() -> None:
-            await asyncio.wait({running.future})
-            if not running.future.cancelled():
-                await run_in_threadpool(self._finish_job, job.id, running.future.exception(), label, address)
-
-        task = asyncio.create_task(follow())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return job
-
-    def _finish_job(self, job: str, error: BaseException | None, label: str, address: str) -> None:
-        try:
-            if self._store.job(job).state == "cancelled":
-                return
-            if error is None:
-                detail = f"made {label}"
-                self._store.update_job(job, state="done", progress=1.0, detail=detail, result={"location": address})
-            else:
-                self._store.update_job(job, state="failed", detail=f"could not make {label}", problem=_problem(error))
-        except FleetMapError as other:
-            log.warning("a job's end could not be noted: %s", other.detail)
-
-    def _touch(self, job: str) -> None:
-        try:
-            state = self._store.job(job).state
-            if state == "running":
-                self._store.update_job(job, state="running")
-            elif state == "cancelled":  # in another process of the server
-                self.cancel(job)
-        except FleetMapError as error:
-            log.warning("a job could not be kept alive: %s", error.detail)
-
-    def _on_done(self, recipe: Recipe, running: _RunningConversion) -> None:
-        with self._lock:
-            if self._running.get(recipe.key) is running:
-                del self._running[recipe.key]
-        done = running.future
-        if done.cancelled() or isinstance(done.exception(), Cancelled):
-            self._count(recipe.format.name, "cancelled")
-        elif done.exception() is not None:
-            self._count(recipe.format.name, "failed")
-        elif done.result().fresh:  # else another request or process had just made it
-            self._count(recipe.format.name, "made")
-
-
-def _problem(error: BaseException) -> dict[str, Any]:
-    if isinstance(error, FleetMapError):
-        return problems.as_document(error)
-    log.error("internal error in a job: %s", problems.describe(error))
-    return problems.document(500, "internal error; the server's log has the details", title="Internal error")
-
-
-def as_dict(job: Job) -> dict[str, Any]:
-    """The job as JSON; one whose process is gone has failed."""
-    state, problem, detail = job.state, job.problem, job.detail
-    if state in ("queued", "running") and datetime.now(UTC) - job.updated > LOST_AFTER:
-        state, detail = "failed", "the server was restarted"
-        problem = problems.document(503, "the server was restarted while it worked on this: ask for it again")
-    out: dict[str, Any] = {"id": job.id, "state": state, "progress": job.progress, "detail": detail}
-    if job.result is not None:
-        out["result"] = dict(job.result)
-    if problem is not None:
-        out["problem"] = dict(problem)
-    return {**out, "created": rfc3339(job.created), "updated": rfc3339(job.updated)}
-
-
-def job_started_response(job: Job) -> Response:
-    """The answer 202 of a call that became a job."""
-    return json_response(as_dict(job), 202, {"location": api_path("jobs", job.id), "retry-after": "2"})
-
+JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=StrictRoute)
 
@@ -226,7 +55,7 @@ def list_jobs(
     """List the jobs of the own token, newest first; administrators whose token is for all environments see all."""
     every = principal.role == "admin" and principal.environments is None
     visible_jobs = (job for job in reversed(services.store.jobs()) if every or job.owner == principal.id)
-    bodies = (body for body in map(as_dict, visible_jobs) if state in (None, body["state"]))
+    bodies = (body for body in map(job_as_json, visible_jobs) if state in (None, body["state"]))
     return json_response(list(itertools.islice(bodies, limit)))
 
 
@@ -235,7 +64,7 @@ def get_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
     """A job of the own token; an administrator of all environments sees all. ``result.location`` is where a
     finished map is had.
     """
-    return json_response(as_dict(_require_job_owner(services, principal, id)))
+    return json_response(job_as_json(_require_job_owner(services, principal, id)))
 
 
 @router.delete("/{id}", status_code=204, responses=problem_responses(None, 404), summary="Cancel or forget a job")
@@ -244,7 +73,7 @@ def delete_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Respons
     ended.
     """
     job = _require_job_owner(services, principal, id)
-    if as_dict(job)["state"] in ("queued", "running"):
+    if job_as_json(job)["state"] in ("queued", "running"):
         services.store.update_job(id, state="cancelled", detail="cancelled")
         services.jobs.cancel(id)  # where another process is at it, that one notices within seconds
     else:

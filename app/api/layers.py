@@ -12,19 +12,19 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import orjson
 import shapely
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Path, Query, Request
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import BaseModel
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.caching import none_match
-from app.api.dependencies import Services, ServicesDep
-from app.api.environments import numbers, parse_box
-from app.api.maps import parse_version_ref
-from app.api.problems import NotAcceptable
-from app.api.responses import StrictRoute, json_bytes, json_response
-from app.api.schemas import EnvironmentPath, LayerOut, LayerPath, VersionPath, problem_responses
+from app.api.http.auth import Viewer
+from app.api.http.caching import none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import numbers, parse_box, parse_version_ref
+from app.api.http.problems import NotAcceptable
+from app.api.http.responses import StrictRoute, json_bytes, json_response
+from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
 from app.model.features import Features
 from app.model.frame import GROUND, MAX_METRES, Anchor
@@ -35,6 +35,27 @@ from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, PartKey
 from app.model.voxels import DEPTH, Box3, VoxelMap
 from app.model.voxels import cut as cut_voxels
 from app.store.values import Box, PartEntry, Version
+
+
+class LayerOut(BaseModel):
+    """One part of a version's content."""
+
+    layer: str
+    level: str
+    name: str
+    count: int
+    hash: str
+    bounds: dict[str, list[float] | None]
+    information: str
+    format: str | None = None
+    sources: list[str]
+    attribution: list[str]
+
+
+LayerPath = Annotated[
+    Literal["location", "objects", "topology", "occupancy", "voxels", "imagery", "zones"],
+    Path(description="A layer.", examples=["topology"]),
+]
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}/layers", tags=["layers"], route_class=StrictRoute)
 

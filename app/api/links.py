@@ -3,23 +3,59 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
+from functools import partial
 from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Request
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.auth import Principal, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, job_started_response
-from app.api.maps import MapRequest, convert_at_address, parse_version_ref
-from app.api.responses import API, StrictRoute, json_response
-from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, problem_responses
-from app.api.signed import Grant
+from app.api.http.addresses import MapRequest, resolve_recipe
+from app.api.http.auth import Principal, Viewer
+from app.api.http.conversions import JobStarted, job_started_response
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_options, parse_version_ref
+from app.api.http.responses import API, StrictRoute, api_path, json_response
+from app.api.http.schemas import EnvironmentPath, RequestModel, VersionPath, problem_responses
+from app.api.http.signed import Grant
 from app.convert.cache import CachedFile
 from app.convert.maps import select_file
 from app.store.audit import set_audit_target
 from app.store.values import Version, rfc3339
+
+
+class LinkBody(RequestModel):
+    """The map, or one file of it, that a signed link gives."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"format": "geojson", "file": "map.geojson", "seconds": 3600}]},
+    )
+
+    format: str = Field(max_length=64, description="A format's id.")
+    file: str | None = Field(
+        None, min_length=1, max_length=1000, description="One file of the map; left out: the file itself or a zip."
+    )
+    parameters: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, max_length=50, description="Parameters of the map, as in its address."
+    )
+    seconds: int | None = Field(
+        None, ge=1, description="Life of the link. Default and maximum: the setting `FLEETMAP_LINK_SECONDS`."
+    )
+
+
+class LinkOut(BaseModel):
+    """A signed link, and the file that it gives."""
+
+    url: str = Field(description="Needs no token until it expires. Whoever has it can read this map.")
+    expires: datetime
+    version: int
+    root: str
+    name: str = Field(description="Of the file.")
+    size: int = Field(description="Bytes.")
+    sha256: str
+
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
 
@@ -92,8 +128,11 @@ async def link_to(
 
     Raises what converting raises; NotFound for a file that the map does not have.
     """
-    map_request = MapRequest(version.environment, str(version.number), format, file)
-    outcome = await convert_at_address(services, map_request, urlencode(sorted(values.items())).encode(), principal)
+    query = urlencode(sorted(values.items()))
+    wanted = MapRequest(version.environment, str(version.number), format, file, *parse_options(query))
+    address = api_path("environments", version.environment, "versions", version.number, "maps", format)
+    plan = partial(resolve_recipe, services, wanted)
+    outcome = await services.jobs.convert(plan, principal, f"{address}?{query}" if query else address)
     if isinstance(outcome, JobStarted):
         return outcome
     map_file = select_file(*outcome, file)
@@ -102,7 +141,6 @@ async def link_to(
 
     base = str(request.base_url).rstrip("/")
     if not signed:
-        query = urlencode(sorted(values.items()))
         return LinkedFile(base + quote(path, safe="/") + (f"?{query}" if query else ""), None, map_file)
 
     def sign() -> Grant:

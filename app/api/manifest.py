@@ -8,21 +8,23 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl
 
 from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats
-from app.api.auth import ServerAdmin, Viewer
-from app.api.caching import none_match
-from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, job_started_response
-from app.api.maps import parse_options, parse_version_ref, request_address
-from app.api.responses import StrictRoute, json_bytes, json_response
-from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, problem_responses
+from app.api.http.addresses import request_address
+from app.api.http.auth import ServerAdmin, Viewer
+from app.api.http.caching import none_match
+from app.api.http.conversions import JobStarted, job_started_response
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_options, parse_version_ref, require_format
+from app.api.http.responses import StrictRoute, json_bytes, json_response
+from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
 from app.convert import site
 from app.convert.cache import CachedMap
 from app.convert.recipe import Recipe, writer_options
@@ -42,6 +44,83 @@ UNAVAILABLE = (CannotConvert, NotFound, Invalid)
 """Why a format cannot be given. Anything else concerns the whole request."""
 
 LAYER_DIGITS = 16
+
+
+class KeyOut(BaseModel):
+    """A public key; bytes in base64."""
+
+    id: str
+    algorithm: Literal["Ed25519"]
+    public_key: str
+    created: datetime
+    endorsed_by: str | None = None
+    endorsement: str | None = None
+
+
+class ManifestFile(BaseModel):
+    """One file of a map."""
+
+    format: str
+    name: str = Field(description="With the folder of its level, if that is not the default one: `L2/map.yaml`.")
+    size: int
+    sha256: str
+    level: str | None = Field(None, description="Of a file that belongs to one level.")
+
+
+class ManifestLevel(BaseModel):
+    """A storey."""
+
+    name: str
+    elevation: float = Field(description="Metres above the local origin.")
+
+
+class ManifestMissing(BaseModel):
+    """An optional format that cannot be given."""
+
+    format: str
+    detail: str = Field(description="Why, and what to supply.")
+
+
+class ManifestOut(BaseModel):
+    """What a robot verifies; its signature is in a header."""
+
+    environment: str
+    channel: str | None = None
+    epoch: int = Field(
+        0,
+        description="Order is by epoch, then sequence. The operator raises it after a restore; left out at 0.",
+    )
+    sequence: int
+    version: int
+    root: str
+    time: datetime = Field(description="When it was signed, in steps of ten minutes.")
+    expires: datetime
+    levels: list[ManifestLevel] = Field(description="From the lowest up.")
+    files: list[ManifestFile]
+    missing: list[ManifestMissing] = Field([], description="Optional formats that cannot be given; left out if none.")
+    overlays: list[dict[str, Any]] = Field(
+        [], description="The closures in force that its files show, by id; left out if there are none."
+    )
+    closures: Literal["mark", "ignore"] | None = Field(
+        None, description="How its files show the closures in force; left out for `apply`."
+    )
+    parameters: dict[str, dict[str, str]] = Field(
+        {}, description="The parameters that each format was requested with; left out if there are none."
+    )
+    overlays_digest: str = Field(description="SHA-256 of that list; `Fleetmap-Overlays` of each file.")
+    layers: dict[str, str] = Field(description="A hash of each layer: equal where the layer is, in any two versions.")
+    variables: dict[str, str] | None = Field(
+        None, description="What the place is called: literal variables of an environment_template's scripts."
+    )
+
+
+ClosuresQuery = Annotated[
+    ClosureMode | None,
+    Query(
+        description="How maps show the closures in force: `apply` (closed edges are left out of formats that "
+        "cannot express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` for a version's number."
+    ),
+]
 
 router = APIRouter(tags=["manifest"], route_class=StrictRoute)
 
@@ -298,10 +377,7 @@ def _entries(required: str, optional: str) -> list[_Entry]:
 
 def _entry(text: str, location: str, *, required: bool) -> _Entry:
     name, _, query = text.strip().partition("?")
-    try:
-        fmt = formats.get_format(name)
-    except NotFound as error:
-        raise Invalid(error.detail, [Problem("no such format", where=location)]) from None
+    fmt = require_format(name, location)
     if fmt.write is None:
         raise Invalid(f"{name} is not served", [Problem("not served", where=location)])
     try:

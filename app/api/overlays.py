@@ -9,25 +9,17 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import shapely
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Path, Query, Request
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.auth import Editor, Principal, RobotRole, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, job_started_response
-from app.api.maps import convert_plan, request_address
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import (
-    DynamicEdgesOut,
-    EnvironmentPath,
-    LaneRequestsOut,
-    OverlayBody,
-    OverlayOut,
-    OverlayPath,
-    ZoneSetsOut,
-    problem_responses,
-)
+from app.api.http.addresses import request_address
+from app.api.http.auth import Editor, Principal, RobotRole, Viewer
+from app.api.http.conversions import JobStarted, job_started_response
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import ApiTime, EnvironmentPath, RequestModel, problem_responses
 from app.convert.cache import CachedMap
 from app.convert.closures import place_problem
 from app.errors import Conflict, Denied, Invalid, NotFound, Problem
@@ -42,6 +34,106 @@ MAX_POINTS = 1000
 
 DEFAULT_SECONDS = 3600.0
 MAX_SECONDS = 2_592_000.0
+
+
+class OverlayBody(RequestModel):
+    """What is blocked: a polygon or an edge."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "kind": "blocked",
+                    "polygon": {
+                        "type": "Polygon",
+                        "coordinates": [[[5.6133, 52.4206], [5.6134, 52.4206], [5.6134, 52.4207], [5.6133, 52.4206]]],
+                    },
+                    "crs": "wgs84",
+                    "ttl_seconds": 1800,
+                    "detail": "a fallen tree",
+                }
+            ]
+        },
+    )
+
+    kind: Literal["blocked"]
+    polygon: dict[str, Any] | None = Field(None, description="GeoJSON Polygon or MultiPolygon.")
+    edge: str | None = Field(None, min_length=1, max_length=512, description="An edge's id: one direction of a lane.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="What the polygon is in; default: wgs84 where there is a datum."
+    )
+    level: str | None = Field(None, min_length=1, max_length=256, description="Of the polygon; default: `ground`.")
+    ttl_seconds: float | None = Field(
+        None,
+        ge=1,
+        le=2_592_000,
+        description="How long it is blocked from now on; default: 3600 unless `expires` is given.",
+    )
+    expires: ApiTime | None = Field(None, description="End, instead of `ttl_seconds`: RFC 3339 time with zone.")
+    state: Literal["pending", "accepted"] = Field(
+        "pending", description="`accepted` (editors only): in force at once, on every channel."
+    )
+    detail: str | None = Field(None, max_length=2000)
+
+
+class OverlayOut(BaseModel):
+    """What was reported as blocked, and what became of it."""
+
+    id: str
+    environment: str
+    kind: Literal["blocked"]
+    state: Literal["pending", "accepted", "rejected", "expired", "ended"]
+    level: str
+    reporter: str
+    created: datetime
+    expires: datetime
+    polygon: dict[str, Any] | None = None
+    edge: str | None = None
+    crs: Literal["local", "wgs84"] | None = None
+    detail: str | None = None
+    decided_by: str | None = None
+    decided: datetime | None = None
+    version: int | None = Field(None, description="The version that made it permanent.")
+
+
+class DynamicEdgesOut(BaseModel):
+    """A request of `nav2_msgs/srv/DynamicEdges`."""
+
+    closed_edges: list[int]
+    opened_edges: list[int]
+
+
+class LaneRequestOut(BaseModel):
+    """A message of `rmf_fleet_msgs/msg/LaneRequest`."""
+
+    fleet_name: str
+    open_lanes: list[int]
+    close_lanes: list[int]
+
+
+class GraphLanesOut(BaseModel):
+    """What to publish for one navigation graph."""
+
+    graph: str = Field(description="The graph's file, `0.yaml` …")
+    message: LaneRequestOut
+
+
+class LaneRequestsOut(BaseModel):
+    """One message for each navigation graph."""
+
+    requests: list[GraphLanesOut]
+
+
+class ZoneSetsOut(BaseModel):
+    """Closures in the words of VDA 5050 3.0."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    zone_sets: list[dict[str, Any]] = Field(alias="zoneSets")
+    closed_edges: list[dict[str, Any]] = Field(alias="closedEdges")
+
+
+OverlayPath = Annotated[str, Path(max_length=100, description="An overlay's id.")]
 
 router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=StrictRoute)
 
@@ -322,7 +414,7 @@ async def _files_with_marks(
     out = []
     for closures in (shown.closures, Closures(tuple(o.closure for o in ended), "mark")):
         plan = partial(services.maps.recipe, live.with_closures(shown, closures), name)
-        outcome = await convert_plan(services, plan, request_address(request), principal)
+        outcome = await services.jobs.convert(plan, principal, request_address(request))
         if isinstance(outcome, JobStarted):
             return outcome
         out.append(await run_in_threadpool(_files, outcome[1]))

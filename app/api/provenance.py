@@ -7,15 +7,28 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 from fastapi import APIRouter, Request
+from pydantic import BaseModel
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.dependencies import ServicesDep
-from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, problem_responses
+from app.api.http.auth import Viewer
+from app.api.http.dependencies import ServicesDep
+from app.api.http.parameters import parse_version_ref
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
 from app.convert.maps import Maps
 from app.store.values import Version
+
+
+class ProvenanceOut(BaseModel):
+    """Which file made which layer, and which map is made of them; ``links`` lead from id to id."""
+
+    environment: str
+    version: int
+    sources: list[dict[str, Any]]
+    parts: list[dict[str, Any]]
+    maps: list[dict[str, Any]]
+    links: list[dict[str, str]]
+
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=StrictRoute)
 

@@ -5,30 +5,113 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Query, Request
+from fastapi import APIRouter, Header, Path, Query, Request
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import fleet
-from app.api.auth import Editor, Principal, RobotRole, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.responses import StrictRoute, json_response, page_response
-from app.api.schemas import (
-    CHANNEL,
-    NAME,
-    Cursor,
-    Limit,
-    RobotDetailOut,
-    RobotOut,
-    RobotPath,
-    StatusBody,
-    problem_responses,
-)
+from app.api.http.auth import Editor, Principal, RobotRole, Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import StrictRoute, json_response, page_response
+from app.api.http.schemas import CHANNEL, NAME, ApiTime, Cursor, Limit, RequestModel, problem_responses
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.audit import set_audit_target
 from app.store.values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport, rfc3339
+
+
+class StatusHoldsBody(RequestModel):
+    """A version that a robot has loaded."""
+
+    version: int = Field(ge=0, lt=2**63)
+    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Root hash of the version; 64 zeros: no map is loaded.")
+
+
+class StatusBody(RequestModel):
+    """What a robot says of itself."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {"environment": "orchard", "channel": "latest", "version": 1, "root": "0" * 64, "state": "active"}
+            ]
+        },
+    )
+
+    environment: str = Field(pattern=NAME)
+    channel: str = Field(pattern=CHANNEL, description="The channel that it follows.")
+    version: int = Field(ge=0, lt=2**63)
+    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Of the version, as the manifest says it.")
+    state: Literal["downloading", "ready", "active", "failed"] = Field(
+        description="`ready`: it has the version and does not drive on it yet; `active`: it does."
+    )
+    detail: str | None = Field(None, max_length=2000)
+    time: ApiTime | None = Field(None, description="RFC 3339 time with zone, by the robot's clock.")
+    sequence: int | None = Field(None, ge=0, lt=2**63, description="Of the last event that it has processed.")
+    overlays: str | None = Field(
+        None, pattern=r"^[0-9a-f]{64}$", description="Digest of the closures in the map that it has loaded."
+    )
+    holds: StatusHoldsBody | None = Field(
+        None, description="The loaded map, if the status is about another version. Default: the last `active` one."
+    )
+
+
+class LagOut(BaseModel):
+    """How far a robot is behind its channel: events not acted on, whether its root differs, since when."""
+
+    events: int
+    differs: bool
+    since: datetime | None
+
+
+class HoldsOut(BaseModel):
+    """What a robot drives on, and since when it said so (the server's clock)."""
+
+    version: int
+    root: str
+    overlays: str | None = Field(None, description="Digest of the closures in it.")
+    since: datetime
+
+
+class RobotOut(BaseModel):
+    """A robot in an environment. ``time``: by its clock, where it told one; ``received`` and ``since`` (when it first
+    said the same) by the server's. ``lag`` is null where its channel stands nowhere.
+    """
+
+    robot: str
+    environment: str
+    channel: str
+    version: int
+    root: str
+    state: Literal["downloading", "ready", "active", "failed"]
+    detail: str | None = None
+    sequence: int | None = None
+    overlays: str | None = None
+    time: datetime
+    received: datetime
+    since: datetime
+    holds: HoldsOut | None
+    online: bool
+    vouched: bool = Field(
+        description="Whether a report came with authority (by a token that may report for it, or over a router with "
+        "users). Other robots do not count in roll-outs."
+    )
+    lag: LagOut | None
+
+
+class RobotDetailOut(RobotOut):
+    """A robot with its past."""
+
+    environments: list[str]
+    history: list[dict[str, Any]]
+
+
+RobotPath = Annotated[
+    str,
+    Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$", description="A robot's name.", examples=["mower-3"]),
+]
 
 router = APIRouter(prefix="/robots", tags=["robots"], route_class=StrictRoute)
 

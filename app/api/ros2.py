@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 
 from app import formats
-from app.api.dependencies import Services
+from app.api.http.dependencies import Services
 from app.errors import CannotConvert, NotFound
 from app.events import cdr
 from app.events.ros2 import TopicContent

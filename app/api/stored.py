@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path
 from starlette.responses import Response
 
-from app.api.auth import ServerAdmin
-from app.api.dependencies import ServicesDep
-from app.api.maps import IN_MEMORY, stream_file
-from app.api.responses import StrictRoute
-from app.api.schemas import problem_responses
+from app.api.http.auth import ServerAdmin
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute
+from app.api.http.schemas import problem_responses
+from app.api.http.streams import IN_MEMORY, stream_file
 from app.errors import Damaged, NotFound
 
 TYPE = "application/octet-stream"

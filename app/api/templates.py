@@ -5,32 +5,103 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import formats, templates
-from app.api.auth import Editor, Principal, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import (
+from app.api.http.auth import Editor, Principal, Viewer
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
+from app.api.http.responses import StrictRoute, commit_response, json_response, version_headers
+from app.api.http.schemas import (
     MAX_TEXT,
     VERSION,
     EnvironmentPath,
-    FormatTemplatesBody,
-    FormatTemplatesOut,
     IdempotencyKey,
     IfMatch,
-    TemplatesBody,
-    TemplateSetOut,
-    TemplatesOut,
+    RequestModel,
     VersionOut,
     problem_responses,
 )
-from app.api.versions import commit_response
 from app.formats import Format
 from app.ingest import TemplateUpdate
 from app.model.templates import FormatTemplate, Templates
-from app.store.values import Version
+
+
+class FormatTemplatesBody(RequestModel):
+    """What is filled in where the format asks for more than the layers have."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"values": {"action": "NavigateToPose", "xy_goal_tolerance": 0.4}}]},
+    )
+
+    set: str | None = Field(None, max_length=100, description="Another set than the environment's; see `/templates`.")
+    values: dict[str, Any] = Field(
+        default_factory=dict, max_length=100, description="By parameter of the format, as `/formats` lists them."
+    )
+    message: str = Field("", max_length=MAX_TEXT)
+    dry_run: bool = Field(False, description="Only say what would be.")
+
+
+class OwnTemplatesBody(RequestModel):
+    """One format's templates among others."""
+
+    set: str | None = Field(None, max_length=100)
+    values: dict[str, Any] = Field(default_factory=dict, max_length=100)
+
+
+class TemplatesBody(RequestModel):
+    """The set of an environment, and values for several formats at once."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"set": "outdoor", "formats": {"tmap2": {"values": {"xy_goal_tolerance": 0.4}}}}]
+        },
+    )
+
+    set: str | None = Field(None, max_length=100, description="A set's name; left out: it stays.")
+    formats: dict[str, OwnTemplatesBody] = Field(
+        default_factory=dict, max_length=100, description="What is said of these, instead of all that was."
+    )
+    message: str = Field("", max_length=MAX_TEXT)
+    dry_run: bool = Field(False, description="Only say what would be.")
+
+
+class TemplateSetOut(BaseModel):
+    """A named set of values, by format and parameter."""
+
+    name: str
+    title: str
+    formats: dict[str, dict[str, Any]]
+
+
+class FormatTemplateOut(BaseModel):
+    """One format's templates. ``set``: where it is another than the environment's. ``ignored``: what was kept once and
+    this release cannot use."""
+
+    format: str
+    set: str | None
+    values: dict[str, Any]
+    effective: dict[str, dict[str, Any]]
+    ignored: list[str] | None = None
+
+
+class FormatTemplatesOut(FormatTemplateOut):
+    """A format's templates in a version of an environment."""
+
+    environment: str
+    version: int
+
+
+class TemplatesOut(BaseModel):
+    """A version's templates."""
+
+    environment: str
+    version: int
+    set: str
+    sets: list[str]
+    formats: list[FormatTemplateOut]
+
 
 router = APIRouter(tags=["templates"], route_class=StrictRoute)
 
@@ -82,7 +153,7 @@ def get_templates(
         "sets": list(templates.SETS),
         "formats": [_line(stored_version.templates, one) for one in fmts],
     }
-    return json_response(body, headers=_headers(stored_version))
+    return json_response(body, headers=version_headers(stored_version))
 
 
 @router.put("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Choose a template set")
@@ -128,7 +199,7 @@ def get_format_templates(
     fmt = templates.check_format(format)
     stored_version = services.store.version(env, parse_version_ref(version))
     body = {"environment": env, "version": stored_version.number, **_line(stored_version.templates, fmt)}
-    return json_response(body, headers=_headers(stored_version))
+    return json_response(body, headers=version_headers(stored_version))
 
 
 @router.put(
@@ -202,8 +273,3 @@ def _line(stored_templates: Templates, fmt: Format) -> dict[str, Any]:
         "effective": templates.effective(stored_templates, fmt),
         **({"ignored": list(ignored)} if ignored else {}),
     }
-
-
-def _headers(version: Version) -> dict[str, str]:
-    number = str(version.number)
-    return {"etag": f'"{number}"', "fleetmap-version": number, "fleetmap-root": version.root}

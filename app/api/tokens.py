@@ -3,18 +3,64 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Path
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
-from app.api.auth import ServerAdmin
-from app.api.dependencies import ServicesDep
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, problem_responses
+from app.api.http.auth import ServerAdmin
+from app.api.http.dependencies import ServicesDep
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import ApiTime, RequestModel, problem_responses
 from app.errors import Conflict, Invalid, NotFound, Problem
 from app.events.messages import ROBOT_NAME
 from app.store.values import Token, rfc3339
+
+
+class TokenBody(RequestModel):
+    """A new token."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"name": "mower-3", "role": "robot", "environments": "farm*", "robot": "mower-3"}]
+        },
+    )
+
+    name: str = Field(min_length=1, max_length=200, description="Who it is for; it stands as author in the history.")
+    role: Literal["viewer", "robot", "editor", "admin"]
+    environments: str | None = Field(
+        None, min_length=1, max_length=200, description="Name pattern (`farm-*`) of the environments it reaches."
+    )
+    robot: str | None = Field(
+        None,
+        min_length=1,
+        max_length=200,
+        description="Role `robot`: the robot whose status it may set. Default: `name`.",
+    )
+    expires: ApiTime | None = Field(None, description="RFC 3339 time with zone; left out: never.")
+
+
+class TokenOut(BaseModel):
+    """A token without its secret."""
+
+    id: str
+    name: str
+    role: str
+    environments: str | None
+    robot: str | None
+    expires: datetime | None
+    created: datetime
+    ended: datetime | None = Field(description="When it was seen to have expired; it stays expired.")
+
+
+class NewTokenOut(TokenOut):
+    """A new token with its secret, which is told only now."""
+
+    token: str
+
+
+TokenPath = Annotated[str, Path(max_length=100, description="A token's id.")]
 
 router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=StrictRoute)
 

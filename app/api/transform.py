@@ -6,17 +6,26 @@ from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Query
+from pydantic import BaseModel
 from starlette.responses import Response
 
-from app.api.auth import Viewer
-from app.api.dependencies import ServicesDep
-from app.api.environments import numbers
-from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_response
-from app.api.schemas import VERSION, EnvironmentPath, TransformOut, problem_responses
+from app.api.http.auth import Viewer
+from app.api.http.dependencies import ServicesDep
+from app.api.http.parameters import numbers, parse_version_ref
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import VERSION, DatumOut, EnvironmentPath, problem_responses
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES
 from app.model.geodesy import local_frame
+
+
+class TransformOut(BaseModel):
+    """One place in both frames."""
+
+    latlon: list[float]
+    xy: list[float]
+    datum: DatumOut
+
 
 router = APIRouter(prefix="/environments/{env}", tags=["transform"], route_class=StrictRoute)
 

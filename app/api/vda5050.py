@@ -4,33 +4,66 @@ from __future__ import annotations
 
 import dataclasses
 import secrets
+from datetime import datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Query, Request
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats
-from app.api.auth import Principal, RobotRole, Viewer
-from app.api.dependencies import Services, ServicesDep
-from app.api.jobs import JobStarted, job_started_response
+from app.api.http.auth import Principal, RobotRole, Viewer
+from app.api.http.conversions import JobStarted, job_started_response
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
+from app.api.http.responses import StrictRoute, json_response
+from app.api.http.schemas import CHANNEL, NAME, EnvironmentPath, VersionPath, problem_responses
 from app.api.links import LinkedFile, link_to
-from app.api.maps import parse_version_ref
-from app.api.responses import StrictRoute, json_response
-from app.api.robots import require_report_permission, store_report
-from app.api.schemas import (
-    CHANNEL,
-    NAME,
-    ActionsOut,
-    EnvironmentPath,
-    RobotPath,
-    StateOut,
-    VersionPath,
-    problem_responses,
-)
+from app.api.robots import RobotOut, RobotPath, require_report_permission, store_report
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
 from app.store.values import Channel, RobotReport, RobotState, Version
+
+
+class FloorActionsOut(BaseModel):
+    """Instant actions of VDA 5050 for one floor of a version."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    map_id: str = Field(alias="mapId")
+    map_version: str = Field(alias="mapVersion")
+    level: str | None = Field(description="Null where no level was named.")
+    size: int = Field(description="Bytes behind the link.")
+    expires: datetime | None = Field(description="End of the link; null where it needs a token.")
+    download_map: dict[str, Any] = Field(alias="downloadMap")
+    enable_map: dict[str, Any] = Field(alias="enableMap")
+    delete_map: dict[str, Any] = Field(alias="deleteMap")
+
+
+class MissingLevelOut(BaseModel):
+    """A level without such a map, and why."""
+
+    level: str
+    detail: str
+
+
+class ActionsOut(FloorActionsOut):
+    """Instant actions of VDA 5050 for one version: of its first floor, and in ``maps`` of each."""
+
+    environment: str
+    version: int
+    root: str
+    maps: list[FloorActionsOut]
+    missing: list[MissingLevelOut] = Field(description="With `level=*`: levels that have no such map.")
+
+
+class StateOut(BaseModel):
+    """What became of a vehicle's state."""
+
+    robots: list[RobotOut]
+    ignored: list[dict[str, str]]
+
 
 router = APIRouter(tags=["vda5050"], route_class=StrictRoute)
 

@@ -2,47 +2,144 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request
-from pydantic import ValidationError
+from fastapi.exceptions import RequestValidationError
+from pydantic import ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from app import formats
-from app.api.auth import Editor, Principal, Viewer
-from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
-from app.api.dependencies import Services, ServicesDep
-from app.api.maps import IN_MEMORY, parse_version_ref, stream_file
-from app.api.problems import UnsupportedMedia
-from app.api.responses import StrictRoute, api_path, json_response, page_response
-from app.api.schemas import (
+from app.api.http.auth import Editor, Viewer
+from app.api.http.caching import content_disposition, none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.forms import FormFields
+from app.api.http.parameters import parse_version_ref
+from app.api.http.problems import MalformedBody, UnsupportedMedia
+from app.api.http.responses import StrictRoute, commit_response, json_response, page_response, version_headers
+from app.api.http.schemas import (
+    MAX_TEXT,
     VERSION,
     Cursor,
-    EditsBody,
     EnvironmentPath,
     IdempotencyKey,
     IfMatch,
     Limit,
-    RevertBody,
+    RequestModel,
     SourceOut,
     VersionOut,
     VersionPath,
     problem_responses,
 )
-from app.api.uploads import UploadForm
+from app.api.http.streams import IN_MEMORY, range_headers, raw_response, requested_range, stream_file
+from app.api.http.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
-from app.ingest import CommitResult, SpooledFile, Upload
-from app.ingest.service import name_problem
-from app.model.frame import GROUND, Level
+from app.ingest import CommitResult, Upload
 from app.store.values import Source
-from app.upload_reader import DRAWN_LAYERS, parse_drawn_layer
+from app.upload_reader import DRAWN_LAYERS
+
+
+class RevertBody(RequestModel):
+    """A new version with the content of an old one."""
+
+    revert_to: int = Field(ge=0, description="The old version's number.")
+    message: str = Field("", max_length=MAX_TEXT)
+
+
+class PutChange(RequestModel):
+    """Add or replace one feature, by id.
+
+    A feature may be put back as `GET …/layers/{layer}` shows it: what was not edited stays exactly as it is stored. A
+    feature that is there already keeps its anchor (local metres, or a place on earth), whatever `crs` its new place is
+    told in; delete it and put it again to anchor it otherwise. A fence's `properties.datum` sets the environment's
+    datum. Edges that end at a node which is moved move along.
+    """
+
+    op: Literal["put"]
+    layer: Literal["location", "objects", "topology", "zones"]
+    feature: dict[str, Any] = Field(
+        description="GeoJSON Feature with an `id` (a text); `place` instead of `geometry` is local metres. An edge "
+        "without geometry runs straight."
+    )
+    level: str | None = Field(None, max_length=256)
+    name: str | None = Field(None, max_length=256, description="The part's name, where a layer has several.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="What `geometry` is in; default: wgs84 where there is a datum."
+    )
+
+
+class DeleteChange(RequestModel):
+    """Remove one feature, by id."""
+
+    op: Literal["delete"]
+    layer: Literal["location", "objects", "topology", "zones"]
+    id: str = Field(min_length=1, max_length=512)
+    level: str | None = Field(None, max_length=256)
+    name: str | None = Field(None, max_length=256)
+
+
+class CellsChange(RequestModel):
+    """Set the cells of a grid whose centres lie in a polygon."""
+
+    op: Literal["cells"]
+    grid: str | None = Field(None, max_length=256, description="Default: `map`, else the only grid.")
+    level: str | None = Field(None, max_length=256)
+    polygon: dict[str, Any] = Field(description="GeoJSON Polygon or MultiPolygon.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="What the polygon is in; default: wgs84 where there is a datum."
+    )
+    value: int = Field(ge=0, le=255, description="0 free … 100 occupied, 255 unknown.")
+
+
+Change = Annotated[PutChange | DeleteChange | CellsChange, Field(discriminator="op")]
+
+
+class EditsBody(RequestModel):
+    """Changes that make one version together, or none."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "message": "a charging dock by the gate",
+                    "changes": [
+                        {
+                            "op": "put",
+                            "layer": "topology",
+                            "feature": {
+                                "type": "Feature",
+                                "id": "dock",
+                                "geometry": {"type": "Point", "coordinates": [5.6133, 52.4206]},
+                                "properties": {"kind": "node", "name": "dock"},
+                            },
+                        },
+                        {
+                            "op": "put",
+                            "layer": "topology",
+                            "feature": {
+                                "type": "Feature",
+                                "id": "Gate_dock",
+                                "geometry": None,
+                                "properties": {"kind": "edge", "source": "Gate", "target": "dock"},
+                            },
+                        },
+                    ],
+                }
+            ]
+        },
+    )
+
+    message: str = Field("", max_length=MAX_TEXT)
+    changes: list[Change] = Field(min_length=1, max_length=100_000)
+
 
 router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=StrictRoute)
 
 UPLOAD_BODY: dict[str, Any] = {
     "x-free-query": True,
+    "x-schemas": {"RevertBody": RevertBody.model_json_schema()},
     "requestBody": {
         "required": True,
         "content": {
@@ -127,12 +224,26 @@ async def create_version(
         async with services.intake.receive(request) as form:
             upload = _upload(form, request)
             outcome = await run_in_threadpool(
-                _count_upload, services, services.ingest.upload, env, upload, principal, if_match, idempotency_key
+                _counted,
+                services,
+                services.ingest.upload,
+                env,
+                upload,
+                author=principal.name,
+                if_match=if_match,
+                idempotency=idempotency_key,
             )
     elif media == "application/json" or media.endswith("+json"):
         _no_query(request)
+        body = await _revert_body(request)
         outcome = await run_in_threadpool(
-            _revert, services, env, await _revert_body(request), principal, if_match, idempotency_key
+            services.ingest.revert,
+            env,
+            body.revert_to,
+            message=body.message,
+            author=principal.name,
+            if_match=if_match,
+            idempotency=idempotency_key,
         )
     else:
         raise UnsupportedMedia("send multipart/form-data with files, or application/json with revert_to")
@@ -158,15 +269,16 @@ def create_edit(
 ) -> Response:
     """Some features put or deleted, some cells set: one version, or none. Edges that would dangle are refused."""
     changes = [change.model_dump(exclude_none=True) for change in body.changes]
-    _count = services.metrics.uploads.labels
-    try:
-        outcome = services.ingest.edit(
-            env, changes, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
-        )
-    except FleetMapError:
-        _count("refused").inc()
-        raise
-    _count(outcome.status).inc()
+    outcome = _counted(
+        services,
+        services.ingest.edit,
+        env,
+        changes,
+        message=body.message,
+        author=principal.name,
+        if_match=if_match,
+        idempotency=idempotency_key,
+    )
     return commit_response(outcome)
 
 
@@ -174,8 +286,7 @@ def create_edit(
 def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """A version by number, by channel, or the newest."""
     version = services.store.version(env, parse_version_ref(v))
-    headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    return json_response(version.as_dict(), headers=headers)
+    return json_response(version.as_dict(), headers=version_headers(version))
 
 
 @router.get(
@@ -227,23 +338,14 @@ def get_source(
         (b"etag", etag.encode()),
     ]
     if none_match(request.headers.get("if-none-match"), etag):
-        response = Response(status_code=304)
-        response.raw_headers = [(n, v) for n, v in headers if n in (b"etag", b"cache-control")]
-        return response
-    part = byte_range(request.headers.get("range"), request.headers.get("if-range"), etag, source.size)
-    if isinstance(part, Unsatisfiable):
-        detail = f"the file has {source.size} bytes"
-        raise HTTPException(416, detail, {"content-range": f"bytes */{source.size}"})
+        return raw_response(304, [(n, v) for n, v in headers if n in (b"etag", b"cache-control")])
+    part = requested_range(request, etag, source.size)
     start, end = part or (0, source.size)
-    headers.insert(0, (b"content-length", str(end - start).encode()))
-    if part:
-        headers.insert(1, (b"content-range", f"bytes {start}-{end - 1}/{source.size}".encode()))
+    headers = [*range_headers(part, source.size), *headers]
     status = 206 if part else 200
     if source.size > IN_MEMORY:
         return stream_file(services.store.blobs.open(source.sha256), start, end, status, headers)
-    response = Response(services.store.blobs.get(source.sha256)[start:end], status)
-    response.raw_headers = headers
-    return response
+    return raw_response(status, headers, services.store.blobs.get(source.sha256)[start:end])
 
 
 def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Source:
@@ -254,83 +356,26 @@ def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Sourc
     return next((s for s in fitting if s.used), fitting[0])
 
 
-def commit_response(outcome: CommitResult) -> Response:
-    """The answer for what became of a change: 201 where there is a new version, also when it is told again."""
-    version = outcome.version
-    if version is None:
-        return json_response(outcome.body)
-    headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
-    location = api_path("environments", version.environment, "versions", version.number)
-    if outcome.status == "unchanged":
-        return json_response(outcome.body, headers={**headers, "content-location": location})
-    return json_response(outcome.body, 201, {**headers, "location": location})
-
-
 def _upload(form: UploadForm, request: Request) -> Upload:
     """What the form and the query say, checked."""
-    fields = dict(form.fields)
-    for name, value in request.query_params.multi_items():
-        if name in fields:
-            raise Invalid(f"{name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
-        fields[name] = value
-    layer = parse_drawn_layer(fields.pop("layer", "") or None)
-    mode = fields.pop("mode", "") or "replace"
+    fields = FormFields(form, request.query_params.multi_items())
+    mode = fields.take("mode") or "replace"
     if mode not in ("replace", "merge"):
         raise Invalid("mode must be replace or merge", [Problem("unknown", where="mode")])
-    level = fields.pop("level", "") or GROUND
-    Level(level)
-    message = fields.pop("message", "")
+    hints, message, dry_run = fields.take_hints(), fields.take("message"), fields.take_flag("dry_run")
     return Upload(
         files=tuple(form.files),
-        format=parse_format_name(fields.pop("format", ""), "format"),
-        layer=layer,
-        level=level,
-        grid=fields.pop("grid", "") or None,
+        hints=replace(hints, options=fields.take_rest()),
         mode=mode,  # type: ignore[arg-type]  # checked above
         message=message,
-        dry_run=truth(fields.pop("dry_run", ""), "dry_run"),
-        options=fields,
+        dry_run=dry_run,
     )
 
 
-def parse_format_name(text: str, location: str) -> str | None:
-    """A format's id as a form says it; empty is none. Invalid, with those there are, where it is not known."""
-    if not text:
-        return None
+def _counted(services: Services, change: Callable[..., CommitResult], *args: Any, **kwargs: Any) -> CommitResult:
+    """Carry out an upload or edit, and count what became of it."""
     try:
-        return formats.get_format(text).name
-    except NotFound as error:
-        raise Invalid(error.detail, [Problem("no such format", where=location)]) from None
-
-
-def check_names(files: list[SpooledFile]) -> None:
-    """Invalid for names that cannot be kept, and where there is no file at all."""
-    if not files:
-        raise Invalid("there is no file: send at least one in the field 'files'", [Problem("missing", where="files")])
-    seen: set[str] = set()
-    for file in files:
-        problem = name_problem(file.name) or ("this name is used twice" if file.name in seen else None)
-        if problem:
-            shown = file.name[:200]
-            raise Invalid(f"the file name {shown!r} cannot be used: {problem}", [Problem(problem, shown)])
-        seen.add(file.name)
-
-
-def truth(text: str, parameter: str) -> bool:
-    """A form's yes or no; empty is no."""
-    values = {"": False, "false": False, "0": False, "no": False, "true": True, "1": True, "yes": True}
-    if text.lower() not in values:
-        raise Invalid(
-            f"{parameter} must be true or false, got {text[:80]!r}", [Problem("true or false", where=parameter)]
-        )
-    return values[text.lower()]
-
-
-def _count_upload(
-    services: Services, take: Any, env: str, upload: Upload, principal: Principal, if_match: str | None, key: str | None
-) -> CommitResult:
-    try:
-        outcome: CommitResult = take(env, upload, author=principal.name, if_match=if_match, idempotency=key)
+        outcome = change(*args, **kwargs)
     except FleetMapError:
         services.metrics.uploads.labels("refused").inc()
         raise
@@ -338,19 +383,7 @@ def _count_upload(
     return outcome
 
 
-def _revert(
-    services: Services, env: str, body: RevertBody, principal: Principal, if_match: str | None, key: str | None
-) -> CommitResult:
-    return services.ingest.revert(
-        env, body.revert_to, message=body.message, author=principal.name, if_match=if_match, idempotency=key
-    )
-
-
 async def _revert_body(request: Request) -> RevertBody:
-    from fastapi.exceptions import RequestValidationError
-
-    from app.api.problems import MalformedBody
-
     try:
         value = await request.json()
     except ValueError as error:

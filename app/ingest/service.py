@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import orjson
 
-from app import formats, parameters
 from app import generate as generators
+from app import parameters
 from app.errors import CannotDerive, Conflict, Invalid, Problem, StaleParent, UnreadableFile
 from app.ingest import online
 from app.ingest.alignment import AlignmentRequest, AlignmentResult, prepare_alignment, previous_alignment
@@ -23,8 +23,7 @@ from app.ingest.generation import GenerationRequest, prepare_generation
 from app.ingest.prepare import Mode, PreparedUpload, datum_moved_warnings, prepare_changes, prepare_upload
 from app.ingest.templates import TemplateUpdate
 from app.limits import Limits
-from app.model.frame import GROUND, Datum
-from app.model.layers import Layer
+from app.model.frame import Datum
 from app.pool import WorkerDied
 from app.store.changes import KEEP, Changes, Prepared
 from app.store.store import Store
@@ -59,14 +58,10 @@ class Upload:
     """What a client sent and said of it."""
 
     files: tuple[SpooledFile, ...]
-    format: str | None = None
-    layer: Layer | None = None
-    level: str = GROUND
-    grid: str | None = None
+    hints: UploadHints = field(default_factory=UploadHints)
     mode: Mode = "replace"
     message: str = ""
     dry_run: bool = False
-    options: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +96,11 @@ class Ingest:
         """
         _check_upload(upload)
         key = _idempotency(idempotency, _fingerprint(upload))
-        hints = UploadHints(upload.format, upload.layer, upload.level, upload.grid, dict(upload.options))
         paths = {f.name: f.path for f in upload.files}
 
         def once(base: Version) -> CommitResult:
             proposal: PreparedUpload = self._run_in_worker(
-                prepare_upload, base, paths, hints, upload.mode, self._limits
+                prepare_upload, base, paths, upload.hints, upload.mode, self._limits
             )
             notes = {n.name: n for n in proposal.notes}
             if upload.dry_run:
@@ -503,13 +497,14 @@ def check_if_match(header: str | None, head: Version) -> None:
 def _check_upload(upload: Upload) -> None:
     if not upload.files:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
-    if upload.mode not in ("replace", "merge"):
-        raise Invalid(f"mode must be replace or merge, got {upload.mode!r}")
-    if upload.format is not None:
-        formats.get_format(upload.format)
-    check_grid_name(upload.grid)
+    check_grid_name(upload.hints.grid)
+    check_file_names(upload.files)
+
+
+def check_file_names(files: Sequence[SpooledFile]) -> None:
+    """Invalid for names that cannot be kept, and for one that is used twice."""
     seen: set[str] = set()
-    for file in upload.files:
+    for file in files:
         problem = name_problem(file.name)
         if problem is None and file.name in seen:
             problem = "this name is used twice"
@@ -566,9 +561,10 @@ def _idempotency(key: str | None, fingerprint: str) -> Idempotency | None:
 
 
 def _fingerprint(upload: Upload) -> str:
-    values = [upload.format, upload.layer, upload.level, upload.grid, upload.mode, upload.message, upload.dry_run]
+    hints = upload.hints
+    values = [hints.format, hints.layer, hints.level, hints.grid, upload.mode, upload.message, upload.dry_run]
     files = sorted([f.name, f.sha256] for f in upload.files)
-    return _digest(["upload", values, dict(sorted(upload.options.items())), files])
+    return _digest(["upload", values, dict(sorted(hints.options.items())), files])
 
 
 def _exceeds_depth(limit: int, value: Any) -> bool:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import orjson
 from sqlalchemy import Connection, Engine, create_engine, event, exc
@@ -22,9 +22,6 @@ from sqlalchemy.engine import make_url
 from app.errors import DISK_FULL_ERRNOS, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
 
 log = logging.getLogger(__name__)
-
-if TYPE_CHECKING:
-    from app.store.audit import Caller
 
 BUSY_MILLISECONDS = 5000
 TURN_SECONDS = 30.0
@@ -113,6 +110,12 @@ class _FileGone(DatabaseDamaged):
     """SQLite's file is not the one that was opened. It may come back at any moment."""
 
 
+class AuditMark(Protocol):
+    """Whether a request's row in the audit log is committed."""
+
+    recorded: bool
+
+
 class Database:
     """Transactions on an engine. Every database error that another try may not have becomes Unavailable.
 
@@ -126,7 +129,7 @@ class Database:
         *,
         readonly: bool,
         written: Callable[[], None] = lambda: None,
-        record: Callable[[Connection], Caller | None] = lambda _: None,
+        record: Callable[[Connection], AuditMark | None] = lambda _: None,
     ) -> None:
         self.engine = engine(url, readonly=readonly)
         self._written, self._record = written, record

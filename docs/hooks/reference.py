@@ -32,10 +32,10 @@ from pydantic import SecretStr
 from typer.main import get_command
 
 from app import derive, generate
-from app.api import problems
-from app.api.auth import RequireRole
-from app.api.metrics import Metrics, _HeadVersionCollector, _Scrubs
-from app.api.responses import API
+from app.api.http import problems
+from app.api.http.auth import RequireRole
+from app.api.http.metrics import Metrics, _HeadVersionCollector, _Scrubs
+from app.api.http.responses import API
 from app.cli import commands
 from app.config import Settings, format_size
 from app.derive import Derivation

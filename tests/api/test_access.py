@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from app.api.auth import (
+from app.api.http.auth import (
     FRESH_SECONDS,
     WINDOW_SECONDS,
     Authenticator,
@@ -16,7 +16,7 @@ from app.api.auth import (
     is_loopback,
     is_open,
 )
-from app.api.problems import Throttled
+from app.api.http.problems import Throttled
 from app.errors import Denied, Unauthenticated
 from app.store.values import Role, Token
 

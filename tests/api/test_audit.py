@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from app.api import middleware
-from app.api.middleware import MAX_LOGGED_REJECTIONS
+from app.api.http import middleware
+from app.api.http.middleware import MAX_LOGGED_REJECTIONS
 from app.logs import REQUEST_ID, JsonFormatter, TextFormatter
 from app.store.audit import CALLER, Caller
 from app.store.store import Store

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from app.api.caching import Unsatisfiable, byte_range, content_disposition, match, none_match
+from app.api.http.caching import Unsatisfiable, byte_range, content_disposition, match, none_match
 
 TAG = '"abc"'
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from app.api.dependencies import Writability
+from app.api.http.dependencies import Writability
 from app.errors import NoRoom
 from tests.api import samples
 from tests.api.conftest import Api, problem, running, settings_for
@@ -80,7 +80,7 @@ def test_a_large_cached_map_that_is_damaged_is_never_received_whole(
     own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("app.api.maps.IN_MEMORY", 100)
-    monkeypatch.setattr("app.api.maps.CHUNK", 64)
+    monkeypatch.setattr("app.api.http.streams.CHUNK", 64)
     api, folder = own
     farm = environment(api, "large")
     before = set(cached(folder))
@@ -211,8 +211,8 @@ def test_the_disk_is_probed_once_for_many_requests() -> None:
 
 def test_readiness_probes_the_disk_now_and_then(own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     api, probes = own[0], list[int]()
-    monkeypatch.setattr("app.api.dependencies.WRITABLE_SECONDS", 3600.0)
-    monkeypatch.setattr("app.api.uploads.check_room", lambda _: probes.append(1))
+    monkeypatch.setattr("app.api.http.dependencies.WRITABLE_SECONDS", 3600.0)
+    monkeypatch.setattr("app.api.http.uploads.check_room", lambda _: probes.append(1))
     api.app.state.services.writability.forget()
     for _ in range(5):
         assert api.get("/readyz?for=writes").json()["writes"] == "ok"

@@ -18,7 +18,7 @@ from backports import zstd
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from app.api.deltas import Deltas
+from app.api.http.deltas import Deltas
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 

@@ -312,10 +312,11 @@ def test_a_fleet_asks_at_once(api: Api, farm: str) -> None:
 
 def test_a_large_file_is_streamed_from_disk(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.api import maps
+    from app.api.http import streams
 
     small = api.get(f"/maps/{farm}/tmap2")
     monkeypatch.setattr(maps, "IN_MEMORY", 100)
-    monkeypatch.setattr(maps, "CHUNK", 1000)
+    monkeypatch.setattr(streams, "CHUNK", 1000)
     api.app.state.services.response_cache._entries.clear()
     for _ in range(2):
         large = api.get(f"/maps/{farm}/tmap2")

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from app.api import channels, maps
-from app.api.auth import Authenticator
-from app.api.single_flight import SingleFlight
+from app.api.http.auth import Authenticator
+from app.api.http.single_flight import SingleFlight
 from app.errors import NotFound, Unavailable
 from app.store.database import Database
 from app.store.store import Store
@@ -128,7 +128,7 @@ def test_no_map_is_older_than_a_commit_that_was_told(api: Api, bare: str, monkey
     api.get(f"environments/{bare}/versions/2/maps/tmap2/network.tmap2.yaml")
     services = api.app.state.services
     gate, began = Gate(), threading.Event()
-    find, ready = maps._resolve, services.maps.get_cached
+    find, ready = maps.resolve_recipe, services.maps.get_cached
 
     def resolve(*args: Any) -> Any:
         result = find(*args)
@@ -143,7 +143,7 @@ def test_no_map_is_older_than_a_commit_that_was_told(api: Api, bare: str, monkey
             gate()
         return ready(recipe)
 
-    monkeypatch.setattr(maps, "_resolve", resolve)
+    monkeypatch.setattr(maps, "resolve_recipe", resolve)
     monkeypatch.setattr(services.maps, "get_cached", slow)
     with at_once(2) as ask:
         first = ask(api.get, path)

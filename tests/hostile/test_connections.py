@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from app.api.connections import TRUST_SECONDS, ConnectionLimits, Connections, fit_open_files
+from app.api.http.connections import TRUST_SECONDS, ConnectionLimits, Connections, fit_open_files
 from tests.api.conftest import ADMIN, Api, running, settings_for
 from tests.certificates import Authority
 from tests.cli.conftest import ServerProcess

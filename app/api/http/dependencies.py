@@ -7,12 +7,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from fastapi import Depends, Request
 
-from app.api.auth import Authenticator
-from app.api.signed import SignedLinks
+from app.api.http.auth import Authenticator
+from app.api.http.conversions import ConversionJobs
+from app.api.http.deltas import Deltas
+from app.api.http.metrics import Metrics
+from app.api.http.response_cache import ResponseCache
+from app.api.http.signed import SignedLinks
+from app.api.http.uploads import UploadSpool
 from app.convert.maps import Maps
 from app.errors import Unavailable
 from app.fleet import ReportQueue as FleetIntake
@@ -21,13 +26,6 @@ from app.limits import Limits
 from app.pool import Pool
 from app.signing import Keys
 from app.store.store import Store
-
-if TYPE_CHECKING:
-    from app.api.deltas import Deltas
-    from app.api.jobs import ConversionJobs
-    from app.api.maps import ResponseCache
-    from app.api.metrics import Metrics
-    from app.api.uploads import UploadSpool
 
 WRITABLE_SECONDS = 2.0
 """How long it is remembered whether something can be stored."""

@@ -14,7 +14,9 @@ from fastapi.routing import APIRoute
 from starlette.responses import Response
 
 from app.errors import Invalid, Problem
+from app.ingest import CommitResult
 from app.model.names import did_you_mean
+from app.store.values import Version
 
 API = "/api/v1"
 
@@ -42,6 +44,24 @@ def page_response(request: Request, items: list[Any], cursor: str | None) -> Res
         path = quote(request.url.path, safe="/")
         headers["link"] = f'<{path}?{urlencode([*query, ("cursor", cursor)])}>; rel="next"'
     return json_response(items, headers=headers)
+
+
+def version_headers(version: Version) -> dict[str, str]:
+    """``ETag`` for ``If-Match``, and which version it is."""
+    number = str(version.number)
+    return {"etag": f'"{number}"', "fleetmap-version": number, "fleetmap-root": version.root}
+
+
+def commit_response(outcome: CommitResult) -> Response:
+    """The answer for what became of a change: 201 where there is a new version, also when it is told again."""
+    version = outcome.version
+    if version is None:
+        return json_response(outcome.body)
+    headers = version_headers(version)
+    location = api_path("environments", version.environment, "versions", version.number)
+    if outcome.status == "unchanged":
+        return json_response(outcome.body, headers={**headers, "content-location": location})
+    return json_response(outcome.body, 201, {**headers, "location": location})
 
 
 class _StrictRequest(Request):

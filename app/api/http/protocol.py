@@ -18,8 +18,9 @@ from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.protocols.utils import get_remote_addr
 
-from app.api.connections import Connections
-from app.api.problems import MEDIA_TYPE, RETRY_SECONDS, document
+from app.api.http.auth import PROVE
+from app.api.http.connections import Connections
+from app.api.http.problems import MEDIA_TYPE, RETRY_SECONDS, document
 
 MAX_HEAD = 64 * 2**10
 """Bytes of a request line and headers."""
@@ -30,9 +31,6 @@ LINGER_BYTES = 64 * 2**20
 
 ON_STOP = "on_stop"
 """In the ``state`` of a request's scope: what to call where the server stops before its answer has ended."""
-
-PROVE = "prove"
-"""In the ``state`` of a request's scope: what to call once the request has shown a valid token or link."""
 
 
 def _feed(protocol: Any, data: bytearray) -> None:

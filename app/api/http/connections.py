@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from app.api.auth import client_source, is_loopback
+from app.api.http.auth import client_source, is_loopback
 
 log = logging.getLogger(__name__)
 

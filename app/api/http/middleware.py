@@ -10,22 +10,20 @@ import logging
 import re
 import secrets
 import time
-from urllib.parse import urlsplit
 
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api import problems
-from app.api.auth import MAX_SOURCES, Principal, client_source, environment_in_path, is_open
-from app.api.dependencies import Services
-from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
-from app.api.protocol import PROVE
-from app.api.responses import API
-from app.api.signed import LINK, request_link
-from app.api.single_flight import SingleFlight
-from app.errors import Denied, FleetMapError, TooLarge
+from app.api.http import problems
+from app.api.http.auth import MAX_SOURCES, Principal, authorise, client_source, environment_in_path, is_open
+from app.api.http.dependencies import Services
+from app.api.http.problems import SlowBody, UnsupportedMedia
+from app.api.http.responses import API
+from app.api.http.signed import LINK, request_link
+from app.api.http.single_flight import SingleFlight
+from app.errors import FleetMapError, TooLarge
 from app.logs import REQUEST_ID, log_request
 from app.store.audit import CALLER, Caller
 
@@ -37,8 +35,6 @@ MULTIPART_OVERHEAD = 2**20
 PART_OVERHEAD = 1024
 _BODY = frozenset({"POST", "PUT", "PATCH"})
 _METHODS = frozenset({"GET", "DELETE", "OPTIONS", *_BODY})
-_LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
-
 
 _REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 _REPORT = re.compile(r"/api/v1/robots/[^/]+/(?:status|vda5050/state)")
@@ -107,18 +103,14 @@ class Guard:
 
     async def _pass(self, scope: Scope, body: _RequestBody, answer: _ResponseSender, services: Services) -> None:
         headers = _headers(scope)
-        if services.options.insecure_no_auth:
-            _require_local_origin(headers)
+        services.access.check_origin(scope["headers"])
         if is_open(scope["path"]):
             # Anybody can send a body: it is not read before it is known who takes it.
             await self._app(scope, body, answer)
             return
         principal = await self._principal(scope, headers, services)
-        if PROVE in scope["state"]:
-            scope["state"][PROVE]()
         environment = environment_in_path(scope["path"])
-        if environment is not None:
-            principal.require_environment(environment)
+        authorise(scope, principal, environment)
         scope["state"]["principal"] = principal
         CALLER.set(_caller(scope, principal, environment))
         if scope["method"] in _BODY and body.check_headers(scope, headers):
@@ -226,21 +218,6 @@ def _log(scope: Scope, status: int, seconds: float, reason: str) -> None:
 
 def _headers(scope: Scope) -> dict[bytes, bytes]:
     return dict(scope["headers"])
-
-
-def _require_local_origin(headers: dict[bytes, bytes]) -> None:
-    if not is_local_origin(headers):
-        raise Denied(
-            "without access control the server answers only to a loopback name (localhost, 127.0.0.1), and no pages of "
-            "other sites"
-        )
-
-
-def is_local_origin(headers: dict[bytes, bytes]) -> bool:
-    """Without tokens a browser must not be led here by a foreign page (DNS rebinding, cross-site requests)."""
-    host = urlsplit("//" + headers.get(b"host", b"").decode("latin-1")).hostname
-    origin = headers.get(b"origin")
-    return host in _LOOPBACK and (origin is None or urlsplit(origin.decode("latin-1")).hostname in _LOOPBACK)
 
 
 class _ResponseSender:
@@ -362,14 +339,3 @@ def accepts_files(path: str) -> bool:
     if path == "/api/v1/convert":
         return True
     return len(parts) == 6 and parts[:4] == ["", "api", "v1", "environments"] and parts[5] == "versions"
-
-
-def multipart_boundary(content_type: str) -> bytes:
-    """The boundary of a multipart body; MalformedBody where there is none."""
-    from python_multipart.multipart import parse_options_header
-
-    _, options = parse_options_header(content_type)
-    boundary = options.get(b"boundary", b"")
-    if not 1 <= len(boundary) <= 200:
-        raise MalformedBody("the multipart body's Content-Type has no usable boundary")
-    return boundary

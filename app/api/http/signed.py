@@ -12,8 +12,8 @@ from urllib.parse import quote
 from starlette.types import Scope
 
 from app import links
-from app.api.auth import Authenticator, Principal
-from app.api.responses import API
+from app.api.http.auth import Authenticator, Principal
+from app.api.http.responses import API
 from app.errors import Invalid, InvalidLink, NotFound, Problem
 from app.links import LinkSecrets, SignedAddress
 from app.store.values import Environment

@@ -12,15 +12,17 @@ import re
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
+from starlette.types import Scope
 
-from app.api.problems import Throttled
+from app.api.http.problems import Throttled
 from app.errors import Denied, Unauthenticated
 from app.store.values import Role, Token
 
@@ -44,6 +46,10 @@ MAX_TOKEN = 512
 OPEN = frozenset({"/", "/healthz", "/readyz", "/docs", "/openapi.json"})
 """Addresses that need no token; also all below /docs/ (the pages' own files)."""
 
+PROVE = "prove"
+"""In the ``state`` of a request's scope: what to call once the request has shown a valid token or link."""
+
+_LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps)/([^/]+)(?:/.*)?", re.DOTALL)
 
 
@@ -62,6 +68,10 @@ class Principal:
     def from_token(cls, token: Token) -> Principal:
         """Who holds this token."""
         return cls(token.id, token.name, token.role, token.environments, token.robot, token.expires)
+
+    def has_expired(self) -> bool:
+        """Whether the token or link is over."""
+        return self.expires is not None and self.expires <= datetime.now(UTC)
 
     def has_role(self, need: RequiredRole) -> bool:
         """Whether the role allows it."""
@@ -86,6 +96,18 @@ class Principal:
         """Denied for tokens that are limited to some environments."""
         if self.environments is not None:
             raise Denied(f"this call takes a token for all environments; yours is limited to {self.environments}")
+
+
+def authorise(scope: Scope, principal: Principal, environment: str | None) -> None:
+    """Let a caller in whose token or link is valid: to the environment of the address, if it speaks of one.
+
+    Raises Denied. The connection counts as proven all the same. What role a call takes is for its route to say.
+    """
+    prove = scope["state"].get(PROVE)
+    if prove is not None:
+        prove()
+    if environment is not None:
+        principal.require_environment(environment)
 
 
 ANONYMOUS_ADMIN = Principal("", "anonymous", "admin")
@@ -120,6 +142,24 @@ class Authenticator:
         self._sources: OrderedDict[str, deque[float]] = OrderedDict()
         self._lock = threading.Lock()
         self.is_invalidated = 0
+
+    def check_origin(self, headers: Iterable[tuple[bytes, bytes]]) -> None:
+        """Denied without access control, unless a request names this machine and comes from no other site's page.
+
+        Without tokens a browser must not be led here by a foreign page (DNS rebinding, cross-site requests).
+        """
+        if not self.insecure:
+            return
+        values = dict(headers)
+        host = urlsplit("//" + values.get(b"host", b"").decode("latin-1")).hostname
+        origin = values.get(b"origin")
+        if host not in _LOOPBACK or (
+            origin is not None and urlsplit(origin.decode("latin-1")).hostname not in _LOOPBACK
+        ):
+            raise Denied(
+                "without access control the server answers only to a loopback name (localhost, 127.0.0.1), and no "
+                "pages of other sites"
+            )
 
     def cached_principal(self, header: bytes | None) -> Principal | None:
         """Who sent this Authorization header, if it was checked less than a second ago. Never blocks."""

@@ -12,7 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 
-from app.api.single_flight import SingleFlight
+from app.api.http.single_flight import SingleFlight
 from app.convert.cache import Cache, CachedFile
 
 if sys.version_info >= (3, 14):

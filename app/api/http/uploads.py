@@ -24,8 +24,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
-from app.api.middleware import multipart_boundary
-from app.api.problems import MalformedBody
+from app.api.http.problems import MalformedBody
 from app.errors import DISK_FULL_ERRNOS, Invalid, NoRoom, Problem, TooLarge, Unavailable
 from app.ingest import SpooledFile
 from app.limits import Limits
@@ -101,7 +100,7 @@ class UploadSpool:
             self._active += 1
         folder = self._folder / uuid4().hex
         try:
-            boundary = multipart_boundary(request.headers.get("content-type", ""))
+            boundary = _boundary(request.headers.get("content-type", ""))
             self._open()
             folder.mkdir()
             receiver = _MultipartReceiver(boundary, folder, self._limits)
@@ -114,6 +113,15 @@ class UploadSpool:
             with self._lock:
                 self._active -= 1
             await run_in_threadpool(shutil.rmtree, folder, True)
+
+
+def _boundary(content_type: str) -> bytes:
+    """The boundary of a multipart body; MalformedBody where there is none."""
+    _, options = parse_options_header(content_type)
+    boundary = options.get(b"boundary", b"")
+    if not 1 <= len(boundary) <= 200:
+        raise MalformedBody("the multipart body's Content-Type has no usable boundary")
+    return boundary
 
 
 async def _feed(request: Request, receiver: _MultipartReceiver) -> None:

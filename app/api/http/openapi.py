@@ -8,14 +8,13 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
-from pydantic import BaseModel
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from app import formats, parameters
-from app.api.auth import is_open
-from app.api.problems import MEDIA_TYPE
-from app.api.responses import API
-from app.api.schemas import ProblemOut, RevertBody, problem_responses
+from app.api.http.auth import is_open
+from app.api.http.problems import MEDIA_TYPE
+from app.api.http.responses import API
+from app.api.http.schemas import ProblemOut, problem_responses
 from app.derive import all_derivations
 from app.errors import NotFound
 from app.model.closures import CLOSURE_MODES
@@ -113,11 +112,12 @@ def build(app: FastAPI) -> dict[str, Any]:
     schemas = components.setdefault("schemas", {})
     schemas.pop("HTTPValidationError", None)
     schemas.pop("ValidationError", None)
-    models: dict[str, type[BaseModel]] = {"Problem": ProblemOut, "RevertBody": RevertBody}
-    for name, model in models.items():
-        shape = model.model_json_schema(ref_template="#/components/schemas/{model}")
-        schemas.update(shape.pop("$defs", {}))
-        schemas[name] = shape
+    problem = ProblemOut.model_json_schema(ref_template="#/components/schemas/{model}")
+    schemas.update(problem.pop("$defs"))
+    schemas["Problem"] = problem
+    for operations in schema["paths"].values():
+        for operation in operations.values():
+            schemas.update(operation.pop("x-schemas", {}))  # of bodies that a route reads itself
     components["securitySchemes"] = {
         "token": {"type": "http", "scheme": "bearer", "description": "A token; see `/api/v1/tokens`."},
         "link": {

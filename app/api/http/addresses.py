@@ -1,0 +1,94 @@
+"""What the address of a map asks for, and the version and recipe that it means."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from urllib.parse import quote
+
+from fastapi import Request
+
+from app.api.http.dependencies import Services
+from app.api.http.parameters import parse_options, parse_version_ref
+from app.api.http.responses import API
+from app.api.http.signed import LINK
+from app.convert.recipe import Recipe
+from app.errors import Invalid, NotFound
+from app.links import SignedAddress
+from app.model.closures import ClosureMode
+from app.store.values import LATEST, Version
+
+PRODUCTION = "production"
+
+_SHORT = re.compile(r"/maps/([^/]+)/([^/]+)(?:/(.+))?", re.DOTALL)
+_LONG = re.compile(rf"{API}/environments/([^/]+)/versions/([^/]+)/maps/([^/]+)(?:/(.+))?", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class MapRequest:
+    """What an address asks for, checked. version: None on a short address. file: None for the whole map. values: the
+    map's own parameters. derive: whether derived information is allowed. closures: None for the default of the address.
+    """
+
+    environment: str
+    version: str | None
+    format: str
+    file: str | None
+    values: Mapping[str, str] = field(default_factory=dict)
+    derive: bool = True
+    closures: ClosureMode | None = None
+
+
+def parse_map_request(request: Request) -> MapRequest:
+    """What the address of a map asks for. Raises Invalid for a query that cannot be read."""
+    link = signed_link(request)
+    options = parse_query(request.scope["query_string"] if link is None else link.query)
+    path = request.scope["path"]
+    if short := _SHORT.fullmatch(path):
+        return MapRequest(short[1], None, short[2], short[3], *options)
+    if long := _LONG.fullmatch(path):
+        return MapRequest(long[1], long[2], long[3], long[4], *options)
+    raise NotFound("there is no map at this address")
+
+
+def signed_link(request: Request) -> SignedAddress | None:
+    """The signed link, already checked, that a request was made by."""
+    link: SignedAddress | None = request.scope["state"].get(LINK)
+    return link
+
+
+def request_address(request: Request) -> str:
+    """The request's own address, to be asked for again; without the signature of a link."""
+    link = signed_link(request)
+    query = request.url.query if link is None else link.query.decode()
+    return quote(request.scope["path"], safe="/") + (f"?{quote(query, safe='&=%,.:+-_~/')}" if query else "")
+
+
+def parse_query(query: bytes) -> tuple[dict[str, str], bool, ClosureMode | None]:
+    """``parse_options`` of the bytes in an address."""
+    try:
+        text = query.decode("ascii")
+    except UnicodeDecodeError:
+        raise Invalid("the query cannot be read: it must be percent-encoded UTF-8") from None
+    return parse_options(text)
+
+
+def resolve_recipe(services: Services, wanted: MapRequest) -> Recipe:
+    """The recipe that an address means at this moment. Blocks. Raises what ``Maps.recipe`` raises."""
+    version = resolve_version(services, wanted)
+    return services.maps.recipe(version, wanted.format, wanted.values, derive=wanted.derive, file=wanted.file)
+
+
+def resolve_version(services: Services, wanted: MapRequest) -> Version:
+    """The version that an address means, with the closures that its maps show: on a short one production where there is
+    one, else the head.
+    """
+    target = partial(services.store.channel_target, wanted.environment)
+    if wanted.version is not None:
+        return target(parse_version_ref(wanted.version), wanted.closures)[0]
+    try:
+        return target(PRODUCTION, wanted.closures)[0]
+    except NotFound:
+        return target(LATEST, wanted.closures)[0]

@@ -1,0 +1,91 @@
+"""Values in addresses and forms, as text: numbers, positions, boxes, versions, and the parameters of a map."""
+
+from __future__ import annotations
+
+from urllib.parse import parse_qsl
+
+from app import formats
+from app.errors import Invalid, NotFound, Problem
+from app.formats import Format
+from app.model.closures import CLOSURE_MODES, ClosureMode
+from app.store.values import Box
+
+
+def numbers(text: str, parameter: str, names: str) -> tuple[float, ...]:
+    """Numbers separated by commas; Invalid unless there is one for each of ``names`` (``LAT,LON``)."""
+    count = names.count(",") + 1
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(abs(v) <= 1e9 for v in values):
+        raise Invalid(
+            f"{parameter} must be {names}: {count} numbers separated by commas", [Problem(names, where=parameter)]
+        )
+    return values
+
+
+def parse_box(text: str, parameter: str = "bbox") -> Box:
+    """West, south, east, north in degrees; west > east crosses the antimeridian."""
+    west, south, east, north = numbers(text, parameter, "W,S,E,N")
+    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
+        raise Invalid(
+            f"{parameter} must be west, south, east, north in degrees, with south ≤ north",
+            [Problem("W,S,E,N", where=parameter)],
+        )
+    return west, south, east, north
+
+
+def parse_position(text: str, parameter: str = "contains") -> tuple[float, float]:
+    """Latitude and longitude in degrees."""
+    latitude, longitude = numbers(text, parameter, "LAT,LON")
+    if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
+        raise Invalid(
+            f"{parameter} must be LAT,LON in degrees: the latitude comes first, within ±90",
+            [Problem("LAT,LON", where=parameter)],
+        )
+    return latitude, longitude
+
+
+def require_format(name: str, parameter: str) -> Format:
+    """A format by its id. Invalid, with those there are, for an unknown one."""
+    try:
+        return formats.get_format(name)
+    except NotFound as error:
+        raise Invalid(error.detail, [Problem("no such format", where=parameter)]) from None
+
+
+def parse_version_ref(ref: str) -> str | int:
+    """A version as an address names it: a number, or a channel."""
+    return int(ref) if ref.isascii() and ref.isdigit() and len(ref) <= 18 else ref
+
+
+def parse_options(query: str) -> tuple[dict[str, str], bool, ClosureMode | None]:
+    """A map's query: the format's options, whether derived information is allowed, and how closures are shown.
+
+    Raises Invalid; also for what is given twice.
+    """
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, max_num_fields=100, errors="strict")
+    except ValueError:
+        raise Invalid("the query cannot be read: it must be percent-encoded UTF-8 with at most 100 members") from None
+    values: dict[str, str] = {}
+    for name, value in pairs:
+        if name in values:
+            raise Invalid(f"the parameter {name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
+        values[name] = value
+    derive = values.pop("derive", "true")
+    if derive not in ("true", "false"):
+        raise Invalid(f"derive must be true or false, got {derive[:80]!r}", [Problem("true or false", where="derive")])
+    return values, derive == "true", closure_mode(values.pop("closures", None))
+
+
+def closure_mode(text: str | None) -> ClosureMode | None:
+    """The parameter ``closures`` of a map; None for the default of the address. Raises Invalid."""
+    if text is None:
+        return None
+    for mode in CLOSURE_MODES:
+        if mode == text:
+            return mode
+    accepted = ", ".join(CLOSURE_MODES)
+    raise Invalid(f"closures must be one of {accepted}, got {text[:80]!r}", [Problem(accepted, where="closures")])
