@@ -49,7 +49,7 @@ class JobStarted:
 class _RunningConversion:
     """A map in the making. waiters: requests that wait for it. jobs: principal's id -> job id."""
 
-    future: asyncio.Future[CachedMap]
+    future: asyncio.Future[tuple[Recipe, CachedMap]]
     stop: CancelHandle
     waiters: int = 0
     jobs: dict[str, str] = field(default_factory=dict)
@@ -65,8 +65,11 @@ class ConversionJobs:
         self._threads = ThreadPoolExecutor(MAX_CONCURRENT_CONVERSIONS, thread_name_prefix="fleetmap-make")
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def get_or_start(self, recipe: Recipe, principal: Principal, address: str) -> CachedMap | JobStarted:
-        """The map, or after ``seconds`` the job that will end with it. address: where the finished map is had.
+    async def get_or_start(
+        self, recipe: Recipe, principal: Principal, address: str
+    ) -> tuple[Recipe, CachedMap] | JobStarted:
+        """The map with the recipe that worked, or after ``seconds`` the job that will end with it. address: where the
+        finished map is had.
 
         Raises what making raises; Unavailable where too much is being made.
         """
@@ -175,7 +178,7 @@ class ConversionJobs:
             self._count(recipe.format.name, "cancelled")
         elif done.exception() is not None:
             self._count(recipe.format.name, "failed")
-        elif done.result().fresh:  # else another request or process had just made it
+        elif done.result()[1].fresh:  # else another request or process had just made it
             self._count(recipe.format.name, "made")
 
 

@@ -40,7 +40,7 @@ from app.api.single_flight import SingleFlight
 from app.convert.cache import CachedFile, CachedMap, LostMap
 from app.convert.maps import select_file
 from app.convert.recipe import Recipe
-from app.errors import CannotDerive, Invalid, NotFound, Problem, Unavailable
+from app.errors import Invalid, NotFound, Problem, Unavailable
 from app.links import SignedAddress
 from app.model.closures import CLOSURE_MODES, ClosureMode
 from app.store.values import LATEST, Version
@@ -159,11 +159,12 @@ class ResponseCache:
                 outcome = await services.jobs.get_or_start(recipe, principal, request_address(request))
                 if isinstance(outcome, JobStarted):
                     return outcome
+                working, cached_map = outcome
+                if working.key != recipe.key:
+                    continue  # made another way, so with another tag, which the client may have
                 entry = await self._poll_task.run(
-                    (key, _recipe_identity(recipe), "fill"), self._fill, key, empty, outcome
+                    (key, _recipe_identity(recipe), "fill"), self._fill, key, empty, cached_map
                 )
-            except CannotDerive:
-                continue  # it is remembered: the next recipe goes another way, or says that there is none
             except LostMap:  # damaged or evicted while it was read: it is made again
                 if attempt >= MAX_LOST_ATTEMPTS:
                     raise
@@ -661,20 +662,12 @@ async def convert_at_address(
 async def convert_plan(
     services: Services, plan: Callable[[], Recipe], address: str, principal: Principal
 ) -> tuple[Recipe, CachedMap] | JobStarted:
-    """The map of a recipe, made where need be; the job that makes it for ``address`` if it takes long.
-
-    plan: called again if a derivation finds nothing to use; the next recipe goes another way, or says there is none.
-    """
-    while True:
-        recipe = await run_in_threadpool(plan)
-        cached_map = await run_in_threadpool(services.maps.get_cached, recipe)
-        if cached_map is not None:
-            return recipe, cached_map
-        try:
-            outcome = await services.jobs.get_or_start(recipe, principal, address)
-        except CannotDerive:
-            continue
-        return outcome if isinstance(outcome, JobStarted) else (recipe, outcome)
+    """The map of a plan, made where need be; the job that makes it for ``address`` if it takes long."""
+    recipe = await run_in_threadpool(plan)
+    cached_map = await run_in_threadpool(services.maps.get_cached, recipe)
+    if cached_map is not None:
+        return recipe, cached_map
+    return await services.jobs.get_or_start(recipe, principal, address)
 
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
