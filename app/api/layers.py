@@ -328,7 +328,7 @@ def _voxels(services: Services, version: Version, key: PartKey, box: Box | None,
         options = {"kind": "bt", "name": key.name, "level": key.level}
         if column is not None:
             options["bbox"] = ",".join(map(repr, column))
-        cached_map = services.maps.get_or_convert(services.maps.recipe(version, "octomap", options))
+        cached_map = services.maps.get_blocking(version, "octomap", options)
         return Response(cached_map.single_file().read(), media_type=kind)
     part = services.store.load(version, [key]).parts[key]
     assert isinstance(part, VoxelMap)

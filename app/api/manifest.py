@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import hashlib
 from collections.abc import Mapping
@@ -28,7 +27,7 @@ from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
 from app.convert import site
 from app.convert.cache import CachedMap
 from app.convert.recipe import Recipe, writer_options
-from app.errors import CannotConvert, CannotDerive, FleetMapError, Invalid, NotFound, Problem
+from app.errors import CannotConvert, FleetMapError, Invalid, NotFound, Problem
 from app.events.messages import SIGNATURE
 from app.model.closures import NO_CLOSURES, ClosureMode
 from app.store.values import Version, frame_input
@@ -203,15 +202,15 @@ async def get_manifest(
         if not isinstance(outcome, _PendingConversion):
             break
         try:
-            conversion = await _convert_entry(services, outcome.recipe, request, principal)
+            conversion = await services.jobs.get_or_start(outcome.recipe, principal, request_address(request))
         except UNAVAILABLE as error:
             if outcome.entry.required:
                 raise _with_format_name(error, outcome.entry) from error
             continue  # it is remembered: the next look lists it as missing
         if isinstance(conversion, JobStarted):
             return job_started_response(conversion.job)
-        if conversion is not None:
-            cached_maps[outcome.recipe.key] = conversion
+        recipe, cached_map = conversion
+        cached_maps[recipe.key] = cached_map
     headers, data = outcome
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
@@ -386,16 +385,3 @@ def _entry(text: str, location: str, *, required: bool) -> _Entry:
     except Invalid as error:
         raise Invalid(f"{name}: {error.detail}", error.problems) from None
     return _Entry(name, values, derive, closures, required, dict(parse_qsl(query, keep_blank_values=True)))
-
-
-async def _convert_entry(
-    services: Services, recipe: Recipe, request: Request, principal: Any
-) -> CachedMap | JobStarted | None:
-    """A map that is not ready, or the job that makes it. None where it cannot be derived so: the next recipe goes
-    another way, or says that there is none.
-    """
-    try:
-        return await services.jobs.get_or_start(recipe, principal, request_address(request))
-    except CannotDerive:
-        await asyncio.sleep(0)
-        return None

@@ -36,7 +36,7 @@ from app.api.http.streams import IN_MEMORY, Headers, range_headers, raw_response
 from app.convert.cache import CachedFile, CachedMap, LostMap
 from app.convert.maps import select_file
 from app.convert.recipe import Recipe
-from app.errors import CannotDerive, Unavailable
+from app.errors import Unavailable
 
 MAX_LOST_ATTEMPTS = 5
 """How often a map is made again that was lost from the cache before it was read."""
@@ -84,9 +84,9 @@ async def _get_or_convert(request: Request, services: Services) -> CachedRespons
             return empty
         # From here on the recipe says what is meant: who was told of a later commit has another one.
         try:
-            return await _fetch(request, services, key, wanted, recipe, empty)
-        except CannotDerive:
-            continue  # it is remembered: the next recipe goes another way, or says that there is none
+            answer = await _fetch(request, services, key, wanted, recipe, empty)
+            if answer is not None:
+                return answer
         except LostMap:  # damaged or evicted while it was read: it is made again
             if attempt >= MAX_LOST_ATTEMPTS:
                 raise
@@ -95,8 +95,11 @@ async def _get_or_convert(request: Request, services: Services) -> CachedRespons
 
 async def _fetch(
     request: Request, services: Services, key: Key, wanted: MapRequest, recipe: Recipe, empty: CachedResponse
-) -> CachedResponse | JobStarted:
-    """The answer with the map that a recipe gives: from disk, or made; once for all who ask for it meanwhile."""
+) -> CachedResponse | JobStarted | None:
+    """The answer with the map that a recipe gives: from disk, or made; once for all who ask for it meanwhile.
+
+    None: it was made another way, so with another tag, which the client may have.
+    """
     memory = services.response_cache
 
     def fill(cached_map: CachedMap) -> CachedResponse:
@@ -118,7 +121,10 @@ async def _fetch(
     outcome = await services.jobs.get_or_start(recipe, principal, request_address(request))
     if isinstance(outcome, JobStarted):
         return outcome
-    return await memory.join((key, _identity(recipe), "fill"), fill, outcome)
+    working, cached_map = outcome
+    if working.key != recipe.key:
+        return None
+    return await memory.join((key, _identity(recipe), "fill"), fill, cached_map)
 
 
 def _without_body(

@@ -22,8 +22,9 @@ from app.convert import recipe as recipes
 from app.convert import site
 from app.convert import worker as making
 from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap
-from app.convert.recipe import ChainFailure, Recipe
+from app.convert.recipe import Recipe
 from app.convert.trials import Trials
+from app.derive import ChainFailure, first_working
 from app.errors import (
     Ambiguous,
     CannotConvert,
@@ -99,9 +100,20 @@ class Maps:
         wanted; its name may say more (``keepout.yaml`` is the grid keepout, ``L2/map.yaml`` the one of the level L2).
         listed: as in a manifest: files are named as those of the whole site, and no zip of them is made.
         """
+        plan = self._planner(version, name, values or {}, derive=derive, file=file, listed=listed)
+
+        def check(recipe: Recipe, failed: Sequence[ChainFailure]) -> Recipe:
+            self._check_known_failure(recipe)
+            return replace(recipe, failed=tuple(failed), replan=plan)
+
+        return first_working(plan, check)
+
+    def _planner(
+        self, version: Version, name: str, values: Mapping[str, str], *, derive: bool, file: str | None, listed: bool
+    ) -> Callable[[frozenset[str]], Recipe]:
+        """A function that plans a request's map without some derivations. Raises what ``recipe`` raises."""
         version = applied_closures.add_areas(version)
         fmt = formats.get_format(name)
-        values = values or {}
         filled = templates.resolve(version.templates, fmt)
         hints = fmt.selection.from_filename(file.rpartition("/")[2]) if file is not None else {}
 
@@ -120,54 +132,52 @@ class Maps:
             return recipes.recipe(version, name, option_values, derived=derive, without=without)
 
         origin = {**filled.origin, **dict.fromkeys({**hints, **values}, templates.REQUEST)}
-        return self._plan_working_recipe(version, plan, origin)
+        return lambda without: _with_origin(plan(without), origin)
 
-    def _plan_working_recipe(
-        self, version: Version, plan: Callable[[frozenset[str]], Recipe], origin: Mapping[str, str]
-    ) -> Recipe:
-        """The cheapest recipe whose derivations are not known to fail. plan: a recipe without these derivations."""
-        without: frozenset[str] = frozenset()
-        failed: list[ChainFailure] = []
-        while True:
-            try:
-                recipe = plan(without)
-            except MissingLayer as error:
-                raise recipes.no_chain_error(error, failed) from error
-            tried = self._known_failure(version, recipe)
-            if tried is None:
-                return replace(_with_origin(recipe, origin), failed=tuple(failed))
-            without |= {tried.step}
-            failed.append(tried)
-
-    def _known_failure(self, version: Version, recipe: Recipe) -> ChainFailure | None:
-        """The step that is known to fail on this content. A map that may be empty is planned all the same."""
+    def _check_known_failure(self, recipe: Recipe) -> None:
+        """CannotDerive where a step is known to fail on this content. A map that may be empty is planned all the
+        same."""
         for one in [recipe, *(member.recipe for member in recipe.members)]:
             if one.members or not one.steps or (one.spread is not None and one.spread.optional):
                 continue
             with contextlib.suppress(KeyError):
-                tried = self._trials[_trial_key(version, one.chain)]
+                tried = self._trials[_trial_key(one.version, one.chain)]
                 if tried is not None and tried.step:
-                    return tried
-        return None
+                    raise tried.as_error()
 
     def get_cached(self, recipe: Recipe) -> CachedMap | None:
         """The map, only if it is made already."""
         return self.cache.get(recipe.key)
 
-    def get_or_convert(self, recipe: Recipe, stop: CancelHandle | None = None) -> CachedMap:
-        """The map; blocks until it is made. stop: ends the making from another thread, with Cancelled.
+    def get_or_convert(self, recipe: Recipe, stop: CancelHandle | None = None) -> tuple[Recipe, CachedMap]:
+        """The map, and its recipe: another than this one where a step of it finds nothing to use. Blocks until it is
+        made. stop: ends the making from another thread, with Cancelled.
 
-        CannotDerive where a step finds nothing to use: then ``recipe`` gives another way, if there is one.
+        CannotConvert where no chain works.
         """
+        try:
+            return recipe, self._convert(recipe, stop)
+        except CannotDerive:
+            if recipe.replan is None:
+                raise
+
+        def convert(planned: Recipe, failed: Sequence[ChainFailure]) -> tuple[Recipe, CachedMap]:
+            self._check_known_failure(planned)
+            working = replace(planned, failed=tuple(failed), replan=recipe.replan)
+            return working, self._convert(working, stop)
+
+        return first_working(recipe.replan, convert)
+
+    def _convert(self, recipe: Recipe, stop: CancelHandle | None) -> CachedMap:
+        """The map by this very recipe. What fails is remembered: a step that finds nothing to use for all maps."""
         try:
             if recipe.members:
                 return self.get_cached(recipe) or self._assemble(recipe, stop)
             return self.cache.get_or_make(recipe.key, lambda: self._run_conversion(recipe, stop))
         except CannotDerive as error:
             if not recipe.members:  # else it is the member's
-                failure = ChainFailure(error.step, error.detail, error.choose)
                 key = _trial_key(recipe.version, recipe.chain)
-                self._trials.add(key, failure, lasting=_is_lasting(recipe.chain))
+                self._trials.add(key, ChainFailure.from_error(error), lasting=_is_lasting(recipe.chain))
             raise
         except (CannotConvert, NotFound, Invalid) as error:
             self._note_failure(recipe.key, error)
@@ -200,7 +210,7 @@ class Maps:
     ) -> CachedMap:
         for _ in range(MAX_HOLD_ATTEMPTS):
             with contextlib.suppress(LostMap):  # the cache needed the room in this very moment
-                return hold(self.get_or_convert(recipe, stop))
+                return hold(self._convert(recipe, stop))
         raise Unavailable("the cache of maps is too small for what is made at once: try again, or enlarge it")
 
     def fetch(
@@ -216,39 +226,25 @@ class Maps:
 
         Raises what ``recipe`` and ``get_or_convert`` do; NotFound where the map has no such file.
         """
-        return select_file(*self._convert_by_any_chain(version, name, values, derive=derive, file=file), file)
+        return select_file(*self.get_or_convert(self.recipe(version, name, values, derive=derive, file=file)), file)
 
     def get_blocking(
-        self,
-        version: Version,
-        name: str,
-        values: Mapping[str, str] | None = None,
-        *,
-        derive: bool = True,
-        file: str | None = None,
+        self, version: Version, name: str, values: Mapping[str, str] | None = None, *, derive: bool = True
     ) -> CachedMap:
-        """The map, by whichever way works; blocks until it is made. Raises what ``recipe`` and ``get_or_convert``
-        do."""
-        return self._convert_by_any_chain(version, name, values, derive=derive, file=file)[1]
-
-    def _convert_by_any_chain(
-        self, version: Version, name: str, values: Mapping[str, str] | None, *, derive: bool, file: str | None
-    ) -> tuple[Recipe, CachedMap]:
-        """The first recipe whose derivations find something to use, and its map."""
-        while True:
-            recipe = self.recipe(version, name, values, derive=derive, file=file)
-            try:
-                return recipe, self.get_cached(recipe) or self.get_or_convert(recipe)
-            except CannotDerive:
-                continue  # it is remembered: the next recipe goes another way, or says that there is none
+        """The map; blocks until it is made. Raises what ``recipe`` and ``get_or_convert`` do."""
+        return self.get_or_convert(self.recipe(version, name, values, derive=derive))[1]
 
     def report(self, recipe: Recipe) -> dict[str, Any]:
         """The report for this version: what was raw, derived, filled in and dropped."""
         if recipe.members:
-            clashes = {**making.empty_report(recipe.format), "dropped": self.get_or_convert(recipe).report["dropped"]}
+            clashes = {
+                **making.empty_report(recipe.format),
+                "dropped": self.get_or_convert(recipe)[1].report["dropped"],
+            }
             members = [(member.folder, self.report(member.recipe)) for member in recipe.members]
             return site.merge_reports([*members, ("", clashes)])
-        map_report = self.get_or_convert(recipe).report
+        recipe, cached_map = self.get_or_convert(recipe)
+        map_report = cached_map.report
         entries = {(e.key.layer, e.key.level, e.key.name): e.provenance for e in recipe.version.parts}
         anew = {step.gives for step in recipe.steps}
         lines = []
@@ -356,30 +352,38 @@ class Maps:
     ) -> tuple[recipes.DerivationChain, str | None]:
         """The cheapest chain whose derivations work on what is stored, found by doing them once for each content; and
         what the caller has to name for it, where it works only so."""
-        without: frozenset[str] = frozenset()
-        failed: list[Problem] = []
+        template_values = templates.resolve(version.templates, fmt).values
+        options = formats.write_options(fmt, template_values)
         unnamed: tuple[recipes.DerivationChain, str | None] | None = None
-        while True:
-            try:
-                template_values = templates.resolve(version.templates, fmt).values
-                options = formats.write_options(fmt, template_values)
-                chain = recipes.plan_chain(fmt, available, options, values=template_values, without=without)
-            except MissingLayer as error:
-                if unnamed is not None:
-                    return unnamed
-                raise MissingLayer(error.detail, failed) from error
-            hindrance = self._hindrance(version, chain) if chain.steps else None
-            if hindrance is None:
+
+        def plan(without: frozenset[str]) -> recipes.DerivationChain:
+            return recipes.plan_chain(fmt, available, options, values=template_values, without=without)
+
+        def attempt(
+            chain: recipes.DerivationChain, failed: Sequence[ChainFailure]
+        ) -> tuple[recipes.DerivationChain, str | None]:
+            nonlocal unnamed
+            failure = self._find_chain_failure(version, chain) if chain.steps else None
+            if failure is None:
                 self._check_content(version, fmt, chain)
                 return chain, None
-            failed.append(Problem(hindrance.reason))
-            if not hindrance.step and unnamed is not None:
+            if failure.step:
+                if failure.choose and unnamed is None:
+                    unnamed = chain, failure.reason
+                raise failure.as_error()
+            if unnamed is not None:
                 return unnamed
-            if not hindrance.step:
-                raise CannotConvert(hindrance.reason, failed)
-            if hindrance.choose:
-                unnamed = unnamed or (chain, hindrance.reason)
-            without |= {hindrance.step}
+            raise CannotConvert(failure.reason, [Problem(one.reason) for one in (*failed, failure)])
+
+        def exhausted(error: MissingLayer, failed: Sequence[ChainFailure]) -> MissingLayer:
+            return MissingLayer(error.detail, [Problem(one.reason) for one in failed])
+
+        try:
+            return first_working(plan, attempt, exhausted)
+        except MissingLayer:
+            if unnamed is None:
+                raise
+            return unnamed
 
     def _check_content(self, version: Version, fmt: formats.Format, chain: recipes.DerivationChain) -> None:
         """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
@@ -391,7 +395,7 @@ class Maps:
         if failure is not None:
             raise CannotConvert(failure.reason, [Problem(failure.reason)])
 
-    def _hindrance(self, version: Version, chain: recipes.DerivationChain) -> ChainFailure | None:
+    def _find_chain_failure(self, version: Version, chain: recipes.DerivationChain) -> ChainFailure | None:
         """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""
         chain = recipes.reduce_chain(chain)
         return self._find_failure(_trial_key(version, chain), chain, making.find_chain_failure, version, chain)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,8 +16,8 @@ import orjson
 
 from app import __version__, derive, formats, parameters, templates
 from app.convert import closures as applied_closures
-from app.derive import Step
-from app.errors import Ambiguous, CannotConvert, Invalid, MissingDatum, MissingLayer, Problem
+from app.derive import ChainFailure, Step
+from app.errors import Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
 from app.model.features import Features
 from app.model.layers import LAYERS, MAP, Layer, Layers, PartKey
@@ -107,7 +107,8 @@ class Recipe:
     origin: where the parameters that are no defaults came from (request, environment, a set); it is no part of the key.
     spread: every part that the chain gives, instead of one. members: the maps that this one is put together from.
     archive: whether a zip of those is wanted. file: the wanted file's name in the map, where one is wanted. failed: the
-    cheaper ways that the content does not allow; no part of the key either.
+    cheaper ways that the content does not allow; no part of the key either. replan: this request's recipe without these
+    derivations (see ``derive.first_working``); None where no other is looked for.
     """
 
     version: Version
@@ -121,6 +122,7 @@ class Recipe:
     archive: bool = False
     file: str | None = None
     failed: tuple[ChainFailure, ...] = ()
+    replan: Callable[[frozenset[str]], Recipe] | None = field(default=None, compare=False, repr=False)
 
     @property
     def etag(self) -> str:
@@ -350,30 +352,9 @@ def missing_layers(fmt: Format, available: AvailableLayers) -> list[str]:
     return [text for text in dict.fromkeys(out) if text]
 
 
-@dataclass(frozen=True, slots=True)
-class ChainFailure:
-    """Why a chain does not work on what is stored. step: the one to blame, empty where none is. choose: it would, with
-    one of several things named."""
-
-    step: str
-    reason: str
-    choose: bool = False
-
-
 def detours(failed: Sequence[ChainFailure]) -> list[dict[str, Any]]:
     """The warnings of a map that was made another way than the usual one: which step failed, and why."""
     return [{"problem": f"made another way, since {one.step} failed: {one.reason}"} for one in failed if one.step]
-
-
-def no_chain_error(error: MissingLayer, failed: Sequence[ChainFailure]) -> CannotConvert:
-    """Nothing is left to try: what to name or to supply, and why the derivations that were tried found nothing."""
-    unnamed = next((one for one in failed if one.choose), None)
-    if unnamed is not None:
-        return Ambiguous(unnamed.reason)
-    if not failed:
-        return error
-    reasons = "; ".join(one.reason for one in failed)
-    return MissingLayer(f"{error.detail}; what is stored does not do: {reasons}", error.problems)
 
 
 def recipe(

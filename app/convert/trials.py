@@ -16,7 +16,7 @@ from uuid import uuid4
 
 import orjson
 
-from app.convert.recipe import ChainFailure
+from app.derive import ChainFailure
 
 MAX_TRIALS = 10_000
 """Trials that are remembered; the file is written anew at twice as many lines."""

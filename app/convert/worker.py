@@ -14,8 +14,8 @@ from app import derive, formats, parameters
 from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert import site
-from app.convert.recipe import ChainFailure, DerivationChain, Spread
-from app.derive import Step
+from app.convert.recipe import DerivationChain, Recipe, Spread
+from app.derive import ChainFailure, Step
 from app.errors import CannotConvert, CannotDerive, FleetMapError, MissingLayer, Problem
 from app.formats import UNTITLED, Format, NestedMap, WriteContext
 from app.model.closures import Closures
@@ -79,7 +79,7 @@ def find_chain_failure(
     try:
         derive.try_steps(chain.steps, layers)
     except CannotDerive as error:
-        return ChainFailure(error.step, error.detail, error.choose)
+        return ChainFailure.from_error(error)
     except FleetMapError as error:
         return ChainFailure("", error.detail)
     return None
@@ -284,36 +284,28 @@ def from_layers(
             fmt, layers, option_values, derived=derived, entries=entries, origin=origin, credit=credit
         )
     writer_options = recipes.writer_options(fmt, option_values)
-    without: frozenset[str] = frozenset()
-    failed: list[ChainFailure] = []
     stock = recipes.available_in(layers)
-    while True:
-        try:
-            chain = recipes.plan_chain(
-                fmt, stock, writer_options, derived=derived, values=option_values, without=without
-            )
-        except MissingLayer as error:
-            raise recipes.no_chain_error(error, failed) from error
-        chain_layers = Layers({k: layers.parts[k] for k in chain.keys}, layers.datum, layers.levels)
-        try:
-            beside = around or layers
-            written = write(
-                fmt,
-                chain_layers,
-                option_values,
-                chain,
-                entries,
-                origin,
-                credit,
-                closures=closures,
-                around=beside,
-                title=title,
-            )
-            warnings = [*recipes.detours(failed), *written.report["warnings"]]
-            return replace(written, report={**written.report, "warnings": warnings})
-        except CannotDerive as error:
-            without |= {error.step}
-            failed.append(ChainFailure(error.step, error.detail, error.choose))
+
+    def plan(without: frozenset[str]) -> DerivationChain:
+        return recipes.plan_chain(fmt, stock, writer_options, derived=derived, values=option_values, without=without)
+
+    def attempt(chain: DerivationChain, failed: Sequence[ChainFailure]) -> WrittenMap:
+        written = write(
+            fmt,
+            Layers({k: layers.parts[k] for k in chain.keys}, layers.datum, layers.levels),
+            option_values,
+            chain,
+            entries,
+            origin,
+            credit,
+            closures=closures,
+            around=around or layers,
+            title=title,
+        )
+        warnings = [*recipes.detours(failed), *written.report["warnings"]]
+        return replace(written, report={**written.report, "warnings": warnings})
+
+    return derive.first_working(plan, attempt)
 
 
 def _write_every_part(
@@ -328,33 +320,28 @@ def _write_every_part(
 ) -> WrittenMap:
     """The map of several parts (``app.convert.site``), of layers that are in memory."""
     version = _as_version(layers)
-    without: frozenset[str] = frozenset()
-    failed: list[ChainFailure] = []
-    while True:
-        try:
-            recipe = site.recipe(version, fmt, option_values, derived=derived, without=without, archive=False)
-        except MissingLayer as error:
-            raise recipes.no_chain_error(error, failed) from error
+
+    def plan(without: frozenset[str]) -> Recipe:
+        return site.recipe(version, fmt, option_values, derived=derived, without=without, archive=False)
+
+    def attempt(recipe: Recipe, _: Sequence[ChainFailure]) -> WrittenMap:
         files: dict[str, bytes] = {}
         places: dict[str, tuple[str, str]] = {}
         reports: list[tuple[str, Mapping[str, Any]]] = []
-        try:
-            for member in recipe.members:
-                chain, spread = member.recipe.chain, member.recipe.spread
-                chain_layers = Layers({k: layers.parts[k] for k in chain.keys}, layers.datum, layers.levels)
-                values = parameters.canonical(member.recipe.options)
-                one = write(fmt, chain_layers, values, chain, entries, origin, credit, spread=spread)
-                reports.append((member.folder, one.report))
-                for file in site.select([_PlacedFile(name, one.places.get(name)) for name in one.files], member):
-                    files.setdefault(member.folder + file.name, one.files[file.name])
-                    places.setdefault(member.folder + file.name, file.place or member.place or ("", ""))
-        except CannotDerive as error:
-            without |= {error.step}
-            failed.append(ChainFailure(error.step, error.detail, error.choose))
-            continue
+        for member in recipe.members:
+            chain, spread = member.recipe.chain, member.recipe.spread
+            chain_layers = Layers({k: layers.parts[k] for k in chain.keys}, layers.datum, layers.levels)
+            values = parameters.canonical(member.recipe.options)
+            one = write(fmt, chain_layers, values, chain, entries, origin, credit, spread=spread)
+            reports.append((member.folder, one.report))
+            for file in site.select([_PlacedFile(name, one.places.get(name)) for name in one.files], member):
+                files.setdefault(member.folder + file.name, one.files[file.name])
+                places.setdefault(member.folder + file.name, file.place or member.place or ("", ""))
         if not files:
             raise site.no_parts_error(recipe)
         return WrittenMap(files, site.merge_reports(reports), places)
+
+    return derive.first_working(plan, attempt)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,10 +15,10 @@ import pkgutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 from app import parameters
-from app.errors import Ambiguous, CannotConvert, CannotDerive, Problem
+from app.errors import Ambiguous, CannotConvert, CannotDerive, MissingLayer, Problem
 from app.model.features import Features
 from app.model.grid import FREE, UNKNOWN, OccupancyGrid
 from app.model.layers import Layer, Layers, Part
@@ -47,6 +47,9 @@ class DerivationNotes:
         option_entry = {} if option is None else {"option": option}
         self.template.append({"what": subject, "value": value, "why": why, **option_entry})
 
+
+P = TypeVar("P")
+T = TypeVar("T")
 
 Function = Callable[[Layers, Any, DerivationNotes], Layers]
 """(stored and derived layers, parameters, notes) -> the new parts. Pure but for the notes."""
@@ -194,6 +197,61 @@ def plan(
                 pushed += 1
                 heapq.heappush(queue, (cost + d.cost, pushed, have | {d.gives}, (*steps, d.step())))
     return None
+
+
+@dataclass(frozen=True, slots=True)
+class ChainFailure:
+    """Why a chain does not work on what is stored. step: the one to blame, empty where none is. choose: it would, with
+    one of several things named."""
+
+    step: str
+    reason: str
+    choose: bool = False
+
+    @classmethod
+    def from_error(cls, error: CannotDerive) -> ChainFailure:
+        """The failure that an error reports."""
+        return cls(error.step, error.detail, error.choose)
+
+    def as_error(self) -> CannotDerive:
+        """The error that reports this failure."""
+        return CannotDerive(self.reason, step=self.step, choose=self.choose)
+
+
+def no_chain_error(error: MissingLayer, failed: Sequence[ChainFailure]) -> CannotConvert:
+    """Nothing is left to try: what to name or to supply, and why the derivations that were tried found nothing."""
+    unnamed = next((one for one in failed if one.choose), None)
+    if unnamed is not None:
+        return Ambiguous(unnamed.reason)
+    if not failed:
+        return error
+    reasons = "; ".join(one.reason for one in failed)
+    return MissingLayer(f"{error.detail}; what is stored does not do: {reasons}", error.problems)
+
+
+def first_working(
+    make_plan: Callable[[frozenset[str]], P],
+    attempt: Callable[[P, Sequence[ChainFailure]], T],
+    exhausted: Callable[[MissingLayer, Sequence[ChainFailure]], CannotConvert] = no_chain_error,
+) -> T:
+    """What the cheapest plan gives whose derivations find something to use in the content.
+
+    make_plan: the cheapest plan without these derivations; MissingLayer if none is left, which ``exhausted`` turns into
+    the error to raise. attempt: carry out a plan, given the failures so far; CannotDerive names the step that failed.
+    All else that these raise is passed on.
+    """
+    failed: list[ChainFailure] = []
+    while True:
+        try:
+            planned = make_plan(frozenset(one.step for one in failed))
+        except MissingLayer as error:
+            raise exhausted(error, failed) from error
+        try:
+            return attempt(planned, failed)
+        except CannotDerive as error:
+            if not error.step:
+                raise
+            failed.append(ChainFailure.from_error(error))
 
 
 def parameter_names(name: str) -> frozenset[str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app import derive, parameters
-from app.derive import DerivationNotes, Step
+from app.derive import ChainFailure, DerivationNotes, Step
 from app.errors import CannotDerive, Conflict, Invalid, MissingLayer, NotFound, Problem
 from app.ingest.prepare import open_store
 from app.model.layers import MAP, Layer, Layers, PartKey, is_empty
@@ -56,10 +56,15 @@ def prepare_derivation(
         e.key: e for e in base.parts if e.count > 0 and e.key.layer != derivation.gives and not _is_display_only(e)
     }
     existing_parts = {e.key: e for e in base.parts if e.count > 0 and e.key.layer == derivation.gives}
-    without: frozenset[str] = frozenset({request.method})
-    failed: list[str] = []
-    while True:
-        steps = _steps(derivation, frozenset(k.layer for k in stored), base, without, failed)
+    available: frozenset[Layer] = frozenset({k.layer for k in stored} | ({"location"} if base.datum else set()))
+
+    def plan(without: frozenset[str]) -> tuple[Step, ...]:
+        return _steps(derivation, available, without)
+
+    def attempt(
+        steps: tuple[Step, ...], _: Sequence[ChainFailure]
+    ) -> tuple[tuple[Step, ...], dict[PartKey, PartEntry], Layers, DerivationNotes]:
+        """Carry out all steps but the last: the chain, the stored parts that it reads, the layers, the notes."""
         needed = {layer for step in steps for layer in step.reads}
         used = {k: e for k, e in stored.items() if k.layer in needed}
         used |= {
@@ -70,17 +75,13 @@ def prepare_derivation(
         # Not only the layers that are needed: a derivation may look at others where they are there (a fence).
         loaded = store.load(base, sorted(used))
         notes = DerivationNotes()
-        try:
-            layers = Layers(loaded.parts, base.datum, base.levels)
-            chain = derive.with_parameters(steps, request.values)
-            before = derive.run(chain[:-1], layers, notes)
-            derived_layers = derive.run(chain[-1:], before, notes)
-            break
-        except CannotDerive as error:
-            if error.step == request.method or not error.step:
-                raise
-            without |= {error.step}
-            failed.append(error.detail)
+        chain = derive.with_parameters(steps, request.values)
+        before = derive.run(chain[:-1], Layers(loaded.parts, base.datum, base.levels), notes)
+        return chain, used, before, notes
+
+    # Outside of ``attempt``: where the method itself finds nothing, no other way to it is looked for.
+    chain, used, before, notes = derive.first_working(plan, attempt, _no_chain_error)
+    derived_layers = derive.run(chain[-1:], before, notes)
     _check_values(request, chain)
     fresh = {
         k: p for k, p in derived_layers.parts.items() if k.layer == derivation.gives and before.parts.get(k) is not p
@@ -109,22 +110,18 @@ def _is_display_only(entry: PartEntry) -> bool:
     return not entry.provenance.is_edited and derive.ends_in_display_step(entry.provenance.steps)
 
 
-def _steps(
-    derivation: derive.Derivation,
-    available: frozenset[Layer],
-    base: Version,
-    without: frozenset[str],
-    failed: Sequence[str],
-) -> tuple[Step, ...]:
-    have: frozenset[Layer] = available if base.datum is None else available | {"location"}
-    before = derive.plan(have, derivation.needs, without)
+def _steps(derivation: derive.Derivation, available: frozenset[Layer], without: frozenset[str]) -> tuple[Step, ...]:
+    """The cheapest chain that ends in a derivation; MissingLayer if there is none."""
+    before = derive.plan(available, derivation.needs, without | {derivation.name})
     if before is None:
-        lacking = ", ".join(sorted(derivation.needs - have))
-        tried = f"; what is stored does not do: {'; '.join(failed)}" if failed else ""
-        raise MissingLayer(
-            f"{derivation.name} needs {lacking}, and the environment has none: upload a map that has{tried}"
-        )
+        lacking = ", ".join(sorted(derivation.needs - available))
+        raise MissingLayer(f"{derivation.name} needs {lacking}, and the environment has none: upload a map that has")
     return (*before.steps, derivation.step())
+
+
+def _no_chain_error(error: MissingLayer, failed: Sequence[ChainFailure]) -> MissingLayer:
+    tried = f"; what is stored does not do: {'; '.join(one.reason for one in failed)}" if failed else ""
+    return MissingLayer(f"{error.detail}{tried}")
 
 
 def _check_values(request: DerivationRequest, chain: Sequence[Step]) -> None:

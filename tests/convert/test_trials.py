@@ -12,8 +12,9 @@ from app import derive
 from app.convert import maps as module
 from app.convert import trials
 from app.convert.maps import Maps
-from app.convert.recipe import ChainFailure, DerivationChain
+from app.convert.recipe import DerivationChain
 from app.convert.trials import Trials
+from app.derive import ChainFailure
 from app.limits import Limits
 from app.pool import WorkerDied
 from tests.api import samples

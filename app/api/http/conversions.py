@@ -20,7 +20,7 @@ from app.api.http.responses import api_path, json_response
 from app.convert.cache import CachedMap
 from app.convert.maps import Maps
 from app.convert.recipe import Recipe
-from app.errors import CannotDerive, FleetMapError, NoRoom, Unavailable
+from app.errors import FleetMapError, NoRoom, Unavailable
 from app.pool import CancelHandle, Cancelled
 from app.store.store import Store
 from app.store.values import Job, rfc3339
@@ -45,7 +45,7 @@ class JobStarted:
 class _RunningConversion:
     """A map in the making. waiters: requests that wait for it. jobs: principal's id -> job id."""
 
-    future: asyncio.Future[CachedMap]
+    future: asyncio.Future[tuple[Recipe, CachedMap]]
     stop: CancelHandle
     waiters: int = 0
     jobs: dict[str, str] = field(default_factory=dict)
@@ -61,8 +61,12 @@ class ConversionJobs:
         self._threads = ThreadPoolExecutor(MAX_CONCURRENT_CONVERSIONS, thread_name_prefix="fleetmap-make")
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def get_or_start(self, recipe: Recipe, principal: Principal, address: str) -> CachedMap | JobStarted:
-        """The map, or after ``seconds`` the job that will end with it. address: where the finished map is had.
+    async def get_or_start(
+        self, recipe: Recipe, principal: Principal, address: str
+    ) -> tuple[Recipe, CachedMap] | JobStarted:
+        """The map with the recipe that worked, or after ``seconds`` the job that will end with it.
+
+        address: where the finished map is available.
 
         Raises what making raises; Unavailable where too much is being made.
         """
@@ -91,21 +95,12 @@ class ConversionJobs:
     async def convert(
         self, plan: Callable[[], Recipe], principal: Principal, address: str
     ) -> tuple[Recipe, CachedMap] | JobStarted:
-        """The map of a recipe, made where need be; the job that makes it for ``address`` if it takes long.
-
-        plan: called again if a derivation finds nothing to use; the next recipe goes another way, or says there is
-        none.
-        """
-        while True:
-            recipe = await run_in_threadpool(plan)
-            cached_map = await run_in_threadpool(self._maps.get_cached, recipe)
-            if cached_map is not None:
-                return recipe, cached_map
-            try:
-                outcome = await self.get_or_start(recipe, principal, address)
-            except CannotDerive:
-                continue
-            return outcome if isinstance(outcome, JobStarted) else (recipe, outcome)
+        """The map of a plan, made where need be; the job that makes it for ``address`` if it takes long."""
+        recipe = await run_in_threadpool(plan)
+        cached_map = await run_in_threadpool(self._maps.get_cached, recipe)
+        if cached_map is not None:
+            return recipe, cached_map
+        return await self.get_or_start(recipe, principal, address)
 
     def cancel(self, job: str) -> bool:
         """Stop the making that a job waits for, unless others wait for it too: whether it was of this process."""
@@ -190,7 +185,7 @@ class ConversionJobs:
             self._count(recipe.format.name, "cancelled")
         elif done.exception() is not None:
             self._count(recipe.format.name, "failed")
-        elif done.result().fresh:  # else another request or process had just made it
+        elif done.result()[1].fresh:  # else another request or process had just made it
             self._count(recipe.format.name, "made")
 
 
