@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-WRITE = ("api", "ingest", "pool", "bundle", "formats", "store", "events", "agent")
+WRITE = ("api", "ingest", "pool", "upload_reader", "formats", "store", "events", "agent")
 READ = ("api", "convert", "store", "derive", "formats")
 FLOWS = (
     (
@@ -30,6 +30,9 @@ def layers() -> list[list[str]]:
 def svg() -> str:
     """The picture."""
     rows = layers()
+    missing = {name for _, steps, _ in FLOWS for name in steps}.difference(*rows)
+    if missing:
+        raise ValueError(f"steps of the flows that are in no row of the picture: {sorted(missing)}")
     height = TOP + len(rows) * (ROW + GAP) + 24 * len(FLOWS) + 24
     out = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '

@@ -1,0 +1,115 @@
+"""How the code is laid out, counted: lengths of functions and files, old names, imports of private modules."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+from app.formats import Format
+
+TOP = Path(__file__).parents[1]
+MAX_FUNCTION_LINES = 60
+MAX_FILE_LINES = 600
+
+LONG_FUNCTIONS: dict[str, str] = {}
+"""Longer ones: why."""
+
+LONG_FILES: dict[str, str] = {}
+"""Longer ones: why."""
+
+VAGUE_NAMES = frozenset(
+    "told said known found made held who where here there what which own mine tell say ask ear wish".split()
+)
+"""Participles and question words, which tell a reader nothing as names."""
+
+PUBLIC_NAMES: dict[str, str] = {}
+"""Where such a word is part of what clients see: why."""
+
+
+@cache
+def modules(folder: str) -> dict[str, ast.Module]:
+    """The syntax tree of each file below a folder, by its path."""
+    paths = sorted((TOP / folder).rglob("*.py"))
+    return {path.relative_to(TOP).as_posix(): ast.parse(path.read_text()) for path in paths}
+
+
+def functions(folder: str) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+    for path, tree in modules(folder).items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                yield f"{path}:{node.name}", node
+
+
+def body_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of what a function does: neither its parameters, which are the options of a command, nor its docstring."""
+    body = node.body[1:] if ast.get_docstring(node, clean=False) is not None else node.body
+    return (node.end_lineno or 0) - body[0].lineno + 1 if body else 0
+
+
+def test_functions_are_short() -> None:
+    lengths = {name: body_lines(node) for name, node in functions("app")}
+    assert {name for name, length in lengths.items() if length > MAX_FUNCTION_LINES} == set(LONG_FUNCTIONS)
+    assert len(LONG_FUNCTIONS) <= 5
+
+
+def test_files_are_short() -> None:
+    lengths = {path: len((TOP / path).read_text().splitlines()) for path in modules("app")}
+    assert {path for path, length in lengths.items() if length > MAX_FILE_LINES} == set(LONG_FILES)
+    assert len(LONG_FILES) <= 5
+
+
+def assigned_names(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.attr
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.arg):
+            yield node.arg
+
+
+def test_names_are_nouns_and_verbs() -> None:
+    vague = {
+        f"{path}:{name}"
+        for folder in ("app", "docs")
+        for path, tree in modules(folder).items()
+        for name in assigned_names(tree)
+        if name.strip("_").lower() in VAGUE_NAMES
+    }
+    assert vague == set(PUBLIC_NAMES)
+
+
+def test_private_modules_are_imported_in_their_package_only() -> None:
+    outside = []
+    for path, tree in modules("app").items():
+        importer = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            else:
+                continue
+            for name in names:
+                pieces = name.split(".")
+                private = next((k for k, piece in enumerate(pieces) if piece.startswith("_")), None)
+                if pieces[0] != "app" or private is None or not is_module(pieces[: private + 1]):
+                    continue
+                package = ".".join(pieces[:private])
+                if not f"{importer}.".startswith(f"{package}."):
+                    outside.append(f"{importer} imports {name}")
+    assert outside == []
+
+
+def is_module(pieces: list[str]) -> bool:
+    path = TOP.joinpath(*pieces)
+    return path.is_dir() or path.with_suffix(".py").is_file()
+
+
+def test_format_has_few_fields() -> None:
+    assert len(dataclasses.fields(Format)) <= 16
