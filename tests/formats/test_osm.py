@@ -24,6 +24,7 @@ from app import formats
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
 from app.formats import FileGroup, ReadContext, WriteContext, osm
 from app.formats.osm import parsing
+from app.formats.osm.tags import direction
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
@@ -296,7 +297,7 @@ def test_the_samples_objects() -> None:
     ],
 )
 def test_direction(tags: dict[str, str], expected: str) -> None:
-    assert osm.direction(tags) == expected
+    assert direction(tags) == expected
 
 
 @pytest.mark.parametrize("pack", [gzip.compress, bz2.compress], ids=["gz", "bz2"])
