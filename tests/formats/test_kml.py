@@ -371,7 +371,7 @@ def test_placemarks_of_the_oldest_form_are_kept_with_a_warning(real, same):
 
 def test_what_only_kml_knows_can_be_left_out():
     data = (SAMPLES / "orchard.kml").read_bytes()
-    complete, short = objects(load(data)[0]), objects(load(data, whole=False)[0])
+    complete, short = objects(load(data)[0]), objects(load(data, keep_source_properties=False)[0])
     assert short.ids == complete.ids
     assert all(a.equals(b) for a, b in zip(short.geometry, complete.geometry, strict=True))
     assert [{**p, "kml": 0} for p in short.properties] == [{**p, "kml": 0} for p in complete.properties]

@@ -133,7 +133,7 @@ def test_committed_datums_are_the_corner_of_the_bounds(name: str, shared: Path, 
 def test_the_datasets_own_network_has_our_nodes_and_edges(shared: Path, facts: Any) -> None:
     folder = shared / "data/osm/urban-usa-mn-minnesota-zoo"
     theirs = facts.tmap2_nodes(facts.tmap2((folder / "network_autogen.tmap2.yaml").read_bytes()))
-    graph = network(read((folder / "osm.xml").read_bytes(), wanted=frozenset({"topology"})))
+    graph = network(read((folder / "osm.xml").read_bytes(), requested_layers=frozenset({"topology"})))
     assert len(theirs) == graph.number_of_nodes()
     # Their names are not ours; their degrees and places are: (0, 0) is the datum, metres by their own rule.
     degrees = sorted(len({e["node"] for e in n["edges"]}) for n in theirs)
@@ -169,7 +169,7 @@ def test_both_ways_through_xml_and_a_reader_who_wants_less(name: str, shared: Pa
     assert (quick.tags, quick.ways, quick.relations) == (careful.tags, careful.ways, careful.relations)
     assert (quick.root, quick.bounds) == (careful.root, careful.bounds)
     assert all(quick.attributes(k) == careful.attributes(k) for k in range(len(quick.ids)))
-    complete, less = read(data), read(data, wanted=frozenset({"topology"}))
+    complete, less = read(data), read(data, requested_layers=frozenset({"topology"}))
     assert set(less.parts) == {TOPOLOGY}
     a, b = part(complete, TOPOLOGY), part(less, TOPOLOGY)
     assert (a.ids, a.properties, a.document) == (b.ids, b.properties, b.document)
