@@ -56,7 +56,8 @@ from app.formats._network import CROSS_PART_PROPERTIES, Edge, MergedNetwork, get
 from app.formats.lanelet2 import lane_geometry
 from app.formats.lanelet2.lane_geometry import Arm, Array, Border
 from app.formats.osm import xml_text
-from app.formats.osm.parsing import INT64, Data, Tags, Way, parse
+from app.formats.osm.elements import INT64, Data, Tags, Way
+from app.formats.osm.parsing import parse
 from app.formats.osm.xml_text import NO_ATTRIBUTES, as_texts, attribute_text, element_id, integers
 from app.model.features import NO_GEOMETRY, Features, Properties, SharedKeyDicts, from_columns, unique_ids
 from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Anchor, Datum

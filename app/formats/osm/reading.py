@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, ReadContext
 from app.formats.osm.bounds import bounding_box, read_box
-from app.formats.osm.parsing import Data, Relation, Tags, Way, parse
+from app.formats.osm.elements import Data, Relation, Tags, Way
+from app.formats.osm.parsing import parse
 from app.formats.osm.tags import (
     BACKWARD,
     BOTH,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from app.formats import WriteContext
 from app.formats.osm import xml_text
 from app.formats.osm.bounds import is_box, written_bounds
-from app.formats.osm.parsing import INT64
+from app.formats.osm.elements import INT64
 from app.formats.osm.tags import (
     CARRIES,
     EDGE_WORDS,

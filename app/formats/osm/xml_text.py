@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any
 
-from app.formats.osm.parsing import INT64, MAX_UNKNOWN_DEPTH
+from app.formats.osm.elements import INT64, MAX_UNKNOWN_DEPTH
 from app.syntax.decimals import DEGREES, numbers
 
 MAX_CACHED_ATTRIBUTES = 4096
