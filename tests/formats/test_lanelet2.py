@@ -21,7 +21,9 @@ from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
 from app.formats import FileGroup, ReadContext, WriteContext, get_format
-from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, is_two_way, parse_speed
+from app.formats.lanelet2 import detect
+from app.formats.lanelet2.new_lanelets import WriteOptions
+from app.formats.lanelet2.tags import MAIN, PROJECTOR, is_two_way, parse_speed
 from app.formats.osm.scanning import scan
 from app.formats.osm.strict import read_events
 from app.limits import Limits
