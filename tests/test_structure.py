@@ -20,9 +20,27 @@ LONG_FUNCTIONS: dict[str, str] = {}
 LONG_FILES: dict[str, str] = {}
 """Longer ones: why."""
 
-VAGUE_NAMES = frozenset(
-    "told said known found made held who where here there what which own mine tell say ask ear wish".split()
-)
+VAGUE_NAMES = {
+    "told",
+    "said",
+    "known",
+    "found",
+    "made",
+    "held",
+    "who",
+    "where",
+    "here",
+    "there",
+    "what",
+    "which",
+    "own",
+    "mine",
+    "tell",
+    "say",
+    "ask",
+    "ear",
+    "wish",
+}
 """Participles and question words, which tell a reader nothing as names."""
 
 PUBLIC_NAMES: dict[str, str] = {}

@@ -21,8 +21,11 @@ from app import formats
 from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
 from app.formats import FileGroup, ReadContext, WriteContext, get_format
-from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, is_two_way, parse_speed
-from app.formats.osm import parsing
+from app.formats.lanelet2 import detect
+from app.formats.lanelet2.new_lanelets import WriteOptions
+from app.formats.lanelet2.tags import MAIN, PROJECTOR, is_two_way, parse_speed
+from app.formats.osm.scanning import scan
+from app.formats.osm.strict import read_events
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
@@ -714,7 +717,7 @@ def test_members_as_autoware_writes_them_are_read_the_quick_way() -> None:
     ]
     members = "".join(f"    <member {row}/>\n" for row in rows)
     data = f'{head}  <relation id="7">\n{members}    <tag k="type" v="lanelet"/>\n  </relation>\n</osm>\n'.encode()
-    quick, careful = parsing._scan(data, Limits(), False), parsing._events(data, Limits())
+    quick, careful = scan(data, Limits(), False), read_events(data, Limits())
     assert quick is not None
     assert quick.relations == careful.relations
     assert quick.relations[0].members == [("way", -5, "left"), ("way", 6, "right & more"), ("node", 1, "")]

@@ -22,6 +22,8 @@ from PIL import Image
 from app import formats
 from app.errors import Ambiguous, BadUpload, Invalid, MissingLayer, NotFound, TooLarge, UnreadableFile
 from app.formats import ReadContext, WriteContext, occupancy_grid
+from app.formats.occupancy_grid.resampling import normalize, resample
+from app.formats.occupancy_grid.words import KEYS
 from app.limits import Limits
 from app.model.grid import UNKNOWN_GREY, OccupancyGrid
 from app.model.layers import Layers, PartKey
@@ -559,7 +561,7 @@ JSON = st.recursive(
 @given(extra=st.dictionaries(st.text(st.characters(codec="utf-8"), max_size=8), JSON, max_size=4))
 @settings(max_examples=300, deadline=None)
 def test_extra_keys_of_any_kind_come_back(extra: dict[str, Any]) -> None:
-    extra = {k: v for k, v in extra.items() if k not in occupancy_grid.KEYS}
+    extra = {k: v for k, v in extra.items() if k not in KEYS}
     grid = grid_of([[0]], properties={"occupancy_grid": extra} if extra else {})
     again, _ = read(write(grid)[0])
     assert again.properties == grid.properties
@@ -589,20 +591,20 @@ def test_a_grid_too_wide_for_nav2_is_warned_of() -> None:
 # --- resampling ---------------------------------------------------------------------------------------------------
 def test_coarser_cells_keep_obstacles_and_the_unseen() -> None:
     grid = grid_of([[0, 0, 0, 255, 0], [0, 0, 0, 0, 100], [255, 255, 0, 7, 0]], 0.5)
-    out = occupancy_grid.resample(grid, 1.0)
+    out = resample(grid, 1.0)
     assert seen(out) == [[0, 255, 0], [255, 7, 100]]
     assert (out.resolution, out.origin) == (1.0, grid.origin)
-    assert seen(occupancy_grid.resample(grid, 10.0)) == [[100]]
+    assert seen(resample(grid, 10.0)) == [[100]]
 
 
 def test_cells_that_share_an_old_cell_both_have_its_obstacle() -> None:
     grid = grid_of([[0, 100, 0]], 1.0)
-    assert seen(occupancy_grid.resample(grid, 1.5)) == [[100, 100]]
+    assert seen(resample(grid, 1.5)) == [[100, 100]]
 
 
 def test_finer_cells_are_copies() -> None:
     grid = grid_of([[0, 100], [255, 3]], 1.0)
-    out = occupancy_grid.resample(grid, 0.5)
+    out = resample(grid, 0.5)
     assert seen(out) == [[0, 0, 100, 100], [0, 0, 100, 100], [255, 255, 3, 3], [255, 255, 3, 3]]
 
 
@@ -616,7 +618,7 @@ def test_finer_cells_are_copies() -> None:
 @settings(max_examples=200, deadline=None)
 def test_resampling_agrees_with_areas(cells: list[list[int]], old: float, new: float) -> None:
     grid = grid_of(cells, old)
-    out = occupancy_grid.resample(grid, new)
+    out = resample(grid, new)
     rank = {0: 0, 255: 1, 40: 41, 100: 101}
     slack = 1e-5 * old
     for j in range(out.height):
@@ -668,7 +670,7 @@ def test_baking_a_yaw_keeps_every_place(yaw: float, origin: tuple[float, float])
     dice = np.random.default_rng(5)
     cells = dice.choice(np.array([0, 0, 0, 255, 100], np.uint8), (23, 31))
     grid = OccupancyGrid(cells, 0.2, (*origin, yaw))
-    out = occupancy_grid.normalize(grid)
+    out = normalize(grid)
     assert out.origin[2] == 0.0
     for v in out.origin[:2]:
         assert abs(v / 0.2 - round(v / 0.2)) < 1e-6
@@ -697,14 +699,14 @@ def test_baking_a_yaw_keeps_every_place(yaw: float, origin: tuple[float, float])
 def test_quarter_turns_are_exact() -> None:
     cells = np.random.default_rng(2).choice(np.array([0, 100, 255], np.uint8), (5, 7))
     for turns, yaw in enumerate([0.0, math.pi / 2, math.pi, 3 * math.pi / 2]):
-        out = occupancy_grid.normalize(OccupancyGrid(cells, 0.5, (2.0, -1.0, yaw)))
+        out = normalize(OccupancyGrid(cells, 0.5, (2.0, -1.0, yaw)))
         expected = np.rot90(cells[::-1], turns)[::-1]
         assert (out.cells == expected).all()
 
 
 def test_an_aligned_grid_stays_as_it_is() -> None:
     grid = grid_of([[0, 100, 255]], 0.05, origin=(0.15, -100.0, 0.0))
-    out = occupancy_grid.normalize(grid)
+    out = normalize(grid)
     assert (out.cells == grid.cells).all()
     assert out.origin == grid.origin
 
@@ -714,13 +716,13 @@ def test_normalize_is_a_parameter(facts: Any) -> None:
     served, context = write(grid, normalize="true")
     assert context.warnings == []
     assert facts.load_yaml(served["map.yaml"])["origin"][2] == 0.0
-    assert (independent(served, facts) == occupancy_grid.normalize(grid).cells).all()
+    assert (independent(served, facts) == normalize(grid).cells).all()
 
 
 def test_turning_is_bounded() -> None:
     long = OccupancyGrid(np.zeros((1, 2**20), np.uint8), 1.0, (0.0, 0.0, math.pi / 4))
     with pytest.raises(Invalid, match="cells"):
-        occupancy_grid.normalize(long)
+        normalize(long)
 
 
 # --- hostile ------------------------------------------------------------------------------------------------------

@@ -23,7 +23,11 @@ from lxml import etree
 from app import formats
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
 from app.formats import FileGroup, ReadContext, WriteContext, osm
-from app.formats.osm import parsing
+from app.formats.osm import scanning
+from app.formats.osm.elements import Data
+from app.formats.osm.scanning import scan
+from app.formats.osm.strict import read_events
+from app.formats.osm.tags import direction
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
@@ -161,7 +165,7 @@ def test_real_extracts_come_back(name: str, shared: Path, same: Callable[..., li
 @pytest.mark.parametrize("name", REAL)
 def test_both_ways_through_xml_and_a_reader_who_wants_less(name: str, shared: Path) -> None:
     data = (shared / "data/osm" / name / "osm.xml").read_bytes()
-    quick, careful = parsing._scan(data, Limits(), False), parsing._events(data, Limits())
+    quick, careful = scan(data, Limits(), False), read_events(data, Limits())
     assert quick is not None, "a file as the OSM server writes it is regular"
     assert quick.ids == careful.ids
     assert np.array_equal(quick.lonlat, careful.lonlat)
@@ -175,7 +179,7 @@ def test_both_ways_through_xml_and_a_reader_who_wants_less(name: str, shared: Pa
     assert shapely.equals(a.geometry, b.geometry).all()
 
 
-def contents(data: parsing.Data) -> Any:
+def contents(data: Data) -> Any:
     """All that was read, to be compared."""
     nodes = [(i, at, data.tags.get(k), data.attributes(k)) for k, (i, at) in enumerate(zip(data.ids, data.lonlat.tolist(), strict=True))]  # fmt: skip  # noqa: E501
     return nodes, data.ways, data.relations, data.root, data.bounds
@@ -191,21 +195,21 @@ def test_nodes_are_scanned_piece_by_piece(piece: int, monkeypatch: pytest.Monkey
     way = ' <way id="5" version="1">\n  <nd ref="1"/>\n  <nd ref="39"/>\n  <tag k="highway" v="path"/>\n </way>'
     text = "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6">', *nodes, way, "</osm>", ""])
     data = text.encode()
-    reference = parsing._events(data, Limits())
-    monkeypatch.setattr(parsing, "SCAN_BYTES", piece)
-    pieces = parsing._scan(data, Limits(), False)
+    reference = read_events(data, Limits())
+    monkeypatch.setattr(scanning, "SCAN_BYTES", piece)
+    pieces = scan(data, Limits(), False)
     assert pieces is not None
     assert len(pieces.ids) > 5
     assert contents(pieces) == contents(reference)
 
 
 def test_attributes_of_any_name_are_kept_however_many_lists_of_them_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parsing, "PATTERNS", 3)
-    monkeypatch.setattr(parsing, "MAX_CACHED_TEXTS", 2)
+    monkeypatch.setattr(scanning, "PATTERNS", 3)
+    monkeypatch.setattr(scanning, "MAX_CACHED_TEXTS", 2)
     names = ["version", "__class__", "__dict__", "user", "uid", "changeset", "x:y", "a.b-c"]
     rows = [f'<node id="{k}" {n}="{k} &amp; {n}" visible="true" lat="1.5" lon="{k}"/>' for k, n in enumerate(names, 1)]
     text = f'<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6">\n{" ".join(rows)}\n</osm>'.encode()
-    content = parsing._scan(text.replace(b"x:y", b"x_y"), Limits(), False)
+    content = scan(text.replace(b"x:y", b"x_y"), Limits(), False)
     assert content is not None
     expected = [
         {n.replace(":", "_"): f"{k} & {n.replace(':', '_')}", "visible": "true"} for k, n in enumerate(names, 1)
@@ -296,7 +300,7 @@ def test_the_samples_objects() -> None:
     ],
 )
 def test_direction(tags: dict[str, str], expected: str) -> None:
-    assert osm.direction(tags) == expected
+    assert direction(tags) == expected
 
 
 @pytest.mark.parametrize("pack", [gzip.compress, bz2.compress], ids=["gz", "bz2"])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any
 
-from app.formats.osm.parsing import INT64, MAX_UNKNOWN_DEPTH
+from app.formats.osm.elements import INT64, MAX_UNKNOWN_DEPTH
 from app.syntax.decimals import DEGREES, numbers
 
 MAX_CACHED_ATTRIBUTES = 4096
@@ -109,27 +109,23 @@ def _lines(
             yield f' <node id="{i}"{attributes(node.attributes)}{position}/>'
     for i in sorted(ways, key=rank):
         refs, tags, element_attributes = ways[i]
-        further = unknown("way", i)
-        if not refs and not tags and not further:
-            yield f' <way id="{i}"{attributes(element_attributes)}/>'
-            continue
-        yield f' <way id="{i}"{attributes(element_attributes)}>'
-        yield from [f'  <nd ref="{r}"/>' for r in refs]
-        yield from tag_lines(tags)
-        yield from further
-        yield " </way>"
+        inner = [*[f'  <nd ref="{r}"/>' for r in refs], *tag_lines(tags), *unknown("way", i)]
+        yield from _element_with("way", i, attributes(element_attributes), inner)
     for i in sorted(relations, key=rank):
         members, tags, element_attributes = relations[i]
-        further = unknown("relation", i)
-        if not members and not tags and not further:
-            yield f' <relation id="{i}"{attributes(element_attributes)}/>'
-            continue
-        yield f' <relation id="{i}"{attributes(element_attributes)}>'
-        yield from [f'  <member type="{escape(t)}" ref="{r}" role="{escape(role)}"/>' for t, r, role in members]
-        yield from tag_lines(tags)
-        yield from further
-        yield " </relation>"
+        inner = [f'  <member type="{escape(t)}" ref="{r}" role="{escape(role)}"/>' for t, r, role in members]
+        inner += [*tag_lines(tags), *unknown("relation", i)]
+        yield from _element_with("relation", i, attributes(element_attributes), inner)
     yield "</osm>"
+
+
+def _element_with(kind: str, i: int, attributes: str, inner: list[str]) -> Iterator[str]:
+    if not inner:
+        yield f' <{kind} id="{i}"{attributes}/>'
+        return
+    yield f' <{kind} id="{i}"{attributes}>'
+    yield from inner
+    yield f" </{kind}>"
 
 
 def element_lines(rows: Any, indent: str = " ", depth: int = 1) -> list[str]:

@@ -1,0 +1,279 @@
+"""Writing map_server files: which grids, their pictures, and the YAML beside each."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import Invalid
+from app.formats import WriteContext, _masks
+from app.formats._select import file_stem, select_part
+from app.formats.occupancy_grid.resampling import normalize, resample
+from app.formats.occupancy_grid.words import KEYS, MAP_SAVER_PIXELS, NAME, Table, cell_table, reads_unknown_as_free
+from app.model.grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    UNKNOWN_GREY,
+    OccupancyGrid,
+    pack_cells,
+    unknown_grey,
+    unknown_grey_as_unknown,
+    without_unknown_grey,
+)
+from app.model.layers import Layers, PartKey
+from app.parameters import parameter
+from app.syntax import images, yaml
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """Which grid, and how it is written."""
+
+    grid: str | None = parameter(None, "name of the grid; *: all, drawn masks too; default: map, else the only one")
+    level: str | None = parameter(None, "level of the grid; *: all; default: the one it is on")
+    file_type: Literal["pgm", "png"] | None = parameter(
+        None, "picture format; default: pgm, or png where only transparency can say unknown"
+    )
+    mode: Literal["trinary", "scale", "raw"] | None = parameter(
+        None, "how greys encode cells; default: as uploaded, or raw where that cannot say every value"
+    )
+    resolution: float | None = parameter(
+        None,
+        "resample to this size of a cell: a coarser cell has the highest value that it covers (unknown counts just "
+        "above free), a finer one that of the cell at its centre",
+        minimum=1e-3,
+        maximum=1e3,
+        unit="m",
+    )
+    normalize: bool = parameter(
+        False,
+        "bake the yaw (which Nav2 ignores) into the cells, unknown outside, and move the origin to a whole multiple "
+        "of the resolution; obstacles never get lost",
+    )
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``<grid>.yaml`` and its picture, and ``<grid>_filter_info.yaml`` of a mask.
+
+    Raises MissingLayer, NotFound, Ambiguous, or Invalid for impossible options.
+    """
+    options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+    key = choose(sorted(layers.grids()), options)[0]
+    grid = layers.grids()[key]
+    if options.resolution is not None and options.resolution != grid.resolution:
+        grid = _with_mask(grid, partial(resample, resolution=options.resolution))
+    if options.normalize:
+        grid = _with_mask(grid, normalize)
+    stem = file_stem(key.name)
+    grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
+    grid, pixels = _with_grey(grid, pixels)
+    if grid.origin[2] != 0.0:
+        reason = f"the origin is turned by {grid.origin[2]:g} rad; Nav2 ignores that: ask for normalize=true"
+        context.warn(reason, file=stem + ".yaml", where="origin")
+    picture = f"{stem}.{kind}"
+    files = {stem + ".yaml": _yaml_text(grid, picture), picture: _picture(grid, pixels, kind)}
+    return files | _masks.write(grid, stem, context)
+
+
+def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
+    """The named grid; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
+    supply = "upload one (a YAML and its image)"
+    return select_part(keys, "occupancy", options.grid, options.level, noun="grid", option="grid", supply=supply)
+
+
+def _encoding(
+    grid: OccupancyGrid, options: WriteOptions, context: WriteContext, file: str
+) -> tuple[OccupancyGrid, Table, Literal["pgm", "png"]]:
+    """The grid in the mode it is written in, the pixel of each cell value, and the picture's format.
+
+    In a PNG unknown may have no pixel of its own: it is transparent then.
+    """
+    present = np.flatnonzero(_present_file(grid.cells))
+    if options.mode is not None:
+        same_mode = options.mode == grid.mode
+        grid = replace(grid, mode=options.mode)
+        if options.mode == "trinary":
+            if not same_mode and _pixels(grid, present) is None:
+                grid = replace(grid, occupied_thresh=0.65, free_thresh=0.196)
+            grid = _apply_thresholds(grid, context)
+            present = np.flatnonzero(_present_file(grid.cells))
+        elif options.mode == "scale" and not same_mode and _pixels(grid, present[present != UNKNOWN]) is None:
+            grid = replace(grid, occupied_thresh=1.0, free_thresh=0.0)
+    pixels = _pixels(grid, present)
+    if pixels is not None:
+        return grid, pixels, options.file_type or "pgm"
+    cell_values = present[present != UNKNOWN]
+    pixels = _pixels(grid, cell_values)
+    if pixels is not None and options.file_type != "pgm":
+        return grid, pixels, "png"
+    if options.mode is not None:
+        reason = (
+            f"mode={options.mode} with these thresholds has no grey for unknown: ask for file_type=png or mode=raw"
+            if pixels is not None
+            else f"mode={options.mode} has no grey for every value of this grid: ask for mode=raw"
+        )
+        raise Invalid(reason)
+    why = "unknown" if pixels is not None else "every value of this grid"
+    context.warn(f"written with mode: raw, since {grid.mode} has no grey for {why}", file=file, where="mode")
+    grid = replace(grid, mode="raw")
+    pixels = _pixels(grid, present)
+    if pixels is None:
+        raise AssertionError("raw says every value")
+    return grid, pixels, options.file_type or "pgm"
+
+
+def _with_mask(grid: OccupancyGrid, change: Callable[[OccupancyGrid], OccupancyGrid]) -> OccupancyGrid:
+    """A grid in other cells, whose free cells have unknown's grey if one of those that they show had it."""
+    out = without_unknown_grey(change(grid))
+    if unknown_grey(grid) is None:
+        return out
+    grey = (change(unknown_grey_as_unknown(grid)).cells == UNKNOWN) & (out.cells == FREE)
+    return replace(out, properties={**out.properties, UNKNOWN_GREY: pack_cells(grey)}) if grey.any() else out
+
+
+def _with_grey(grid: OccupancyGrid, pixels: Table) -> tuple[OccupancyGrid, Table]:
+    """Free cells that came with the grey of unknown ones get it back, by a value that no cell has."""
+    rule = cell_table(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
+    grey = unknown_grey(grid) if reads_unknown_as_free(rule, grid.mode, negate=grid.negate) else None
+    if grey is None:
+        return grid, pixels
+    present = _present_file(grid.cells)
+    spare = next((v for v in range(FREE + 1, OCCUPIED) if not present[v]), None)
+    if spare is None:
+        return grid, pixels
+    pixels = pixels.copy()
+    pixels[spare] = MAP_SAVER_PIXELS[UNKNOWN]
+    return replace(grid, cells=np.where(grey, np.uint8(spare), grid.cells)), pixels
+
+
+def _present_file(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Which of the 256 values occur."""
+    seen = np.zeros(256, bool)
+    rows = max(1, images.STRIP // cells.shape[1])
+    for y in range(0, len(cells), rows):
+        block = cells[y : y + rows]
+        counts = {value: int(np.count_nonzero(block == value)) for value in MAP_SAVER_PIXELS}
+        for value, count in counts.items():
+            seen[value] |= count > 0
+        if sum(counts.values()) < block.size:
+            seen[block] = True
+    return seen
+
+
+def _pixels(grid: OccupancyGrid, values: NDArray[np.intp]) -> Table | None:
+    """For each cell value a pixel that the consumer's rule turns back into it; None if one of ``values`` has none.
+
+    The pixels of map_saver where they fit, else blackest for occupied, whitest for free, the middle of those that fit.
+    """
+    rule = cell_table(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
+    out = np.zeros(256, np.uint8)
+    for value in values.tolist():
+        fit = np.flatnonzero(rule == value)
+        if not len(fit):
+            return None
+        pixel = MAP_SAVER_PIXELS.get(value, -1)
+        pixel = 255 - pixel if grid.negate and pixel >= 0 else pixel
+        black, white = (int(fit[-1]), int(fit[0])) if grid.negate else (int(fit[0]), int(fit[-1]))
+        if grid.mode == "raw":
+            out[value] = value
+        elif grid.mode == "trinary" and pixel in fit:
+            out[value] = pixel
+        else:
+            out[value] = {OCCUPIED: black, FREE: white}.get(value, int(fit[len(fit) // 2]))
+    return out
+
+
+def _apply_thresholds(grid: OccupancyGrid, context: WriteContext) -> OccupancyGrid:
+    """Values between free and occupied put to the thresholds, as trinary knows three values only."""
+    value = np.arange(256)
+    table = np.where(value >= grid.occupied_thresh * OCCUPIED, OCCUPIED, UNKNOWN)
+    table[value <= grid.free_thresh * OCCUPIED] = FREE
+    table[[FREE, OCCUPIED, UNKNOWN]] = FREE, OCCUPIED, UNKNOWN
+    between = int(grid.cells.size) - sum(int(np.count_nonzero(grid.cells == v)) for v in (FREE, OCCUPIED, UNKNOWN))
+    context.drop("cells between free and occupied", between, "mode=trinary knows free, occupied and unknown only")
+    return replace(grid, cells=images.apply_table(grid.cells, table.astype(np.uint8).tobytes())) if between else grid
+
+
+def _yaml_text(grid: OccupancyGrid, picture: str) -> bytes:
+    """The keys in map_saver's order, numbers as short as they read back exactly, then what else the source said."""
+    origin = ", ".join(_float(v) for v in grid.origin)
+    lines = [
+        f"image: {_text(picture)}",
+        f"mode: {grid.mode}",
+        f"resolution: {_float(grid.resolution)}",
+        f"origin: [{origin}]",
+        f"negate: {int(grid.negate)}",
+        f"occupied_thresh: {_float(grid.occupied_thresh)}",
+        f"free_thresh: {_float(grid.free_thresh)}",
+    ]
+    extra = grid.properties.get(NAME)
+    if isinstance(extra, Mapping):
+        lines += [f"{_text(key)}: {_value(value)}" for key, value in extra.items() if key not in KEYS]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _float(value: float) -> str:
+    """repr, with the point that YAML 1.1 wants before an exponent; no -0.0."""
+    text = repr(float(value) + 0.0)
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
+
+
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
+_ESCAPE = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
+
+
+def _text(value: str) -> str:
+    """A YAML scalar that is read as this text."""
+    if _PLAIN.fullmatch(value) and value not in yaml.CONSTANTS:
+        return value
+    quoted = json.dumps(value, ensure_ascii=False)
+    return _ESCAPE.sub(lambda match: f"\\u{ord(match.group()):04x}", quoted)
+
+
+def _value(value: Any) -> str:
+    """Any JSON-like value as YAML in flow style."""
+    if isinstance(value, str):
+        return _text(value)
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    if isinstance(value, float):
+        return _float(value)
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_text(str(k))}: {_value(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    return str(int(value))
+
+
+def _picture(grid: OccupancyGrid, pixels: Table, kind: Literal["pgm", "png"]) -> bytes:
+    table = pixels.tobytes()
+    if kind == "pgm":
+        header = f"P5\n{grid.width} {grid.height}\n255\n".encode()
+        out = io.BytesIO()
+        out.seek(len(header) + grid.cells.size - 1)
+        out.write(
+            b"\0"
+        )  # all of it at once: a buffer that grows is copied, and so is what ``join`` or ``+`` make of parts
+        out.seek(0)
+        out.write(header)
+        rows = max(1, images.STRIP // grid.width)
+        for top in range(grid.height, 0, -rows):
+            out.write(grid.cells[max(0, top - rows) : top][::-1].tobytes().translate(table))
+        return out.getvalue()
+    rule = cell_table(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
+    if rule[pixels[UNKNOWN]] == UNKNOWN or not bool((grid.cells == UNKNOWN).any()):
+        return images.encode_png(grid.cells, flip=True, table=table)
+    both = np.empty((grid.height, grid.width, 2), np.uint8)
+    both[..., 0] = images.apply_table(grid.cells, table)
+    both[..., 1] = 255
+    both[..., 1][grid.cells == UNKNOWN] = 0
+    return images.encode_png(both, flip=True)
