@@ -410,7 +410,7 @@ def test_far_places_and_many_fiducials_are_refused() -> None:
 
 
 def test_only_wanted_layers_are_given() -> None:
-    layers, _ = read(sample("clinic"), wanted=frozenset({"topology"}))
+    layers, _ = read(sample("clinic"), requested_layers=frozenset({"topology"}))
     assert {key.layer for key in layers.parts} == {"topology"}
     assert not any(isinstance(p, Resources) for p in layers.parts.values())
 
