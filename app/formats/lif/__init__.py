@@ -28,7 +28,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, _lif_rules, register
+from app.formats import Files, Format, LayerRequirements, ReadContext, WriteContext, _fields, register
 from app.formats._fields import ANGLE, COORDINATE, NOT_NEGATIVE, SPEED, Number, OneOf, record
 from app.formats._network import (
     CROSS_PART_PROPERTIES,
@@ -53,6 +53,7 @@ from app.formats._network import (
     shorten_list,
     yaw_or_source,
 )
+from app.formats.lif import rules as _lif_rules
 from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, unique_ids
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
