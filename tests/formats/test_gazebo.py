@@ -23,8 +23,8 @@ from lxml import etree
 from app import formats
 from app.convert.files import offline
 from app.errors import Ambiguous, BadUpload, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
-from app.formats import WriteContext, _sdf, _sdf_bodies, gazebo, get_format
-from app.formats.gazebo import WriteOptions
+from app.formats import WriteContext, gazebo, get_format
+from app.formats.gazebo import WriteOptions, bodies, sdf
 from app.limits import Limits
 from app.model import solids
 from app.model.features import Features, features
@@ -747,10 +747,10 @@ def test_rectangles_hold_each_cell_once() -> None:
     for shape, share in (((17, 23), 0.5), ((40, 8), 0.9), ((1, 9), 0.4), ((9, 1), 0.6)):
         cells = dice.random(shape) < share
         count = np.zeros(shape, int)
-        for x0, x1, y0, y1 in _sdf_bodies.rectangles(cells):
+        for x0, x1, y0, y1 in bodies.rectangles(cells):
             count[y0:y1, x0:x1] += 1
         assert (count == cells).all()
-        surface = _sdf_bodies.extrude(cells, 1.0, 1.0).astype(float)
+        surface = bodies.extrude(cells, 1.0, 1.0).astype(float)
         volume = np.einsum("ij,ij->i", surface[:, 0], np.cross(surface[:, 1], surface[:, 2])).sum() / 6
         assert volume == pytest.approx(cells.sum())
 
@@ -761,7 +761,7 @@ def test_a_large_grid_stays_handy() -> None:
     cells[::200, :] = cells[:, ::250] = 100
     dice = np.random.default_rng(1)
     cells[dice.integers(0, 4000, 20_000), dice.integers(0, 4000, 20_000)] = 100
-    surface = _sdf_bodies.extrude(cells == 100, 0.05, 2.5)
+    surface = bodies.extrude(cells == 100, 0.05, 2.5)
     assert len(surface) < 500_000
     a, b, c = surface.astype(float).transpose(1, 0, 2)
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
@@ -999,13 +999,13 @@ def test_stored_text_that_was_tampered_with_is_made_anew() -> None:
 
 def test_names_are_made_valid_and_unique() -> None:
     taken: set[str] = set()
-    names = [_sdf_bodies.free_name(n, taken) for n in ("a", "a", "a::b", "__x__", "world", "\x01", "a_2")]
+    names = [bodies.free_name(n, taken) for n in ("a", "a", "a::b", "__x__", "world", "\x01", "a_2")]
     assert names == ["a", "a_2", "a_b", "object_x", "object_world", "object", "a_2_2"]
-    assert _sdf_bodies.slug("näh (1)/x") == "n_h_1_x"
+    assert bodies.slug("näh (1)/x") == "n_h_1_x"
 
 
 def test_a_models_file_is_chosen_by_its_config() -> None:
-    library = _sdf.Library(folder(SAMPLES / "yard"))
+    library = sdf.Library(folder(SAMPLES / "yard"))
     assert library.model_file("models/crate") == "models/crate/model.sdf"
     assert library.model_file("models/none") is None
 

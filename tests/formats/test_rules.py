@@ -339,12 +339,12 @@ def test_topological_navigation(change: Callable[[dict[str, Any]], object], expe
 
 
 def test_a_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
-    from app.formats import _tmap2_rules
+    from app.formats.tmap import rules
 
     def parse(*_: Any) -> Any:
         raise AssertionError
 
-    monkeypatch.setattr(_tmap2_rules.yaml, "load", parse)
+    monkeypatch.setattr(rules.yaml, "load", parse)
     block = yaml.dump(tmap2(), default_flow_style=False).encode()
     assert findings_of("tmap2", {"a.tmap2.yaml": block}) == set()
 

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 
 from app import formats
 from app.errors import BadUpload, Invalid, MissingDatum, UnreadableFile
-from app.formats import FileGroup, ReadContext, WriteContext, _tmap, get_format
+from app.formats import FileGroup, ReadContext, WriteContext, get_format
+from app.formats.tmap.network import EPOCH, LAST_UPDATED, TRANSFORMATION
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
@@ -133,7 +134,7 @@ def test_served_files_are_valid_for_the_schema_and_other_readers(shared: Path) -
 def check_schema(top: dict[str, Any]) -> None:
     """topological_navigation's tmap-schema.yaml, written out."""
     assert {"meta", "metric_map", "name", "nodes", "pointset"} <= top.keys()
-    assert _tmap.LAST_UPDATED.match(top["meta"]["last_updated"])
+    assert LAST_UPDATED.match(top["meta"]["last_updated"])
     assert all(isinstance(top[key], str) for key in ("metric_map", "name", "pointset"))
     for entry in top["nodes"]:
         assert {key: type(value) for key, value in entry["meta"].items() if key in ("map", "node", "pointset")} == {
@@ -254,7 +255,7 @@ def two(first: Any, second: Any = "B") -> str:
             "node": {"name": name, "edges": edges, "pose": pose},
         }
 
-    top = {"meta": {"last_updated": _tmap.EPOCH}, "metric_map": "m", "name": "p", "pointset": "p"}
+    top = {"meta": {"last_updated": EPOCH}, "metric_map": "m", "name": "p", "pointset": "p"}
     nodes = [node(first, second, 1.0), node(second, None, 5.0)]
     return yaml.safe_dump(top | {"nodes": nodes}, allow_unicode=True)
 
@@ -362,7 +363,7 @@ def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> No
     top = yaml.safe_load(served)
     check_schema(top)
     assert (top["name"], top["metric_map"], top["pointset"]) == ("farm", "farm", "farm")
-    assert top["meta"]["last_updated"] == _tmap.EPOCH
+    assert top["meta"]["last_updated"] == EPOCH
     n1, n2, n10, bend = (n["node"] for n in top["nodes"])
     assert [n["name"] for n in (n1, n2, n10, bend)] == ["n1", "n2", "n10", "n1~n10~1"]
     assert n1["pose"]["position"] == {"x": 0.0, "y": 0.0, "z": 0.0}
@@ -446,7 +447,7 @@ def test_a_last_updated_that_is_no_time_is_replaced_and_said_so() -> None:
     for value in (0, "yesterday", None, 20220623):
         document["meta"]["last_updated"] = value
         served, context = again(read(yaml.safe_dump(document))[0])
-        assert yaml.safe_load(served)["meta"]["last_updated"] == _tmap.EPOCH
+        assert yaml.safe_load(served)["meta"]["last_updated"] == EPOCH
         assert ("no time" in warnings(context)) == (value is not None)
     document["meta"]["last_updated"] = "2022-06-23_13-10-11"
     assert yaml.safe_load(again(read(yaml.safe_dump(document))[0])[0])["meta"]["last_updated"] == "2022-06-23_13-10-11"
@@ -465,7 +466,7 @@ def test_what_nobody_knows_is_kept_where_it_stood() -> None:
     entry["node"]["pose"]["position"]["accuracy"] = 0.1
     entry["node"]["edges"][0] |= {"action": None, "weight": 1e-09, "b": False}
     served = yaml.safe_load(again(read(yaml.safe_dump(document))[0])[0])
-    document["transformation"] = _tmap.TRANSFORMATION
+    document["transformation"] = TRANSFORMATION
     document["nodes"][1]["node"]["parent_frame"] = "map"
     assert served == document
 
@@ -563,7 +564,7 @@ def networks(draw: st.DrawFn) -> dict[str, Any]:
         nodes.append({"meta": {"map": draw(names), "node": name, "pointset": "p"}, "node": node})
     top = draw(st.dictionaries(names.filter(lambda k: k not in ("nodes", "transformation")), nested, max_size=2))
     fixed = {"meta": {"last_updated": "2024-05-01_08-30-00"}, "metric_map": "m", "name": "p", "pointset": "p"}
-    return {**top, **fixed, "transformation": _tmap.TRANSFORMATION, "nodes": nodes}
+    return {**top, **fixed, "transformation": TRANSFORMATION, "nodes": nodes}
 
 
 def plain(top: dict[str, Any]) -> dict[str, Any]:

@@ -22,7 +22,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import ReadContext, _sdf
+from app.formats import ReadContext
+from app.formats.gazebo import sdf
 from app.model.frame import MAX_METRES, is_writable
 from app.model.solids import matrix
 from app.syntax import yaml
@@ -57,7 +58,7 @@ def detect(name: str, data: bytes) -> bool:
     return bool(_ROWS.search(data) and _TURNED.search(data) and _POINT.search(data))
 
 
-def _custom(library: _sdf.Library, reference: str, near: str) -> str | None:
+def _custom(library: sdf.Library, reference: str, near: str) -> str | None:
     """The list or model that a reference names: in ``custom_models`` beside the list first."""
     for path in (f"custom_models/{reference}", reference):
         for ending in ("", ".yaml", ".yml"):
@@ -67,7 +68,7 @@ def _custom(library: _sdf.Library, reference: str, near: str) -> str | None:
     return None
 
 
-def required_files(library: _sdf.Library, main: str) -> list[str]:
+def required_files(library: sdf.Library, main: str) -> list[str]:
     """The custom objects, models and meshes that a list needs, directly or through others, and ``models.yaml``."""
     out: dict[str, None] = {}
     todo = [main]
@@ -84,9 +85,9 @@ def required_files(library: _sdf.Library, main: str) -> list[str]:
                 if detect(file, library.files[file]):
                     todo.append(file)
             else:
-                out.update(dict.fromkeys(_sdf.required_files(library, main, [f"model://{reference}"])))
+                out.update(dict.fromkeys(sdf.required_files(library, main, [f"model://{reference}"])))
         meshes = [t.decode("utf-8", "replace") for t in _MESH.findall(data)]
-        out.update(dict.fromkeys(_sdf.required_files(library, name, meshes)))
+        out.update(dict.fromkeys(sdf.required_files(library, name, meshes)))
     beside = main.rpartition("/")[0] + "/" if "/" in main else ""
     catalogue = beside + "models.yaml"
     if catalogue in library.files and catalogue != main and not detect(catalogue, library.files[catalogue]):
@@ -103,7 +104,7 @@ class ParsedList:
     served: dict[str, str] = field(default_factory=dict)
 
 
-def read(library: _sdf.Library, main: str, context: ReadContext) -> ParsedList:
+def read(library: sdf.Library, main: str, context: ReadContext) -> ParsedList:
     """A list with all it refers to. Raises UnreadableFile or TooLarge."""
     data = yaml.load(library.files[main], context.limits)
     reader = _Reader(library, main, context)
@@ -172,10 +173,10 @@ def _list(items: Any, location: str) -> list[Mapping[str, Any]]:
 class _Reader:
     """A list being read."""
 
-    def __init__(self, library: _sdf.Library, main: str, context: ReadContext) -> None:
+    def __init__(self, library: sdf.Library, main: str, context: ReadContext) -> None:
         self.library, self.main, self.context = library, main, context
         self.found = ParsedList()
-        self.unfolder = _sdf.ModelFlattener(library, self.found.served, context)
+        self.unfolder = sdf.ModelFlattener(library, self.found.served, context)
         self._lists: dict[str, list[Mapping[str, Any]]] = {}
         self._count = 0
 
@@ -202,7 +203,7 @@ class _Reader:
                 pose = list(anchor)
             else:
                 shapes = [self._shape(item, reference, self.main, location)]
-                pose = _sdf.six(matrix(anchor) @ matrix(_pose(item, location)))
+                pose = sdf.six(matrix(anchor) @ matrix(_pose(item, location)))
             properties: dict[str, Any] = {"kind": "model", "name": name, "pose": pose, NAMESPACE: source_properties}
             if shapes:
                 properties["shapes"] = shapes
@@ -251,16 +252,16 @@ class _Reader:
                     self._shape(item, inner, path, item_location), anchor @ matrix(_pose(item, item_location))
                 )
 
-    def _place_shape(self, shape: Mapping[str, Any], at: _sdf.Matrix) -> dict[str, Any]:
+    def _place_shape(self, shape: Mapping[str, Any], at: sdf.Matrix) -> dict[str, Any]:
         self._count += 1
-        if self._count > _sdf.MAX_SHAPES:
-            raise TooLarge(f"the custom objects have more than {_sdf.MAX_SHAPES} shapes")
+        if self._count > sdf.MAX_SHAPES:
+            raise TooLarge(f"the custom objects have more than {sdf.MAX_SHAPES} shapes")
         out = {k: v for k, v in shape.items() if k != "pose"}
-        pose = _sdf.six(at)
+        pose = sdf.six(at)
         return out | {"pose": pose} if any(pose) else out
 
     def _shape(self, item: Mapping[str, Any], reference: str, near: str, location: str) -> dict[str, Any]:
-        """A primitive without its pose; ``visual`` where it says no ``collision``. See ``_sdf.is_absent``."""
+        """A primitive without its pose; ``visual`` where it says no ``collision``. See ``sdf.is_absent``."""
         out: dict[str, Any]
         if reference == "sphere":
             out = {"type": reference, "radius": _number(item.get("radius"), f"{location}.radius")}
@@ -274,7 +275,7 @@ class _Reader:
             out = {"type": reference, "normal": [0.0, 0.0, 1.0], "size": size}
         elif reference == "mesh":
             uri = _text(item.get("dae"), f"{location}.dae")
-            self.found.served.update(_sdf.required_files(self.library, near, [uri]))
+            self.found.served.update(sdf.required_files(self.library, near, [uri]))
             file = self.library.find(uri, near)
             path = self.found.served.get(file) if file is not None else None
             if path is None:
@@ -332,13 +333,13 @@ class _Reader:
 
     def _model(self, folder: str, reference: str) -> list[dict[str, Any]]:
         """The shapes of a model folder."""
-        self.found.served.update(_sdf.required_files(self.library, self.main, [f"model://{reference}"]))
+        self.found.served.update(sdf.required_files(self.library, self.main, [f"model://{reference}"]))
         file = self.library.model_file(folder)
         body = None if file is None else self.unfolder.file(file)
         if body is None:
             self.unfolder.missing(f"custom_models/{reference}")
             return [{"type": "model", "uri": f"custom_models/{reference}"}]
-        body_pose = _sdf.ZERO if body.pose is None else body.pose
+        body_pose = sdf.ZERO if body.pose is None else body.pose
         return [self._place_shape(s, body_pose.matrix @ matrix(s.get("pose", (0.0,) * 6))) for s in body.shapes()]
 
     # rows

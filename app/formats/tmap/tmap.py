@@ -1,6 +1,6 @@
 """tmap: the older networks of topological_navigation (strands_navigation), a YAML list of nodes: ``*.tmap``.
 
-See ``app.formats._tmap``. What its reader (topological_navigation, manager.py) takes of a node: ``name``, ``map``,
+See ``tmap.network``. What its reader (topological_navigation, manager.py) takes of a node: ``name``, ``map``,
 ``pointset``, ``pose``, ``verts``, ``edges``, ``localise_by_topic``, ``xy_goal_tolerance`` and ``yaw_goal_tolerance``;
 of an edge: ``edge_id``, ``node``, ``action``, ``top_vel``, ``map_2d``, ``inflation_radius`` and
 ``recovery_behaviours_config``. All of these are written; further keys, at which it does not look, are kept.
@@ -8,7 +8,8 @@ of an edge: ``edge_id``, ``node``, ``action``, ``top_vel``, ``map_2d``, ``inflat
 
 from __future__ import annotations
 
-from app.formats import Claims, Format, LayerRequirements, Selection, Traits, WriteContext, _tmap, register
+from app.formats import Claims, Format, LayerRequirements, Selection, Traits, WriteContext, register
+from app.formats.tmap import network as _tmap
 from app.model.layers import Layers
 
 FILE = "map.tmap"
@@ -16,7 +17,7 @@ ENDS = (".tmap", ".yaml", ".yml", ".tmap2")
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.tmap``; see ``_tmap.write``. The map's name and transformation have no place in it."""
+    """``map.tmap``; see ``network.write``. The map's name and transformation have no place in it."""
     return {FILE: _tmap.write(layers, context, listed=True)}
 
 

@@ -27,18 +27,7 @@ import numpy as np
 import shapely
 
 from app.errors import Problem, UnreadableFile
-from app.formats import (
-    Claims,
-    Files,
-    Format,
-    LayerRequirements,
-    ReadContext,
-    Traits,
-    WriteContext,
-    _fields,
-    _navgraph_rules,
-    register,
-)
+from app.formats import Claims, Files, Format, LayerRequirements, ReadContext, Traits, WriteContext, _fields, register
 from app.formats._fields import ANGLE, COORDINATE, Number, Record, record
 from app.formats._network import (
     CROSS_PART_PROPERTIES,
@@ -65,6 +54,7 @@ from app.formats._network import (
     source_document,
     yaw_or_source,
 )
+from app.formats.navgraph import rules as _navgraph_rules
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.layers import NETWORK, Layers, PartKey
 from app.parameters import parameter

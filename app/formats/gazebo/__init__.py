@@ -1,7 +1,7 @@
 """Gazebo worlds: SDFormat 1.4 to 1.11, with the models, meshes and materials they need.
 
 A file is a world (``.world``, ``.world.xml``, ``.sdf``), a lone ``model.sdf`` (a world of one model), or one of the
-lists that environment_common makes worlds from (``objects.yaml``, ``known_obstacles.yaml``; see ``_sdf_lists``).
+lists that environment_common makes worlds from (``objects.yaml``, ``known_obstacles.yaml``; see ``gazebo.yaml_lists``).
 
 Canonical: each direct model, include and light of a world is an object of the kind ``model``, ``include`` or ``light``,
 called by its name, with its ``pose`` and, where the upload tells its solids, ``shapes``, ``size`` and a footprint in
@@ -41,13 +41,12 @@ from app.formats import (
     Selection,
     Traits,
     WriteContext,
-    _sdf,
-    _sdf_bodies,
-    _sdf_lists,
     register,
 )
-from app.formats._sdf_elements import KNOWN
 from app.formats._select import select_part
+from app.formats.gazebo import sdf, yaml_lists
+from app.formats.gazebo.bodies import Bodies, BodyDefaults, free_name, slug, sun, valid
+from app.formats.gazebo.elements import KNOWN
 from app.limits import Limits
 from app.model import masks, solids, worlds
 from app.model.features import Feature, Features, features, unique_ids
@@ -71,7 +70,7 @@ SAME_POSE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class WriteOptions(_sdf_bodies.BodyDefaults):
+class WriteOptions(BodyDefaults):
     """Which world, and what is made of objects and grids that no world has told of."""
 
     world: str | None = parameter(
@@ -96,29 +95,29 @@ class WriteOptions(_sdf_bodies.BodyDefaults):
 # --- telling -----------------------------------------------------------------------------------------------------
 def detect(name: str, data: bytes) -> bool:
     """A root element ``<sdf>`` with a world, model or light, or a list of the generator's."""
-    if _sdf.is_sdf(data):
-        return _sdf.contains_element(data, b"world", b"model", b"light")
-    return _sdf_lists.detect(name, data)
+    if sdf.is_sdf(data):
+        return sdf.contains_element(data, b"world", b"model", b"light")
+    return yaml_lists.detect(name, data)
 
 
 def sort(files: Files, mains: Sequence[str]) -> dict[str, list[str]]:
     """Worlds and lists are maps of their own; a model only where there is no world in the upload and no other model
     includes it. With each come the model folders and files that it needs, also through other models."""
-    library = _sdf.Library(files)
-    lists = [n for n in mains if not _sdf.is_sdf(files[n])]
-    worlds = [n for n in mains if _sdf.is_sdf(files[n]) and _sdf.contains_element(files[n], b"world")]
-    out = {name: list(_sdf.required_files(library, name)) for name in worlds}
-    parts = {name: _sdf_lists.required_files(library, name) for name in lists}
+    library = sdf.Library(files)
+    lists = [n for n in mains if not sdf.is_sdf(files[n])]
+    worlds = [n for n in mains if sdf.is_sdf(files[n]) and sdf.contains_element(files[n], b"world")]
+    out = {name: list(sdf.required_files(library, name)) for name in worlds}
+    parts = {name: yaml_lists.required_files(library, name) for name in lists}
     inner = {other for name, companions in parts.items() for other in companions if other != name}
     for name in lists:
         if name not in inner or not set(lists) - inner:
             out[name] = parts[name]
     if not out:
-        out = _lone_models(library, [n for n in mains if _sdf.is_sdf(files[n])])
+        out = _lone_models(library, [n for n in mains if sdf.is_sdf(files[n])])
     return out
 
 
-def _lone_models(library: _sdf.Library, models: Sequence[str]) -> dict[str, list[str]]:
+def _lone_models(library: sdf.Library, models: Sequence[str]) -> dict[str, list[str]]:
     """Of an upload without a world the models that ``model.config`` chooses and no other model includes."""
     mains = []
     for name in models:
@@ -126,7 +125,7 @@ def _lone_models(library: _sdf.Library, models: Sequence[str]) -> dict[str, list
         config = f"{folder}/model.config" if folder else "model.config"
         if config not in library.files or library.model_file(folder) in (name, None):
             mains.append(name)
-    out = {name: [*_sdf.required_files(library, name), *_model_files(library, name)] for name in mains}
+    out = {name: [*sdf.required_files(library, name), *_model_files(library, name)] for name in mains}
     inner = {other for name, companions in out.items() for other in companions if other != name}
     free = {name: companions for name, companions in out.items() if name not in inner}
     # Models that include each other all the way round: one of them tells what is wrong.
@@ -137,36 +136,34 @@ def _lone_models(library: _sdf.Library, models: Sequence[str]) -> dict[str, list
 def read(files: Files, context: ReadContext) -> Layers:
     """The worlds of a file. Raises UnreadableFile (with file, line and element) or TooLarge."""
     main = context.main or next(iter(files))
-    library = _sdf.Library(files)
-    if not _sdf.is_sdf(files[main]) and _sdf_lists.detect(main, files[main]):
+    library = sdf.Library(files)
+    if not sdf.is_sdf(files[main]) and yaml_lists.detect(main, files[main]):
         return _read_list(library, main, context)
-    root = _sdf.parse(files[main], context.limits)
+    root = sdf.parse(files[main], context.limits)
     xml.report_active_content(files[main], context.warn, has_scripts=True)
     xml.report_unknown_elements(files[main], root, KNOWN, context.warn, free={"plugin"})
-    _sdf.report_suspicious_values(root, context)
-    version = _sdf.parse_version(root.get("version"))
-    if version is None or not (1, 4) <= version <= _sdf.NEWEST:
+    sdf.report_suspicious_values(root, context)
+    version = sdf.parse_version(root.get("version"))
+    if version is None or not (1, 4) <= version <= sdf.NEWEST:
         version_text = root.get("version")
         context.warn(f"SDFormat version {version_text!r} is not one of 1.4 to 1.11: read as 1.7", line=root.sourceline)
-    served = _sdf.required_files(library, main)
-    reader = _Reader(
-        _sdf.ModelFlattener(library, served, context), main, {served[n]: files[n] for n in served}, context
-    )
+    served = sdf.required_files(library, main)
+    reader = _Reader(sdf.ModelFlattener(library, served, context), main, {served[n]: files[n] for n in served}, context)
     worlds = root.findall("world")
     for k, world in enumerate(worlds):
         name = _key(main) if not k else f"{_key(main)}#{k + 1}"
         reader.world(world, name, root.get("version", ""))
     if not worlds:
         alone = etree.Element("world")
-        alone.extend(list(_sdf.iter_models(root)))
+        alone.extend(list(sdf.iter_models(root)))
         if not len(alone):
-            raise _sdf.unreadable_error("there is no world, model or light in it", root)
+            raise sdf.unreadable_error("there is no world, model or light in it", root)
         reader.world(alone, _key(main), root.get("version", ""), alone=True)
     reader.unfolder.report()
     return reader.layers()
 
 
-def _model_files(library: _sdf.Library, main: str) -> list[str]:
+def _model_files(library: sdf.Library, main: str) -> list[str]:
     """What lies in a lone model's own folder."""
     folder = main.rpartition("/")[0]
     if not folder or (main.rpartition("/")[2] != "model.sdf" and f"{folder}/model.config" not in library.files):
@@ -177,14 +174,14 @@ def _model_files(library: _sdf.Library, main: str) -> list[str]:
 def _key(main: str) -> str:
     """A world's name in the store: its file's path without the ending."""
     folder, slash, base = main.rpartition("/")
-    return folder + slash + _sdf.stem(base)
+    return folder + slash + sdf.stem(base)
 
 
 @dataclass(slots=True)
 class _Reader:
     """The objects and the rest of a file's worlds."""
 
-    unfolder: _sdf.ModelFlattener
+    unfolder: sdf.ModelFlattener
     main: str
     resources: dict[str, bytes]
     context: ReadContext
@@ -206,31 +203,31 @@ class _Reader:
     def world(self, world: etree._Element, key: str, version: str, *, alone: bool = False) -> None:
         """Take a world apart."""
         elements = []
-        frames = _sdf.WorldFrames(self.unfolder, self.main)
+        frames = sdf.WorldFrames(self.unfolder, self.main)
         for element in world.iterchildren("frame"):
-            frames.add(element.get("name", ""), _sdf.parse_pose(element), element.get("attached_to", ""), element)
+            frames.add(element.get("name", ""), sdf.parse_pose(element), element.get("attached_to", ""), element)
         for element in world.iterchildren(*OBJECTS):
             body = self._body(element)
             name = self._name(element, body)
-            element_pose = _sdf.parse_pose(element)
+            element_pose = sdf.parse_pose(element)
             body_pose = body.pose if body is not None and element.tag == "include" else None
-            back = None if body is None else _sdf.placement(element, body)
-            frames.add_model(name, element_pose or body_pose or _sdf.ZERO, body or _sdf.Body(), back, element)
+            back = None if body is None else sdf.placement(element, body)
+            frames.add_model(name, element_pose or body_pose or sdf.ZERO, body or sdf.Body(), back, element)
             elements.append((element, body, name, element_pose, body_pose, back))
         moved = self._state(world)
         footprints = Footprints(self.resources, self.context)
         seen: set[str] = set()
         for element, body, name, element_pose, body_pose, back in elements:
-            source_pose = element_pose or body_pose or _sdf.ZERO
+            source_pose = element_pose or body_pose or sdf.ZERO
             simple = not source_pose.relative and back is None
             if name in seen:
                 self.context.warn("two objects of the world have this name", line=element.sourceline, where=name[:80])
-            pose = list(source_pose.values) if simple or name in seen else _sdf.six(frames.place(name))
+            pose = list(source_pose.values) if simple or name in seen else sdf.six(frames.place(name))
             seen.add(name)
             source_properties: dict[str, Any] = {"world": key}
             if not (simple and (element_pose.plain if element_pose is not None else element.tag != "include")):
                 source_properties["pose"] = pose
-            if element.tag == "include" and not _sdf.element_text(element, "name"):
+            if element.tag == "include" and not sdf.element_text(element, "name"):
                 source_properties["name"] = name
             if name in moved and not _is_same_pose(moved[name], pose):
                 source_properties["state"] = moved[name]
@@ -240,7 +237,7 @@ class _Reader:
         for child in world:
             if child.tag not in (*OBJECTS, "state") and isinstance(child.tag, str):
                 remainder.append(child)
-        entry: dict[str, Any] = {"sdf": _sdf.compact(remainder), "version": version}
+        entry: dict[str, Any] = {"sdf": sdf.compact(remainder), "version": version}
         if alone:
             entry["alone"] = True
         datum = self._datum(remainder.find("spherical_coordinates"))
@@ -248,32 +245,32 @@ class _Reader:
             entry["datum"] = [datum.latitude, datum.longitude, datum.altitude, datum.heading]
         self.worlds[key] = entry
 
-    def _body(self, element: etree._Element) -> _sdf.Body | None:
+    def _body(self, element: etree._Element) -> sdf.Body | None:
         if element.tag == "include":
             return self.unfolder.include(element, self.main)
         return self.unfolder.body(element, self.main)
 
-    def _name(self, element: etree._Element, body: _sdf.Body | None) -> str:
+    def _name(self, element: etree._Element, body: sdf.Body | None) -> str:
         """What the object is called: an include without a name like its model."""
-        name = _sdf.element_text(element, "name") if element.tag == "include" else element.get("name", "")
+        name = sdf.element_text(element, "name") if element.tag == "include" else element.get("name", "")
         if not name:
-            reference = _sdf.element_text(element, "uri").rstrip("/")
+            reference = sdf.element_text(element, "uri").rstrip("/")
             name = (body.name if body is not None else "") or reference.rpartition("/")[2] or str(element.tag)
         if len(name) > 256 or not is_writable(name):
-            raise _sdf.unreadable_error("a name must have at most 256 characters and no control characters", element)
+            raise sdf.unreadable_error("a name must have at most 256 characters and no control characters", element)
         return name
 
     def _add(
         self,
         element: etree._Element,
-        body: _sdf.Body | None,
+        body: sdf.Body | None,
         name: str,
         pose: list[float],
         source_properties: dict[str, Any],
         footprints: Footprints,
     ) -> None:
         properties: dict[str, Any] = {"kind": str(element.tag), "name": name, "pose": pose}
-        shapes = _sdf.absent_model(element) if body is None else body.shapes() if body.kind == "model" else []
+        shapes = sdf.absent_model(element) if body is None else body.shapes() if body.kind == "model" else []
         if shapes:
             properties["shapes"] = shapes
         shape, size = footprints.footprint_and_size(properties, name)
@@ -284,7 +281,7 @@ class _Reader:
                 element.remove(old)
         if element.tag != "include" and "name" in element.attrib:
             del element.attrib["name"]
-        source_properties["sdf"] = _sdf.compact(element)
+        source_properties["sdf"] = sdf.compact(element)
         properties[NAME] = source_properties
         self.rows.append((name, shape, properties))
 
@@ -295,7 +292,7 @@ class _Reader:
         out = {}
         for state in world.iterchildren("state"):
             for model in state.iterchildren("model", "light"):
-                pose = _sdf.parse_pose(model)
+                pose = sdf.parse_pose(model)
                 if pose is not None:
                     out[model.get("name", "")] = list(pose.values)
             if state.find("insertions") is not None:
@@ -321,13 +318,13 @@ class _Reader:
         """The datum that spherical coordinates mean; None where they tell no place on earth."""
         if element is None:
             return None
-        surface = _sdf.element_text(element, "surface_model") or "EARTH_WGS84"
-        axes = _sdf.element_text(element, "world_frame_orientation") or "ENU"
+        surface = sdf.element_text(element, "surface_model") or "EARTH_WGS84"
+        axes = sdf.element_text(element, "world_frame_orientation") or "ENU"
         if surface != "EARTH_WGS84" or axes != "ENU":
             self.context.warn(f"a world on {surface} with axes {axes} gives no datum", line=element.sourceline)
             return None
         latitude, longitude, elevation, heading = (
-            _sdf.vector(element, tag, 1, (0.0,))[0]
+            sdf.vector(element, tag, 1, (0.0,))[0]
             for tag in ("latitude_deg", "longitude_deg", "elevation", "heading_deg")
         )
         if latitude == 0.0 and longitude == 0.0:
@@ -400,7 +397,7 @@ class Footprints:
         try:
             (self._flat or solids.Solids(self.resources)).shape(shape)
         except (Invalid, TooLarge) as error:
-            if not _sdf.is_absent(shape):
+            if not sdf.is_absent(shape):
                 self._warn_once(error, name)
             return False
         return True
@@ -421,9 +418,9 @@ def _is_same_pose(a: Sequence[float], b: Sequence[float]) -> bool:
     return bool(np.abs(solids.matrix(a) - solids.matrix(b)).max() <= SAME_POSE)
 
 
-def _read_list(library: _sdf.Library, main: str, context: ReadContext) -> Layers:
+def _read_list(library: sdf.Library, main: str, context: ReadContext) -> Layers:
     """The generator's list of objects as a world of its own."""
-    listing = _sdf_lists.read(library, main, context)
+    listing = yaml_lists.read(library, main, context)
     resources = {path: library.files[name] for name, path in listing.served.items()}
     footprints = Footprints(resources, context)
     rows = []
@@ -524,7 +521,7 @@ class _Writer:
     def _select_world(self) -> _StoredWorld | None:
         world_name = self.options.world
         if world_name is not None:
-            matches = [w for w in self.stored if world_name in (w.key, _sdf.stem(w.key))]
+            matches = [w for w in self.stored if world_name in (w.key, sdf.stem(w.key))]
             if not matches:
                 names = ", ".join(w.key for w in self.stored) or "none"
                 raise NotFound(f"there is no world {world_name!r}; there are: {names}")
@@ -545,7 +542,7 @@ class _Writer:
         world = self._frame(source_world)
         for one in sorted(source_world.objects if source_world is not None else [], key=lambda o: _natural(o.id)):
             self._restore_object(one)
-        bodies = _sdf_bodies.Bodies(self.context, self.resources, self.options)
+        bodies = Bodies(self.context, self.resources, self.options)
         self._make_models(bodies, [(self.options.level or GROUND, one) for one in self.loose])
         everything = self.options.content == "all" or (
             self.options.content == "auto" and not (source_world is not None and source_world.is_world)
@@ -567,7 +564,7 @@ class _Writer:
             if self.options.grid is None and everything and has_objects and _is_slice(grid):
                 continue  # its walls are these objects
             if everything or self.options.grid is not None:
-                name = _sdf_bodies.free_name(f"walls_{_sdf_bodies.slug(key.name)}", self.taken)
+                name = free_name(f"walls_{slug(key.name)}", self.taken)
                 model = bodies.walls(grid, name, self.options.threshold, self.layers.elevation(key.level))
                 if model is not None:
                     self.made.append((name, model))
@@ -594,9 +591,7 @@ class _Writer:
                     self.taken.update(e.get("name", "") for e in world.iterchildren(tag))
                 return world
             self.context.warn(f"what was kept of the world {source_world.key} cannot be read: it is left out")
-        return etree.Element(
-            "world", name=_sdf_bodies.valid(_sdf.stem(source_world.key) if source_world else self.context.title)
-        )
+        return etree.Element("world", name=valid(sdf.stem(source_world.key) if source_world else self.context.title))
 
     def _restore_object(self, one: Feature) -> None:
         """An object of the stored world as it was, under its present name and pose."""
@@ -634,27 +629,27 @@ class _Writer:
                 element.remove(old)
             element.attrib.pop("placement_frame", None)
             if element.tag == "include" or any(pose):
-                element.insert(0, _sdf.pose_element(pose))
+                element.insert(0, sdf.pose_element(pose))
         self.made.append((name, element))
 
-    def _make_models(self, bodies: _sdf_bodies.Bodies, rows: Iterable[tuple[str, Feature]]) -> None:
+    def _make_models(self, bodies: Bodies, rows: Iterable[tuple[str, Feature]]) -> None:
         """Static models of objects that no world has told of."""
         for level, one in sorted(rows, key=lambda row: _natural(row[1].id)):
             model = bodies.model(one, self.layers.elevation(level), self.taken)
             if model is not None:
                 self.made.append((model.get("name", ""), model))
 
-    def _furnish(self, bodies: _sdf_bodies.Bodies) -> None:
+    def _furnish(self, bodies: Bodies) -> None:
         """A ground to stand on and a light, where a world is made."""
         if "ground_plane" not in self.taken and self.options.ground and not bodies.hilly:
             self.made.append(("ground_plane", bodies.ground()))
             self.context.fill("ground plane", bodies.ground_size, "no world tells of the ground", "ground")
         lit = any(
-            e.tag == "light" or _sdf.element_text(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.made
+            e.tag == "light" or sdf.element_text(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.made
         )
         if not lit and self.options.sun:
-            name = _sdf_bodies.free_name("sun", self.taken)
-            self.made.append((name, _sdf_bodies.sun(name)))
+            name = free_name("sun", self.taken)
+            self.made.append((name, sun(name)))
             self.context.fill("sun", "directional light", "no world tells of a light", "sun")
 
     def _place(self, world: etree._Element, source_world: _StoredWorld | None) -> None:
@@ -675,29 +670,27 @@ class _Writer:
             if meant is not None and [float(v) for v in meant] == position:
                 return
             world.remove(old_coordinates)
-        coordinates = _sdf.child(world, "spherical_coordinates")
-        _sdf.child(coordinates, "surface_model", "EARTH_WGS84")
-        if (_sdf.parse_version(self._version(source_world)) or (1, 7)) >= (1, 6):
-            _sdf.child(coordinates, "world_frame_orientation", "ENU")
-        _sdf.child(coordinates, "latitude_deg", number(datum.latitude, DEGREES))
-        _sdf.child(coordinates, "longitude_deg", number(datum.longitude, DEGREES))
-        _sdf.child(coordinates, "elevation", number(datum.altitude))
-        _sdf.child(coordinates, "heading_deg", number(-datum.heading, DEGREES))
+        coordinates = sdf.child(world, "spherical_coordinates")
+        sdf.child(coordinates, "surface_model", "EARTH_WGS84")
+        if (sdf.parse_version(self._version(source_world)) or (1, 7)) >= (1, 6):
+            sdf.child(coordinates, "world_frame_orientation", "ENU")
+        sdf.child(coordinates, "latitude_deg", number(datum.latitude, DEGREES))
+        sdf.child(coordinates, "longitude_deg", number(datum.longitude, DEGREES))
+        sdf.child(coordinates, "elevation", number(datum.altitude))
+        sdf.child(coordinates, "heading_deg", number(-datum.heading, DEGREES))
 
     def _version(self, source_world: _StoredWorld | None) -> str:
         source_version = str(source_world.entry.get("version") or "") if source_world is not None else ""
-        valid_version = source_version if source_version in _sdf.VERSIONS else None
+        valid_version = source_version if source_version in sdf.VERSIONS else None
         if self.options.version is not None:
             if valid_version is not None and valid_version != self.options.version:
                 self.context.warn(f"the world was written as SDFormat {valid_version}: its elements are not converted")
             return self.options.version
         return source_version or "1.7"
 
-    def _bundle(
-        self, world: etree._Element, source_world: _StoredWorld | None, bodies: _sdf_bodies.Bodies
-    ) -> dict[str, bytes]:
+    def _bundle(self, world: etree._Element, source_world: _StoredWorld | None, bodies: Bodies) -> dict[str, bytes]:
         version = self._version(source_world)
-        if bodies.newest > (_sdf.parse_version(version) or (1, 7)):
+        if bodies.newest > (sdf.parse_version(version) or (1, 7)):
             needed_version = ".".join(map(str, bodies.newest))
             if self.options.version is None and not (source_world is not None and source_world.is_world):
                 version = needed_version
@@ -705,7 +698,7 @@ class _Writer:
                 self.context.warn(f"some shapes need SDFormat {needed_version}")
         root = etree.Element("sdf", version=version)
         root.append(world)
-        main = _sdf.serialise(root)
+        main = sdf.serialise(root)
         files = {MAIN: main}
         stored: dict[str, bytes] = {}
         for part in self.layers.parts_of("resources", self.options.level, NAME).values():
@@ -713,8 +706,8 @@ class _Writer:
         if source_world is not None and len(self.stored) == 1:
             needed = dict(stored)
         else:
-            library = _sdf.Library({**stored, MAIN: main})
-            needed = {n: stored[n] for n in _sdf.required_files(library, MAIN)}
+            library = sdf.Library({**stored, MAIN: main})
+            needed = {n: stored[n] for n in sdf.required_files(library, MAIN)}
         needed |= bodies.files
         needed.pop(MAIN, None)
         return files | dict(sorted(needed.items()))

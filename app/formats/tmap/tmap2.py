@@ -1,21 +1,13 @@
 """tmap2: the networks of topological_navigation, as YAML: ``*.tmap2.yaml`` or ``*.tmap2``.
 
-See ``app.formats._tmap``. The older list (``tmap``) is read too where a sender calls it tmap2, and served completed.
+See ``tmap.network``. The older list (``tmap``) is read too where a sender calls it tmap2, and served completed.
 """
 
 from __future__ import annotations
 
-from app.formats import (
-    Claims,
-    Format,
-    LayerRequirements,
-    Selection,
-    Traits,
-    WriteContext,
-    _tmap,
-    _tmap2_rules,
-    register,
-)
+from app.formats import Claims, Format, LayerRequirements, Selection, Traits, WriteContext, register
+from app.formats.tmap import network as _tmap
+from app.formats.tmap import rules as _tmap2_rules
 from app.model.layers import Layers
 
 FILE = "network.tmap2.yaml"
@@ -23,7 +15,7 @@ NAMES = (".tmap2.yaml", ".tmap2.yml", ".tmap2")
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``network.tmap2.yaml``; see ``_tmap.write``."""
+    """``network.tmap2.yaml``; see ``network.write``."""
     return {FILE: _tmap.write(layers, context)}
 
 

@@ -16,7 +16,8 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Invalid
-from app.formats import WriteContext, _sdf
+from app.formats import WriteContext
+from app.formats.gazebo import sdf
 from app.model import obstacles, solids
 from app.model.features import Feature
 from app.model.frame import is_writable
@@ -141,11 +142,11 @@ def free_name(text: str, taken: set[str]) -> str:
 def sun(name: str) -> etree._Element:
     """A directional light from above."""
     light = etree.Element("light", name=name, type="directional")
-    light.append(_sdf.pose_element((0.0, 0.0, 10.0, 0.0, 0.0, 0.0)))
-    _sdf.child(light, "cast_shadows", "true")
-    _sdf.child(light, "diffuse", "0.8 0.8 0.8 1")
-    _sdf.child(light, "specular", "0.2 0.2 0.2 1")
-    _sdf.child(light, "direction", "-0.5 0.1 -0.9")
+    light.append(sdf.pose_element((0.0, 0.0, 10.0, 0.0, 0.0, 0.0)))
+    sdf.child(light, "cast_shadows", "true")
+    sdf.child(light, "diffuse", "0.8 0.8 0.8 1")
+    sdf.child(light, "specular", "0.2 0.2 0.2 1")
+    sdf.child(light, "direction", "-0.5 0.1 -0.9")
     return light
 
 
@@ -218,11 +219,11 @@ class Bodies:
         """The shapes whose words are known and whose files are there; the files go along."""
         out = []
         for shape in shapes:
-            if _sdf.is_absent(shape):
+            if sdf.is_absent(shape):
                 reason = f"{str(shape['uri'])[:200]} is not stored: upload it"
                 self._dropped[f"solids of objects of kind {kind}", reason] += 1
                 continue
-            if str(shape.get("type")) not in _sdf.SHAPES:
+            if str(shape.get("type")) not in sdf.SHAPES:
                 self._dropped[
                     f"shapes of objects of kind {kind}", f"Gazebo knows no {str(shape.get('type'))[:40]}"
                 ] += 1
@@ -232,13 +233,13 @@ class Bodies:
                 if file not in self.resources:
                     self._dropped[f"meshes of objects of kind {kind}", f"{file[:200]} is not stored: upload it"] += 1
                     continue
-                path = file if file.startswith(f"{_sdf.MODELS}/") else f"{_sdf.MODELS}/{file}"
+                path = file if file.startswith(f"{sdf.MODELS}/") else f"{sdf.MODELS}/{file}"
                 self.files[path] = self.resources[file]
-                shape["uri"] = "model://" + path[len(_sdf.MODELS) + 1 :]
+                shape["uri"] = "model://" + path[len(sdf.MODELS) + 1 :]
             if shape["type"] in ("capsule", "ellipsoid"):
                 self.newest = max(self.newest, (1, 8))
             try:
-                _sdf.geometry_element(shape, shape.get("uri"))
+                sdf.geometry_element(shape, shape.get("uri"))
             except (LookupError, TypeError, ValueError):
                 self._dropped[f"shapes of objects of kind {kind}", f"a {shape['type']} without its measures"] += 1
                 continue
@@ -338,18 +339,18 @@ class Bodies:
         """
         model = etree.Element("model", name=name)
         if any(pose):
-            model.append(_sdf.pose_element(pose))
-        _sdf.child(model, "static", "true")
-        link = _sdf.child(model, "link", name="link")
+            model.append(sdf.pose_element(pose))
+        sdf.child(model, "static", "true")
+        link = sdf.child(model, "link", name="link")
         material = source_properties.get("material") if isinstance(source_properties, Mapping) else None
         for k, shape in enumerate(shapes):
             for tag in ("collision", "visual"):
                 if shape.get("visual" if tag == "collision" else "unseen") is True:
                     continue
-                part = _sdf.child(link, tag, name=f"{tag}_{k}")
+                part = sdf.child(link, tag, name=f"{tag}_{k}")
                 if any(shape.get("pose", ())):
-                    part.append(_sdf.pose_element(shape["pose"]))
-                part.append(_sdf.geometry_element(shape, shape.get("uri")))
+                    part.append(sdf.pose_element(shape["pose"]))
+                part.append(sdf.geometry_element(shape, shape.get("uri")))
                 if tag == "visual":
                     own_colour = _colour(shape)
                     if own_colour is None and colour is not None and not _is_script(material):
@@ -392,7 +393,7 @@ class Bodies:
             self.context.warn(f"no cell has a value of {threshold} or more: there are no walls", where=name)
             return None
         file = f"{name}/meshes/{name}.stl"
-        self.files[f"{_sdf.MODELS}/{file}"] = stl(extrude(occupied, grid.resolution, self.usual.wall_height))
+        self.files[f"{sdf.MODELS}/{file}"] = stl(extrude(occupied, grid.resolution, self.usual.wall_height))
         self.context.fill("height of walls", self.usual.wall_height, "a grid tells none", "wall_height")
         x, y, yaw = grid.origin
         corners = grid.corners()
@@ -409,7 +410,7 @@ def _colour(shape: Mapping[str, Any]) -> str | None:
         return None
     if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and 0.0 <= v <= 1.0 for v in colour):
         return None
-    return _sdf.format_numbers([*colour, 1.0][:4])
+    return sdf.format_numbers([*colour, 1.0][:4])
 
 
 def _is_script(material: Any) -> bool:
@@ -419,18 +420,18 @@ def _is_script(material: Any) -> bool:
 def _material(visual: etree._Element, colour: str | None, script: Any) -> None:
     """The colour of a kind, or the material script that a list names."""
     if _is_script(script):
-        material = _sdf.child(_sdf.child(visual, "material"), "script")
+        material = sdf.child(sdf.child(visual, "material"), "script")
         uri = script.get("uri")
         if isinstance(uri, str):
-            _sdf.child(material, "uri", uri)
-            _sdf.child(material, "name", script["name"])
+            sdf.child(material, "uri", uri)
+            sdf.child(material, "name", script["name"])
         else:
-            _sdf.child(material, "uri", "file://media/materials/scripts/gazebo.material")
-            _sdf.child(material, "name", f"Gazebo/{script['name']}")
+            sdf.child(material, "uri", "file://media/materials/scripts/gazebo.material")
+            sdf.child(material, "name", f"Gazebo/{script['name']}")
     elif colour is not None:
-        material = _sdf.child(visual, "material")
-        _sdf.child(material, "ambient", colour)
-        _sdf.child(material, "diffuse", colour)
+        material = sdf.child(visual, "material")
+        sdf.child(material, "ambient", colour)
+        sdf.child(material, "diffuse", colour)
 
 
 def _positive(value: Any, otherwise: float) -> float:

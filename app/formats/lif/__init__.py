@@ -38,7 +38,6 @@ from app.formats import (
     Traits,
     WriteContext,
     _fields,
-    _lif_rules,
     register,
 )
 from app.formats._fields import ANGLE, COORDINATE, NOT_NEGATIVE, SPEED, Number, OneOf, record
@@ -65,6 +64,7 @@ from app.formats._network import (
     shorten_list,
     yaw_or_source,
 )
+from app.formats.lif import rules as _lif_rules
 from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, unique_ids
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey

@@ -39,7 +39,6 @@ from app.formats import (
     Traits,
     WriteContext,
     _fields,
-    _nav2_route_rules,
     register,
 )
 from app.formats._fields import NOT_NEGATIVE, SPEED, Number, OneOf, record
@@ -60,6 +59,7 @@ from app.formats._network import (
     shorten_list,
     source_document,
 )
+from app.formats.nav2_route import rules as _nav2_route_rules
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.layers import NETWORK, Layers, PartKey
 from app.parameters import parameter
