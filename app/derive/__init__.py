@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
-from app import parameters
+from app import parameters, plugins
 from app.errors import Ambiguous, CannotConvert, CannotDerive, Problem
 from app.model.features import Features
 from app.model.grid import FREE, UNKNOWN, OccupancyGrid
@@ -136,7 +136,7 @@ def derives(
     def declare(function: Function) -> Function:
         name = function.__name__
         if name in _registry:
-            raise ValueError(f"derivation {name} is declared twice")
+            raise ValueError(f"there is a derivation {name} already, and it stays")
         title = (function.__doc__ or name).strip().splitlines()[0]
         fields = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes, last, trial)
         _registry[name] = Derivation(name, *fields)
@@ -150,6 +150,7 @@ def _discover() -> None:
     for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
         if not module.startswith("_"):
             importlib.import_module(f"{__name__}.{module}")
+    plugins.load("fleetmap.derivations", _registry)
 
 
 def all_derivations() -> Mapping[str, Derivation]:
