@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, TypeVar
 
-from app import parameters
+from app import parameters, plugins
 from app.errors import Ambiguous, CannotConvert, CannotDerive, MissingLayer, Problem
 from app.model.features import Features
 from app.model.grid import FREE, UNKNOWN, OccupancyGrid
@@ -139,7 +139,7 @@ def derives(
     def declare(function: Function) -> Function:
         name = function.__name__
         if name in _registry:
-            raise ValueError(f"derivation {name} is declared twice")
+            raise ValueError(f"there is a derivation {name} already, and it stays")
         title = (function.__doc__ or name).strip().splitlines()[0]
         fields = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes, last, trial)
         _registry[name] = Derivation(name, *fields)
@@ -153,6 +153,7 @@ def _discover() -> None:
     for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
         if not module.startswith("_"):
             importlib.import_module(f"{__name__}.{module}")
+    plugins.load("fleetmap.derivations", _registry)
 
 
 def all_derivations() -> Mapping[str, Derivation]:

@@ -6,19 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from app import formats
 from app.derive import DerivationNotes, derives
 from app.errors import MissingLayer
 from app.model import network
 from app.model.features import Features, concatenate, unique_ids
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
-
-DRAWINGS = frozenset({"kml", "kmz", "geojson"})
-"""Format families whose lines are paths unless told otherwise. Elsewhere a line is one only where its kind says so:
-a building's walls and doors are lines too."""
-
-RAW = frozenset({"osm"})
-"""Format families that bring their own topology."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,16 +31,20 @@ def objects_to_topology(layers: Layers, parameters: Parameters, notes: Derivatio
 
     One network for each level, from all its drawings. Raises MissingLayer where there is nothing to make it from.
     """
+    every = formats.all_formats().values()
+    complete = {fmt.family for fmt in every if fmt.traits.own_network}
+    # Elsewhere a line is a path only where its kind says so: a building's walls and doors are lines, too.
+    drawings = {name for fmt in every if fmt.traits.is_drawing for name in (fmt.name, fmt.family)}
     by_level: dict[str, list[tuple[str, Features]]] = {}
     for key, part in layers.vector("objects").items():
-        if key.name in RAW:
+        if key.name in complete:
             continue
-        chosen = part if key.name in DRAWINGS else part.select_kinds("path", "poi")
+        chosen = part if key.name in drawings else part.select_kinds("path", "poi")
         if len(chosen):
             by_level.setdefault(key.level, []).append((key.name, chosen))
     parts: dict[PartKey, Part] = {}
-    for level, drawings in by_level.items():
-        network_part = _network([part for _, part in drawings], layers, parameters)
+    for level, named in by_level.items():
+        network_part = _network([part for _, part in named], layers, parameters)
         if len(network_part):
             parts[PartKey("topology", level, NETWORK)] = network_part
     if not parts:

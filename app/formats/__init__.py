@@ -24,54 +24,47 @@ from typing import Any
 import yaml
 from lxml import etree
 
-from app import parameters
+from app import parameters, plugins
 from app.errors import BadUpload, FleetMapError, Invalid, NotFound, Problem, TooLarge, UnreadableFile
 from app.formats._format import (
-    UNTITLED as UNTITLED,
-)
-from app.formats._format import (
-    Bends as Bends,
-)
-from app.formats._format import (
-    Claims as Claims,
-)
-from app.formats._format import (
-    Files as Files,
-)
-from app.formats._format import (
-    Format as Format,
-)
-from app.formats._format import (
-    LayerRequirements as LayerRequirements,
-)
-from app.formats._format import (
-    NestedMap as NestedMap,
-)
-from app.formats._format import (
-    NoOptions as NoOptions,
-)
-from app.formats._format import (
-    Parts as Parts,
-)
-from app.formats._format import (
-    ReadContext as ReadContext,
-)
-from app.formats._format import (
-    Selection as Selection,
-)
-from app.formats._format import (
-    Traits as Traits,
-)
-from app.formats._format import (
-    WriteContext as WriteContext,
-)
-from app.formats._format import (
-    one_map_per_folder as one_map_per_folder,
+    UNTITLED,
+    Bends,
+    Claims,
+    Files,
+    Format,
+    LayerRequirements,
+    NestedMap,
+    NoOptions,
+    Parts,
+    ReadContext,
+    Selection,
+    Traits,
+    WriteContext,
+    one_map_per_folder,
 )
 from app.model import bends
 from app.model.features import Features
 from app.model.layers import Layers
 from app.model.names import did_you_mean
+
+__all__ = [  # the public interface; see docs/contributing/plug-ins.md
+    "BAD_INPUT",
+    "UNTITLED",
+    "Bends",
+    "Claims",
+    "Files",
+    "Format",
+    "LayerRequirements",
+    "NestedMap",
+    "NoOptions",
+    "Parts",
+    "ReadContext",
+    "Selection",
+    "Traits",
+    "WriteContext",
+    "one_map_per_folder",
+    "register",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +86,7 @@ _registry: dict[str, Format] = {}
 def register(new: Format) -> Format:
     """Make a format known. The last statement of its module."""
     if new.name in _registry:
-        raise ValueError(f"format {new.name} is registered twice")
+        raise ValueError(f"there is a format {new.name} already, and it stays")
     _registry[new.name] = new
     return new
 
@@ -103,6 +96,7 @@ def _discover() -> None:
     for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
         if not module.startswith("_"):
             importlib.import_module(f"{__name__}.{module}")
+    plugins.load("fleetmap.formats", _registry)
 
 
 def all_formats() -> dict[str, Format]:

@@ -32,6 +32,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 from urllib.parse import quote
 
@@ -42,7 +43,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import ReadContext
+from app.formats import ReadContext, all_formats
 from app.formats._fields import COORDINATE, LATITUDE, LONGITUDE, Number, OneOf
 from app.model.features import MAX_ID, NO_GEOMETRY, Features, unique_ids
 from app.model.frame import MAX_METRES, Datum, Level
@@ -72,13 +73,17 @@ OWN_KEYS = frozenset({"layer", "level", "part", "id", "local", "geometry", "more
 PLACE_KEYS = frozenset({"layer", "level", "part", "id"})
 """Those whose values are names."""
 
-RESERVED = OWN_KEYS | {
+_CANONICAL = OWN_KEYS | {
     *("kind", "name", "source", "target", "orientation", "action", "speed_limit", "width", "value", "expires"),
-    *("pose", "size", "datum", "drawn_from", "data", "documents", "tags", "properties", "style", "kml", "kmz", "osm"),
-    *("geojson", "tmap", "tmap2", "openrmf", "rmf_nav_graph", "gazebo", "navgraph", "nav2_route", "lif", "lanelet2"),
-    *("environment", "occupancy_grid", "octomap", "satellite", "pcd", "ply", "las", "prm", "ffr_network", "rmf_site"),
+    *("pose", "size", "datum", "drawn_from", "data", "documents", "tags", "properties", "style"),
 }
-"""Property names that mean something to us: a drawing's own value of that name stays under ``properties.kml.data``."""
+
+
+@cache
+def reserved_names() -> frozenset[str]:
+    """Property names that mean something to us: a drawing's own value of that name stays under ``kml.data``."""
+    return _CANONICAL | all_formats().keys()
+
 
 DOCUMENT_KEY_DIGITS = 16
 """Hexadecimal digits of a SHA-256 that serve as a drawing's key among the drawings of an environment."""
@@ -808,6 +813,7 @@ class _Reader:
         ids, titles = _identify(items, self.context)
         properties: list[dict[str, Any]] = []
         types = shapely.get_type_id(geometry).tolist()
+        reserved = reserved_names()
         for k, item in enumerate(items):
             title = titles[k]
             kind = "overlay" if local_name(item.element) in OVERLAYS else _KINDS[types[k]] or _mixed_type(geometry[k])
@@ -816,7 +822,7 @@ class _Reader:
             if title is not None and title[1]:
                 item_properties["name"] = title[1]
             for label, value in item.data:
-                aside = label in RESERVED
+                aside = label in reserved
                 (source_element.setdefault("data", {}) if aside else item_properties)[label] = value.text or ""
             item_properties[FAMILY] = source_element
             properties.append(item_properties)

@@ -10,30 +10,35 @@ import contextlib
 import dataclasses
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from app import formats
 from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFile
 from app.formats import FileGroup, Files, Format, ReadContext, _content
 from app.limits import Limits
-from app.model import network
-from app.model.features import Features, concatenate, from_columns, unique_ids
+from app.model.features import Features, from_columns
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum, Level
 from app.model.geodesy import local_frame
-from app.model.imagery import GeoImage
-from app.model.layers import NETWORK, SITE, ZONES, Layer, Layers, Part, PartKey, Resources, is_empty, join_levels
+from app.model.layers import Layer, Layers, Part, PartKey, is_empty, join_levels
 from app.model.names import did_you_mean
 from app.syntax import archives, json, shell, xml, yaml
+from app.upload_reader.bundle import Bundle as Bundle
+from app.upload_reader.bundle import EnvironmentContext as EnvironmentContext
+from app.upload_reader.bundle import FileUse, ParsedPart
+from app.upload_reader.bundle import UploadHints as UploadHints
+from app.upload_reader.conflicts import resolve_conflicts
+from app.upload_reader.drawings import assign_layer
 
 TEMPLATE_FOLDERS = ("location", "metric", "topological", "world")
 """The folders of an environment_template's ``config``; the folder says what a drawing is meant for."""
 
 _FOLDER_LAYER: Mapping[str, Layer] = {"location": "location", "topological": "topology", "world": "objects"}
+
+PACKAGE = "environment"
+"""The format of a folder with maps of other formats (environment_template)."""
 
 VARIABLES_FILES = ("properties.sh", "environment.sh")
 
@@ -47,10 +52,6 @@ _COPYRIGHT = re.compile(r"(copyright|©|\(c\)).*\d{4}", re.IGNORECASE)
 _NOTICE_BYTES, _NOTICE_LINE = 2**14, 160
 _JSON_ENDS, _YAML_ENDS = (".json", ".geojson"), (".yaml", ".yml")
 _XML_ENDS = (".xml", ".osm", ".kml", ".sdf", ".world", ".gpx")
-_FENCE = re.compile(r"fence|boundary|perimeter", re.IGNORECASE)
-
-SAME_PLACE_DEGREES = 1e-7
-"""About a centimetre: two fences whose corners are nearer are one."""
 
 
 def parse_drawn_layer(name: str | None) -> Layer | None:
@@ -62,79 +63,6 @@ def parse_drawn_layer(name: str | None) -> Layer | None:
         return None
     problem = f"must be one of {', '.join(DRAWN_LAYERS)}, got {name[:80]!r}{did_you_mean(name, DRAWN_LAYERS)}"
     raise Invalid(f"layer {problem}", [Problem(problem, where="layer")])
-
-
-@dataclass(frozen=True, slots=True)
-class UploadHints:
-    """What the sender said of the files; everything else is found out from their content."""
-
-    format: str | None = None
-    layer: Layer | None = None
-    level: str = GROUND
-    grid: str | None = None
-    options: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class EnvironmentContext:
-    """What the environment knows already, and what will be used of the files (see ``ReadContext``)."""
-
-    datum: Datum | None = None
-    fence: shapely.Polygon | None = None
-    wanted: frozenset[Layer] | None = None
-    cells: bool = True
-    whole: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class ParsedPart:
-    """One part as one file told it."""
-
-    key: PartKey
-    part: Part
-    group: FileGroup
-
-
-@dataclass(slots=True)
-class FileUse:
-    """What became of a file."""
-
-    format: str | None = None
-    used: bool = False
-
-
-@dataclass(slots=True)
-class Bundle:
-    """What the files say together: parts by key, each with the files and format it came from."""
-
-    parts: dict[PartKey, Part] = field(default_factory=dict)
-    origin: dict[PartKey, tuple[tuple[str, ...], str]] = field(default_factory=dict)
-    datum: Datum | None = None
-    levels: tuple[Level, ...] = ()
-    files: dict[str, FileUse] = field(default_factory=dict)
-    warnings: list[Problem] = field(default_factory=list)
-    fence: shapely.Polygon | None = None
-    notices: dict[str, str] = field(default_factory=dict)
-    credits: Mapping[PartKey, tuple[str, ...]] = field(default_factory=dict)
-    inner: bool = False
-
-    def credit(self, key: PartKey) -> tuple[str, ...]:
-        """Licences and credits of a part: what its files say themselves, and the licence files of their folders."""
-        part = self.parts[key]
-        attribution = part.document.get("attribution", ()) if isinstance(part, Features) else ()
-        attribution = part.attribution if isinstance(part, GeoImage) else attribution
-        texts = [text for text in attribution if isinstance(text, str)] if isinstance(attribution, list | tuple) else []
-        texts += self.credits.get(key, ())
-        names, _ = self.origin.get(key, ((), ""))
-        for notice, text in sorted(self.notices.items()):
-            folder = notice.rpartition("/")[0]
-            if any(not folder or name.startswith(f"{folder}/") for name in names):
-                texts.append(text)
-        return tuple(dict.fromkeys(texts))
-
-    def layers(self, datum: Datum | None) -> Layers:
-        """The parts under a datum (the bundle's own wins)."""
-        return Layers(dict(self.parts), self.datum or datum, join_levels((Level(),), self.levels))
 
 
 def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
@@ -208,7 +136,7 @@ def read(
     if errors:
         raise errors[0](details[0] if len(details) == 1 else "; ".join(details), problems)
     _report_unread_files({name: files[name] for name in rest}, bundle)
-    _resolve_conflicts(parsed_parts, bundle)
+    resolve_conflicts(parsed_parts, bundle)
     if hints.format is None and not any(u.format for u in bundle.files.values()) and not variables:
         lacks = {name: text for name in sorted(files) if (text := _missing_metadata(name, files[name]))}
         known_formats = ", ".join(f.name for f in formats.all_formats().values() if f.read)
@@ -243,7 +171,7 @@ def _unread_files(files: Files) -> set[str]:
 
 def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Limits, bundle: Bundle) -> bool:
     """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
-    if dataclasses.replace(hints, format=None) != UploadHints() or hints.format not in (None, "environment"):
+    if dataclasses.replace(hints, format=None) != UploadHints() or hints.format not in (None, PACKAGE):
         content: _content.Content | str = "the upload says how its maps are to be read"
     else:
         try:
@@ -259,13 +187,13 @@ def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Lim
             raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)]) from error
     if isinstance(content, str):
         for name in _content.content_files(files, main):
-            bundle.files[name] = FileUse("environment", used=False)
+            bundle.files[name] = FileUse(PACKAGE, used=False)
         bundle.warnings.append(Problem(f"not used, the maps of the package count: {content}", main))
         return False
-    bundle.files |= {name: FileUse("environment", used=True) for name in files if name not in content.added}
+    bundle.files |= {name: FileUse(PACKAGE, used=True) for name in files if name not in content.added}
     _report_unread_files({name: files[name] for name in sorted(content.added)}, bundle)
     bundle.parts, bundle.datum, bundle.levels = dict(content.layers.parts), content.layers.datum, content.layers.levels
-    bundle.origin = dict.fromkeys(bundle.parts, ((main,), "environment"))
+    bundle.origin = dict.fromkeys(bundle.parts, ((main,), PACKAGE))
     bundle.credits = content.credits
     return True
 
@@ -383,13 +311,13 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
         with _errors_in_file(name):
             assigned, doubts = shell.assignments(files[name])
         variables.update({n: v for n, v in assigned.items() if v or n not in shell.OF_FILES})
-        bundle.files[name] = FileUse("environment", used=True)
+        bundle.files[name] = FileUse(PACKAGE, used=True)
         # Where the package's files lie is told anew whenever it is served: no loss worth a word.
         bundle.warnings += [Problem(doubt, name) for doubt in doubts if not _OF_FILES.search(doubt)]
     if names:
-        key = PartKey("objects", GROUND, "environment")
-        empty = from_columns([], np.empty(0, object), [], "local", {"environment": {"variables": variables}})
-        bundle.parts[key], bundle.origin[key] = empty, (tuple(names), "environment")
+        key = PartKey("objects", GROUND, PACKAGE)
+        empty = from_columns([], np.empty(0, object), [], "local", {PACKAGE: {"variables": variables}})
+        bundle.parts[key], bundle.origin[key] = empty, (tuple(names), PACKAGE)
     return set(names)
 
 
@@ -397,7 +325,7 @@ def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]
     """Leave out what another file tells better, without reading it: ``X_autogen`` beside ``X``, a drawn network beside
     a real one in ``topological/``, a drawn fence beside a datum in ``location/``."""
     mains = {g.main: g for g in groups}
-    kinds = {(g.format.name, (template_folder(g.main) or ("",))[0]) for g in groups}
+    leaders = _leaders(groups)
     out = []
     for group in groups:
         name = group.main
@@ -407,26 +335,35 @@ def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]
         if sibling in mains and mains[sibling].format is group.format:
             reason = f"{sibling} is used instead of what was generated"
         elif (
-            (group.format.traits.is_drawing or group.format.name == "prm")
+            (group.format.traits.is_drawing or group.format.claims.gives_way)
             and folder == "topological"
             and not _is_regions(name)
         ):
-            richer = next((n for n in ("tmap2", "tmap") if (n, "topological") in kinds), None)
-            if richer is not None:
-                reason = f"the network comes from the richer {richer} file"
+            if folder in leaders:
+                reason = f"the network comes from the richer {leaders[folder]} file"
         elif (
             group.format.traits.is_drawing
             and folder == "location"
             and PurePosixPath(name).name.startswith("fence_autogen.")
-            and ("datum", "location") in kinds
+            and folder in leaders
         ):
-            reason = "the fence comes from the datum file"
+            reason = f"the fence comes from the {leaders[folder]} file"
         if reason is None:
             out.append(group)
             continue
         for file in group.files:
             bundle.files[file] = FileUse(group.format.name, used=False)
         bundle.warnings.append(Problem(f"not used, kept as a source: {reason}", name))
+    return out
+
+
+def _leaders(groups: list[FileGroup]) -> dict[str, str]:
+    """Of each folder of an environment_template the format whose file is believed there, where one has such a file."""
+    out: dict[str, str] = {}
+    for group in sorted(groups, key=lambda g: -g.format.claims.priority):
+        folder = (template_folder(group.main) or ("",))[0]
+        if folder and group.format.claims.leads_folder == folder:
+            out.setdefault(folder, group.format.name)
     return out
 
 
@@ -481,7 +418,7 @@ def _read_group(
         bundle.fence = bundle.fence or (site.geometry[0] if len(site) else None)
     parts = dict(layers.parts)
     if group.format.traits.is_drawing and layer not in (None, "objects"):
-        parts = _assign(parts, layer, hints.level, upload_context, layers.datum, group.main, bundle)
+        parts = assign_layer(parts, layer, hints.level, upload_context, layers.datum, group.main, bundle)
     if layers.datum is not None:
         if bundle.datum is None:
             bundle.datum = layers.datum
@@ -504,163 +441,6 @@ def _folder_reader(
         return inner.layers(None)
 
     return read_folder
-
-
-def _assign(
-    parts: dict[PartKey, Part],
-    layer: Layer | None,
-    level: str,
-    context: EnvironmentContext,
-    datum: Datum | None,
-    file: str,
-    bundle: Bundle,
-) -> dict[PartKey, Part]:
-    """A drawing's lines and polygons as the layer they were drawn for."""
-    out = dict(parts)
-    for key, part in parts.items():
-        if key.layer != "objects" or not isinstance(part, Features) or not len(part):
-            continue
-        kinds = shapely.get_type_id(part.geometry)
-        lines = np.isin(kinds, [1, 2, 5])
-        areas = np.isin(kinds, [3, 6])
-        if layer == "topology":
-            frame = local_frame(datum or context.datum) if datum or context.datum else None
-            drawn = part if lines.any() else part.select(areas)
-            if not lines.any() and not areas.any():
-                bundle.warnings.append(Problem("it has no lines or polygons to make a network of", file))
-                continue
-            drawn_network = network.from_drawing(drawn, frame=frame, outlines=not lines.any())
-            out[PartKey("topology", level, NETWORK)] = drawn_network
-        elif layer == "zones":
-            _move(out, key, part, areas, PartKey("zones", level, ZONES), "keepout")
-        elif layer == "location":
-            fence = _is_own_fence(part, areas, context, bundle, file)
-            _move(out, key, part, fence, PartKey("location", level, SITE), "fence")
-    return out
-
-
-def _move(
-    parts: dict[PartKey, Part], key: PartKey, part: Features, mask: NDArray[np.bool_], to: PartKey, kind: str
-) -> None:
-    """Take these features out of the objects and into another layer; the drawing's document goes along."""
-    if not mask.any():
-        return
-    moved = part.select(mask)
-    generic = ("region", "path", "poi", None)
-    properties = tuple({**p, "kind": kind} if p.get("kind") in generic else p for p in moved.properties)
-    parts[to] = Features(moved.ids, moved.geometry, properties, moved.local, part.document)
-    parts[key] = part.select(~mask)
-
-
-def _is_own_fence(
-    part: Features, areas: NDArray[np.bool_], context: EnvironmentContext, bundle: Bundle, file: str
-) -> NDArray[np.bool_]:
-    """Which of the polygons is the environment's own fence: a mask with at most one True."""
-    indices = np.flatnonzero(areas & ~part.local)
-    chosen = np.zeros(len(part), bool)
-    fence = bundle.fence or context.fence
-    if fence is not None:
-        same = [k for k in indices if shapely.hausdorff_distance(part.geometry[k], fence) < SAME_PLACE_DEGREES]
-        chosen[same[:1]] = True
-        return chosen
-    named = [k for k in indices if _FENCE.search(str(part.properties[k].get("name") or ""))]
-    if len(indices) == 1 or len(named) == 1:
-        chosen[indices if len(indices) == 1 else named] = True
-    elif len(indices):
-        bundle.warnings.append(
-            Problem("none of its polygons is called fence, so all are kept as regions and no GNSS fence is set", file)
-        )
-    return chosen
-
-
-def _resolve_conflicts(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
-    """Join what belongs together; where two files tell the same network, site or grid, believe one of them."""
-    by_key: dict[PartKey, list[ParsedPart]] = {}
-    for one in parsed_parts:
-        by_key.setdefault(one.key, []).append(one)
-    useful: set[str] = set()
-    renamed: dict[str, dict[str, str]] = {}
-    for key, rivals in sorted(by_key.items()):  # objects come before the topology that was drawn from them
-        winners = rivals
-        if key.layer in _SINGLE_SOURCE_LAYERS and len(rivals) > 1:
-            rivals.sort(key=_priority)
-            winners = rivals[:1]
-            for loser in rivals[1:]:
-                if key.layer == "location" and _merge_fence_style(winners, loser):
-                    useful.add(loser.group.main)
-                    continue
-                noun = _SINGLE_SOURCE_LAYERS[key.layer].format(name=key.name)
-                reason = f"its {noun} is not used: {winners[0].group.main} tells it"
-                bundle.warnings.append(Problem(reason, loser.group.main))
-        useful.update(w.group.main for w in winners)
-        bundle.parts[key] = _join(winners, renamed)
-        names = tuple(sorted({n for w in winners for n in w.group.files}))
-        bundle.origin[key] = (names, winners[0].group.format.name)
-    for one in parsed_parts:
-        if one.group.main not in useful:
-            for name in one.group.files:
-                bundle.files[name].used = False
-
-
-_SINGLE_SOURCE_LAYERS: Mapping[str, str] = {
-    "topology": "network",
-    "location": "location",
-    "occupancy": "grid {name}",
-    "voxels": "voxel map {name}",
-    "imagery": "picture {name}",
-}
-"""Layers of which one file's word is enough, as a user calls them."""
-
-
-def _merge_fence_style(winners: list[ParsedPart], loser: ParsedPart) -> bool:
-    """A drawn fence in the same place as the believed one: its name and style go along, and nothing is lost."""
-    site, drawn = winners[0].part, loser.part
-    if not (isinstance(site, Features) and isinstance(drawn, Features) and len(site) == len(drawn) == 1):
-        return False
-    if site.local.any() or drawn.local.any():
-        return False
-    if shapely.hausdorff_distance(site.geometry[0], drawn.geometry[0]) >= SAME_PLACE_DEGREES:
-        return False
-    properties = ({**drawn.properties[0], **site.properties[0]},)
-    part = Features(site.ids, site.geometry, properties, site.local, {**drawn.document, **site.document})
-    winners[0] = ParsedPart(winners[0].key, part, winners[0].group)
-    return True
-
-
-def _priority(one: ParsedPart) -> tuple[object, ...]:
-    name = PurePosixPath(one.group.main).name
-    return (-one.group.format.claims.priority, name.startswith("."), "_autogen" in name, len(name), one.group.main)
-
-
-def _join(candidates: list[ParsedPart], renamed: dict[str, dict[str, str]]) -> Part:
-    """Several files' parts of one key as one; ids that repeat are made distinct, and ``renamed`` remembers how."""
-    if len(candidates) == 1:
-        part = candidates[0].part
-        new = renamed.get(candidates[0].group.main, {})
-        if candidates[0].key.layer == "topology" and isinstance(part, Features) and new:
-            properties = [
-                {**p, "drawn_from": new[i]} if isinstance(i := p.get("drawn_from"), str) and i in new else p
-                for p in part.properties
-            ]
-            part = Features(part.ids, part.geometry, tuple(properties), part.local, part.document)
-        return part
-    if candidates[0].key.layer == "resources":
-        files: dict[str, bytes] = {}
-        for one in candidates:
-            files.update(one.part.files if isinstance(one.part, Resources) else {})
-        return Resources(files)
-    taken: set[str] = set()
-    collections = []
-    for one in candidates:
-        part = one.part
-        assert isinstance(part, Features)
-        ids = tuple(unique_ids(part.ids, taken))
-        taken.update(ids)
-        if ids != part.ids:
-            renamed[one.group.main] = {a: b for a, b in zip(part.ids, ids, strict=True) if a != b}
-            part = Features(ids, part.geometry, part.properties, part.local, part.document)
-        collections.append(part)
-    return concatenate(collections)
 
 
 def _choose_datum(bundle: Bundle, context: EnvironmentContext) -> None:

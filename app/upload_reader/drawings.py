@@ -1,0 +1,90 @@
+"""A drawing's lines and polygons as the layer that they were drawn for."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import Problem
+from app.model import network
+from app.model.features import Features
+from app.model.frame import Datum
+from app.model.geodesy import local_frame
+from app.model.layers import NETWORK, SITE, ZONES, Layer, Part, PartKey
+from app.upload_reader.bundle import Bundle, EnvironmentContext
+
+_FENCE = re.compile(r"fence|boundary|perimeter", re.IGNORECASE)
+
+
+SAME_PLACE_DEGREES = 1e-7
+"""About a centimetre: two fences whose corners are nearer are one."""
+
+
+def assign_layer(
+    parts: dict[PartKey, Part],
+    layer: Layer | None,
+    level: str,
+    context: EnvironmentContext,
+    datum: Datum | None,
+    file: str,
+    bundle: Bundle,
+) -> dict[PartKey, Part]:
+    """A drawing's lines and polygons as the layer they were drawn for."""
+    out = dict(parts)
+    for key, part in parts.items():
+        if key.layer != "objects" or not isinstance(part, Features) or not len(part):
+            continue
+        kinds = shapely.get_type_id(part.geometry)
+        lines = np.isin(kinds, [1, 2, 5])
+        areas = np.isin(kinds, [3, 6])
+        if layer == "topology":
+            frame = local_frame(datum or context.datum) if datum or context.datum else None
+            drawn = part if lines.any() else part.select(areas)
+            if not lines.any() and not areas.any():
+                bundle.warnings.append(Problem("it has no lines or polygons to make a network of", file))
+                continue
+            drawn_network = network.from_drawing(drawn, frame=frame, outlines=not lines.any())
+            out[PartKey("topology", level, NETWORK)] = drawn_network
+        elif layer == "zones":
+            _move(out, key, part, areas, PartKey("zones", level, ZONES), "keepout")
+        elif layer == "location":
+            fence = _is_own_fence(part, areas, context, bundle, file)
+            _move(out, key, part, fence, PartKey("location", level, SITE), "fence")
+    return out
+
+
+def _move(
+    parts: dict[PartKey, Part], key: PartKey, part: Features, mask: NDArray[np.bool_], to: PartKey, kind: str
+) -> None:
+    """Take these features out of the objects and into another layer; the drawing's document goes along."""
+    if not mask.any():
+        return
+    moved = part.select(mask)
+    generic = ("region", "path", "poi", None)
+    properties = tuple({**p, "kind": kind} if p.get("kind") in generic else p for p in moved.properties)
+    parts[to] = Features(moved.ids, moved.geometry, properties, moved.local, part.document)
+    parts[key] = part.select(~mask)
+
+
+def _is_own_fence(
+    part: Features, areas: NDArray[np.bool_], context: EnvironmentContext, bundle: Bundle, file: str
+) -> NDArray[np.bool_]:
+    """Which of the polygons is the environment's own fence: a mask with at most one True."""
+    indices = np.flatnonzero(areas & ~part.local)
+    chosen = np.zeros(len(part), bool)
+    fence = bundle.fence or context.fence
+    if fence is not None:
+        same = [k for k in indices if shapely.hausdorff_distance(part.geometry[k], fence) < SAME_PLACE_DEGREES]
+        chosen[same[:1]] = True
+        return chosen
+    named = [k for k in indices if _FENCE.search(str(part.properties[k].get("name") or ""))]
+    if len(indices) == 1 or len(named) == 1:
+        chosen[indices if len(indices) == 1 else named] = True
+    elif len(indices):
+        bundle.warnings.append(
+            Problem("none of its polygons is called fence, so all are kept as regions and no GNSS fence is set", file)
+        )
+    return chosen
