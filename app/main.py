@@ -105,35 +105,10 @@ CACHE_SHARE = 0.1
 
 def create_app(settings: Settings) -> FleetMapApp:
     """The application. Its lifespan opens the store and starts the workers, and closes both."""
-
-    @contextlib.asynccontextmanager
-    async def lifespan(app: FleetMapApp) -> AsyncIterator[None]:
-        services = await run_in_threadpool(open_services, settings)
-        app.state.services = services
-        app.state.feed = events.EventFeed(services)
-        services.fleet.start()
-        threading.Thread(target=_prepare, args=(services,), daemon=True).start()
-        publishing = [p for p in (start_ros2(settings, services), start_relay(settings, services)) if p is not None]
-        app.response_cache = services.response_cache
-        scrub = start_scrub(settings, services)
-        ticker = asyncio.create_task(_run_housekeeping(services))
-        try:
-            yield
-        finally:
-            app.response_cache = None
-            ticker.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await ticker
-            if scrub is not None:
-                await run_in_threadpool(scrub.close)
-            for one in publishing:
-                await run_in_threadpool(one.close)
-            await run_in_threadpool(close_services, services)
-
     app = FleetMapApp(
         title="Fleet Map Server",
         version=__version__,
-        lifespan=lifespan,
+        lifespan=partial(_lifespan, settings),
         openapi_url=None,
         docs_url=None,
         redoc_url=None,
@@ -177,6 +152,31 @@ def create_app(settings: Settings) -> FleetMapApp:
     app.include_router(api)
     app.include_router(health.router)
     return app
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]:
+    services = await run_in_threadpool(open_services, settings)
+    app.state.services = services
+    app.state.feed = events.EventFeed(services)
+    services.fleet.start()
+    threading.Thread(target=_prepare, args=(services,), daemon=True).start()
+    publishing = [p for p in (start_ros2(settings, services), start_relay(settings, services)) if p is not None]
+    app.response_cache = services.response_cache
+    scrub = start_scrub(settings, services)
+    ticker = asyncio.create_task(_run_housekeeping(services))
+    try:
+        yield
+    finally:
+        app.response_cache = None
+        ticker.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await ticker
+        if scrub is not None:
+            await run_in_threadpool(scrub.close)
+        for one in publishing:
+            await run_in_threadpool(one.close)
+        await run_in_threadpool(close_services, services)
 
 
 def from_environment() -> FleetMapApp:
