@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from typing import Any
 
+import orjson
 from fastapi import FastAPI, Request
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
@@ -88,8 +89,6 @@ def add_pages(app: FastAPI) -> None:
     """``/openapi.json`` and ``/docs``, with all that the page loads from this server."""
 
     async def schema(_: Request) -> Response:
-        import orjson
-
         return Response(orjson.dumps(app.openapi()), media_type="application/json")
 
     async def docs(_: Request) -> Response:
@@ -117,13 +116,6 @@ def add_pages(app: FastAPI) -> None:
     app.router.add_route("/openapi.json", schema, methods=["GET"], include_in_schema=False)
     app.router.add_route("/docs", docs, methods=["GET"], include_in_schema=False)
     app.router.add_route("/docs/{name}", asset, methods=["GET"], include_in_schema=False)
-    app.openapi = lambda: _schema(app)  # type: ignore[method-assign]
-
-
-def _schema(app: FastAPI) -> dict[str, Any]:
-    if app.openapi_schema is None:
-        app.openapi_schema = build(app)
-    return app.openapi_schema
 
 
 def build(app: FastAPI) -> dict[str, Any]:
