@@ -55,6 +55,7 @@ from app.api import (
     versions,
 )
 from app.api.http import openapi, problems
+from app.api.http.application import FleetMapApp
 from app.api.http.auth import Authenticator
 from app.api.http.connections import ConnectionLimits, Connections, fit_open_files
 from app.api.http.conversions import HEARTBEAT_SECONDS, ConversionJobs
@@ -63,7 +64,7 @@ from app.api.http.dependencies import ApiOptions, Services, Writability
 from app.api.http.metrics import Metrics
 from app.api.http.middleware import Guard
 from app.api.http.protocol import BoundedProtocol, tls_context
-from app.api.http.response_cache import FleetMapApp, ResponseCache
+from app.api.http.response_cache import ResponseCache
 from app.api.http.responses import API
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
@@ -105,35 +106,10 @@ CACHE_SHARE = 0.1
 
 def create_app(settings: Settings) -> FleetMapApp:
     """The application. Its lifespan opens the store and starts the workers, and closes both."""
-
-    @contextlib.asynccontextmanager
-    async def lifespan(app: FleetMapApp) -> AsyncIterator[None]:
-        services = await run_in_threadpool(open_services, settings)
-        app.state.services = services
-        app.state.feed = events.EventFeed(services)
-        services.fleet.start()
-        threading.Thread(target=_prepare, args=(services,), daemon=True).start()
-        publishing = [p for p in (start_ros2(settings, services), start_relay(settings, services)) if p is not None]
-        app.response_cache = services.response_cache
-        scrub = start_scrub(settings, services)
-        ticker = asyncio.create_task(_run_housekeeping(services))
-        try:
-            yield
-        finally:
-            app.response_cache = None
-            ticker.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await ticker
-            if scrub is not None:
-                await run_in_threadpool(scrub.close)
-            for one in publishing:
-                await run_in_threadpool(one.close)
-            await run_in_threadpool(close_services, services)
-
     app = FleetMapApp(
         title="Fleet Map Server",
         version=__version__,
-        lifespan=lifespan,
+        lifespan=partial(_lifespan, settings),
         openapi_url=None,
         docs_url=None,
         redoc_url=None,
@@ -177,6 +153,31 @@ def create_app(settings: Settings) -> FleetMapApp:
     app.include_router(api)
     app.include_router(health.router)
     return app
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]:
+    services = await run_in_threadpool(open_services, settings)
+    app.state.services = services
+    app.state.feed = events.EventFeed(services)
+    services.fleet.start()
+    threading.Thread(target=_prepare, args=(services,), daemon=True).start()
+    publishing = [p for p in (start_ros2(settings, services), start_relay(settings, services)) if p is not None]
+    app.response_cache = services.response_cache
+    scrub = start_scrub(settings, services)
+    ticker = asyncio.create_task(_run_housekeeping(services))
+    try:
+        yield
+    finally:
+        app.response_cache = None
+        ticker.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await ticker
+        if scrub is not None:
+            await run_in_threadpool(scrub.close)
+        for one in publishing:
+            await run_in_threadpool(one.close)
+        await run_in_threadpool(close_services, services)
 
 
 def from_environment() -> FleetMapApp:
@@ -259,9 +260,6 @@ def open_services(settings: Settings) -> Services:
             if not settings.insecure_no_auth:
                 _ensure_first_token(store, settings)
             intake = UploadSpool(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
-        if settings.models_dir is not None:
-            os.environ["FLEETMAP_MODELS_DIR"] = str(settings.models_dir.resolve())  # where derivations look for it
-            os.environ["FLEETMAP_MODELS_MAX_BYTES"] = str(settings.models_max_bytes)
         # One more worker, started when it is needed: coverage tables do not wait for maps in the making.
         pool, spare = pools = [_worker_pool(settings, workers) for workers in (settings.conversion_workers, 1)]
         return _services(settings, store, pool, spare, intake)
@@ -280,7 +278,16 @@ def _worker_pool(settings: Settings, workers: int) -> Pool:
         waiting=settings.conversion_queue,
         warm=PRELOADED_MODULES,
         allowed=sandbox_policy(settings),
+        environment=_model_variables(settings),
     )
+
+
+def _model_variables(settings: Settings) -> dict[str, str]:
+    """Where derivations in workers find models: as variables, since they run without settings, too."""
+    if settings.models_dir is None:
+        return {}
+    folder, max_bytes = str(settings.models_dir.resolve()), str(settings.models_max_bytes)
+    return {"FLEETMAP_MODELS_DIR": folder, "FLEETMAP_MODELS_MAX_BYTES": max_bytes}
 
 
 def sandbox_policy(settings: Settings) -> SandboxPolicy:

@@ -16,7 +16,7 @@ import queue
 import resource
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
@@ -89,6 +89,7 @@ class Pool:
 
     memory_bytes: address space of a worker. seconds: longest time of a job. warm: modules that a worker imports before
     its first job. allowed: what a worker may do besides computing and reading; None: everything.
+    environment: variables that a worker has besides this process's own.
     """
 
     def __init__(
@@ -100,7 +101,9 @@ class Pool:
         waiting: int = 64,
         warm: tuple[str, ...] = (),
         allowed: SandboxPolicy | None = None,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
+        self._environment = dict(environment or {})
         self._memory_bytes, self._seconds, self._warm, self._allowed = memory_bytes, seconds, warm, allowed
         self._slots = threading.BoundedSemaphore(workers + waiting)
         self._idle: queue.LifoQueue[_Worker | None] = queue.LifoQueue()
@@ -199,7 +202,7 @@ class Pool:
             ours, theirs = _processes.Pipe()
         except OSError as error:
             raise Unavailable("the system lets no further file be opened: try again in a few seconds") from error
-        arguments = (theirs, dict(os.environ), self._memory_bytes, self._warm, self._allowed)
+        arguments = (theirs, {**os.environ, **self._environment}, self._memory_bytes, self._warm, self._allowed)
         process = _processes.Process(target=_work, args=arguments, daemon=True, name="fleetmap-worker")
         try:
             process.start()

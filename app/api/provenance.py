@@ -100,29 +100,10 @@ class _Box:
     lines: list[str] = field(default_factory=list)
 
 
-def svg(told_graph: dict[str, Any], title: str) -> bytes:
+def svg(graph: dict[str, Any], title: str) -> bytes:
     """The graph as an SVG picture: files on the left, layers in the middle, maps on the right; stale ones in red."""
     boxes: dict[str, _Box] = {}
-    columns = [
-        [
-            (s["id"], s["name"].rpartition("/")[2], "" if s["used"] else "kept, not used", "raw", s["name"])
-            for s in told_graph["sources"]
-        ],
-        [
-            (
-                p["id"],
-                f"{p['layer']}: {p['name']}" + ("" if p["level"] == "ground" else f" ({p['level']})"),
-                "stale: " + ", ".join(p["stale"]) if p["stale"] else ", ".join(filter(None, p["steps"])),
-                "stale" if p["stale"] else p["information"],
-                p["information"],
-            )
-            for p in told_graph["parts"]
-        ],
-        [
-            (m["id"], m["format"], ", ".join(step["step"] for step in m["chain"]), _state(m["state"]), m["state"])
-            for m in told_graph["maps"]
-        ],
-    ]
+    columns = _columns(graph)
     for column, rows in enumerate(columns):
         for row, (name, text, note, colour, full) in enumerate(rows):
             x, y = 20 + column * (WIDTH + GAP), TOP + row * ROW
@@ -137,33 +118,65 @@ def svg(told_graph: dict[str, Any], title: str) -> bytes:
     ]
     for column, heading in enumerate(("files", "layers", "maps")):
         out.append(f'<text x="{20 + column * (WIDTH + GAP)}" y="35" font-size="15">{heading}</text>')
-    for link in told_graph["links"]:
+    for link in graph["links"]:
         a, b = boxes.get(link["from"]), boxes.get(link["to"])
-        if a is None or b is None:
-            continue
-        same = a.x == b.x
-        x1, y1, y2 = a.x + WIDTH, a.y + 13, b.y + 13
-        x2 = b.x + WIDTH if same else b.x
-        bend = 60 if same else GAP / 2
-        x3 = x2 + bend if same else x2 - bend
-        red = b.colour == COLOURS["stale"]
-        stroke = "#c0392b" if red else "#9aa5b1"
-        out.append(
-            f'<path d="M{x1} {y1} C{x1 + bend} {y1} {x3} {y2} {x2} {y2}" fill="none" stroke="{stroke}" '
-            f'stroke-width="1"{" stroke-dasharray=" + chr(34) + "4 3" + chr(34) if red else ""}/>'
-        )
+        if a is not None and b is not None:
+            out.append(_curve(a, b))
     for box in boxes.values():
-        out.append(
-            f'<g><title>{escape(box.title)}</title><rect x="{box.x}" y="{box.y}" width="{WIDTH}" height="27" rx="4" '
-            f'fill="{box.colour}" stroke="#7b8794"/><text x="{box.x + 8}" y="{box.y + (12 if box.note else 18)}">'
-            f"{escape(_short(box.text, 38))}</text>"
-        )
-        if box.note:
-            note = escape(_short(box.note, 46))
-            out.append(f'<text x="{box.x + 8}" y="{box.y + 23}" font-size="9" fill="#52606d">{note}</text>')
-        out.append("</g>")
+        out += _box_lines(box)
     out.append("</svg>")
     return "\n".join(out).encode()
+
+
+def _columns(graph: dict[str, Any]) -> list[list[tuple[str, str, str, str, str]]]:
+    """Files, layers and maps: of each its id, text, note, colour and full text."""
+    return [
+        [
+            (s["id"], s["name"].rpartition("/")[2], "" if s["used"] else "kept, not used", "raw", s["name"])
+            for s in graph["sources"]
+        ],
+        [
+            (
+                p["id"],
+                f"{p['layer']}: {p['name']}" + ("" if p["level"] == "ground" else f" ({p['level']})"),
+                "stale: " + ", ".join(p["stale"]) if p["stale"] else ", ".join(filter(None, p["steps"])),
+                "stale" if p["stale"] else p["information"],
+                p["information"],
+            )
+            for p in graph["parts"]
+        ],
+        [
+            (m["id"], m["format"], ", ".join(step["step"] for step in m["chain"]), _state(m["state"]), m["state"])
+            for m in graph["maps"]
+        ],
+    ]
+
+
+def _curve(a: _Box, b: _Box) -> str:
+    """From the right of a box to the left of the next column's, or around to the right of one in its own column."""
+    same = a.x == b.x
+    x1, y1, y2 = a.x + WIDTH, a.y + 13, b.y + 13
+    x2 = b.x + WIDTH if same else b.x
+    bend = 60 if same else GAP / 2
+    x3 = x2 + bend if same else x2 - bend
+    red = b.colour == COLOURS["stale"]
+    stroke = "#c0392b" if red else "#9aa5b1"
+    return (
+        f'<path d="M{x1} {y1} C{x1 + bend} {y1} {x3} {y2} {x2} {y2}" fill="none" stroke="{stroke}" '
+        f'stroke-width="1"{" stroke-dasharray=" + chr(34) + "4 3" + chr(34) if red else ""}/>'
+    )
+
+
+def _box_lines(box: _Box) -> list[str]:
+    out = [
+        f'<g><title>{escape(box.title)}</title><rect x="{box.x}" y="{box.y}" width="{WIDTH}" height="27" rx="4" '
+        f'fill="{box.colour}" stroke="#7b8794"/><text x="{box.x + 8}" y="{box.y + (12 if box.note else 18)}">'
+        f"{escape(_short(box.text, 38))}</text>"
+    ]
+    if box.note:
+        note = escape(_short(box.note, 46))
+        out.append(f'<text x="{box.x + 8}" y="{box.y + 23}" font-size="9" fill="#52606d">{note}</text>')
+    return [*out, "</g>"]
 
 
 def _state(state: str) -> str:

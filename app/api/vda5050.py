@@ -65,6 +65,34 @@ class StateOut(BaseModel):
     ignored: list[dict[str, str]]
 
 
+MapIdQuery = Annotated[
+    str | None,
+    Query(alias="mapId", min_length=1, max_length=256, description="The map's id in the fleet manager. Default: env."),
+]
+FormatQuery = Annotated[
+    str,
+    Query(
+        max_length=64,
+        description="The format that the vehicles read: any but `lif`, which is for fleet managers.",
+        examples=["geojson"],
+    ),
+]
+LevelQuery = Annotated[
+    str | None,
+    Query(
+        min_length=1,
+        max_length=256,
+        description="A level's name, or `*` for one map of each level that has one. Default: the default level. "
+        "Only for formats with a parameter `level`.",
+    ),
+]
+SignedQuery = Annotated[
+    bool, Query(description="Whether the links need no token until they expire. `false`: they need one.")
+]
+SecondsQuery = Annotated[
+    int | None, Query(ge=1, description="Life of the links. Default and maximum: `FLEETMAP_LINK_SECONDS`.")
+]
+
 router = APIRouter(tags=["vda5050"], route_class=StrictRoute)
 
 STATE: dict[str, Any] = {
@@ -89,35 +117,11 @@ async def get_actions(
     request: Request,
     services: ServicesDep,
     principal: Viewer,
-    map_id: Annotated[
-        str | None,
-        Query(
-            alias="mapId", min_length=1, max_length=256, description="The map's id in the fleet manager. Default: env."
-        ),
-    ] = None,
-    format: Annotated[
-        str,
-        Query(
-            max_length=64,
-            description="The format that the vehicles read: any but `lif`, which is for fleet managers.",
-            examples=["geojson"],
-        ),
-    ] = "occupancy_grid",
-    level: Annotated[
-        str | None,
-        Query(
-            min_length=1,
-            max_length=256,
-            description="A level's name, or `*` for one map of each level that has one. Default: the default level. "
-            "Only for formats with a parameter `level`.",
-        ),
-    ] = None,
-    signed: Annotated[
-        bool, Query(description="Whether the links need no token until they expire. `false`: they need one.")
-    ] = True,
-    seconds: Annotated[
-        int | None, Query(ge=1, description="Life of the links. Default and maximum: `FLEETMAP_LINK_SECONDS`.")
-    ] = None,
+    map_id: MapIdQuery = None,
+    format: FormatQuery = "occupancy_grid",
+    level: LevelQuery = None,
+    signed: SignedQuery = True,
+    seconds: SecondsQuery = None,
 ) -> Response:
     """`downloadMap` with the link to one file (a zip where the format has several) and its SHA-256, `enableMap`,
     `deleteMap`: to be sent as `instantActions` by the fleet manager. Further query parameters are the map's.

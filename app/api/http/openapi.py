@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from typing import Any
 
+import orjson
 from fastapi import FastAPI, Request
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
@@ -57,12 +58,37 @@ converts, moves channels and sets datums; `admin` does all.
 """
 
 
+TAGS = {
+    "environments": "Mapped places.",
+    "versions": "Immutable states: upload, edit, revert, compare.",
+    "sources": "The uploaded files, byte for byte.",
+    "layers": "Canonical content.",
+    "maps": "Maps in a format, converted on demand.",
+    "maps by format": "The short address of each format, with the parameters of that format.",
+    "channels": "Which version robots drive on.",
+    "robots": "Who holds what, who lags.",
+    "overlays": "What robots report as blocked.",
+    "vda5050": "Maps for fleet managers that speak VDA 5050.",
+    "events": "Every change as it happens.",
+    "manifest": "What a robot verifies.",
+    "transform": "Between earth and local frame.",
+    "derivations": "What is computed from what, and committing it.",
+    "alignments": "Laying a map of another frame onto what is stored.",
+    "generations": "Sites made up from parameters and a seed.",
+    "templates": "What is filled in where a format asks for more than the layers have.",
+    "formats": "What can be read, served and converted.",
+    "jobs": "Work that takes long.",
+    "stored data": "Healing from another server.",
+    "tokens": "Access.",
+    "audit": "Who changed what, from where.",
+    "health": "Operation.",
+}
+
+
 def add_pages(app: FastAPI) -> None:
     """``/openapi.json`` and ``/docs``, with all that the page loads from this server."""
 
     async def schema(_: Request) -> Response:
-        import orjson
-
         return Response(orjson.dumps(app.openapi()), media_type="application/json")
 
     async def docs(_: Request) -> Response:
@@ -90,13 +116,6 @@ def add_pages(app: FastAPI) -> None:
     app.router.add_route("/openapi.json", schema, methods=["GET"], include_in_schema=False)
     app.router.add_route("/docs", docs, methods=["GET"], include_in_schema=False)
     app.router.add_route("/docs/{name}", asset, methods=["GET"], include_in_schema=False)
-    app.openapi = lambda: _schema(app)  # type: ignore[method-assign]
-
-
-def _schema(app: FastAPI) -> dict[str, Any]:
-    if app.openapi_schema is None:
-        app.openapi_schema = build(app)
-    return app.openapi_schema
 
 
 def build(app: FastAPI) -> dict[str, Any]:
@@ -131,34 +150,7 @@ def build(app: FastAPI) -> dict[str, Any]:
     for path, operations in schema["paths"].items():
         for method, operation in operations.items():
             _finish(path, method, operation)
-    schema["tags"] = [
-        {"name": name, "description": text}
-        for name, text in (
-            ("environments", "Mapped places."),
-            ("versions", "Immutable states: upload, edit, revert, compare."),
-            ("sources", "The uploaded files, byte for byte."),
-            ("layers", "Canonical content."),
-            ("maps", "Maps in a format, converted on demand."),
-            ("maps by format", "The short address of each format, with the parameters of that format."),
-            ("channels", "Which version robots drive on."),
-            ("robots", "Who holds what, who lags."),
-            ("overlays", "What robots report as blocked."),
-            ("vda5050", "Maps for fleet managers that speak VDA 5050."),
-            ("events", "Every change as it happens."),
-            ("manifest", "What a robot verifies."),
-            ("transform", "Between earth and local frame."),
-            ("derivations", "What is computed from what, and committing it."),
-            ("alignments", "Laying a map of another frame onto what is stored."),
-            ("generations", "Sites made up from parameters and a seed."),
-            ("templates", "What is filled in where a format asks for more than the layers have."),
-            ("formats", "What can be read, served and converted."),
-            ("jobs", "Work that takes long."),
-            ("stored data", "Healing from another server."),
-            ("tokens", "Access."),
-            ("audit", "Who changed what, from where."),
-            ("health", "Operation."),
-        )
-    ]
+    schema["tags"] = [{"name": name, "description": text} for name, text in TAGS.items()]
     return schema
 
 

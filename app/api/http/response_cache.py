@@ -1,4 +1,4 @@
-"""Answers in memory, so that a fleet that asks again costs microseconds, and the application that gives them first.
+"""Answers in memory, so that a fleet that asks again costs microseconds.
 
 An answer is believed while ``Store.generation()`` stays the same and for a second at most, the caller's token likewise.
 All else goes the long way: guard, route, recipe (the ETag), cache on disk, conversion.
@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
-from fastapi import FastAPI, Request
-from starlette.types import Receive, Scope, Send
+from fastapi import Request
+from starlette.types import Scope
 
 from app.api.http.auth import Authenticator, Principal, authorise
 from app.api.http.caching import none_match
@@ -195,22 +195,3 @@ def request_key(request: Request) -> Key:
 
 def _entry_bytes(response: CachedResponse) -> int:
     return 2048 + len(response.body or b"")
-
-
-class FleetMapApp(FastAPI):
-    """The application, with the answers it has in memory in front of everything else.
-
-    ``response_cache`` is None until the services are open.
-    """
-
-    response_cache: ResponseCache | None = None
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a repeated request for a map from memory, or go the long way."""
-        if self.response_cache is not None and scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
-            reply = self.response_cache.reply(scope)
-            if reply is not None:
-                await send(reply[0])
-                await send(reply[1])
-                return
-        await super().__call__(scope, receive, send)
