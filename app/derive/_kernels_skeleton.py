@@ -102,49 +102,75 @@ def _lone_block(mask: U8, y: int, x: int) -> bool:
 
 
 @native
-def thin(mask: U8) -> int:
-    """Thin a mask of zeros and ones in place, to lines one cell wide; how many cells are left."""
-    height, width = mask.shape
-    flat = mask.ravel()
-    count = 0
-    edge = 0
-    for y in range(1, height - 1):
-        for x in range(1, width - 1):
+def _count_cells(mask: U8) -> tuple[int, int]:
+    """Count the cells of a mask, and those at its edge."""
+    count = edge = 0
+    for y in range(1, mask.shape[0] - 1):
+        for x in range(1, mask.shape[1] - 1):
             if mask[y, x]:
                 count += 1
                 if not (mask[y - 1, x] and mask[y + 1, x] and mask[y, x - 1] and mask[y, x + 1]):
                     edge += 1
+    return count, edge
+
+
+@native
+def _list_edge(mask: U8, first: I32, second: I32) -> int:
+    """Mark the cells at the edge with 6, as waiting for both passes, and list them for each; how many they are.
+
+    Cells whose only missing neighbours are diagonal cannot be deleted yet: they have seven.
+    """
+    n = 0
+    width = mask.shape[1]
+    for y in range(1, mask.shape[0] - 1):
+        for x in range(1, width - 1):
+            if mask[y, x] and not (mask[y - 1, x] and mask[y + 1, x] and mask[y, x - 1] and mask[y, x + 1]):
+                first[n] = second[n] = y * width + x
+                n += 1
+                mask[y, x] |= 6
+    return n
+
+
+@native
+def _delete(mask: U8, step: I64, cells: I32, count: int, bit: int, removed: I32) -> int:
+    """Delete those of the first ``count`` cells that the pass of this bit deletes, and list them; how many they are.
+
+    All are judged before the first is deleted.
+    """
+    width = mask.shape[1]
+    flat = mask.ravel()
+    deleted = 0
+    keep = 255 - 2 * bit
+    for i in range(count):
+        cell = cells[i]
+        flat[cell] &= keep
+        if flat[cell] & 1 == 0:
+            continue
+        code = 0
+        for k in range(8):
+            code |= (flat[cell + step[k]] & 1) << k
+        if _PASSES[code] & bit and not (code == _BLOCK and _lone_block(mask, cell // width, cell % width)):
+            removed[deleted] = cell
+            deleted += 1
+    for i in range(deleted):
+        flat[removed[i]] &= 6
+    return deleted
+
+
+@native
+def thin(mask: U8) -> int:
+    """Thin a mask of zeros and ones in place, to lines one cell wide; how many cells are left."""
+    flat = mask.ravel()
+    count, edge = _count_cells(mask)
     size = max(1024, edge * 2)
     first, second = np.empty(size, np.int32), np.empty(size, np.int32)
     removed = np.empty(size, np.int32)
-    n1 = n2 = 0
-    # Cells whose only missing neighbours are diagonal cannot be deleted yet: they have seven.
-    for y in range(1, height - 1):
-        for x in range(1, width - 1):
-            if mask[y, x] and not (mask[y - 1, x] and mask[y + 1, x] and mask[y, x - 1] and mask[y, x + 1]):
-                first[n1] = second[n2] = y * width + x
-                n1 += 1
-                n2 += 1
-                mask[y, x] |= 6
-    step = steps(width)
+    n1 = n2 = _list_edge(mask, first, second)
+    step = steps(mask.shape[1])
     bit = 1
     while n1 > 0 or n2 > 0:
-        deleted = 0
-        keep = 255 - 2 * bit
-        for i in range(n1):
-            cell = first[i]
-            flat[cell] &= keep
-            if flat[cell] & 1 == 0:
-                continue
-            code = 0
-            for k in range(8):
-                code |= (flat[cell + step[k]] & 1) << k
-            if _PASSES[code] & bit and not (code == _BLOCK and _lone_block(mask, cell // width, cell % width)):
-                removed[deleted] = cell
-                deleted += 1
+        deleted = _delete(mask, step, first, n1, bit, removed)
         n1 = 0
-        for i in range(deleted):
-            flat[removed[i]] &= 6
         count -= deleted
         need = max(n2, 0) + 8 * deleted
         if need > len(second):
@@ -169,15 +195,14 @@ def thin(mask: U8) -> int:
         if n1 > len(removed):
             removed = np.empty(len(first), np.int32)
         bit = 3 - bit
-    # What is left of corners.
-    left = np.empty(count, np.int32)
+    corners = np.empty(count, np.int32)
     n = 0
     for cell in range(len(flat)):
         if flat[cell]:
             flat[cell] = 1
-            left[n] = cell
+            corners[n] = cell
             n += 1
-    return slim(flat, step, left, count)
+    return slim(flat, step, corners, count)
 
 
 @native
@@ -226,6 +251,24 @@ def _neighbours(mask: U8, cells: I32, rows: I64, k: int, out: I64) -> int:
 
 
 @native
+def _walk(mask: U8, cells: I32, rows: I64, node: I64, done: U8, path: I64, used: int, at: int, following: int) -> int:
+    """Append the cells from node ``at`` over its neighbour ``following`` to the next node; cells of the path now."""
+    near = np.empty(8, np.int64)
+    path[used] = at
+    used += 1
+    previous, current = at, following
+    while node[current] < 0:
+        done[current] = 1
+        path[used] = current
+        used += 1
+        _neighbours(mask, cells, rows, current, near)
+        following = near[0] if near[0] != previous else near[1]
+        previous, current = current, following
+    path[used] = current
+    return used + 1
+
+
+@native
 def trace(mask: U8, cells: I32, rows: I64) -> Graph:
     """The graph of a skeleton: (nodes, start, end, begin, path).
 
@@ -234,18 +277,17 @@ def trace(mask: U8, cells: I32, rows: I64) -> Graph:
     own cells included.
     """
     n = len(cells)
-    near, other = np.empty(8, np.int64), np.empty(8, np.int64)
-    degree = np.empty(n, np.int64)
+    near = np.empty(8, np.int64)
     node = np.full(n, -1, np.int64)
     nodes = np.empty(n, np.int64)
     count = ends = 0
     for k in range(n):
-        degree[k] = _neighbours(mask, cells, rows, k, near)
-        if degree[k] != 2:
+        degree = _neighbours(mask, cells, rows, k, near)
+        if degree != 2:
             node[k] = count
             nodes[count] = k
             count += 1
-            ends += degree[k]
+            ends += degree
     rings = n // 4 + 1
     start, end = np.empty(ends + rings, np.int64), np.empty(ends + rings, np.int64)
     begin = np.empty(ends + rings + 1, np.int64)
@@ -269,22 +311,12 @@ def trace(mask: U8, cells: I32, rows: I64) -> Graph:
                 if (node[q] >= 0 and q < k) or done[q]:
                     continue
                 begin[edges] = used
-                path[used] = k
-                used += 1
-                previous, current = k, q
-                while node[current] < 0:
-                    done[current] = 1
-                    path[used] = current
-                    used += 1
-                    _neighbours(mask, cells, rows, current, other)
-                    following = other[0] if other[0] != previous else other[1]
-                    previous, current = current, following
-                path[used] = current
-                used += 1
-                if current == k and used - begin[edges] < 5:
+                used = _walk(mask, cells, rows, node, done, path, used, k, q)
+                last = path[used - 1]
+                if last == k and used - begin[edges] < 5:
                     used = begin[edges]  # two cells beside a junction, around nothing
                     continue
-                start[edges], end[edges] = node[k], node[current]
+                start[edges], end[edges] = node[k], node[last]
                 edges += 1
     begin[edges] = used
     return nodes[:count].copy(), start[:edges].copy(), end[:edges].copy(), begin[: edges + 1].copy(), path[:used].copy()
@@ -323,23 +355,20 @@ def _lengths(cells: I32, begin: I64, path: I64) -> F64:
 
 
 @native
-def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
-    """One junction where several lie within ``radius`` cells of each other along the skeleton.
+def _cluster(graph: Graph, gap: U16, cells: I32, radius: float, length: F64) -> tuple[I64, I64, F64]:
+    """The junctions that lie together: (head, via, away).
 
-    The one farthest from obstacles stays, and edges of the others are led on to it over the cells between. Loops that
-    arise and are not longer than four times the radius go, since they lead nowhere.
+    head: [nodes], the node that each is led on to, itself for one that stays; via: the edge towards it, or -1; away:
+    how far that is along the skeleton, in cells.
     """
-    nodes, start, end, begin, path = graph
-    count, edges = len(nodes), len(start)
-    length = _lengths(cells, begin, path)
-    first, at = _incidence(count, start, end, np.ones(edges, np.uint8))
+    nodes, start, end = graph[:3]
+    count = len(nodes)
+    first, at = _incidence(count, start, end, np.ones(len(start), np.uint8))
     clearance = np.empty(count, np.int64)
     for v in range(count):
         clearance[v] = distance2(gap, cells[nodes[v], 0], cells[nodes[v], 1])
     order = np.argsort(-clearance, kind="mergesort")
-    head = np.full(count, -1, np.int64)
-    via = np.full(count, -1, np.int64)  # the edge towards the head
-    away = np.zeros(count)
+    head, via, away = np.full(count, -1, np.int64), np.full(count, -1, np.int64), np.zeros(count)
     queue = np.empty(count, np.int64)
     for rank in range(count):
         v = order[rank]
@@ -359,6 +388,20 @@ def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
                     head[u], via[u], away[u] = v, e, far
                     queue[size] = u
                     size += 1
+    return head, via, away
+
+
+@native
+def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
+    """One junction where several lie within ``radius`` cells of each other along the skeleton.
+
+    The one farthest from obstacles stays, and edges of the others are led on to it over the cells between. Loops that
+    arise and are not longer than four times the radius go, since they lead nowhere.
+    """
+    nodes, start, end, begin, path = graph
+    count, edges = len(nodes), len(start)
+    length = _lengths(cells, begin, path)
+    head, via, away = _cluster(graph, gap, cells, radius, length)
     remaining = np.zeros(edges, np.uint8)
     room = m = 0
     for e in range(edges):
@@ -374,14 +417,9 @@ def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
             while via[v] >= 0:
                 room += begin[via[v] + 1] - begin[via[v]]
                 v = end[via[v]] if start[via[v]] == v else start[via[v]]
+    heads = np.flatnonzero(head == np.arange(count))
     place = np.full(count, -1, np.int64)
-    new_nodes = np.empty(count, np.int64)
-    n = 0
-    for v in range(count):
-        if head[v] == v:
-            place[v] = n
-            new_nodes[n] = nodes[v]
-            n += 1
+    place[heads] = np.arange(len(heads))
     new_start, new_end, new_begin = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m + 1, np.int64)
     new_path = np.empty(room, np.int64)
     used = m = 0
@@ -391,18 +429,14 @@ def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
         a, b = start[e], end[e]
         new_start[m], new_end[m], new_begin[m] = place[head[a]], place[head[b]], used
         used = _onwards(a, start, end, begin, path, via, new_path, used)
-        i, j = new_begin[m], used - 1
-        while i < j:
-            new_path[i], new_path[j] = new_path[j], new_path[i]
-            i += 1
-            j -= 1
+        new_path[new_begin[m] : used] = new_path[new_begin[m] : used][::-1].copy()
         for i in range(begin[e], begin[e + 1]):
             new_path[used] = path[i]
             used += 1
         used = _onwards(b, start, end, begin, path, via, new_path, used)
         m += 1
     new_begin[m] = used
-    return new_nodes[:n].copy(), new_start, new_end, new_begin, new_path[:used].copy()
+    return nodes[heads], new_start, new_end, new_begin, new_path[:used].copy()
 
 
 @native
