@@ -1,7 +1,11 @@
-"""YAML: what scalars mean, what is refused and on which line, and that the quick way and libyaml's agree."""
+"""YAML: what scalars mean, what is refused and on which line, and that the quick way and libyaml's agree.
+
+``FLEETMAP_EXAMPLES=5000 pytest tests/formats/test_yaml.py`` (a part of ``make fuzz``) looks longer than CI does.
+"""
 
 from __future__ import annotations
 
+import os
 import time
 from contextlib import suppress
 from itertools import pairwise
@@ -21,6 +25,8 @@ from app.limits import Limits
 from app.syntax import yaml
 
 LIMITS = Limits()
+
+examples = settings(max_examples=int(os.environ.get("FLEETMAP_EXAMPLES", "200")), deadline=None)
 
 
 def load(text: str | bytes) -> Any:
@@ -259,7 +265,7 @@ line = st.tuples(
 )  # fmt: skip
 
 
-@settings(max_examples=1500, deadline=None)
+@examples
 @given(st.lists(line, max_size=9), st.sampled_from(["\n", "\n", "\r\n"]))
 @example([(0, "", ["k: &n"], ""), (0, "- ", ["a"], ""), (0, "", ["b"], ": "), (0, "- ", ["*n"], "")], "\n")
 @example([(0, "", ["a", "1"], ": "), (2, "", ["b c"], "")], "\n")
@@ -277,7 +283,7 @@ FLOWING = [
 ]  # fmt: skip
 
 
-@settings(max_examples=1500, deadline=None)
+@examples
 @given(
     st.lists(
         st.tuples(
@@ -308,7 +314,7 @@ flowing = st.recursive(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@examples
 @given(st.lists(st.lists(flowing, min_size=1, max_size=5), min_size=1, max_size=5))
 def test_rows_in_flow_style_are_taken_the_quick_way(rows: list[Any]) -> None:
     text = "rows:\n" + "".join(f"  - {Flow()(row)}\n" for row in rows)
@@ -332,7 +338,7 @@ def test_limits_hold_for_collections_in_flow_style() -> None:
     assert yaml.load(b"a:\n" + rows, Limits(yaml_depth=5))["a"][9] == [1, 2, {"a": [4, True], "b": [1, ""]}]
 
 
-@settings(max_examples=500, deadline=None)
+@examples
 @given(st.text("ab1.-: \n'\"#[]{}&*!|>~é", max_size=60))
 def test_both_ways_agree_on_any_text(said: str) -> None:
     value = quick(said)
@@ -340,7 +346,7 @@ def test_both_ways_agree_on_any_text(said: str) -> None:
         assert orjson.dumps(value) == orjson.dumps(yaml._load_events(said, LIMITS)), said
 
 
-@settings(max_examples=300, deadline=None)
+@examples
 @given(st.binary(max_size=200))
 def test_any_bytes_are_read_or_refused(data: bytes) -> None:
     try:
@@ -369,7 +375,7 @@ values = st.recursive(
 )
 
 
-@settings(max_examples=500, deadline=None)
+@examples
 @given(st.dictionaries(texts, values, min_size=1, max_size=5))
 def test_what_is_written_is_read_back_by_us_and_by_pyyaml(value: dict[str, Any]) -> None:
     text = yaml.mapping(value, 0)
@@ -378,7 +384,7 @@ def test_what_is_written_is_read_back_by_us_and_by_pyyaml(value: dict[str, Any])
     assert yaml.mapping(dict(reversed(value.items())), 0) == text
 
 
-@settings(max_examples=600, deadline=None)
+@examples
 @given(st.dictionaries(texts, values, min_size=1, max_size=5), st.randoms(use_true_random=False))
 def test_both_ways_agree_on_damaged_documents(value: dict[str, Any], random: Any) -> None:
     lines = yaml.mapping(value, 0).split("\n")
@@ -410,7 +416,7 @@ plain = st.text(st.characters(categories=["L", "N", "P", "Zs"], max_codepoint=0x
 )
 
 
-@settings(max_examples=200, deadline=None)
+@examples
 @given(
     st.dictionaries(plain, plain | st.booleans() | st.integers(-1000, 1000) | st.lists(plain, max_size=3), min_size=1)
 )
