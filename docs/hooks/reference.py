@@ -240,9 +240,9 @@ def format_page(known: Format) -> str:
 
 def _module(known: Format) -> types.ModuleType:
     """The module that is the format's: by its name, in the package of its family or in ``app.formats``."""
-    function = (known.read or known.write or known.detect).__module__
-    family = ".".join(function.split(".")[:3])
-    names = (f"{family}.{known.name}", f"app.formats.{known.name}", function)
+    module = known.detect.__module__
+    family = ".".join(module.split(".")[:3])
+    names = (f"{family}.{known.name}", f"app.formats.{known.name}", module)
     return next(sys.modules[name] for name in names if name in sys.modules)
 
 
