@@ -1,5 +1,21 @@
-"""The HTTP interface: one module for each noun.
+"""The HTTP interface: one module for each noun, which is discovered: it exposes its routes as ``router``.
 
 ``middleware`` stands in front (token, bodies, errors), ``maps.FleetMapApp`` before it (repeated requests from memory);
 ``problems`` knows the status of every error, ``schemas`` the shapes and examples.
 """
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Iterator
+
+from fastapi import APIRouter
+
+
+def routers() -> Iterator[APIRouter]:
+    """The routes below ``/api/v1`` of all nouns, by the names of their modules."""
+    for name in sorted(module.name for module in pkgutil.iter_modules(__path__)):
+        router = getattr(importlib.import_module(f"{__name__}.{name}"), "router", None)
+        if isinstance(router, APIRouter):
+            yield router
