@@ -25,35 +25,7 @@ from starlette.exceptions import HTTPException
 
 from app import __version__, derive, logs
 from app import formats as every_format
-from app.api import (
-    alignments,
-    audit,
-    changes,
-    channels,
-    convert,
-    derivations,
-    diff,
-    environments,
-    events,
-    formats,
-    generations,
-    health,
-    jobs,
-    layers,
-    links,
-    manifest,
-    maps,
-    overlays,
-    provenance,
-    robots,
-    ros2,
-    stored,
-    templates,
-    tokens,
-    transform,
-    vda5050,
-    versions,
-)
+from app.api import events, health, maps, ros2, routers
 from app.api.http import openapi, problems
 from app.api.http.application import FleetMapApp
 from app.api.http.auth import Authenticator
@@ -122,36 +94,10 @@ def create_app(settings: Settings) -> FleetMapApp:
     maps.add_routes(app)
     openapi.add_pages(app)
     api = APIRouter(prefix=API)
-    for module in (
-        environments,
-        versions,
-        layers,
-        maps,
-        links,
-        diff,
-        changes,
-        channels,
-        transform,
-        formats,
-        derivations,
-        generations,
-        templates,
-        alignments,
-        convert,
-        events,
-        manifest,
-        provenance,
-        robots,
-        overlays,
-        vda5050,
-        jobs,
-        stored,
-        tokens,
-        audit,
-    ):
-        api.include_router(module.router)
+    for router in routers():
+        api.include_router(router)
     app.include_router(api)
-    app.include_router(health.router)
+    app.include_router(health.root_router)
     return app
 
 

@@ -21,7 +21,7 @@ from app.events.relay import relay_state
 
 READY_SECONDS = 5.0
 
-router = APIRouter(tags=["health"], route_class=StrictRoute)
+root_router = APIRouter(tags=["health"], route_class=StrictRoute)
 
 
 _ENDPOINT = re.compile(r"([a-z]+)/(.+):(\d+)(.*)")
@@ -53,13 +53,13 @@ def advertised_router(advertised: str, listen: str, host: str) -> str:
     return ",".join(out)
 
 
-@router.get("/healthz", summary="Alive")
+@root_router.get("/healthz", summary="Alive")
 async def healthz() -> Response:
     """Answers as long as the process does, whatever the database and the conversions do."""
     return json_response({"status": "ok"})
 
 
-@router.get("/readyz", responses=problem_responses(None, 422, 503), summary="Ready")
+@root_router.get("/readyz", responses=problem_responses(None, 422, 503), summary="Ready")
 async def readyz(
     request: Request,
     for_: Literal["reads", "writes"] = Query(
@@ -102,7 +102,7 @@ async def readyz(
     return json_response({**state, "events": events, **topics})
 
 
-@router.get(
+@root_router.get(
     "/metrics",
     summary="Prometheus metrics",
     response_class=Response,

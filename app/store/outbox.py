@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, func, insert, select, update
 
 from app.errors import NotFound
-from app.event_types import EventType
+from app.event_types import EventType, check_members
 from app.store import tables
 from app.store.base import StoreBase, environment_row
 from app.store.values import Event, PartEntry, rfc3339
@@ -49,8 +49,9 @@ def append_event(
 ) -> None:
     """Add one event. The caller holds the environment's row and stores ``sequence`` in it.
 
-    Call it last: it takes the lock that puts all environments' events in one order.
+    Call it last: it takes the lock that puts all environments' events in one order. more: members of this type alone.
     """
+    check_members(kind, more)
     body = {
         "sequence": sequence,
         "type": kind,

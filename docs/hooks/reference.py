@@ -11,6 +11,7 @@ import html
 import importlib
 import inspect
 import itertools
+import json
 import re
 import sys
 import tempfile
@@ -40,6 +41,7 @@ from app.cli import commands
 from app.config import Settings, format_size
 from app.derive import Derivation
 from app.errors import FleetMapError
+from app.event_types import EVENT_TYPES, describe
 from app.formats import Format, all_formats
 from app.generate import Generator
 from app.main import create_app
@@ -432,6 +434,16 @@ def application() -> Any:
         return create_app(Settings(_env_file=None, data_dir=Path(folder), zenoh_mode="off"))  # type: ignore[call-arg]
 
 
+def events() -> str:
+    """Each event type: when it happens, and an example."""
+    out = []
+    for name in EVENT_TYPES:
+        doc, members = describe(name)
+        example = json.dumps({"type": name, **EVENT, **members}, indent=2)
+        out += [f"## {name}\n", f"{doc}\n", f"```json\n{example}\n```\n"]
+    return "\n".join(out)
+
+
 @cache
 def openapi() -> dict[str, Any]:
     """The OpenAPI document."""
@@ -625,6 +637,28 @@ def chunk_tree() -> str:
     return f"{prose(text.partition(chr(10))[2])}\n{table(('number', 'value'), numbers)}"
 
 
+EVENT: Mapping[str, Any] = {
+    "sequence": 6,
+    "environment": "my-farm",
+    "version": 3,
+    "root": "5048dcddc88d47e4a78da440de2f9886569444a9019e7620f618f8de726c956c",
+    "previous": {"version": 2, "root": "8c3ee386be22778ecddad6d6fc39946a02942512065f33781671b317460894b9"},
+    "layers": [
+        {
+            "layer": "occupancy",
+            "level": "ground",
+            "name": "map",
+            "change": "added",
+            "hash": "63b06a3f65b1140a8af28147e65070a11af03970b07a0f772c9ff6c759868d61",
+        }
+    ],
+    "message": "mapped",
+    "author": "administrator",
+    "time": "2026-03-02T09:21:16.486836Z",
+}
+"""The members that all events have, by an example."""
+
+
 BLOCKS: Mapping[str, Callable[[], str]] = {
     "formats": formats_table,
     "derivations": derivations,
@@ -633,6 +667,7 @@ BLOCKS: Mapping[str, Callable[[], str]] = {
     "metrics": metrics,
     "errors": errors,
     "http": http,
+    "events": events,
     "cli": cli,
     "encoding": encoding,
     "chunk-tree": chunk_tree,
