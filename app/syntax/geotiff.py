@@ -232,18 +232,26 @@ def _check_size(dataset: Any, limits: Limits) -> None:
 
 
 def _decode(dataset: Any, rasterio: Any) -> Raster:
-    count, height, width = dataset.count, dataset.height, dataset.width
     doubts = []
     pages = len(dataset.subdatasets)
     if pages > 1:
         doubts.append(f"it has {pages} pages: the first one is read, the others are kept in the source only")
-    colours = [c.name for c in dataset.colorinterp]
-    nodata = dataset.nodata
     flags = dataset.mask_flag_enums[0]
     masked = rasterio.enums.MaskFlags.per_dataset in flags and not {
         rasterio.enums.MaskFlags.alpha,
         rasterio.enums.MaskFlags.nodata,
     } & set(flags)
+    pixels = _pixels(dataset, rasterio, masked)
+    tags = _texts(dataset.tags())
+    is_local = tags.pop(OWN_TAG, None) == LOCAL
+    transform, crs = _placement(dataset, is_local, doubts)
+    properties = _properties(dataset, tags, masked)
+    return Raster(np.moveaxis(pixels, 0, 2), transform, crs, properties, tuple(doubts))
+
+
+def _pixels(dataset: Any, rasterio: Any, masked: bool) -> NDArray[Any]:
+    """[bands, height, width]; a mask becomes one more band."""
+    count, height, width = dataset.count, dataset.height, dataset.width
     kind = np.dtype(dataset.dtypes[0])
     pixels = np.empty((count + masked, height, width), kind)
     for window in _windows(dataset, rasterio):
@@ -252,59 +260,68 @@ def _decode(dataset: Any, rasterio: Any) -> Raster:
     if masked:
         full = 127 if kind == np.int8 else 255
         np.multiply(dataset.read_masks(1) != 0, full, out=pixels[count], casting="unsafe")
+    return pixels
+
+
+def _placement(dataset: Any, is_local: bool, doubts: list[str]) -> tuple[Affine | None, str | None]:
+    """Transform and CRS, from ground control points where the file has no transform. Raises UnreadableFile."""
     transform: Affine | None = tuple(float(v) for v in dataset.transform[:6])  # type: ignore[assignment]
-    dataset_tags = _texts(dataset.tags())
-    local = dataset_tags.pop(OWN_TAG, None) == LOCAL
-    crs = crs_name(dataset.crs) if dataset.crs else LOCAL if local else None
-    if transform == NO_TRANSFORM and not local:
-        transform = None
-        points, points_crs = dataset.gcps
-        if points:
-            plane = fit_affine([(p.col, p.row, p.x, p.y) for p in points])
-            if plane is None:
-                raise UnreadableFile("its ground control points lie on one line: they do not say where it lies")
-            transform, off = plane
-            crs = crs_name(points_crs) if points_crs else crs
-            if off > 0.5:
-                doubts.append(
-                    f"its {len(points)} ground control points are {off:.1f} pixels off the plane through them: warp it "
-                    "(gdalwarp) for a closer fit"
-                )
-        elif dataset.rpcs:
+    crs = crs_name(dataset.crs) if dataset.crs else LOCAL if is_local else None
+    if transform != NO_TRANSFORM or is_local:
+        return transform, crs
+    points, points_crs = dataset.gcps
+    if not points:
+        if dataset.rpcs:
             raise UnreadableFile("it is placed by a sensor model (RPC) only: orthorectify it first (gdalwarp -rpc)")
-    bands = []
-    for k, colour in enumerate(colours):
-        band_values = {
-            "description": dataset.descriptions[k] or None,
-            "unit": dataset.units[k] or None,
-            "scale": _unless(dataset.scales[k], 1.0),
-            "offset": _unless(dataset.offsets[k], 0.0),
-        }
-        band: dict[str, Any] = {
-            "colour": colour,
-            **{name: value for name, value in band_values.items() if value is not None},
-        }
-        tags = _texts(dataset.tags(k + 1))
-        if tags:
-            band["satellite"] = {"tags": tags}
-        bands.append(band)
+        return None, crs
+    plane = fit_affine([(p.col, p.row, p.x, p.y) for p in points])
+    if plane is None:
+        raise UnreadableFile("its ground control points lie on one line: they do not say where it lies")
+    transform, off = plane
+    if off > 0.5:
+        doubts.append(
+            f"its {len(points)} ground control points are {off:.1f} pixels off the plane through them: warp it "
+            "(gdalwarp) for a closer fit"
+        )
+    return transform, crs_name(points_crs) if points_crs else crs
+
+
+def _properties(dataset: Any, tags: dict[str, str], masked: bool) -> dict[str, Any]:
+    """What the file says besides its pixels. tags: of the whole file; those that only say how it was made leave."""
+    colours = [c.name for c in dataset.colorinterp]
+    bands = [_band(dataset, k, colour) for k, colour in enumerate(colours)]
     if masked:
         bands.append({"colour": "mask"})
     properties: dict[str, Any] = {"bands": bands}
+    nodata = dataset.nodata
     if nodata is not None:
+        kind = np.dtype(dataset.dtypes[0])
         is_integer = math.isfinite(nodata) and kind.kind in "iu" and float(nodata).is_integer()
         properties["nodata"] = int(nodata) if is_integer else nodata if math.isfinite(nodata) else str(float(nodata))
     if "palette" in colours:
         table = dataset.colormap(colours.index("palette") + 1)
         properties["palette"] = [list(table[k]) for k in sorted(table)]
-    if dataset_tags.get("AREA_OR_POINT") == "Area":
-        del dataset_tags["AREA_OR_POINT"]
-    dataset_tags.pop("OVR_RESAMPLING_ALG", None)
-    if dataset_tags.get("TIFFTAG_COPYRIGHT"):
-        properties["attribution"] = [dataset_tags["TIFFTAG_COPYRIGHT"]]
-    if dataset_tags:
-        properties["satellite"] = {"tags": dataset_tags}
-    return Raster(np.moveaxis(pixels, 0, 2), transform, crs, properties, tuple(doubts))
+    if tags.get("AREA_OR_POINT") == "Area":
+        del tags["AREA_OR_POINT"]
+    tags.pop("OVR_RESAMPLING_ALG", None)
+    if tags.get("TIFFTAG_COPYRIGHT"):
+        properties["attribution"] = [tags["TIFFTAG_COPYRIGHT"]]
+    if tags:
+        properties["satellite"] = {"tags": tags}
+    return properties
+
+
+def _band(dataset: Any, k: int, colour: str) -> dict[str, Any]:
+    values = {
+        "description": dataset.descriptions[k] or None,
+        "unit": dataset.units[k] or None,
+        "scale": _unless(dataset.scales[k], 1.0),
+        "offset": _unless(dataset.offsets[k], 0.0),
+    }
+    band: dict[str, Any] = {"colour": colour, **{name: value for name, value in values.items() if value is not None}}
+    if tags := _texts(dataset.tags(k + 1)):
+        band["satellite"] = {"tags": tags}
+    return band
 
 
 def _windows(dataset: Any, rasterio: Any) -> Iterator[Any]:

@@ -19,7 +19,7 @@ from lxml import etree
 
 from app.errors import BadUpload, MissingDatum, UnreadableFile
 from app.formats import FileGroup, ReadContext, WriteContext, get_format, read, write
-from app.formats.kml.reading import parse_coordinates
+from app.formats.kml.coordinates import parse_coordinates
 from app.model.features import NO_GEOMETRY, Features, concatenate, features, from_columns, merge_documents
 from app.model.frame import GROUND, Datum, Level
 from app.model.grid import OccupancyGrid

@@ -23,6 +23,8 @@ from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats.rmf.common import Flow
 from app.limits import Limits
 from app.syntax import yaml
+from app.syntax.yaml.events import load_events
+from app.syntax.yaml.lines import NotSimpleError, load_lines
 
 LIMITS = Limits()
 
@@ -221,8 +223,8 @@ def test_limits_on_nodes_and_bytes() -> None:
 def quick(text: str) -> Any:
     """What the quick way makes of it, or a mark that it leaves it to the reference."""
     try:
-        return yaml._load_lines(text, LIMITS)
-    except yaml._NotSimpleError:
+        return load_lines(text, LIMITS)
+    except NotSimpleError:
         return NotImplemented
 
 
@@ -234,9 +236,9 @@ def test_both_ways_agree_on_all_real_files(shared: Path) -> None:
         text = path.read_text()
         if path.parts[-3] == "navgraph":
             with pytest.raises(UnreadableFile, match="%TAG"):  # Fawkes' own tags
-                yaml._load_events(text, LIMITS)
+                load_events(text, LIMITS)
             continue
-        reference = yaml._load_events(text, LIMITS)
+        reference = load_events(text, LIMITS)
         assert reference == pyyaml.load(text, pyyaml.CSafeLoader) or "graphs" in text, path
         value = quick(text)
         if value is not NotImplemented:
@@ -273,7 +275,7 @@ def test_both_ways_agree_on_whatever_the_quick_way_takes(rows: list[Any], end: s
     text = end.join(" " * indent + dash + glue.join(words) for indent, dash, words, glue in rows)
     value = quick(text)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(yaml._load_events(text, LIMITS)), text
+        assert orjson.dumps(value) == orjson.dumps(load_events(text, LIMITS)), text
 
 
 FLOWING = [
@@ -301,7 +303,7 @@ def test_both_ways_agree_on_collections_in_flow_style(rows: list[Any]) -> None:
     text = "\n".join(indent + start + "".join(words) for indent, start, words in rows)
     value = quick(text)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(yaml._load_events(text, LIMITS)), text
+        assert orjson.dumps(value) == orjson.dumps(load_events(text, LIMITS)), text
 
 
 floats = st.floats(allow_nan=False, allow_infinity=False)
@@ -318,7 +320,7 @@ flowing = st.recursive(
 @given(st.lists(st.lists(flowing, min_size=1, max_size=5), min_size=1, max_size=5))
 def test_rows_in_flow_style_are_taken_the_quick_way(rows: list[Any]) -> None:
     text = "rows:\n" + "".join(f"  - {Flow()(row)}\n" for row in rows)
-    reference = yaml._load_events(text, LIMITS)
+    reference = load_events(text, LIMITS)
     assert orjson.dumps(reference) == orjson.dumps({"rows": rows}, option=orjson.OPT_SORT_KEYS)
     value = quick(text)
     assert value is not NotImplemented, text
@@ -343,7 +345,7 @@ def test_limits_hold_for_collections_in_flow_style() -> None:
 def test_both_ways_agree_on_any_text(said: str) -> None:
     value = quick(said)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(yaml._load_events(said, LIMITS)), said
+        assert orjson.dumps(value) == orjson.dumps(load_events(said, LIMITS)), said
 
 
 @examples
@@ -407,7 +409,7 @@ def test_both_ways_agree_on_damaged_documents(value: dict[str, Any], random: Any
     text = "\n".join(lines)
     taken = quick(text)
     if taken is not NotImplemented:
-        assert orjson.dumps(taken) == orjson.dumps(yaml._load_events(text, LIMITS)), text
+        assert orjson.dumps(taken) == orjson.dumps(load_events(text, LIMITS)), text
 
 
 plain = st.text(st.characters(categories=["L", "N", "P", "Zs"], max_codepoint=0x2000), max_size=12).filter(

@@ -14,7 +14,8 @@ from xml.sax.saxutils import unescape
 
 from app.formats import Claims, Files, Format, ReadContext, Traits, WriteContext, register
 from app.formats.kml import rules as _kml_rules
-from app.formats.kml.reading import MAIN, read_kml
+from app.formats.kml.reading import read_kml
+from app.formats.kml.words import MAIN
 from app.formats.kml.writing import NEEDS, write_kml
 from app.model.layers import Layers
 from app.parameters import parameter

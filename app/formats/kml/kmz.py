@@ -12,7 +12,8 @@ from dataclasses import replace
 from app.errors import Problem, UnreadableFile
 from app.formats import Claims, Files, Format, ReadContext, Traits, WriteContext, register
 from app.formats.kml import rules as _kml_rules
-from app.formats.kml.reading import FAMILY, read_kml
+from app.formats.kml.reading import read_kml
+from app.formats.kml.words import FAMILY
 from app.formats.kml.writing import NEEDS, write_kml
 from app.model.layers import Layers, Part, PartKey, Resources
 from app.model.names import name_problem

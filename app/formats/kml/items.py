@@ -1,0 +1,95 @@
+"""Placemarks and overlays while their tree is read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from lxml import etree
+
+from app.formats.kml.words import CONTAINERS, GEOMETRIES, ITEMS, child, local_name, unspell
+from app.model.features import MAX_ID
+
+
+@dataclass(slots=True)
+class Item:
+    """A placemark or overlay while its tree is read."""
+
+    element: etree._Element
+    title: etree._Element | None = None
+    data: tuple[tuple[str, etree._Element], ...] = ()
+    geometries: tuple[etree._Element, ...] = ()
+    sequences: tuple[tuple[str, int, etree._Element], ...] = ()
+    shape: str = ""
+
+
+def find_items(root: etree._Element) -> list[Item]:
+    """The placemarks and overlays of the document: those that stand in nothing but containers (elsewhere, as in an
+    Update or in an element that nobody knows, they are part of what they stand in).
+    """
+    usable: dict[etree._Element, bool] = {}
+
+    def contained(element: etree._Element) -> bool:
+        chain = []
+        while element is not None and element not in usable:
+            chain.append(element)
+            if local_name(element) not in CONTAINERS:
+                usable[element] = False
+                break
+            element = element.getparent()
+        answer = True if element is None else usable[element]
+        usable.update(dict.fromkeys(chain, answer))
+        return answer
+
+    items: list[Item] = []
+    index: dict[etree._Element, Item] = {}
+    for element in root.iter(*(f"{{*}}{name}" for name in sorted(ITEMS))):
+        parent = element.getparent()
+        if parent is None or usable.get(parent) or contained(parent):
+            item = Item(element)
+            items.append(item)
+            index[element] = item
+    for g in root.iter(*(f"{{*}}{name}" for name in sorted(GEOMETRIES))):
+        owner = index.get(g.getparent())
+        if owner is not None:
+            owner.geometries += (g,)
+    for tag in root.iter("{*}name"):
+        owner = index.get(tag.getparent())
+        if owner is not None and owner.title is None:
+            owner.title = tag
+    for extended in root.iter("{*}ExtendedData"):
+        owner = index.get(extended.getparent())
+        if owner is not None:
+            owner.data += tuple(extended_values(extended))
+    return items
+
+
+def extended_values(extended: etree._Element) -> list[tuple[str, etree._Element]]:
+    """The plain values of an ExtendedData: (name, element whose text is the value), the first of each name."""
+    out: dict[str, etree._Element] = {}
+    for entry in extended.iter("{*}Data", "{*}SimpleData"):
+        name = entry.get("name")
+        if local_name(entry) == "SimpleData":
+            value = entry
+        else:
+            value = entry[0] if len(entry) == 1 and local_name(entry[0]) == "value" else child(entry, "value")
+        if name and value is not None and not len(value) and name not in out:
+            out[name] = value
+    return list(out.items())
+
+
+def own_words(data: Iterable[tuple[str, etree._Element]], names: frozenset[str]) -> dict[str, str]:
+    """The values by name as texts; of these names as they were before ``spell`` quoted what looks like a number."""
+    values = {name: value.text or "" for name, value in data}
+    for name in names & values.keys():
+        value = unspell(values[name])
+        values[name] = value if isinstance(value, str) else values[name]
+    return values
+
+
+def usable_text(text: str) -> str:
+    """A text as an id: printable and not too long."""
+    if text.isprintable() and 0 < len(text) <= MAX_ID - 12 and text[0] != " " != text[-1]:
+        return text
+    clean = "".join(c if c.isprintable() else " " for c in text).strip()
+    return clean[: MAX_ID - 12] or "_"
