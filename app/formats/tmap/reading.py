@@ -70,13 +70,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         _lift(node_properties, source_properties["node"])
         properties.append(node_properties)
     geometry = _node_points(xyz)
-    meta = document.get("meta")
-    credit = [
-        text for key in ("attribution", "license", "copyright") if isinstance(meta, dict) and (text := meta.get(key))
-    ]
-    credit = [text for text in credit if isinstance(text, str)]
-    collection_document: dict[str, Any] = {"attribution": credit} if credit else {}
-    collection_document |= {NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
+    collection_document = {**_credit(document), NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
     if kind == "poi":
         context.warn(f"no node has an edge: the {len(nodes)} nodes are taken as points of interest")
         key = PartKey("objects", context.level, NAME)
@@ -86,6 +80,25 @@ def read(files: Files, context: ReadContext) -> Layers:
     targets = np.array([r[1] for r in rows], np.intp)
     _warn_isolated(names, sources, targets, dangling, context)
     edge_ids = unique_ids((_identifier(r[2]) for r in rows), set(ids))
+    properties += _edge_properties(rows, edge_ids, ids, context)
+    both = np.concatenate([geometry, _edge_lines(xyz, sources, targets)])
+    key = PartKey("topology", context.level, NETWORK)
+    return Layers({key: from_columns([*ids, *edge_ids], both, properties, "local", collection_document)})
+
+
+def _credit(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The licences and credits that ``meta`` says, as a part's document holds them."""
+    meta = document.get("meta")
+    texts = [meta.get(key) for key in ("attribution", "license", "copyright")] if isinstance(meta, dict) else []
+    credit = [text for text in texts if isinstance(text, str) and text]
+    return {"attribution": credit} if credit else {}
+
+
+def _edge_properties(
+    rows: Sequence[Row], edge_ids: Sequence[str], ids: Sequence[str], context: ReadContext
+) -> list[Properties]:
+    """The properties of edges between nodes of these ids; warns of ids that stand for several things."""
+    out: list[Properties] = []
     repeated = []
     for (source, target, source_id, edge), edge_id in zip(rows, edge_ids, strict=True):
         extra_members = {key: value for key, value in edge.items() if key not in EDGE_WORDS}
@@ -100,12 +113,10 @@ def read(files: Files, context: ReadContext) -> Layers:
             repeated.append(source_id)
         if "properties" in extra_members:
             _lift(line, extra_members)
-        properties.append(line)
+        out.append(line)
     if repeated:
         context.warn(f"{len(repeated)} edge ids stand for several things: {shorten_list(repeated)}; all are kept")
-    both = np.concatenate([geometry, _edge_lines(xyz, sources, targets)])
-    key = PartKey("topology", context.level, NETWORK)
-    return Layers({key: from_columns([*ids, *edge_ids], both, properties, "local", collection_document)})
+    return out
 
 
 def _top(top: Any, context: ReadContext) -> tuple[list[Any], dict[str, Any]]:
