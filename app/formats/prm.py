@@ -319,22 +319,34 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     document = source_document(layers, NAME)
     xy = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
     picture = _select_picture(layers, document, xy, context)
-    exact = picture.pixels(xy)
-    near = np.round(exact)
-    own_nodes = np.array([NAME in n.properties for n in net.nodes], bool)
-    is_integer = np.asarray((np.abs(exact - near) <= MAX_ROUNDING_PIXELS).all(axis=1), bool)
-    moved = int((~is_integer & ~own_nodes).sum())
-    context.drop("places of nodes within their pixels", moved, f"pixels of {picture.resolution:g} m are whole numbers")
-    # The pixel that holds the place, its left and lower edge included; a roadmap's own broken pixels stay broken.
-    inside = np.stack(
-        [np.floor(exact[:, 0] + 0.5 + MAX_ROUNDING_PIXELS), np.ceil(exact[:, 1] - 0.5 - MAX_ROUNDING_PIXELS)], axis=1
-    )
-    pixels = np.where(is_integer[:, None], near, np.where(own_nodes[:, None], np.round(exact, 6), inside))
+    pixels = _pixels(net, picture.pixels(xy), picture.resolution, context)
     ids = _ids(net)
     top = document.get("top")
     top = {key: v for key, v in top.items() if key not in OWN_KEYS} if isinstance(top, dict) else {}
     out = [yaml.mapping(top, 0)] if top else []
-    out.append("nodes:\n" if net.nodes else "nodes: []\n")
+    out += ["nodes:\n", *_node_texts(net, ids, pixels, context)] if net.nodes else ["nodes: []\n"]
+    line_texts = _line_texts(net, ids, pixels, document, context)
+    out += ["edges:\n", *line_texts] if line_texts else ["edges: []\n"]
+    out.append(yaml.mapping({PICTURE: picture.as_dict()}, 0))
+    return {FILE: "".join(out).encode()}
+
+
+def _pixels(net: MergedNetwork, exact: Array, resolution: float, context: WriteContext) -> Array:
+    """float64 [n, 2]: the nodes' pixels, whole numbers but for nodes that a roadmap had elsewhere."""
+    near = np.round(exact)
+    own_nodes = np.array([NAME in n.properties for n in net.nodes], bool)
+    is_integer = np.asarray((np.abs(exact - near) <= MAX_ROUNDING_PIXELS).all(axis=1), bool)
+    moved = int((~is_integer & ~own_nodes).sum())
+    context.drop("places of nodes within their pixels", moved, f"pixels of {resolution:g} m are whole numbers")
+    # The pixel that holds the place, its left and lower edge included; a roadmap's own broken pixels stay broken.
+    inside = np.stack(
+        [np.floor(exact[:, 0] + 0.5 + MAX_ROUNDING_PIXELS), np.ceil(exact[:, 1] - 0.5 - MAX_ROUNDING_PIXELS)], axis=1
+    )
+    return np.where(is_integer[:, None], near, np.where(own_nodes[:, None], np.round(exact, 6), inside))
+
+
+def _node_texts(net: MergedNetwork, ids: Sequence[Any], pixels: Array, context: WriteContext) -> list[str]:
+    out = []
     dropped_count = renamed = 0
     for k, (node, i) in enumerate(zip(net.nodes, ids, strict=True)):
         p = node.properties
@@ -352,27 +364,32 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     context.drop("attributes of nodes", dropped_count, "the format has no place for them")
     if renamed:
         context.warn(f"{renamed} nodes got a number for an id; their own one is their name, where they had none")
+    return out
+
+
+def _line_texts(
+    net: MergedNetwork, ids: Sequence[Any], pixels: Array, document: Mapping[str, Any], context: WriteContext
+) -> list[str]:
+    """The edges, and those of the source that lead nowhere."""
     weighed = 0
-    line_texts = []
+    out = []
     for line in lines(net, context, NAME):
         members = {key: v for key, v in line.said.items() if key not in ("from", "to")}
         if not isinstance(members.get("weight"), (int, float)):
             a, b = pixels[line.a], pixels[line.b]
             members["weight"] = round(float(np.hypot(*(a - b))), 9)
             weighed += 1
-        line_texts.append(_edge(ids[line.a], ids[line.b], members))
+        out.append(_edge(ids[line.a], ids[line.b], members))
     dangling = document.get("dangling")
     dangling = (
         [e for e in dangling if isinstance(e, dict) and {"from", "to"} <= e.keys()]
         if isinstance(dangling, list)
         else []
     )
-    line_texts += [_edge(e["from"], e["to"], {k: v for k, v in e.items() if k not in ("from", "to")}) for e in dangling]
+    out += [_edge(e["from"], e["to"], {k: v for k, v in e.items() if k not in ("from", "to")}) for e in dangling]
     if weighed:
         context.fill("edges: weight", "distance in pixels", f"{weighed} edges come from a format that does not say it")
-    out += ["edges:\n", *line_texts] if line_texts else ["edges: []\n"]
-    out.append(yaml.mapping({PICTURE: picture.as_dict()}, 0))
-    return {FILE: "".join(out).encode()}
+    return out
 
 
 def _edge(a: Any, b: Any, members: dict[str, Any]) -> str:

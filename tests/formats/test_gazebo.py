@@ -24,7 +24,9 @@ from app import formats
 from app.convert.files import offline
 from app.errors import Ambiguous, BadUpload, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
 from app.formats import WriteContext, gazebo, get_format
-from app.formats.gazebo import WriteOptions, bodies, sdf
+from app.formats.gazebo import bodies, writing
+from app.formats.gazebo.library import Library
+from app.formats.gazebo.writing import WriteOptions
 from app.limits import Limits
 from app.model import solids
 from app.model.features import Features, features
@@ -770,17 +772,17 @@ def test_a_large_grid_stays_handy() -> None:
 
 def test_which_grid_and_what_is_needed() -> None:
     keys = [PartKey("occupancy", name=n) for n in ("keepout", "lab", "map")]
-    assert [k.name for k in gazebo.choose(keys, WriteOptions())] == ["map"]
-    assert [k.name for k in gazebo.choose(keys, WriteOptions(grid="keepout"))] == ["keepout"]
-    assert [k.name for k in gazebo.choose(keys[:2], WriteOptions())] == ["lab"], "a mask is no wall"
+    assert [k.name for k in writing.choose(keys, WriteOptions())] == ["map"]
+    assert [k.name for k in writing.choose(keys, WriteOptions(grid="keepout"))] == ["keepout"]
+    assert [k.name for k in writing.choose(keys[:2], WriteOptions())] == ["lab"], "a mask is no wall"
     with pytest.raises(MissingLayer, match="supply"):
-        gazebo.choose(keys[:1], WriteOptions())
+        writing.choose(keys[:1], WriteOptions())
     rivals = [PartKey("occupancy", name=n) for n in ("a", "b")]
     with pytest.raises(Ambiguous):
-        gazebo.choose(rivals, WriteOptions())
-    assert gazebo.choose([OBJECTS, *rivals], WriteOptions()) == [OBJECTS]
+        writing.choose(rivals, WriteOptions())
+    assert writing.choose([OBJECTS, *rivals], WriteOptions()) == [OBJECTS]
     with pytest.raises(NotFound):
-        gazebo.choose(keys, WriteOptions(grid="none"))
+        writing.choose(keys, WriteOptions(grid="none"))
 
 
 @pytest.mark.parametrize("version", ["1.4", "1.5", "1.6", "1.7", "1.8", "1.9"])
@@ -1005,7 +1007,7 @@ def test_names_are_made_valid_and_unique() -> None:
 
 
 def test_a_models_file_is_chosen_by_its_config() -> None:
-    library = sdf.Library(folder(SAMPLES / "yard"))
+    library = Library(folder(SAMPLES / "yard"))
     assert library.model_file("models/crate") == "models/crate/model.sdf"
     assert library.model_file("models/none") is None
 

@@ -16,7 +16,7 @@ from app import formats
 from app.convert.files import offline
 from app.errors import CannotConvert, MissingDatum, TooLarge, UnreadableFile
 from app.formats import FileGroup, ReadContext, WriteContext, get_format
-from app.formats.lif import WriteOptions
+from app.formats.lif.writing import WriteOptions
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from app.errors import Invalid
 from app.formats import WriteContext
 from app.formats.gazebo import sdf
+from app.formats.gazebo.library import MODELS
+from app.formats.gazebo.models import is_absent
 from app.model import obstacles, solids
 from app.model.features import Feature
 from app.model.frame import is_writable
@@ -219,7 +221,7 @@ class Bodies:
         """The shapes whose words are known and whose files are there; the files go along."""
         out = []
         for shape in shapes:
-            if sdf.is_absent(shape):
+            if is_absent(shape):
                 reason = f"{str(shape['uri'])[:200]} is not stored: upload it"
                 self._dropped[f"solids of objects of kind {kind}", reason] += 1
                 continue
@@ -233,9 +235,9 @@ class Bodies:
                 if file not in self.resources:
                     self._dropped[f"meshes of objects of kind {kind}", f"{file[:200]} is not stored: upload it"] += 1
                     continue
-                path = file if file.startswith(f"{sdf.MODELS}/") else f"{sdf.MODELS}/{file}"
+                path = file if file.startswith(f"{MODELS}/") else f"{MODELS}/{file}"
                 self.files[path] = self.resources[file]
-                shape["uri"] = "model://" + path[len(sdf.MODELS) + 1 :]
+                shape["uri"] = "model://" + path[len(MODELS) + 1 :]
             if shape["type"] in ("capsule", "ellipsoid"):
                 self.newest = max(self.newest, (1, 8))
             try:
@@ -393,7 +395,7 @@ class Bodies:
             self.context.warn(f"no cell has a value of {threshold} or more: there are no walls", where=name)
             return None
         file = f"{name}/meshes/{name}.stl"
-        self.files[f"{sdf.MODELS}/{file}"] = stl(extrude(occupied, grid.resolution, self.usual.wall_height))
+        self.files[f"{MODELS}/{file}"] = stl(extrude(occupied, grid.resolution, self.usual.wall_height))
         self.context.fill("height of walls", self.usual.wall_height, "a grid tells none", "wall_height")
         x, y, yaw = grid.origin
         corners = grid.corners()

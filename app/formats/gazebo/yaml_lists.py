@@ -24,6 +24,8 @@ from typing import Any
 from app.errors import Problem, TooLarge, UnreadableFile
 from app.formats import ReadContext
 from app.formats.gazebo import sdf
+from app.formats.gazebo.library import Library, required_files
+from app.formats.gazebo.models import MAX_SHAPES, ModelFlattener
 from app.model.frame import MAX_METRES, is_writable
 from app.model.solids import matrix
 from app.syntax import yaml
@@ -58,7 +60,7 @@ def detect(name: str, data: bytes) -> bool:
     return bool(_ROWS.search(data) and _TURNED.search(data) and _POINT.search(data))
 
 
-def _custom(library: sdf.Library, reference: str, near: str) -> str | None:
+def _custom(library: Library, reference: str, near: str) -> str | None:
     """The list or model that a reference names: in ``custom_models`` beside the list first."""
     for path in (f"custom_models/{reference}", reference):
         for ending in ("", ".yaml", ".yml"):
@@ -68,7 +70,7 @@ def _custom(library: sdf.Library, reference: str, near: str) -> str | None:
     return None
 
 
-def required_files(library: sdf.Library, main: str) -> list[str]:
+def find_required_files(library: Library, main: str) -> list[str]:
     """The custom objects, models and meshes that a list needs, directly or through others, and ``models.yaml``."""
     out: dict[str, None] = {}
     todo = [main]
@@ -85,9 +87,9 @@ def required_files(library: sdf.Library, main: str) -> list[str]:
                 if detect(file, library.files[file]):
                     todo.append(file)
             else:
-                out.update(dict.fromkeys(sdf.required_files(library, main, [f"model://{reference}"])))
+                out.update(dict.fromkeys(required_files(library, main, [f"model://{reference}"])))
         meshes = [t.decode("utf-8", "replace") for t in _MESH.findall(data)]
-        out.update(dict.fromkeys(sdf.required_files(library, name, meshes)))
+        out.update(dict.fromkeys(required_files(library, name, meshes)))
     beside = main.rpartition("/")[0] + "/" if "/" in main else ""
     catalogue = beside + "models.yaml"
     if catalogue in library.files and catalogue != main and not detect(catalogue, library.files[catalogue]):
@@ -104,7 +106,7 @@ class ParsedList:
     served: dict[str, str] = field(default_factory=dict)
 
 
-def read(library: sdf.Library, main: str, context: ReadContext) -> ParsedList:
+def read(library: Library, main: str, context: ReadContext) -> ParsedList:
     """A list with all it refers to. Raises UnreadableFile or TooLarge."""
     data = yaml.load(library.files[main], context.limits)
     reader = _Reader(library, main, context)
@@ -173,10 +175,10 @@ def _list(items: Any, location: str) -> list[Mapping[str, Any]]:
 class _Reader:
     """A list being read."""
 
-    def __init__(self, library: sdf.Library, main: str, context: ReadContext) -> None:
+    def __init__(self, library: Library, main: str, context: ReadContext) -> None:
         self.library, self.main, self.context = library, main, context
         self.found = ParsedList()
-        self.unfolder = sdf.ModelFlattener(library, self.found.served, context)
+        self.unfolder = ModelFlattener(library, self.found.served, context)
         self._lists: dict[str, list[Mapping[str, Any]]] = {}
         self._count = 0
 
@@ -254,8 +256,8 @@ class _Reader:
 
     def _place_shape(self, shape: Mapping[str, Any], at: sdf.Matrix) -> dict[str, Any]:
         self._count += 1
-        if self._count > sdf.MAX_SHAPES:
-            raise TooLarge(f"the custom objects have more than {sdf.MAX_SHAPES} shapes")
+        if self._count > MAX_SHAPES:
+            raise TooLarge(f"the custom objects have more than {MAX_SHAPES} shapes")
         out = {k: v for k, v in shape.items() if k != "pose"}
         pose = sdf.six(at)
         return out | {"pose": pose} if any(pose) else out
@@ -275,7 +277,7 @@ class _Reader:
             out = {"type": reference, "normal": [0.0, 0.0, 1.0], "size": size}
         elif reference == "mesh":
             uri = _text(item.get("dae"), f"{location}.dae")
-            self.found.served.update(sdf.required_files(self.library, near, [uri]))
+            self.found.served.update(required_files(self.library, near, [uri]))
             file = self.library.find(uri, near)
             path = self.found.served.get(file) if file is not None else None
             if path is None:
@@ -333,7 +335,7 @@ class _Reader:
 
     def _model(self, folder: str, reference: str) -> list[dict[str, Any]]:
         """The shapes of a model folder."""
-        self.found.served.update(sdf.required_files(self.library, self.main, [f"model://{reference}"]))
+        self.found.served.update(required_files(self.library, self.main, [f"model://{reference}"]))
         file = self.library.model_file(folder)
         body = None if file is None else self.unfolder.file(file)
         if body is None:

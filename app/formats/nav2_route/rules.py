@@ -8,7 +8,7 @@ in DynamicEdges, ComputeRoute). A bad graph is noticed after the old one is clea
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import orjson
@@ -63,19 +63,9 @@ def check(files: Files) -> Iterator[Problem]:
                 yield error_finding("a node needs the coordinates [x, y]", main, where=location)
             else:
                 far += max(abs(at[0]), abs(at[1])) > MAX_EXACT_METRES
-            if not isinstance(properties.get("frame", ""), str):
-                yield error_finding(
-                    f"must be a text, is {shown(properties['frame'])}", main, where=f"{location}.properties.frame"
-                )
         else:
             edges.append((properties["id"], properties.get("startid"), properties.get("endid")))
-            if not is_number(properties.get("cost", 0.0)):
-                yield error_finding(
-                    f"must be a number, is {shown(properties['cost'])}", main, where=f"{location}.properties.cost"
-                )
-            if not isinstance(properties.get("overridable", True), bool):
-                reason = f"must be true or false, is {shown(properties['overridable'])}"
-                yield error_finding(reason, main, where=f"{location}.properties.overridable")
+        yield from _types(properties, main, f"{location}.properties", is_node=kind == "Point")
         if "metadata" in properties:
             yield from _metadata(properties["metadata"], main, f"{location}.properties.metadata")
         if "operations" in properties:
@@ -87,6 +77,21 @@ def check(files: Files) -> Iterator[Problem]:
             "2 mm there"
         )
         yield warning_finding(reason, main)
+
+
+def _types(properties: Mapping[str, Any], main: str, location: str, *, is_node: bool) -> Iterator[Problem]:
+    """What a node or an edge may say, with values of the types that the loader asks for."""
+    if is_node:
+        if not isinstance(properties.get("frame", ""), str):
+            reason = f"must be a text, is {shown(properties['frame'])}"
+            yield error_finding(reason, main, where=f"{location}.frame")
+        return
+    if not is_number(properties.get("cost", 0.0)):
+        reason = f"must be a number, is {shown(properties['cost'])}"
+        yield error_finding(reason, main, where=f"{location}.cost")
+    if not isinstance(properties.get("overridable", True), bool):
+        reason = f"must be true or false, is {shown(properties['overridable'])}"
+        yield error_finding(reason, main, where=f"{location}.overridable")
 
 
 def _is_id(value: Any) -> bool:

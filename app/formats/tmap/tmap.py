@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, WriteContext, register
 from app.formats.tmap import network as _tmap
+from app.formats.tmap import writing
+from app.formats.tmap.reading import read
 from app.model.layers import Layers
 
 FILE = "map.tmap"
@@ -17,8 +19,8 @@ ENDS = (".tmap", ".yaml", ".yml", ".tmap2")
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.tmap``; see ``network.write``. The map's name and transformation have no place in it."""
-    return {FILE: _tmap.write(layers, context, listed=True)}
+    """``map.tmap``; see ``tmap.writing``. The map's name and transformation have no place in it."""
+    return {FILE: writing.write(layers, context, listed=True)}
 
 
 def detect(name: str, data: bytes) -> bool:
@@ -33,7 +35,7 @@ register(
         files={FILE: "application/yaml"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,
-        read=_tmap.read,
+        read=read,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=_tmap.ListOptions,

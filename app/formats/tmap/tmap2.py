@@ -8,6 +8,8 @@ from __future__ import annotations
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, WriteContext, register
 from app.formats.tmap import network as _tmap
 from app.formats.tmap import rules as _tmap2_rules
+from app.formats.tmap import writing
+from app.formats.tmap.reading import read
 from app.model.layers import Layers
 
 FILE = "network.tmap2.yaml"
@@ -15,8 +17,8 @@ NAMES = (".tmap2.yaml", ".tmap2.yml", ".tmap2")
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``network.tmap2.yaml``; see ``network.write``."""
-    return {FILE: _tmap.write(layers, context)}
+    """``network.tmap2.yaml``; see ``tmap.writing``."""
+    return {FILE: writing.write(layers, context)}
 
 
 def detect(name: str, data: bytes) -> bool:
@@ -36,7 +38,7 @@ register(
         files={FILE: "application/yaml"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,
-        read=_tmap.read,
+        read=read,
         check=_tmap2_rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),

@@ -285,7 +285,6 @@ def height(value: Any, location: str) -> float | None:
 
 # --- doors -----------------------------------------------------------------------------------------------------------
 
-
 DOORS = ("SingleSliding", "DoubleSliding", "SingleSwing", "DoubleSwing", "Model")
 
 

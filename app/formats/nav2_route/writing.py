@@ -1,0 +1,250 @@
+"""Writing a route graph: nodes and edges with the numbers that they had."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import orjson
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import CannotConvert
+from app.formats import WriteContext
+from app.formats._network import (
+    Edge,
+    MergedNetwork,
+    Node,
+    count,
+    get_source_properties,
+    merge_networks,
+    source_document,
+)
+from app.formats.nav2_route.reading import as_floats, fits, loader_problems
+from app.formats.nav2_route.vocabulary import (
+    CANONICAL_EDGE,
+    CANONICAL_METADATA,
+    CANONICAL_NODE,
+    FRAME,
+    MAX_ID,
+    MAX_USED_ID,
+    NAME,
+    NUMBERS,
+)
+from app.model.features import Properties
+from app.model.layers import Layers
+from app.parameters import parameter
+from app.syntax import json
+from app.syntax.decimals import METRES
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What the file says where no source does."""
+
+    graph_name: str | None = parameter(None, "name of a graph that no source names; default: the map's")
+    frame_id: str = parameter(FRAME, "frame of nodes whose source names none")
+
+
+CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
+"""What Nav2's own graphs say, so that QGIS shows their metres; the route server does not look at it."""
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``graph.geojson``: all networks of the environment as one graph, nodes and then edges by their numbers.
+
+    Numbers of a source come back; any other item gets one that follows from its id alone (unless that is taken), so
+    that it stays the same when others come and go. Wgs84 items are brought to local metres (MissingDatum without a
+    datum). CannotConvert where there is no node or no edge.
+    """
+    return {"graph.geojson": _Writer(layers, context).data()}
+
+
+ORDER = json.rank_keys(
+    "type name id startid endid frame trigger cost overridable metadata operations properties geometry coordinates"
+)
+
+
+def _dump(value: Any) -> bytes:
+    return orjson.dumps(json.sort_keys(value, ORDER))
+
+
+class _Writer:
+    def __init__(self, layers: Layers, context: WriteContext) -> None:
+        self.context = context
+        self.document = source_document(layers, NAME)
+        self.net: MergedNetwork = merge_networks(layers, context)
+        if not self.net.nodes or not self.net.edges:
+            noun = "no node" if not self.net.nodes else "no edge between its nodes"
+            raise CannotConvert(f"the network has {noun}; the route server needs both: supply a network with edges")
+        self.nodes, self.edges = self._numbers()
+        self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+        self.framed = 0
+        self.lost: Counter[str] = Counter()
+
+    def _numbers(self) -> tuple[list[int], list[int]]:
+        """The numbers of nodes and edges, apart from each other where there are enough."""
+        net, context = self.net, self.context
+        nodes, edges = _stored_numbers(net.nodes), _stored_numbers(net.edges)
+        own_nodes, own_edges = set(nodes.values()), set(edges.values())
+        apart = len(net.nodes) + len(net.edges) <= MAX_USED_ID // 2
+        nodes = _assign_numbers(net.nodes, nodes, own_nodes | own_edges if apart else own_nodes)
+        edges = _assign_numbers(net.edges, edges, {*own_edges, *nodes.values()} if apart else own_edges)
+        duplicate_count = sum(_claim(n) not in (None, nodes[k]) for k, n in enumerate(net.nodes))
+        duplicate_count += sum(_claim(e) not in (None, edges[k]) for k, e in enumerate(net.edges))
+        if duplicate_count:
+            context.warn(
+                f"{duplicate_count} numbers stood for several items, which Nav2 would mix up: the others got new ones"
+            )
+        return [nodes[k] for k in range(len(nodes))], [edges[k] for k in range(len(edges))]
+
+    def data(self) -> bytes:
+        """The whole text, one line for each feature."""
+        net, context = self.net, self.context
+        at = np.array([(n.x, n.y, 0.0 if n.z is None else n.z) for n in net.nodes], np.float64)
+        places = (np.round(at, METRES) + 0.0).tolist()
+        rows = [
+            self._feature(node, n, {"type": "Point", "coordinates": position if position[2] else position[:2]}, {})
+            for n, node, position in sorted(zip(self.nodes, net.nodes, places, strict=True), key=lambda t: t[0])
+        ]
+        for n, edge in sorted(zip(self.edges, net.edges, strict=True), key=lambda t: t[0]):
+            ends = {"startid": self.nodes[edge.source], "endid": self.nodes[edge.target]}
+            rows.append(self._feature(edge, n, self._shape(edge), ends))
+        self._report()
+        head = {"type": "FeatureCollection", **self._head()}
+        ignored = self.document.get("ignored")
+        rows += [_dump(row) for row in ignored if isinstance(row, dict)] if isinstance(ignored, list) else []
+        self.lost["dangling"] += count(self.document.get("dangling"))
+        context.drop("edges to nowhere", self.lost["dangling"], "Nav2 refuses a graph with one, and loses the old one")
+        return _dump(head)[:-1] + b',"features":[\n' + b",\n".join(rows) + b"\n]}\n"
+
+    def _head(self) -> dict[str, Any]:
+        members = self.document.get("members")
+        head = {w: v for w, v in members.items() if w not in ("type", "features")} if isinstance(members, dict) else {}
+        if not self.document:
+            title = self.options.graph_name or self.context.title
+            head = {"name": title, "crs": CRS}
+            self.context.fill("name", title, "no source names the graph", "graph_name")
+            self.context.fill("crs", CRS["properties"], "QGIS shows metres by it; the route server ignores it")
+        if self.context.attribution and not head.keys() & {"attribution", "license", "copyright"}:
+            head["attribution"] = "; ".join(self.context.attribution)
+        return head
+
+    def _feature(self, item: Node | Edge, n: int, geometry: dict[str, Any], ends: dict[str, int]) -> bytes:
+        """One line of the file."""
+        p = item.properties
+        source_members = get_source_properties(p, NAME)
+        extra_properties = source_members.get("properties")
+        properties: dict[str, Any] = {"id": n, **ends}
+        if NAME not in p and not ends:
+            properties["frame"] = self.options.frame_id
+            self.framed += 1
+        if isinstance(extra_properties, dict):
+            properties |= {w: v for w, v in extra_properties.items() if w not in properties}
+        metadata = properties.get("metadata")
+        more = self._metadata(p, str(n))
+        if more and isinstance(metadata, (dict, type(None))):
+            properties["metadata"] = {**(metadata or {}), **more}
+        for key in ("metadata", "operations"):
+            if key in properties:
+                properties[key] = as_floats(properties[key])
+        for reason in loader_problems(properties):
+            self.context.warn(reason, where=str(n))
+        self.lost["attributes"] += bool(p.keys() - (CANONICAL_EDGE if ends else CANONICAL_NODE))
+        self.lost["dangling"] += count(source_members.get("dangling"))
+        members = source_members.get("members")
+        row = {"type": "Feature", "properties": properties, "geometry": geometry}
+        if isinstance(members, dict):
+            row |= {w: v for w, v in members.items() if w not in row}
+        return _dump(row)
+
+    def _metadata(self, p: Properties, number: str) -> dict[str, Any]:
+        """The canonical words among the metadata."""
+        out: dict[str, Any] = {}
+        for key, canonical in CANONICAL_METADATA.items():
+            value: Any = p.get(canonical)
+            if fits(key, value):
+                out[key] = float(value) if key in NUMBERS else value
+        if out.get("name") == number:
+            del out["name"]
+        if p.get("blocked") is True:
+            out["blocked"] = True
+        return out
+
+    def _shape(self, edge: Edge) -> dict[str, Any]:
+        source_members = get_source_properties(edge.properties, NAME)
+        kind = "LineString" if source_members.get("line") is True else "MultiLineString"
+        odd = source_members.get("geometry")
+        if isinstance(odd, dict):
+            return {"type": kind, **{w: v for w, v in odd.items() if w != "type"}}
+        if edge.geometry is None or shapely.get_num_coordinates(edge.geometry) < 2:
+            ends = [self.net.nodes[edge.source], self.net.nodes[edge.target]]
+            at: NDArray[np.float64] = np.array([(n.x, n.y) for n in ends])
+        else:
+            at = shapely.get_coordinates(edge.geometry, include_z=bool(shapely.has_z(edge.geometry)))
+        coordinates = (np.round(at, METRES) + 0.0).tolist()
+        return {"type": kind, "coordinates": coordinates if kind == "LineString" else [coordinates]}
+
+    def _report(self) -> None:
+        net, context, counts = self.net, self.context, self.lost
+        if len(set(net.levels)) > 1:
+            context.drop("levels of nodes", len(net.nodes), "all networks are joined into one graph")
+        foreign = sum(NAME not in n.properties for n in net.nodes) + sum(NAME not in e.properties for e in net.edges)
+        if self.framed:
+            context.fill("frame", self.options.frame_id, f"{self.framed} nodes name none", "frame_id")
+        if foreign:
+            context.fill("id", "a number made from each id", f"{foreign} nodes and edges have no number of their own")
+        context.drop(
+            "items with attributes that Nav2 has no word for", counts["attributes"], "other formats' own knowledge"
+        )
+
+
+def _claim(item: Node | Edge) -> int | None:
+    """The number that an item has from its source."""
+    source_id = get_source_properties(item.properties, NAME).get("id")
+    return (
+        source_id
+        if isinstance(source_id, int) and not isinstance(source_id, bool) and 0 <= source_id <= MAX_ID
+        else None
+    )
+
+
+def _stored_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
+    """Place -> number of the items that have one; of several with the same, the one whose id still says it."""
+    claims: dict[int, list[int]] = defaultdict(list)
+    for k, item in enumerate(items):
+        n = _claim(item)
+        if n is not None:
+            claims[n].append(k)
+    return {min(rivals, key=lambda k: (items[k].id != str(n), items[k].id)): n for n, rivals in claims.items()}
+
+
+def _assign_numbers(items: Sequence[Node | Edge], claims: Mapping[int, int], taken: set[int]) -> dict[int, int]:
+    """Place -> number of all items; ``taken`` grows. Ids that are numbers come before those that one is made from."""
+    out = dict(claims)
+    remaining = sorted((k for k in range(len(items)) if k not in out), key=lambda k: items[k].id)
+    for k in remaining:
+        if _is_number(items[k].id) and int(items[k].id) not in taken:
+            out[k] = int(items[k].id)
+            taken.add(out[k])
+    size = 2**16 if len(items) <= MAX_USED_ID // 2 else 2**32
+    for k in remaining:
+        if k not in out:
+            out[k] = next(n for n in _candidates(items[k].id, size) if n not in taken)
+            taken.add(out[k])
+    return out
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) <= 5 and str(int(text)) == text and int(text) <= MAX_USED_ID
+
+
+def _candidates(text: str, size: int) -> Iterable[int]:
+    """Numbers below ``size`` that follow from a text, one after the other."""
+    first = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
+    step = first >> 32 | 1  # odd, so that all numbers come
+    return ((first + k * step) % size for k in range(size))

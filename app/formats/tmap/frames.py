@@ -1,0 +1,95 @@
+"""The frame of a network's nodes: its ``transformation``, and what is told in its child frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from app.errors import Problem, UnreadableFile
+from app.formats import ReadContext
+from app.formats.tmap.network import Array, parse_number
+
+
+@dataclass(frozen=True, slots=True)
+class MapTransform:
+    """A file's ``transformation``: a pose in the child frame, turned and shifted, is one in the local frame."""
+
+    child: str
+    quaternion: tuple[float, float, float, float]
+    shift: Array
+
+    def matrix(self) -> Array:
+        """Rotation matrix [3, 3] of the quaternion (x, y, z, w)."""
+        x, y, z, w = self.quaternion
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+
+def map_transform(document: Mapping[str, Any]) -> MapTransform | None:
+    """The file's transformation, where there is one that changes anything."""
+    transformation = document.get("transformation")
+    if (
+        not isinstance(transformation, dict)
+        or not isinstance(transformation.get("child"), str)
+        or transformation["child"] == transformation.get("parent")
+    ):
+        return None
+    rotation, translation = transformation.get("rotation") or {}, transformation.get("translation") or {}
+    if not isinstance(rotation, dict) or not isinstance(translation, dict):
+        return None
+    location = "transformation"
+    x, y, z = (parse_number(rotation.get(key, 0.0), f"{location}.rotation.{key}") for key in "xyz")
+    w = parse_number(rotation.get("w", 1.0), f"{location}.rotation.w")
+    shift = np.array([parse_number(translation.get(key, 0.0), f"{location}.translation.{key}") for key in "xyz"])
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if not math.isfinite(length) or length < 1e-9:
+        raise UnreadableFile(
+            "transformation.rotation is no rotation", [Problem("no rotation", where=f"{location}.rotation")]
+        )
+    if x == y == z == 0.0 and not shift.any():
+        return None
+    return MapTransform(transformation["child"], (x / length, y / length, z / length, w / length), shift)
+
+
+def multiply(a: Sequence[float], b: Sequence[float]) -> list[float]:
+    """The product of two quaternions (x, y, z, w): first b, then a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return [
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    ]
+
+
+def to_local(
+    xyz: Array,
+    orientations: list[list[float] | None],
+    nodes: Sequence[Mapping[str, Any]],
+    document: Mapping[str, Any],
+    context: ReadContext,
+) -> None:
+    """Bring the poses of nodes whose parent_frame is the transformation's child to the local frame, in place."""
+    turn = map_transform(document)
+    if turn is None:
+        return
+    inside = [k for k, node in enumerate(nodes) if node.get("parent_frame") == turn.child]
+    if not inside:
+        return
+    xyz[inside] = xyz[inside] @ turn.matrix().T + turn.shift
+    for k in inside:
+        orientations[k] = multiply(turn.quaternion, orientations[k] or [0.0, 0.0, 0.0, 1.0])
+    context.warn(
+        f"{len(inside)} nodes stand in the frame {turn.child!r} and were brought to the local one by the file's "
+        "transformation"
+    )
