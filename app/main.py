@@ -278,7 +278,6 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
             max_json_bytes=settings.max_json_bytes,
             body_seconds=settings.body_seconds,
             body_pace=settings.body_pace,
-            insecure_no_auth=settings.insecure_no_auth,
             data_dir=settings.data_dir,
             zenoh_mode=settings.zenoh_mode,
             zenoh_prefix=settings.zenoh_prefix,

@@ -10,7 +10,6 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Annotated, Any
 
 import orjson
@@ -207,7 +206,7 @@ class _StreamAuth:
         """Raises Unavailable where that cannot be known at this moment."""
         if self._access.insecure:
             return True
-        if self.principal.expires is not None and self.principal.expires <= datetime.now(UTC):
+        if self.principal.has_expired():
             return False
         forgotten, now = self._access.is_invalidated, time.monotonic()
         if forgotten == self._invalidated_at and now - self._checked < RECHECK_SECONDS:

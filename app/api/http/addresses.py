@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,8 +11,7 @@ from fastapi import Request
 
 from app.api.http.dependencies import Services
 from app.api.http.parameters import parse_options, parse_version_ref
-from app.api.http.responses import API
-from app.api.http.signed import LINK
+from app.api.http.signed import LINK, MAP_PATH
 from app.convert.recipe import Recipe
 from app.errors import Invalid, NotFound
 from app.links import SignedAddress
@@ -21,9 +19,6 @@ from app.model.closures import ClosureMode
 from app.store.values import LATEST, Version
 
 PRODUCTION = "production"
-
-_SHORT = re.compile(r"/maps/([^/]+)/([^/]+)(?:/(.+))?", re.DOTALL)
-_LONG = re.compile(rf"{API}/environments/([^/]+)/versions/([^/]+)/maps/([^/]+)(?:/(.+))?", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +40,10 @@ def parse_map_request(request: Request) -> MapRequest:
     """What the address of a map asks for. Raises Invalid for a query that cannot be read."""
     link = signed_link(request)
     options = parse_query(request.scope["query_string"] if link is None else link.query)
-    path = request.scope["path"]
-    if short := _SHORT.fullmatch(path):
-        return MapRequest(short[1], None, short[2], short[3], *options)
-    if long := _LONG.fullmatch(path):
-        return MapRequest(long[1], long[2], long[3], long[4], *options)
-    raise NotFound("there is no map at this address")
+    match = MAP_PATH.fullmatch(request.scope["path"])
+    if match is None:
+        raise NotFound("there is no map at this address")
+    return MapRequest(match["short"] or match["long"], match["version"], match["format"], match["file"], *options)
 
 
 def signed_link(request: Request) -> SignedAddress | None:

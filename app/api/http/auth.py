@@ -184,10 +184,10 @@ class Authenticator:
             raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
         forgotten = self.is_invalidated
         token = self._find_token(_token(header)) if _token(header) else None
-        if token is None or (token.expires is not None and token.expires <= datetime.now(UTC)):
+        principal = None if token is None else Principal.from_token(token)
+        if principal is None or principal.has_expired():
             self.note_failure(client)
             raise Unauthenticated("the token is unknown or has expired: ask an administrator for a new one")
-        principal = Principal.from_token(token)
         with self._lock:
             if forgotten == self.is_invalidated:  # else it may have been revoked while it was looked up
                 self._cache[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)

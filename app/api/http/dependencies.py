@@ -42,7 +42,6 @@ class ApiOptions:
     max_json_bytes: int = 64 * 2**20
     body_seconds: float = 30.0
     body_pace: int = 1024
-    insecure_no_auth: bool = False
     data_dir: Path = Path("data")
     zenoh_mode: str = "off"
     zenoh_prefix: str = "fleetmap"

@@ -12,15 +12,18 @@ from urllib.parse import quote
 from starlette.types import Scope
 
 from app import links
-from app.api.http.auth import Authenticator, Principal
+from app.api.http.auth import Authenticator, Principal, environment_in_path
 from app.api.http.responses import API
 from app.errors import Invalid, InvalidLink, NotFound, Problem
 from app.links import LinkSecrets, SignedAddress
 from app.store.values import Environment
 
-_MAP = re.compile(
-    rf"(?:{API}/environments/(?P<long>[^/]+)/versions/[^/]+/maps|/maps/(?P<short>[^/]+))/[^/]+(?:/.+)?", re.DOTALL
+MAP_PATH = re.compile(
+    rf"(?:/maps/(?P<short>[^/]+)|{API}/environments/(?P<long>[^/]+)/versions/(?P<version>[^/]+)/maps)"
+    r"/(?P<format>[^/]+)(?:/(?P<file>.+))?",
+    re.DOTALL,
 )
+"""The two addresses of a map."""
 
 LINK = "link"
 """Id and name of the principal of a request by link, and the member of a request's state that has the link."""
@@ -32,7 +35,7 @@ def request_link(scope: Scope) -> SignedAddress | None:
     Raises InvalidLink where the query has a signature but is no link.
     """
     query: bytes = scope["query_string"]
-    if b"signature=" not in query or scope["method"] != "GET" or _MAP.fullmatch(scope["path"]) is None:
+    if b"signature=" not in query or scope["method"] != "GET" or MAP_PATH.fullmatch(scope["path"]) is None:
         return None
     return links.parse(scope["path"], query)
 
@@ -95,8 +98,7 @@ class SignedLinks:
         except InvalidLink:
             self._access.note_failure(client)
             raise
-        match = _MAP.fullmatch(address.path)
-        name = (match["long"] or match["short"]) if match else ""
+        name = environment_in_path(address.path) or ""
         try:
             environment = self._find(name)
         except NotFound:
