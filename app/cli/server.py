@@ -296,7 +296,7 @@ def check(settings: Settings) -> None:
     """Whether the server could start, told before it does; Unavailable with what to do about it."""
     with _store(settings) as store:
         if settings.database.startswith("sqlite"):
-            with _main().alone(settings.data_dir):
+            with _main().startup_lock(settings.data_dir):
                 store.migrate()
         store.check()
         try:
