@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.generate._site import MAX_NODES, SLACK, Site, SiteOptions, invalid_option_error, mm, rectangle, round_geometry
+from app.generate._shapes import mm, rectangle, round_geometry
+from app.generate._site import MAX_NODES, SLACK, Site, SiteOptions, invalid_option_error
 from app.parameters import parameter
 
 MIN_AISLE_METRES = 2.0

@@ -23,11 +23,13 @@ from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotConvert, CannotGenerate, Invalid, Problem
 from app.generate import MAX_CELLS, MAX_OBJECTS
+from app.generate._reach import clearance, keep_largest_space, passable, unreachable_nodes
+from app.generate._shapes import angle, disc, mm, orientation, rectangle, round_geometry
 from app.model import raster, solids
 from app.model.features import Features, Properties, features
 from app.model.fences import fences
 from app.model.frame import GROUND, Datum, Level
-from app.model.grid import FREE, UNKNOWN, OccupancyGrid
+from app.model.grid import OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import MAP, NETWORK, SITE, ZONES, Layers, Part, PartKey, Resources
 from app.model.raster import RasterFrame
@@ -47,9 +49,6 @@ HEIGHT = 0.2
 RESOLUTIONS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 DEFAULT_MAX_CELLS = 2**22
 """Cells of a grid, and pixels of a picture, up to which the finest of these is taken unless asked otherwise."""
-
-MAX_CLEARANCE_METRES = 20.0
-"""Metres of free width beyond which an edge is not looked at."""
 
 SLACK = 1.5
 """Cells by which a way and an obstacle may come nearer to each other in a grid than they are."""
@@ -121,41 +120,6 @@ class SiteOptions:
         maximum=2.0,
         unit="m",
     )
-
-
-def mm(value: float) -> float:
-    """A coordinate or length in whole millimetres."""
-    return round(float(value), 3) + 0.0
-
-
-def angle(value: float) -> float:
-    """An angle in whole microradians, from -π to π."""
-    return round(math.remainder(float(value), 2 * math.pi), 6) + 0.0
-
-
-def round_geometry(geometry: Any) -> Any:
-    """A geometry in whole millimetres."""
-    return shapely.transform(geometry, lambda xy: np.round(xy, 3) + 0.0)
-
-
-def rectangle(x: float, y: float, yaw: float, length: float, width: float) -> Any:
-    """A polygon around a middle, its length along the yaw."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    corners = [(u * length / 2, v * width / 2) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return round_geometry(shapely.Polygon([(x + c * u - s * v, y + s * u + c * v) for u, v in corners]))
-
-
-_CIRCLE = [(round(math.cos(math.pi * k / 8), 6), round(math.sin(math.pi * k / 8), 6)) for k in range(16)]
-
-
-def disc(x: float, y: float, radius: float) -> Any:
-    """A polygon of 16 sides around a middle."""
-    return shapely.Polygon([(mm(x + radius * c), mm(y + radius * s)) for c, s in _CIRCLE])
-
-
-def orientation(yaw: float) -> list[float]:
-    """The quaternion [x, y, z, w] of a yaw."""
-    return [0.0, 0.0, round(math.sin(yaw / 2), 6) + 0.0, round(math.cos(yaw / 2), 6) + 0.0]
 
 
 def rgb(colour: str) -> list[float]:
@@ -480,7 +444,7 @@ class Site:
         """Metres of free width of each edge. RuntimeError where a robot cannot take one, or come to a node."""
         edges = [(a, b) for a, b, _, _ in self._edges.values()]
         for start, directed in ((0, edges), (1, [(b, a) for a, b in edges])):
-            lost = _unreachable_nodes(list(self._nodes), directed)
+            lost = unreachable_nodes(list(self._nodes), directed)
             if lost:
                 direction = "to" if start == 0 else "from"
                 raise RuntimeError(f"no way leads {direction} {len(lost)} of the nodes, as {', '.join(lost[:5])}")
@@ -517,70 +481,6 @@ class Site:
 # --- the grid ---------------------------------------------------------------------------------------------------------
 
 
-def keep_largest_space(cells: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
-    """Cells of which only the largest piece of free ones (joined by their sides) is free, the others unknown; and how
-    many these were."""
-    import cv2
-
-    free = cells == FREE
-    count, label, stats, _ = cv2.connectedComponentsWithStats(free.astype(np.uint8), connectivity=4)
-    if count <= 2:
-        return cells, 0
-    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    shut = free & (label != largest)
-    out = cells.copy()
-    out[shut] = UNKNOWN
-    return out, int(np.count_nonzero(shut))
-
-
-def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArray[np.bool_]:
-    """Which lines and points (metres) a robot of a radius can take: bool [n].
-
-    Every cell that it touches lies in the grid, and farther than the radius from any that is not free, middle to
-    middle: it is outside of the inflated obstacles. The grid's yaw is 0.
-    """
-    import cv2
-
-    blocked = np.pad(grid.cells != FREE, 1, constant_values=True)
-    away = cv2.distanceTransform((~blocked).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    frame = RasterFrame((grid.origin[0], grid.origin[1]), grid.resolution, grid.width, grid.height)
-    at, owner = shapely.get_coordinates(np.array(lines, object), return_index=True)
-    cells = frame.to_cells(at)
-    good = np.ones(len(lines), bool)
-    outside = ((cells < 0) | (cells > [grid.width, grid.height])).any(axis=1)
-    good[owner[outside]] = False
-    # Consecutive vertices, and each vertex with itself, so that points count too.
-    same = owner[1:] == owner[:-1]
-    edges = np.concatenate([np.stack([at[:-1], at[1:]], axis=1)[same], np.stack([at, at], axis=1)])
-    number = np.concatenate([owner[:-1][same], owner])
-    for spans in raster.lines(edges, frame):
-        index, row, column = raster.expand_spans(spans)
-        near = away[row, column] <= radius / grid.resolution + 1e-4
-        good[number[index[near]]] = False
-    return good
-
-
-def clearance(grid: OccupancyGrid, lines: Sequence[Any]) -> Array:
-    """Metres of free width along lines: twice the distance to the nearest cell that is not free, at most WIDEST,
-    rounded down to centimetres: float64 [n]."""
-    out = np.full(len(lines), MAX_CLEARANCE_METRES)
-    if not len(lines):
-        return out
-    blocked = np.pad(grid.cells != FREE, 1, constant_values=True)
-    rim = blocked.copy()
-    rim[1:-1, 1:-1] &= ~(blocked[:-2, 1:-1] & blocked[2:, 1:-1] & blocked[1:-1, :-2] & blocked[1:-1, 2:])
-    step = np.diff(np.pad(rim, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    (row, first), (_, end) = np.nonzero(step == 1), np.nonzero(step == -1)
-    x, y, r = grid.origin[0], grid.origin[1], grid.resolution
-    boxes = shapely.box(x + (first - 1) * r, y + (row - 1) * r, x + (end - 1) * r, y + row * r)
-    given = np.array(lines, object)
-    pairs, distance = shapely.STRtree(boxes).query_nearest(
-        given, max_distance=MAX_CLEARANCE_METRES / 2, return_distance=True, all_matches=False
-    )
-    out[pairs[0]] = np.floor(np.round(2 * distance, 6) * 100) / 100
-    return np.asarray(np.minimum(out, MAX_CLEARANCE_METRES), np.float64)
-
-
 def _cells(box: Sequence[float], resolution: float) -> float:
     return (box[2] - box[0] + resolution) * (box[3] - box[1] + resolution) / resolution**2
 
@@ -602,20 +502,6 @@ def _datum(given: Layers, options: SiteOptions, notes: DerivationNotes) -> Datum
     if option_datum is None:
         notes.fill("datum", DATUM.as_dict(), "neither the environment nor the parameter datum says where the site is")
     return option_datum or DATUM
-
-
-def _unreachable_nodes(names: Sequence[str], edges: Iterable[tuple[str, str]]) -> list[str]:
-    """The nodes to which no way leads from the first one."""
-    following: dict[str, list[str]] = {name: [] for name in names}
-    for a, b in edges:
-        following[a].append(b)
-    seen, waiting = set(names[:1]), list(names[:1])
-    while waiting:
-        for name in following[waiting.pop()]:
-            if name not in seen:
-                seen.add(name)
-                waiting.append(name)
-    return [name for name in names if name not in seen]
 
 
 def _reaches(shape: Mapping[str, Any], z: float, solid_reader: solids.Solids, radii: dict[str, float]) -> bool:

@@ -10,7 +10,8 @@ import numpy as np
 import shapely
 
 from app.errors import CannotGenerate, Problem
-from app.generate._site import Site, angle, mm
+from app.generate._shapes import angle, mm
+from app.generate._site import Site
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ import numpy as np
 import shapely
 
 from app.generate._field import Field, between
-from app.generate._site import Site, disc, mm, rgb
+from app.generate._shapes import disc, mm
+from app.generate._site import Site, rgb
 
 CROWN = "models/crown/meshes/crown.stl"
 CROWNS = ("crown", "crown_light", "crown", "crown_dark")

@@ -20,7 +20,8 @@ from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.generate import MAX_OBJECTS, RandomSource, _automata, _cells, generates
 from app.generate._cells import STYLES, CellStyle, GridFrame
-from app.generate._site import Site, SiteOptions, angle, disc, invalid_option_error, mm
+from app.generate._shapes import angle, disc, mm
+from app.generate._site import Site, SiteOptions, invalid_option_error
 from app.model.frame import GROUND
 from app.model.layers import Layers
 from app.parameters import parameter

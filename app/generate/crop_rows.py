@@ -10,7 +10,8 @@ import numpy as np
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import FieldOptions, Row
-from app.generate._site import Site, disc, invalid_option_error, mm
+from app.generate._shapes import disc, mm
+from app.generate._site import Site, invalid_option_error
 from app.model.layers import Layers
 from app.parameters import parameter
 

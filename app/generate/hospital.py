@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.derive import DerivationNotes
-from app.generate import RandomSource, _building, generates
+from app.generate import RandomSource, _storeys, generates
 from app.generate._building import Furniture, Room, Storeys
 from app.generate._site import SiteOptions
 from app.model.layers import Layers
@@ -19,7 +19,7 @@ class Options(SiteOptions):
     """How large the wards are, and how many lie above each other."""
 
     levels: int = parameter(
-        1, "wards above each other; from two on a lift joins them", minimum=1, maximum=_building.MAX_LEVELS
+        1, "wards above each other; from two on a lift joins them", minimum=1, maximum=_storeys.MAX_LEVELS
     )
     length: float = parameter(36.0, "of the corridor", minimum=4.0, maximum=500.0, unit="m")
     depth: float = parameter(6.0, "of the rooms on each side of it", minimum=2.5, maximum=50.0, unit="m")
@@ -46,7 +46,7 @@ def hospital(given: Layers, options: Options, source: RandomSource, notes: Deriv
         options.storey_height, lift,
     )  # fmt: skip
     furnish = _furnish if options.furniture else None
-    return _building.build_site(
+    return _storeys.build_site(
         given, options, measures, source, notes, _kinds, furnish, lambda _, room: room.kind == "supply"
     )
 

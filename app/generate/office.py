@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.derive import DerivationNotes
-from app.generate import RandomSource, _building, generates
+from app.generate import RandomSource, _storeys, generates
 from app.generate._building import Furniture, Room, Storeys
 from app.generate._site import SiteOptions
 from app.model.layers import Layers
@@ -21,7 +21,7 @@ CHARGER_ROOMS = ("storage", "copy")
 class Options(SiteOptions):
     """How large the building is, and how fine its rooms."""
 
-    levels: int = parameter(2, "levels; from two on a lift joins them", minimum=1, maximum=_building.MAX_LEVELS)
+    levels: int = parameter(2, "levels; from two on a lift joins them", minimum=1, maximum=_storeys.MAX_LEVELS)
     length: float = parameter(32.0, "of the corridor", minimum=4.0, maximum=500.0, unit="m")
     depth: float = parameter(5.5, "of the rooms on each side of it", minimum=2.5, maximum=50.0, unit="m")
     corridor: float = parameter(2.4, "width of the corridor", minimum=1.2, maximum=20.0, unit="m")
@@ -47,7 +47,7 @@ def office(given: Layers, options: Options, source: RandomSource, notes: Derivat
         options.storey_height, lift,
     )  # fmt: skip
     furnish = _furnish if options.furniture else None
-    return _building.build_site(
+    return _storeys.build_site(
         given, options, measures, source, notes, _kinds, furnish, lambda k, room: k == 0 and room.kind in CHARGER_ROOMS
     )
 

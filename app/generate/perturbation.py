@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -27,9 +27,23 @@ from app.derive.objects_to_occupancy import Parameters as Slice
 from app.derive.objects_to_occupancy import objects_to_occupancy
 from app.errors import BadUpload, CannotConvert, CannotGenerate, Invalid, Problem
 from app.generate import MAX_CELLS, MAX_OBJECTS, RandomSource, generates
+from app.generate._cell_changes import (
+    CellChange,
+    apply_change,
+    grid_to_metres,
+    grid_window,
+    metres_to_grid,
+    occupied_cells,
+    open_cells,
+    replace_cells,
+    square_boxes,
+    unpack_squares,
+)
+from app.generate._connections import drop_unconnected
+from app.generate._movables import Movable, append_rows, changed_features, find_rows, move_shape, separate
 from app.model import masks, solids
-from app.model.features import Features, features
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey, unknown_grey_as_unknown
+from app.model.features import Features
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey_as_unknown
 from app.model.layers import MAP, Layers, Part, PartKey
 from app.model.obstacles import object_footprint
 from app.parameters import parameter
@@ -48,8 +62,6 @@ FIXED_KINDS = frozenset(
 )
 """Kinds of objects that are built, or are ground: they do not move."""
 
-ROW = 3
-"""Things in a row, at least."""
 
 SHAPELESS = 0.25
 """Metres around a model of which nobody has supplied the shape."""
@@ -104,40 +116,6 @@ class Perturbation:
     )
 
 
-@dataclass(slots=True)
-class _Movable:
-    """One object, or piece of a grid. at: its middle. body: the ground it covers (metres). row: its row, or -1.
-
-    moved: (dx, dy, turn); None: it stays for good. gone: whether it is missing.
-    """
-
-    place: tuple[PartKey, int] | int
-    at: tuple[float, float]
-    body: Any
-    row: int = -1
-    moved: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
-    gone: bool = False
-
-    @property
-    def has_changed(self) -> bool:
-        return self.gone or (self.moved is not None and any(self.moved))
-
-    def now(self) -> Any:
-        """The ground it covers now."""
-        return self.body if self.moved is None or not any(self.moved) else _move_shape(self.body, self.at, self.moved)
-
-
-@dataclass(slots=True)
-class _Change:
-    """What a level's obstacles cover no more, cover now, and covered before, as squares of ``size`` metres: int64 [n,
-    2], (column, row) from the local origin; of size 0 they are cells of the grid itself."""
-
-    size: float
-    freed: Cells = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    filled: Cells = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    before: Cells = field(default_factory=lambda: np.empty((0, 2), np.int64))
-
-
 @generates(
     {"objects", "occupancy", "topology"},
     changes={"objects", "occupancy", "topology"},
@@ -184,7 +162,7 @@ def perturbation(given: Layers, options: Perturbation, source: RandomSource, not
             "or upload or derive objects that stand in the way, or a grid"
         )
     if options.edges == "remove":
-        parts |= _drop_unconnected(given, parts, notes)
+        parts |= drop_unconnected(given, parts, notes)
     notes.warn("voxels, zones and pictures are as they were: derive them anew where they are to fit")
     return Layers(parts, given.datum, given.levels)
 
@@ -229,18 +207,18 @@ class _Level:
         network, edge_lines = self._network(change, main)
         out |= network
         for key, grid in self.grids.items():
-            cells = _apply_change(grid, changes[key]) if key in changes else grid.cells
+            cells = apply_change(grid, changes[key]) if key in changes else grid.cells
             if key in self.noisy:
                 cells = self._noise(key, grid, cells, edge_lines)
             if not np.array_equal(cells, grid.cells):
-                out[key] = _with_grey(self.stored[key], cells)
+                out[key] = replace_cells(self.stored[key], cells)
         return out
 
     # --- objects -----------------------------------------------------------------------------------------------------
-    def _things(self) -> list[_Movable]:
+    def _things(self) -> list[Movable]:
         """Everything with a body, those that may move first told apart from those that stay."""
         solid_reader = solids.Solids(self.given.resources())
-        out: list[_Movable] = []
+        out: list[Movable] = []
         for key, part in self.parts.items():
             metres = part.in_local(self.given.frame)
             for k, (p, geometry) in enumerate(zip(part.properties, metres, strict=True)):
@@ -260,20 +238,20 @@ class _Level:
                 stays = (
                     str(p.get("kind")) in FIXED_KINDS or math.hypot(x1 - x0, y1 - y0) > self.options.largest or woven
                 )
-                thing = _Movable((key, k), (float(middle[0]), float(middle[1])), body)
+                thing = Movable((key, k), (float(middle[0]), float(middle[1])), body)
                 if stays:
                     thing.moved = None
                 out.append(thing)
         return out
 
-    def _objects(self, things: list[_Movable], main: OccupancyGrid | None) -> tuple[_Change, dict[PartKey, Part]]:
+    def _objects(self, things: list[Movable], main: OccupancyGrid | None) -> tuple[CellChange, dict[PartKey, Part]]:
         """What changes of the obstacles, and the parts of objects that do."""
         loose = [t for t in things if t.moved is not None]
-        rows = _rows(np.array([t.at for t in loose]).reshape(-1, 2))
+        rows = find_rows(np.array([t.at for t in loose]).reshape(-1, 2))
         for t, row in zip(loose, rows.tolist(), strict=True):
             t.row = row
         self._shaken(loose)
-        back = _apart(things)
+        back = separate(things)
         if back:
             self.notes.drop("shifts", back, "another thing stands there")
         fresh = self._obstacles(things, main or self._slice(self.given.parts, None))
@@ -284,26 +262,26 @@ class _Level:
                 t.place[1]: t for t in things if isinstance(t.place, tuple) and t.place[0] == key and t.has_changed
             }
             if part_things:
-                out[key] = _changed_features(part, part_things, self.given)
+                out[key] = changed_features(part, part_things, self.given)
         if fresh:
             key = PartKey("objects", self.level, NAME)
             before = out.get(key, self.parts.get(key))
             assert before is None or isinstance(before, Features)
-            out[key] = _append_rows(before, fresh)
+            out[key] = append_rows(before, fresh)
             phrases.append(f"{len(fresh)} new obstacles")
         if phrases:
             self.notes.warn(f"disturbed: {', '.join(phrases)}", where=self.level)
         merged = {**self.parts, **out}
         return self._slice_changes(merged, main), out
 
-    def _summary(self, things: Sequence[_Movable]) -> list[str]:
+    def _summary(self, things: Sequence[Movable]) -> list[str]:
         removed_count = sum(t.gone for t in things)
         moved = sum(t.has_changed for t in things) - removed_count
         rows = len({t.row for t in things if t.row >= 0 and t.moved is not None})
         phrases = [f"{moved} things moved" + (f" ({rows} rows)" if rows else "")] if moved else []
         return phrases + ([f"{removed_count} gone"] if removed_count else [])
 
-    def _shaken(self, loose: list[_Movable]) -> None:
+    def _shaken(self, loose: list[Movable]) -> None:
         """Draw what goes, and how far what stays is moved."""
         s, options = self.options.severity, self.options
         go = self.draw("missing").random(len(loose)) < min(options.missing * s, 1.0)
@@ -320,7 +298,7 @@ class _Level:
             angle = math.radians(min(options.turn * s, 180.0)) * turn
             t.moved = (round(x, 3) + 0.0, round(y, 3) + 0.0, round(angle, 6) + 0.0)
 
-    def _slice_changes(self, merged: dict[PartKey, Any], main: OccupancyGrid | None) -> _Change:
+    def _slice_changes(self, merged: dict[PartKey, Any], main: OccupancyGrid | None) -> CellChange:
         """What a slice of the objects shows now and did not before, and the other way round."""
         slice_properties = main.properties.get("slice") if main is not None else None
         height = slice_properties.get("height") if isinstance(slice_properties, dict) else None
@@ -334,10 +312,10 @@ class _Level:
             size = size if grid is None else grid.resolution
             slice_parameters = replace(slice_parameters, resolution=size)
         if size is None:
-            return _Change(1.0)
-        before, after = (_occupied_cells(g) if g is not None else np.empty(0, np.int64) for g in grids)
+            return CellChange(1.0)
+        before, after = (occupied_cells(g) if g is not None else np.empty(0, np.int64) for g in grids)
         freed, filled = np.setdiff1d(before, after, True), np.setdiff1d(after, before, True)
-        return _Change(size, _places(freed), _places(filled), _places(before))
+        return CellChange(size, unpack_squares(freed), unpack_squares(filled), unpack_squares(before))
 
     def _slice(self, parts: Mapping[PartKey, Part], slice_parameters: Slice | None) -> OccupancyGrid | None:
         """The level's grid of these objects; None where nothing stands there at that height."""
@@ -352,7 +330,7 @@ class _Level:
 
     # --- new obstacles -----------------------------------------------------------------------------------------------
     def _obstacles(
-        self, things: Sequence[_Movable], main: OccupancyGrid | None
+        self, things: Sequence[Movable], main: OccupancyGrid | None
     ) -> list[tuple[str, Any, dict[str, Any]]]:
         """New objects where it is free."""
         rng = self.draw("obstacles")
@@ -369,7 +347,7 @@ class _Level:
             for _ in range(MAX_ATTEMPTS):
                 assert random_position is not None
                 x, y = random_position(rng)
-                body = _move_shape(shape, (0.0, 0.0), (x, y, yaw))
+                body = move_shape(shape, (0.0, 0.0), (x, y, yaw))
                 near = [bodies[k] for k in tree.query(body)] + new
                 if not any(shapely.intersects(body, other) for other in near):
                     break
@@ -405,11 +383,11 @@ class _Level:
         """A function that draws a place in the open; None where there is none."""
         if main is None:
             return None
-        spots = _open(main.cells, self.options.obstacle_size[1] / main.resolution)
+        spots = open_cells(main.cells, self.options.obstacle_size[1] / main.resolution)
 
         def drawn(rng: np.random.Generator) -> tuple[float, float]:
             row, column = divmod(int(spots[int(rng.integers(len(spots)))]), main.width)
-            x, y = _metres(main, np.array([[column + 0.5, row + 0.5]]))[0].tolist()
+            x, y = grid_to_metres(main, np.array([[column + 0.5, row + 0.5]]))[0].tolist()
             return round(x, 3) + 0.0, round(y, 3) + 0.0
 
         return drawn if len(spots) else None
@@ -419,7 +397,7 @@ class _Level:
         return min(round(count * self.options.severity), MAX_OBJECTS)
 
     # --- a grid without objects --------------------------------------------------------------------------------------
-    def _pieces(self, key: PartKey, grid: OccupancyGrid) -> _Change:
+    def _pieces(self, key: PartKey, grid: OccupancyGrid) -> CellChange:
         """Its small pieces of occupied cells moved and gone, and new ones: as cells of the grid itself."""
         import cv2
 
@@ -436,8 +414,8 @@ class _Level:
         loose = []
         for k in pieces.tolist():
             x, y, w, h, _ = (int(v) for v in stats[k])
-            loose.append(_Movable(k, ((x + w / 2) * size, (y + h / 2) * size), None))
-        for t, row in zip(loose, _rows(np.array([t.at for t in loose]).reshape(-1, 2)).tolist(), strict=True):
+            loose.append(Movable(k, ((x + w / 2) * size, (y + h / 2) * size), None))
+        for t, row in zip(loose, find_rows(np.array([t.at for t in loose]).reshape(-1, 2)).tolist(), strict=True):
             t.row = row
         self._shaken(loose)
         cells = grid.cells.copy()
@@ -448,9 +426,9 @@ class _Level:
             inside = label[y : y + h, x : x + w] == t.place
             cells[y : y + h, x : x + w][inside] = FREE
             dx, dy = (0, 0) if t.gone or t.moved is None else (round(t.moved[0] / size), round(t.moved[1] / size))
-            into = _window(cells, x + dx, y + dy, w, h)
+            into = grid_window(cells, x + dx, y + dy, w, h)
             if not t.gone and (into is None or (cells[into][inside] != FREE).any()):
-                t.moved, into = (0.0, 0.0, 0.0), _window(cells, x, y, w, h)
+                t.moved, into = (0.0, 0.0, 0.0), grid_window(cells, x, y, w, h)
                 blocked_count += 1
             elif (dx, dy) == (0, 0) and not t.gone:
                 t.moved = (0.0, 0.0, 0.0)
@@ -467,24 +445,24 @@ class _Level:
         row, column = np.nonzero((grid.cells != OCCUPIED) & (cells == OCCUPIED))
         filled = np.stack([column, row], axis=1)
         row, column = np.nonzero(occupied)
-        return _Change(0.0, freed, filled, np.stack([column, row], axis=1))
+        return CellChange(0.0, freed, filled, np.stack([column, row], axis=1))
 
     def _paint_obstacles(self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8]) -> int:
         """Paint new obstacles onto the open cells: how many."""
         import cv2
 
         rng = self.draw(f"obstacles/{key.name}")
-        spots = _open(cells, self.options.obstacle_size[1] / grid.resolution)
+        spots = open_cells(cells, self.options.obstacle_size[1] / grid.resolution)
         done, count = 0, self._scaled_count(self.options.obstacles)
         for _ in range(count if len(spots) else 0):
             shape, yaw, _, _ = self._body(rng)
             for _ in range(MAX_ATTEMPTS):
                 row, column = divmod(int(spots[int(rng.integers(len(spots)))]), grid.width)
-                at = shapely.get_coordinates(_move_shape(shape, (0.0, 0.0), (0.0, 0.0, yaw)))[:-1] / grid.resolution
+                at = shapely.get_coordinates(move_shape(shape, (0.0, 0.0), (0.0, 0.0, yaw)))[:-1] / grid.resolution
                 reach = int(np.ceil(np.abs(at).max())) + 1
                 spot = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
                 cv2.fillPoly(spot, [np.round(at + reach).astype(np.int32)], 1)
-                into = _window(cells, column - reach, row - reach, 2 * reach + 1, 2 * reach + 1)
+                into = grid_window(cells, column - reach, row - reach, 2 * reach + 1, 2 * reach + 1)
                 if into is not None and (cells[into][spot == 1] == FREE).all():
                     cells[into][spot == 1] = OCCUPIED
                     done += 1
@@ -494,11 +472,11 @@ class _Level:
         return done
 
     # --- the network -------------------------------------------------------------------------------------------------
-    def _network(self, change: _Change, main: OccupancyGrid | None) -> tuple[dict[PartKey, Part], list[Any]]:
+    def _network(self, change: CellChange, main: OccupancyGrid | None) -> tuple[dict[PartKey, Part], list[Any]]:
         """The parts of the network that change, and the lines (metres) that robots still take."""
         out: dict[PartKey, Part] = {}
         edge_lines: list[Any] = []
-        boxes, old = (_squares(places, change.size, main) for places in (change.filled, change.before))
+        boxes, old = (square_boxes(places, change.size, main) for places in (change.filled, change.before))
         tree, was = shapely.STRtree(boxes), shapely.STRtree(old)
         for key, part in self.lines.items():
             metres = shapely.force_2d(part.in_local(self.given.frame))
@@ -565,7 +543,7 @@ class _Level:
         free, occupied = cells == FREE, cells == OCCUPIED
         driven = np.zeros(cells.shape, np.uint8)
         for line in lines:
-            at = np.round(_columns(grid, shapely.get_coordinates(line)) - 0.5) - first
+            at = np.round(metres_to_grid(grid, shapely.get_coordinates(line)) - 0.5) - first
             if np.abs(at).max(initial=0.0) < 2**24:  # cv2 takes 32-bit places; what lies far off is in no grid
                 cv2.polylines(driven, [at.astype(np.int32)], False, 1)
         if not driven.any():
@@ -599,237 +577,6 @@ class _Level:
         return out
 
 
-# --- the network as a whole -------------------------------------------------------------------------------------------
-def _drop_unconnected(given: Layers, parts: dict[PartKey, Part], notes: DerivationNotes) -> dict[PartKey, Part]:
-    """Without edges whose nodes are gone, on whatever level they are; with a word on what hangs together no more."""
-    before = given.vector("topology")
-    after: dict[PartKey, Features] = {}
-    for key, part in before.items():
-        new = parts.get(key, part)
-        assert isinstance(new, Features)
-        after[key] = new
-    if all(after[k] is p for k, p in before.items()):
-        return {}
-    removed = {i for p in before.values() for i in p.ids} - {i for p in after.values() for i in p.ids}
-    out: dict[PartKey, Part] = {}
-    for key, part in after.items():
-        lost = [
-            p.get("kind") == "edge" and (p.get("source") in removed or p.get("target") in removed)
-            for p in part.properties
-        ]
-        if any(lost):
-            notes.drop("edges", sum(lost), "an obstacle stands where they lead from or to")
-            after[key] = part.select(~np.array(lost))
-        if after[key] is not before[key]:
-            out[key] = after[key]
-    used = {
-        p[end] for f in before.values() for p in f.properties if p.get("kind") == "edge" for end in ("source", "target")
-    }
-    was, now = (_count_components(list(f.values()), used - removed) for f in (before, after))
-    if now > was:
-        notes.warn(f"the network falls into {now} pieces, and was in {was}")
-    return out
-
-
-def _count_components(collections: Sequence[Features], nodes: set[str]) -> int:
-    """In how many pieces these nodes of a network are."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    number = {i: k for k, i in enumerate(sorted(nodes))}
-    edges = [p for f in collections for p in f.properties if p.get("kind") == "edge"]
-    ends = [
-        (number[p["source"]], number[p["target"]]) for p in edges if p["source"] in number and p["target"] in number
-    ]
-    if not nodes:
-        return 0
-    a, b = np.array(ends, np.int64).reshape(-1, 2).T
-    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(len(nodes),) * 2)
-    return int(connected_components(graph, directed=False)[0])
-
-
-# --- objects ----------------------------------------------------------------------------------------------------------
-def _move_shape(shape: Any, around: tuple[float, float], by: tuple[float, float, float]) -> Any:
-    """A shape turned around a point and shifted, in whole millimetres; heights stay."""
-    dx, dy, turn = by
-    c, s = math.cos(turn), math.sin(turn)
-    x, y = around
-
-    def placed(at: Array) -> Array:
-        u, v = at[:, 0] - x, at[:, 1] - y
-        flat = np.stack([x + c * u - s * v + dx, y + s * u + c * v + dy], axis=1)
-        return np.asarray(np.concatenate([np.round(flat, 3) + 0.0, at[:, 2:]], axis=1), np.float64)
-
-    return shapely.transform(shape, placed, include_z=bool(shapely.has_z(shape)))
-
-
-def _changed_features(part: Features, things: dict[int, _Movable], given: Layers) -> Features:
-    """A part with its objects where they are now, and without those that are gone."""
-    metres = part.in_local(given.frame).copy()
-    geometry = part.geometry.copy()
-    properties = list(part.properties)
-    for k, t in things.items():
-        if t.gone or t.moved is None:
-            continue
-        metres[k] = _move_shape(metres[k], t.at, t.moved)
-        if part.local[k]:
-            geometry[k] = metres[k]
-        else:
-            assert given.frame is not None
-            back = given.frame.geometries_to_wgs84(np.array([metres[k]], object))
-            geometry[k] = shapely.set_precision(back[0], 1e-12, mode="pointwise")
-        object_properties = properties[k]
-        if object_properties.get("pose") is not None or object_properties.get("shapes"):
-            pose = list(solids.parse_pose(object_properties))
-            place = shapely.get_coordinates(_move_shape(shapely.Point(pose[:2]), t.at, t.moved))[0].tolist()
-            yaw = round(math.remainder(pose[5] + t.moved[2], math.tau), 6) + 0.0
-            properties[k] = {**object_properties, "pose": [*place, pose[2], pose[3], pose[4], yaw]}
-    stays = np.array([k not in things or not things[k].gone for k in range(len(part))], bool)
-    return Features(part.ids, geometry, tuple(properties), part.local.copy(), part.document).select(stays)
-
-
-def _append_rows(before: Features | None, rows: list[tuple[str, Any, dict[str, Any]]]) -> Features:
-    """New rows behind what is there."""
-    fresh = features(rows, "local")
-    if before is None:
-        return fresh
-    geometry = np.concatenate([before.geometry, fresh.geometry])
-    local = np.concatenate([before.local, fresh.local])
-    properties = (*before.properties, *fresh.properties)
-    return Features((*before.ids, *fresh.ids), geometry, properties, local, before.document)
-
-
-def _rows(at: Array) -> NDArray[np.int64]:
-    """The row of each of the places [n, 2], from 0; -1: it is in none.
-
-    Rows run in the direction in which most things have their nearest neighbour; a row ends sideways where there is a
-    gap of more than half the usual distance to it.
-    """
-    from scipy.spatial import cKDTree
-
-    out = np.full(len(at), -1, np.int64)
-    if len(at) < ROW:
-        return out
-    away, neighbour = cKDTree(at).query(at, 2)
-    apart = away[:, 1]
-    mask = apart > 1e-6
-    if mask.sum() < ROW:
-        return out
-    to = at[neighbour[:, 1]] - at
-    angle = np.round(np.arctan2(to[:, 1], to[:, 0]) % math.pi, 6)
-    bins = np.bincount((angle[mask] / math.pi * 36).astype(np.int64) % 36, minlength=36)
-    smooth = bins + np.roll(bins, 1) + np.roll(bins, -1)
-    best = int(np.argmax(smooth))
-    if smooth[best] < max(ROW, 0.4 * mask.sum()):
-        return out
-    # The mean of directions that are 180 degrees apart is half the mean of their doubles.
-    close = mask & (np.abs((angle / math.pi * 36 - best - 0.5 + 18) % 36 - 18) <= 1.5)
-    double = 2 * angle[close]
-    direction = math.atan2(float(np.sin(double).sum()), float(np.cos(double).sum())) / 2
-    across = np.round(-math.sin(direction) * at[:, 0] + math.cos(direction) * at[:, 1], 3)
-    gap = max(float(np.median(apart[mask])) / 2, 0.05)
-    order = np.argsort(across, kind="stable")
-    row = np.empty(len(at), np.int64)
-    row[order] = np.concatenate([[0], np.cumsum(np.diff(across[order]) > gap)])
-    count = np.bincount(row)
-    numbers = np.cumsum(count >= ROW) - 1
-    return np.where(count[row] >= ROW, numbers[row], -1)
-
-
-def _apart(things: Sequence[_Movable]) -> int:
-    """Put back what has come to stand in others and did not before: how many things."""
-    present_things = [t for t in things if not t.gone]
-    before = np.array([t.body for t in present_things], object)
-    put = 0
-    while True:
-        now = np.array([t.now() for t in present_things], object)
-        a, b = shapely.STRtree(now).query(now, predicate="intersects")
-        pair = a < b
-        a, b = a[pair], b[pair]
-        moved = np.array([t.moved is not None and any(t.moved) for t in present_things], bool)
-        wrong = (moved[a] | moved[b]) & ~shapely.intersects(before[a], before[b])
-        if not wrong.any():
-            return put
-        for k in np.unique(np.concatenate([a[wrong], b[wrong]])).tolist():
-            if moved[k]:
-                present_things[k].moved = (0.0, 0.0, 0.0)
-                put += 1
-
-
-def _with_grey(stored: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
-    """A stored grid with other cells; those of unknown's grey that stay unknown keep it."""
-    grey = unknown_grey(stored)
-    new_cells = cells if grey is None else np.where(grey & (cells == UNKNOWN), np.uint8(FREE), cells)
-    return replace(stored, cells=new_cells)
-
-
-# --- cells ------------------------------------------------------------------------------------------------------------
-_BIAS, _SPAN = 2**30, 2**31
-
-
-def _occupied_cells(grid: OccupancyGrid) -> Cells:
-    """The occupied cells of a derived grid (yaw 0, origin a multiple of the resolution) as sorted numbers."""
-    row, column = np.nonzero(grid.cells == OCCUPIED)
-    x, y = (round(v / grid.resolution) for v in grid.origin[:2])
-    return np.sort(_numbers(np.stack([column + x, row + y], axis=1)))
-
-
-def _numbers(places: Cells) -> Cells:
-    """Each square (column, row) as one number."""
-    return (places[:, 0].astype(np.int64) + _BIAS) * _SPAN + (places[:, 1].astype(np.int64) + _BIAS)
-
-
-def _places(numbers: Cells) -> Cells:
-    return np.stack([numbers // _SPAN - _BIAS, numbers % _SPAN - _BIAS], axis=1)
-
-
-def _metres(grid: OccupancyGrid, at: Array) -> Array:
-    """Places in a grid, in columns and rows, as metres."""
-    x, y, yaw = grid.origin
-    c, s = math.cos(yaw), math.sin(yaw)
-    u, v = at[:, 0] * grid.resolution, at[:, 1] * grid.resolution
-    return np.stack([x + c * u - s * v, y + s * u + c * v], axis=1)
-
-
-def _columns(grid: OccupancyGrid, at: Array) -> Array:
-    """Metres as columns and rows of a grid."""
-    x, y, yaw = grid.origin
-    c, s = math.cos(yaw), math.sin(yaw)
-    u, v = at[:, 0] - x, at[:, 1] - y
-    return np.stack([c * u + s * v, -s * u + c * v], axis=1) / grid.resolution
-
-
-def _apply_change(grid: OccupancyGrid, change: _Change) -> NDArray[np.uint8]:
-    """The cells with what the obstacles left free and what they cover now."""
-    cells = grid.cells.copy()
-    for places, value in ((change.freed, FREE), (change.filled, OCCUPIED)):
-        at = _covered_cells(grid, change, places)
-        inside = ((at >= 0) & (at < [grid.width, grid.height])).all(axis=1)
-        column, row = at[inside].T
-        if value == FREE:
-            occupied = cells[row, column] == OCCUPIED
-            column, row = column[occupied], row[occupied]
-        cells[row, column] = value
-    return cells
-
-
-def _covered_cells(grid: OccupancyGrid, change: _Change, places: Cells) -> Cells:
-    """The cells of a grid that squares lie in; ``size`` 0: they are its own."""
-    if change.size == 0.0 or not len(places):
-        return places
-    offset = np.array(grid.origin[:2]) / change.size
-    if grid.origin[2] == 0.0 and grid.resolution == change.size and (np.abs(offset - np.round(offset)) < 1e-6).all():
-        return places - np.round(offset).astype(np.int64)
-    # Of the cells that the squares reach into those whose middle lies in one.
-    steps = max(2, math.ceil(2 * change.size / grid.resolution))
-    inner = (np.arange(steps) + 0.5) / steps
-    spread = np.stack(np.meshgrid(inner, inner), axis=-1).reshape(-1, 2)
-    at = ((places[:, None, :] + spread[None]) * change.size).reshape(-1, 2)
-    reached = np.unique(np.floor(_columns(grid, at) + 1e-9).astype(np.int64), axis=0)
-    middles = np.floor(_metres(grid, np.asarray(reached + 0.5, np.float64)) / change.size + 1e-9).astype(np.int64)
-    return reached[np.isin(_numbers(middles), _numbers(places))]
-
-
 def _nearest(tree: shapely.STRtree, metres: NDArray[np.object_], max_distance: float) -> Array:
     """Metres from each geometry to the nearest of the tree's; infinite beyond ``max_distance``."""
     out = np.full(len(metres), np.inf)
@@ -842,45 +589,6 @@ def _nearest(tree: shapely.STRtree, metres: NDArray[np.object_], max_distance: f
     elif len(usable) and len(tree.geometries):
         out[usable[np.unique(tree.query(metres[usable], predicate="intersects")[0])]] = 0.0
     return out
-
-
-def _squares(places: Cells, size: float, main: OccupancyGrid | None) -> NDArray[np.object_]:
-    """Squares as boxes of consecutive ones, in metres. size 0: they are cells of the grid."""
-    if not len(places):
-        return np.empty(0, object)
-    order = np.lexsort((places[:, 0], places[:, 1]))
-    at = places[order]
-    new = np.ones(len(at), bool)
-    new[1:] = (at[1:, 1] != at[:-1, 1]) | (at[1:, 0] != at[:-1, 0] + 1)
-    first = at[new]
-    last = at[np.concatenate([np.flatnonzero(new)[1:] - 1, [len(at) - 1]])]
-    boxes = shapely.box(first[:, 0], first[:, 1], last[:, 0] + 1, last[:, 1] + 1)
-    if size > 0.0:
-        return np.asarray(shapely.transform(boxes, lambda xy: xy * size), object)
-    assert main is not None
-    return np.asarray(shapely.transform(boxes, lambda xy: _metres(main, xy)), object)
-
-
-def _open(cells: NDArray[np.uint8], across: float) -> Cells:
-    """The cells around which it is free as far as half of a thing so large reaches: their numbers."""
-    import cv2
-
-    free = cells == FREE
-    down, over = np.flatnonzero(free.any(axis=1)), np.flatnonzero(free.any(axis=0))
-    if not len(down):
-        return np.empty(0, np.int64)
-    y, x = int(down[0]), int(over[0])
-    inner = np.pad(free[y : int(down[-1]) + 1, x : int(over[-1]) + 1], 1).astype(np.uint8)
-    away = cv2.distanceTransform(inner, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    row, column = np.nonzero(np.round(away, 3) > across * 0.75 + 1)
-    return np.asarray((row + y) * cells.shape[1] + column + x, np.int64)
-
-
-def _window(cells: NDArray[np.uint8], x: int, y: int, w: int, h: int) -> tuple[slice, slice] | None:
-    """A window of the grid; None where it reaches beyond."""
-    if x < 0 or y < 0 or x + w > cells.shape[1] or y + h > cells.shape[0]:
-        return None
-    return slice(y, y + h), slice(x, x + w)
 
 
 def _ring(radius: float) -> Any:

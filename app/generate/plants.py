@@ -10,7 +10,8 @@ import shapely
 from app.derive import DerivationNotes
 from app.errors import Invalid, Problem
 from app.generate import RandomSource, _lsystem, _plants, generates
-from app.generate._site import Site, SiteOptions, disc, invalid_option_error
+from app.generate._shapes import disc
+from app.generate._site import Site, SiteOptions, invalid_option_error
 from app.generate._site_frame import place_site
 from app.model.layers import Layers
 from app.parameters import parameter

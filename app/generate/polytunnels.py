@@ -12,7 +12,8 @@ import numpy as np
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Line, Row
-from app.generate._site import Site, angle, invalid_option_error, mm, rgb
+from app.generate._shapes import angle, mm
+from app.generate._site import Site, invalid_option_error, rgb
 from app.model.layers import Layers
 from app.parameters import parameter
 

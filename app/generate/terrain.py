@@ -21,7 +21,8 @@ from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.generate import MAX_OBJECTS, RandomSource, _cells, generates
 from app.generate._noise import Fractal, noise2, noise3
-from app.generate._site import Site, SiteOptions, disc, invalid_option_error, mm
+from app.generate._shapes import disc, mm
+from app.generate._site import Site, SiteOptions, invalid_option_error
 from app.model import masks
 from app.model.frame import GROUND
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid

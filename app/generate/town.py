@@ -14,7 +14,8 @@ from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, Problem
 from app.generate import RandomSource, _blocks, _plants, _streets, generates
 from app.generate._blocks import Lot
-from app.generate._site import SLACK, Site, SiteOptions, angle, disc, invalid_option_error, mm
+from app.generate._shapes import angle, disc, mm
+from app.generate._site import SLACK, Site, SiteOptions, invalid_option_error
 from app.model.layers import Layers
 from app.parameters import parameter
 

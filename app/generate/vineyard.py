@@ -8,7 +8,8 @@ from typing import Any
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Row
-from app.generate._site import Site, invalid_option_error, mm, rectangle, rgb
+from app.generate._shapes import mm, rectangle
+from app.generate._site import Site, invalid_option_error, rgb
 from app.model.layers import Layers
 from app.parameters import parameter
 

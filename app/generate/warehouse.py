@@ -12,7 +12,8 @@ import shapely
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Line, Row
-from app.generate._site import SLACK, Site, invalid_option_error, mm, rectangle
+from app.generate._shapes import mm, rectangle
+from app.generate._site import SLACK, Site, invalid_option_error
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -193,20 +194,24 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
             raise invalid_option_error("yard", f"{options.yard:g} m are too few for a robot of {radius:g} m radius")
         site.node(name, out.to_local(u, mm(v)), yaw=facing, **words)
         site.add_edges(stop, name, speed=0.5)
+    _walls(site, doors, options.wall_height)
+    slow = out.area(lane.low, 0.0, lane.high, lane.v + 1.0)
+    if slow.geom_type == "Polygon":
+        site.zone("speed-dispatch", "speed", slow, name="Dispatch", value=0.8)
+    return positions
+
+
+def _walls(site: Site, doors: list[Any], height: float) -> None:
+    """Walls around the hall, open at the doors."""
     inside = shapely.buffer(site.fence, -WALL, join_style="mitre")
     walls = shapely.difference(shapely.difference(site.fence, inside), shapely.union_all(doors))
     for k, piece in enumerate(sorted(shapely.get_parts(walls), key=lambda p: p.bounds), 1):
         if piece.geom_type != "Polygon" or piece.area < 1e-4:
             continue
         rings = [np.round(shapely.get_coordinates(r), 3).tolist()[:-1] for r in (piece.exterior, *piece.interiors)]
-        shape = {"type": "polyline", "points": rings, "height": mm(options.wall_height)}
-        members: dict[str, Any] = {"height": mm(options.wall_height), "name": f"Wall {k}"}
+        shape = {"type": "polyline", "points": rings, "height": mm(height)}
+        members: dict[str, Any] = {"height": mm(height), "name": f"Wall {k}"}
         site.add_object(f"wall{k}", "wall", piece, shapes=[shape], pose=(0.0, 0.0, 0.0, 0.0), colour="wall", **members)
-    low, high = lane.low, lane.high
-    slow = out.area(low, 0.0, high, lane.v + 1.0)
-    if slow.geom_type == "Polygon":
-        site.zone("speed-dispatch", "speed", slow, name="Dispatch", value=0.8)
-    return positions
 
 
 def _door(fence: Any, gap: Any) -> Any:

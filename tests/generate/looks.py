@@ -20,7 +20,7 @@ from app.convert.files import write_layers
 from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.formats import FileGroup, ReadContext
-from app.generate import _site
+from app.generate import _reach
 from app.model.features import Features
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 from app.model.imagery import GeoImage
@@ -72,7 +72,7 @@ def agrees_with_itself(layers: Layers, radius: float, height: float = 0.2) -> No
         levels |= {i: key.level for i, p in zip(part.ids, part.properties, strict=True) if p["kind"] == "node"}
         pairs += ends
         grid = next(g for k, g in grids.items() if k.level == key.level)
-        assert _site.passable(grid, lines, radius).all(), "no edge leads through an obstacle"
+        assert _reach.passable(grid, lines, radius).all(), "no edge leads through an obstacle"
     near = {name: {b for a, b in pairs if a == name} for name in levels}
     seen = set(list(levels)[:1])
     waiting = list(seen)

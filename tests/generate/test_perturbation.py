@@ -18,7 +18,7 @@ from PIL import Image
 from app import generate
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, MissingLayer
-from app.generate import _site
+from app.generate import _reach
 from app.generate._site import Site, SiteOptions
 from app.model.features import Features, features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, pack_cells, unknown_grey
@@ -86,7 +86,7 @@ def edges_are_free(layers: Layers, radius: float = 0.3) -> None:
             if p["kind"] == "edge" and not p.get("blocked")
         ]
         assert lines
-        assert _site.passable(grid, lines, radius).all()
+        assert _reach.passable(grid, lines, radius).all()
 
 
 def test_the_grid_follows_the_objects_and_the_network_both() -> None:

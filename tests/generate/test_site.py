@@ -13,7 +13,7 @@ from app.derive import DerivationNotes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotGenerate, Invalid
 from app.formats import FileGroup, ReadContext, WriteContext
-from app.generate import _site
+from app.generate import _reach, _shapes, _site
 from app.generate._site import COLOURS, Site, SiteOptions
 from app.generate._trees import crown_mesh
 from app.model import solids
@@ -97,7 +97,7 @@ def test_free_space_is_one_piece_and_the_rest_is_told() -> None:
     (entry,) = notes.dropped
     assert entry["what"] == "free cells"
     assert entry["count"] == pytest.approx(1.8 * 1.8 / 0.05**2, rel=0.05)
-    cells, closed = _site.keep_largest_space(np.zeros((3, 3), np.uint8))
+    cells, closed = _reach.keep_largest_space(np.zeros((3, 3), np.uint8))
     assert (closed, cells.tolist()) == (0, [[0] * 3] * 3)
 
 
@@ -129,12 +129,12 @@ def test_passable_is_the_grid_inflated_by_the_radius() -> None:
     cells[20, 20] = OCCUPIED
     grid = OccupancyGrid(cells, 0.1)
     line = [shapely.LineString([(0.5, y), (3.5, y)]) for y in (2.05, 2.31, 2.41, 3.8, 4.2)]
-    assert _site.passable(grid, line, 0.3).tolist() == [False, False, True, False, False]
-    assert _site.passable(grid, line, 0.19).tolist() == [False, True, True, True, False]
+    assert _reach.passable(grid, line, 0.3).tolist() == [False, False, True, False, False]
+    assert _reach.passable(grid, line, 0.19).tolist() == [False, True, True, True, False]
     point = [shapely.Point(2.05, 2.31), shapely.Point(1.0, 1.0)]
-    assert _site.passable(grid, point, 0.3).tolist() == [False, True]
-    assert _site.clearance(grid, line[:3]).tolist() == [0.0, 0.42, 0.62]
-    assert _site.clearance(grid, []).tolist() == []
+    assert _reach.passable(grid, point, 0.3).tolist() == [False, True]
+    assert _reach.clearance(grid, line[:3]).tolist() == [0.0, 0.42, 0.62]
+    assert _reach.clearance(grid, []).tolist() == []
 
 
 def test_what_cannot_be_driven_is_a_mistake_of_the_generator() -> None:
@@ -209,7 +209,7 @@ def test_sizes_are_told_before_work_starts() -> None:
 def test_the_picture_shows_what_stands_where() -> None:
     site = yard()
     site.draw(shapely.box(0, 0, 20, 3), "path")
-    site.post("tree", "tree", (4, 6), 0.2, 4.0, colour="crown", seen=_site.disc(4, 6, 1.5))
+    site.post("tree", "tree", (4, 6), 0.2, 4.0, colour="crown", seen=_shapes.disc(4, 6, 1.5))
     layers = site.finish(ground="meadow")
     picture = layers.parts[PartKey("imagery", GROUND, "satellite")]
     assert isinstance(picture, GeoImage)
