@@ -28,99 +28,14 @@ def _tagged_scalar(tag: str, text: str) -> Any:
 def load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed: bool = True) -> Any:
     """The reference: builds the value from libyaml's event stream, without recursion."""
     loader: Any = yaml.CSafeLoader(text)
+    builder = _Builder(text, limits, tags, typed)
     event: Any = None
-    budget = UNFOLD_FREE + UNFOLD_TIMES * len(text)
-    root: list[Any] = []
-    # Open collections, outermost first: [value, pending key, is a mapping, weight, what its anchor stands for, tag].
-    stack: list[list[Any]] = [[root, None, False, 0, None, None]]
-    # What each name stands for, (value, weight), empty while its collection is open. The last anchor of a name counts.
-    anchors: dict[str, list[tuple[Any, int]]] = {}
-    nodes = documents = 0
     try:
         while True:
             event = loader.get_event()
-            kind = type(event)
-            weight = 0
-            anchor_slot: list[tuple[Any, int]] | None = None
-            if kind is yaml.ScalarEvent:
-                nodes += 1
-                if event.anchor is not None:
-                    anchor_slot = anchors[event.anchor] = []
-                literal: str = event.value
-                top = stack[-1]
-                as_key = top[2] and top[1] is None
-                plain = event.implicit[0]
-                if as_key and (event.tag is None or event.tag == "!"):
-                    if plain and literal == "<<":
-                        raise ValueError("merge keys (<<) are not supported; write the keys out")
-                    value: Any = literal
-                elif event.tag is not None:
-                    value = _tagged_scalar(event.tag, literal)
-                elif typed:
-                    value = scalar(literal) if plain else literal
-                else:
-                    value = PlainScalar(literal) if plain else literal
-                weight = 8 + len(literal)
-            elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
-                nodes += 1
-                mapping = kind is yaml.MappingStartEvent
-                tag = None
-                if event.tag not in (None, "!", TAG + ("map" if mapping else "seq")):
-                    if not event.tag.startswith(tags):
-                        raise ValueError(f"the tag {event.tag[:80]} is not supported")
-                    tag = event.tag
-                if stack[-1][2] and stack[-1][1] is None:
-                    raise ValueError("a key must be a text, not a collection")
-                if len(stack) > limits.yaml_depth:
-                    raise ValueError(f"nested deeper than {limits.yaml_depth} levels")
-                if event.anchor is not None:
-                    anchor_slot = anchors[event.anchor] = []
-                stack.append([{} if mapping else [], None, mapping, 8, anchor_slot, tag])
-                continue
-            elif kind is yaml.MappingEndEvent or kind is yaml.SequenceEndEvent:
-                value, _, _, weight, anchor_slot, tag = stack.pop()
-                if tag is not None:
-                    value = Tagged(tag, value)
-            elif kind is yaml.AliasEvent:
-                if event.anchor not in anchors:
-                    raise ValueError(f"the alias *{event.anchor[:80]} has no anchor before it")
-                if not anchors[event.anchor]:
-                    raise ValueError(f"the alias *{event.anchor[:80]} stands inside its own anchor")
-                value, weight = anchors[event.anchor][0]
-                nodes += 1
-                budget -= weight
-                if budget < 0:
-                    raise yaml_error(
-                        "the aliases unfold to far more than the file holds", event.start_mark.line, TooLarge
-                    )
-            elif kind is yaml.DocumentStartEvent:
-                documents += 1
-                if documents > 1:
-                    raise ValueError("a second document begins here; only one is read")
-                if event.tags and not set(event.tags.values()) <= set(tags):
-                    raise ValueError("%TAG directives are not supported" if not tags else "an unknown %TAG directive")
-                continue
-            elif kind is yaml.StreamEndEvent:
+            if type(event) is yaml.StreamEndEvent:
                 break
-            else:
-                continue
-            if nodes > limits.yaml_nodes:
-                raise yaml_error(f"more than {limits.yaml_nodes} nodes", event.start_mark.line, TooLarge)
-            if anchor_slot is not None:
-                anchor_slot.append((value, weight))
-            top = stack[-1]
-            top[3] += weight
-            if not top[2]:
-                top[0].append(value)
-            elif top[1] is None:
-                if not isinstance(value, str):
-                    raise ValueError("a key must be a text")
-                if value in top[0]:
-                    raise ValueError(f"the key {value[:80]!r} stands twice in one mapping")
-                top[1] = value
-            else:
-                top[0][top[1]] = value
-                top[1] = None
+            builder.take(event)
     except ValueError as error:
         raise yaml_error(str(error), event.start_mark.line) from error
     except yaml.MarkedYAMLError as error:
@@ -131,4 +46,119 @@ def load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed:
         raise yaml_error(f"not YAML: {error}", None) from error
     finally:
         loader.dispose()
-    return root[0] if root else None
+    return builder.root[0] if builder.root else None
+
+
+class _Builder:
+    """The value that events make.
+
+    stack: open collections, outermost first: [value, pending key, is a mapping, weight, what its anchor stands for,
+    tag]. anchors: what each name stands for, (value, weight), empty while its collection is open; the last anchor of a
+    name counts. budget: characters that aliases may still add.
+    """
+
+    __slots__ = ("anchors", "budget", "documents", "limits", "nodes", "root", "stack", "tags", "typed")
+
+    def __init__(self, text: str, limits: Limits, tags: tuple[str, ...], typed: bool) -> None:
+        self.limits, self.tags, self.typed = limits, tags, typed
+        self.budget = UNFOLD_FREE + UNFOLD_TIMES * len(text)
+        self.root: list[Any] = []
+        self.stack: list[list[Any]] = [[self.root, None, False, 0, None, None]]
+        self.anchors: dict[str, list[tuple[Any, int]]] = {}
+        self.nodes = self.documents = 0
+
+    def take(self, event: Any) -> None:
+        """The next event. ValueError where it cannot be stored; TooLarge."""
+        kind = type(event)
+        anchor: list[tuple[Any, int]] | None = None
+        if kind is yaml.ScalarEvent:
+            self.nodes += 1
+            if event.anchor is not None:
+                anchor = self.anchors[event.anchor] = []
+            value = self._scalar(event)
+            weight = 8 + len(event.value)
+        elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
+            self._open(event, kind is yaml.MappingStartEvent)
+            return
+        elif kind is yaml.MappingEndEvent or kind is yaml.SequenceEndEvent:
+            value, _, _, weight, anchor, tag = self.stack.pop()
+            if tag is not None:
+                value = Tagged(tag, value)
+        elif kind is yaml.AliasEvent:
+            value, weight = self._alias(event)
+        else:
+            if kind is yaml.DocumentStartEvent:
+                self._begin_document(event)
+            return
+        if self.nodes > self.limits.yaml_nodes:
+            raise yaml_error(f"more than {self.limits.yaml_nodes} nodes", event.start_mark.line, TooLarge)
+        if anchor is not None:
+            anchor.append((value, weight))
+        self._add(value, weight)
+
+    def _scalar(self, event: Any) -> Any:
+        literal: str = event.value
+        top = self.stack[-1]
+        plain = event.implicit[0]
+        if top[2] and top[1] is None and (event.tag is None or event.tag == "!"):
+            if plain and literal == "<<":
+                raise ValueError("merge keys (<<) are not supported; write the keys out")
+            return literal
+        if event.tag is not None:
+            return _tagged_scalar(event.tag, literal)
+        if self.typed:
+            return scalar(literal) if plain else literal
+        return PlainScalar(literal) if plain else literal
+
+    def _open(self, event: Any, is_mapping: bool) -> None:
+        self.nodes += 1
+        tag = None
+        if event.tag not in (None, "!", TAG + ("map" if is_mapping else "seq")):
+            if not event.tag.startswith(self.tags):
+                raise ValueError(f"the tag {event.tag[:80]} is not supported")
+            tag = event.tag
+        stack = self.stack
+        if stack[-1][2] and stack[-1][1] is None:
+            raise ValueError("a key must be a text, not a collection")
+        if len(stack) > self.limits.yaml_depth:
+            raise ValueError(f"nested deeper than {self.limits.yaml_depth} levels")
+        anchor: list[tuple[Any, int]] | None = None
+        if event.anchor is not None:
+            anchor = self.anchors[event.anchor] = []
+        stack.append([{} if is_mapping else [], None, is_mapping, 8, anchor, tag])
+
+    def _alias(self, event: Any) -> tuple[Any, int]:
+        if event.anchor not in self.anchors:
+            raise ValueError(f"the alias *{event.anchor[:80]} has no anchor before it")
+        if not self.anchors[event.anchor]:
+            raise ValueError(f"the alias *{event.anchor[:80]} stands inside its own anchor")
+        value, weight = self.anchors[event.anchor][0]
+        self.nodes += 1
+        self.budget -= weight
+        if self.budget < 0:
+            reason = "the aliases unfold to far more than the file holds"
+            raise yaml_error(reason, event.start_mark.line, TooLarge)
+        return value, weight
+
+    def _begin_document(self, event: Any) -> None:
+        self.documents += 1
+        if self.documents > 1:
+            raise ValueError("a second document begins here; only one is read")
+        if event.tags and not set(event.tags.values()) <= set(self.tags):
+            raise ValueError("%TAG directives are not supported" if not self.tags else "an unknown %TAG directive")
+
+    def _add(self, value: Any, weight: int) -> None:
+        """Put a value into the innermost open collection, as a key where one is missing."""
+        top = self.stack[-1]
+        top[3] += weight
+        if not top[2]:
+            top[0].append(value)
+        elif top[1] is None:
+            if not isinstance(value, str):
+                raise ValueError("a key must be a text")
+            if value in top[0]:
+                raise ValueError(f"the key {value[:80]!r} stands twice in one mapping")
+            top[1] = value
+        else:
+            top[0][top[1]] = value
+            top[1] = None
