@@ -22,7 +22,7 @@ run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
 
 test: install-dev
-	@$(BIN)/python -m pytest -n auto $(ARGS)
+	@$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
 
 lint: install-dev
 	$(BIN)/ruff check .

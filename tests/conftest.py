@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import os
@@ -34,6 +35,7 @@ def pytest_configure(config: pytest.Config) -> None:
     as well; it spares each worker half a minute. Native code: servers take the folder of the user, as the processes of
     the tests do, not one in each data folder.
     """
+    gc.set_threshold(10_000, 10, 10)  # by default looking for garbage is a third of reading a large document
     if hasattr(config, "workerinput"):  # of pytest-xdist: it has the environment of the process that started it
         return
     if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and "PYTHONPYCACHEPREFIX" not in os.environ:
@@ -44,6 +46,12 @@ def pytest_configure(config: pytest.Config) -> None:
         process = subprocess.Popen([sys.executable, "-c", COMPILE], cwd=TOP)
         config.add_cleanup(process.wait)
         config.add_cleanup(process.kill)
+
+
+def pytest_collection_finish() -> None:
+    """What was imported and collected stays: the garbage collector looks at it once and never again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

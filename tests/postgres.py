@@ -71,11 +71,12 @@ class Cluster:
             host="127.0.0.1", port=self.port, user="fleetmap", dbname=database, autocommit=True, connect_timeout=10
         )
 
-    def create_database(self) -> str:
-        """A new, empty database with PostGIS; its name."""
+    def create_database(self, template: str = "fleetmap_template") -> str:
+        """A new database, empty and with PostGIS, or a copy of another one that nobody is connected to; its name."""
         name = f"t{uuid.uuid4().hex}"
         with self.connect() as connection:
-            connection.execute(sql.SQL("CREATE DATABASE {} TEMPLATE fleetmap_template").format(sql.Identifier(name)))
+            names = sql.Identifier(name), sql.Identifier(template)
+            connection.execute(sql.SQL("CREATE DATABASE {} TEMPLATE {}").format(*names))
         return name
 
     def drop_database(self, name: str) -> None:

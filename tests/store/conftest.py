@@ -2,24 +2,64 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from app.store.store import Store
-from tests.postgres import postgres_cluster, postgres_url
+from tests.postgres import Cluster, postgres_cluster, postgres_url
 
 __all__ = ["postgres_cluster", "postgres_url"]
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
-def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty database."""
+DATABASES = ["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)]
+
+
+@pytest.fixture(params=DATABASES)
+def empty_database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A database without a schema."""
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'fleetmap.sqlite'}"
     url: str = request.getfixturevalue("postgres_url")
     return url
+
+
+@pytest.fixture(scope="session")
+def migrated_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An SQLite database with the schema and nothing in it: a copy takes a hundredth of migrating."""
+    folder = tmp_path_factory.mktemp("migrated")
+    migrated(f"sqlite:///{folder / 'fleetmap.sqlite'}", folder)
+    return folder / "fleetmap.sqlite"
+
+
+@pytest.fixture(scope="session")
+def migrated_database(postgres_cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The same in PostgreSQL: a database to make others from."""
+    name = postgres_cluster.create_database()
+    migrated(postgres_cluster.url(name), tmp_path_factory.mktemp("migrated"))
+    return name
+
+
+def migrated(url: str, folder: Path) -> None:
+    store = Store(url, folder / "blobs")
+    store.migrate()
+    store.close()
+
+
+@pytest.fixture(params=DATABASES)
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    """A database with the schema and nothing in it."""
+    if request.param == "sqlite":
+        path = tmp_path / "fleetmap.sqlite"
+        shutil.copyfile(request.getfixturevalue("migrated_file"), path)
+        yield f"sqlite:///{path}"
+        return
+    cluster: Cluster = request.getfixturevalue("postgres_cluster")
+    name = cluster.create_database(request.getfixturevalue("migrated_database"))
+    yield cluster.url(name)
+    cluster.drop_database(name)
 
 
 @pytest.fixture
@@ -32,8 +72,9 @@ def store(database_url: str, tmp_path: Path) -> Iterator[Store]:
 
 
 @pytest.fixture
-def sqlite_store(tmp_path: Path) -> Iterator[Store]:
+def sqlite_store(tmp_path: Path, migrated_file: Path) -> Iterator[Store]:
     """A store on SQLite, for what does not depend on the database."""
+    shutil.copyfile(migrated_file, tmp_path / "only.sqlite")
     new_store = Store(f"sqlite:///{tmp_path / 'only.sqlite'}", tmp_path / "only-blobs")
     new_store.migrate()
     yield new_store

@@ -62,8 +62,8 @@ def test_robots_of_before_are_vouched_for(store: Store, database_url: str):
     assert [r.vouched for r in store.robots("farm")] == [True]
 
 
-def test_check_fails_before_migration(database_url: str, tmp_path: Path):
-    store = Store(database_url, tmp_path / "b")
+def test_check_fails_before_migration(empty_database_url: str, tmp_path: Path):
+    store = Store(empty_database_url, tmp_path / "b")
     with pytest.raises(Unavailable, match="fleetmap migrate"):
         store.check()
     store.close()
@@ -110,9 +110,9 @@ def test_files_of_migrations_tell_the_newest_revision() -> None:
     assert newest() == ScriptDirectory.from_config(config()).get_current_head()
 
 
-def test_of_servers_that_start_together_one_makes_the_administrator(database_url: str, tmp_path: Path) -> None:
+def test_of_servers_that_start_together_one_makes_the_administrator(empty_database_url: str, tmp_path: Path) -> None:
     def start(number: int) -> str | None:
-        store = Store(database_url, tmp_path / "blobs")
+        store = Store(empty_database_url, tmp_path / "blobs")
         try:
             with startup_lock(tmp_path):
                 store.migrate()
@@ -124,7 +124,7 @@ def test_of_servers_that_start_together_one_makes_the_administrator(database_url
     with ThreadPoolExecutor(6) as threads:
         tokens = list(threads.map(start, range(6)))
     assert sum(secret is not None for secret in tokens) == 1
-    store = Store(database_url, tmp_path / "blobs")
+    store = Store(empty_database_url, tmp_path / "blobs")
     assert [token.role for token in store.tokens()] == ["admin"]
     assert store.find_token(next(filter(None, tokens))) is not None
     store.close()
