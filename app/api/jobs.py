@@ -83,7 +83,7 @@ class ConversionJobs:
                 return running.future.result()
             job_id = running.jobs.get(principal.id)
             if job_id is not None:
-                return JobStarted(await run_in_threadpool(self._store.job, job_id))
+                return JobStarted(await run_in_threadpool(self._store.jobs.get, job_id))
             try:
                 return JobStarted(await self._as_job(recipe, running, principal, address))
             except NoRoom:  # nowhere to note a job: the answer waits for the map
@@ -128,8 +128,8 @@ class ConversionJobs:
         label = f"{recipe.format.name} of {recipe.version.environment}, version {recipe.version.number}"
 
         def begin() -> Job:
-            job = self._store.create_job(principal.id, f"making {label}")
-            return self._store.update_job(job.id, state="running")
+            job = self._store.jobs.create(principal.id, f"making {label}")
+            return self._store.jobs.update(job.id, state="running")
 
         job = await run_in_threadpool(begin)
         running.jobs[principal.id] = job.id
@@ -146,21 +146,21 @@ class ConversionJobs:
 
     def _finish_job(self, job: str, error: BaseException | None, label: str, address: str) -> None:
         try:
-            if self._store.job(job).state == "cancelled":
+            if self._store.jobs.get(job).state == "cancelled":
                 return
             if error is None:
                 detail = f"made {label}"
-                self._store.update_job(job, state="done", progress=1.0, detail=detail, result={"location": address})
+                self._store.jobs.update(job, state="done", progress=1.0, detail=detail, result={"location": address})
             else:
-                self._store.update_job(job, state="failed", detail=f"could not make {label}", problem=_problem(error))
+                self._store.jobs.update(job, state="failed", detail=f"could not make {label}", problem=_problem(error))
         except FleetMapError as other:
             log.warning("a job's end could not be noted: %s", other.detail)
 
     def _touch(self, job: str) -> None:
         try:
-            state = self._store.job(job).state
+            state = self._store.jobs.get(job).state
             if state == "running":
-                self._store.update_job(job, state="running")
+                self._store.jobs.update(job, state="running")
             elif state == "cancelled":  # in another process of the server
                 self.cancel(job)
         except FleetMapError as error:
@@ -210,7 +210,7 @@ router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=StrictRoute)
 
 def _require_job_owner(services: ServicesDep, principal: Principal, id: str) -> Job:
     """A job that the caller may see; NotFound for all others, as if there were none."""
-    job = services.store.job(id)
+    job = services.store.jobs.get(id)
     if job.owner != principal.id and not (principal.has_role("admin") and principal.environments is None):
         raise NotFound(f"there is no job {id[:80]!r}")
     return job
@@ -225,7 +225,7 @@ def list_jobs(
 ) -> Response:
     """List the jobs of the own token, newest first; administrators whose token is for all environments see all."""
     every = principal.role == "admin" and principal.environments is None
-    visible_jobs = (job for job in reversed(services.store.jobs()) if every or job.owner == principal.id)
+    visible_jobs = (job for job in reversed(services.store.jobs.all()) if every or job.owner == principal.id)
     bodies = (body for body in map(as_dict, visible_jobs) if state in (None, body["state"]))
     return json_response(list(itertools.islice(bodies, limit)))
 
@@ -245,8 +245,8 @@ def delete_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Respons
     """
     job = _require_job_owner(services, principal, id)
     if as_dict(job)["state"] in ("queued", "running"):
-        services.store.update_job(id, state="cancelled", detail="cancelled")
+        services.store.jobs.update(id, state="cancelled", detail="cancelled")
         services.jobs.cancel(id)  # where another process is at it, that one notices within seconds
     else:
-        services.store.delete_job(id)
+        services.store.jobs.delete(id)
     return Response(status_code=204)

@@ -330,13 +330,13 @@ def resolve_version(services: Services, map_request: MapRequest) -> Version:
     one, else the head.
     """
     if map_request.version is not None:
-        return services.store.channel_target(
+        return services.store.channels.target(
             map_request.environment, parse_version_ref(map_request.version), map_request.closures
         )[0]
     try:
-        return services.store.channel_target(map_request.environment, PRODUCTION, map_request.closures)[0]
+        return services.store.channels.target(map_request.environment, PRODUCTION, map_request.closures)[0]
     except NotFound:
-        return services.store.channel_target(map_request.environment, LATEST, map_request.closures)[0]
+        return services.store.channels.target(map_request.environment, LATEST, map_request.closures)[0]
 
 
 def parse_version_ref(ref: str) -> str | int:
@@ -683,7 +683,7 @@ router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], rou
 @router.get("/maps", responses=problem_responses(list[CoverageOut], 404), summary="Which formats can be had")
 def coverage(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """For every format: whether it can be written as it is, by deriving what lacks, or what to supply."""
-    return json_response(services.maps.coverage(services.store.version(env, parse_version_ref(v))))
+    return json_response(services.maps.coverage(services.store.versions.get(env, parse_version_ref(v))))
 
 
 @router.get(

@@ -96,7 +96,7 @@ async def get_actions(
     """
     reserved_names = {"mapId", "format", "level", "signed", "seconds"}
     values = {name: text for name, text in request.query_params.multi_items() if name not in reserved_names}
-    version = await run_in_threadpool(services.store.version, env, parse_version_ref(v))
+    version = await run_in_threadpool(services.store.versions.get, env, parse_version_ref(v))
     _check_format(format, by_level=level is not None)
     services.links.check_life(seconds)
     maps: list[dict[str, Any]] = []
@@ -236,8 +236,8 @@ def _collect_reports(
     try:
         if not principal.can_access(env):
             raise NotFound("your token does not reach it, or it is none of this server's environments")
-        stored_robot = next(iter(services.store.robots(env, robot)), None)
-        channels = {c.name: c for c in services.store.channels(env)}
+        stored_robot = next(iter(services.store.robots.all(env, robot)), None)
+        channels = {c.name: c for c in services.store.channels.all(env)}
     except NotFound as error:
         out["ignored"] += [{"mapId": floor.map_id, "why": error.detail} for floor in floors]
         return
@@ -289,7 +289,7 @@ def _report(
     try:
         if not (text.isascii() and text.isdigit() and len(text) < 10):
             raise NotFound("its mapVersion is no version's number")
-        version = services.store.version(env, int(text))
+        version = services.store.versions.get(env, int(text))
     except NotFound as error:
         out["ignored"].append({"mapId": map_id, "mapVersion": text, "why": error.detail})
         return []

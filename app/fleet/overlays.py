@@ -50,7 +50,7 @@ def find_edge(store: Store, versions: Iterable[Version], edge: str) -> tuple[Par
         for name, number in names:
             for entry in version.parts:
                 if entry.key.layer == "topology":
-                    for feature in store.get(version, entry.key, [name]):
+                    for feature in store.content.features(version, entry.key, ids=[name]):
                         pieces = shapely.get_num_coordinates(feature.geometry) - 1
                         if feature.properties.get("kind") == "edge" and (not number or number <= pieces > 1):
                             return entry.key, feature

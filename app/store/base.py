@@ -1,11 +1,10 @@
-"""What all parts of the store share: where it is, rows as values, texts that both databases take."""
+"""What all services of the store share: rows as values, names, texts that both databases take."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, Final
 
 from sqlalchemy import Connection, Row, select
@@ -14,9 +13,6 @@ from app.errors import Gone, Invalid, NotFound, Problem
 from app.model.frame import Datum
 from app.model.names import did_you_mean
 from app.store import tables
-from app.store.blobs import Blobs
-from app.store.chunks import Chunks
-from app.store.database import Database
 from app.store.values import LATEST, Environment
 
 ENVIRONMENT_NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
@@ -24,17 +20,6 @@ RESERVED: Final = frozenset({"robots", "server"})
 CHANNEL_NAME: Final = re.compile(r"[a-z][a-z0-9_-]{0,62}")
 
 MAX_TEXT: Final = 64 * 2**10
-
-
-class StoreBase:
-    """One database and one blob folder."""
-
-    database_url: str
-    blob_dir: Path
-    readonly: bool
-    blobs: Blobs
-    _database: Database
-    _chunks: Chunks
 
 
 def utcnow() -> datetime:

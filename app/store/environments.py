@@ -18,7 +18,6 @@ from app.model.templates import NO_TEMPLATES, template_changes
 from app.store import outbox, tables
 from app.store.area import area_after
 from app.store.base import (
-    StoreBase,
     as_environment,
     check_environment_name,
     check_tags,
@@ -27,20 +26,24 @@ from app.store.base import (
     utcnow,
 )
 from app.store.changes import KEEP
+from app.store.chunks import Chunks
+from app.store.database import Database
 from app.store.index import intersects
 from app.store.manifest import read_version
 from app.store.prepare import frame_changes, summarise, version_root
-from app.store.tree import ChunkStage
 from app.store.values import Box, Environment, Version
 from app.store.versions import insert_version
 
 PAGE: Final = 500
 
 
-class Environments(StoreBase):
+class Environments:
     """The mapped places."""
 
-    def create_environment(
+    def __init__(self, database: Database, chunks: Chunks) -> None:
+        self._database, self._chunks = database, chunks
+
+    def create(
         self,
         name: str,
         *,
@@ -60,7 +63,7 @@ class Environments(StoreBase):
         empty = version_root((), None, (Level(),))
         changes = self._initial_changes(datum, clone)
         area = area_after(
-            ChunkStage(self._chunks), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
+            self._chunks.stage(), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
         )
         now = utcnow()
         with self._database.write() as connection:
@@ -149,17 +152,17 @@ class Environments(StoreBase):
     def _initial_changes(self, datum: Datum | None, clone: Version | None) -> dict[str, Any]:
         changes: dict[str, Any] = {}
         if clone is not None:
-            changes, _ = summarise(ChunkStage(self._chunks), {}, {e.key: e for e in clone.parts})
+            changes, _ = summarise(self._chunks.stage(), {}, {e.key: e for e in clone.parts})
         place = datum or (clone.datum if clone else None)
         changes |= template_changes(NO_TEMPLATES, clone.templates if clone else NO_TEMPLATES)
         return changes | frame_changes(None, place, (Level(),), clone.levels if clone else (Level(),))
 
-    def environment(self, name: str, *, deleted: bool = False) -> Environment:
+    def get(self, name: str, *, deleted: bool = False) -> Environment:
         """The environment; Gone where it is deleted (unless asked for), NotFound where it never was."""
         with self._database.read() as connection:
             return as_environment(environment_row(connection, name, deleted=deleted))
 
-    def environments(
+    def page(
         self,
         *,
         q: str | None = None,
@@ -192,7 +195,7 @@ class Environments(StoreBase):
                 after = rows[-1].name
         return out[:limit], out[limit - 1].name if len(out) > limit else None
 
-    def update_environment(
+    def update(
         self,
         name: str,
         *,
@@ -248,11 +251,11 @@ class Environments(StoreBase):
                 message="renamed",  # to which name is not for everybody who may see one of them
             )
 
-    def delete_environment(self, name: str, author: str = "") -> Environment:
+    def delete(self, name: str, author: str = "") -> Environment:
         """Recoverable until purged; the name stays taken."""
         return self._mark(name, author, deleted=True)
 
-    def restore_environment(self, name: str, author: str = "") -> Environment:
+    def restore(self, name: str, author: str = "") -> Environment:
         """Undo a deletion; Conflict where it is not deleted."""
         return self._mark(name, author, deleted=False)
 
@@ -274,7 +277,7 @@ class Environments(StoreBase):
             _append_event(connection, row, kind, sequence=sequence, name=name, author=author, time=now, message=message)
             return as_environment(environment_row(connection, name, deleted=True))
 
-    def purge_environment(self, name: str) -> None:
+    def purge(self, name: str) -> None:
         """Remove a deleted environment for good; Conflict where it is not deleted. Its chunks and files go with the
         next collection, its events stay in the log until they were surely read.
         """
@@ -368,7 +371,7 @@ def _retire(connection: Connection, name: str, sequence: int) -> None:
 
 
 def filters(*, q: str | None, bbox: Box | None, deleted: bool, dialect: str) -> list[ColumnElement[bool]]:
-    """The conditions on an environment's row that ``environments`` describes."""
+    """The conditions on an environment's row that ``Environments.page`` describes."""
     table = tables.environment
     out: list[ColumnElement[bool]] = [table.c.deleted.is_not(None) if deleted else table.c.deleted.is_(None)]
     if q:

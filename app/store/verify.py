@@ -60,6 +60,11 @@ class VerifyResult:
     findings: list[Finding] = field(default_factory=list)
     started: float = field(default_factory=time.time)
 
+    @property
+    def unused_chunks(self) -> list[str]:
+        """The damaged chunks that no version has, to be removed when all others are healed."""
+        return [f.name for f in self.findings if f.kind == "chunk" and not f.versions]
+
 
 @dataclass(frozen=True, slots=True)
 class _PartReferences:

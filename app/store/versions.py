@@ -16,7 +16,6 @@ from app.store import chunks, index, outbox, parts, tables
 from app.store.area import area_after, write_area
 from app.store.audit import skip_audit
 from app.store.base import (
-    StoreBase,
     checked_text,
     clean_problem,
     environment_row,
@@ -24,11 +23,13 @@ from app.store.base import (
     storable_text,
     utcnow,
 )
+from app.store.blobs import Blobs
 from app.store.changes import KEEP, Changes, Keep, Prepared
+from app.store.chunks import Chunks
+from app.store.database import Database
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
 from app.store.prepare import frame_changes, prepare, summarise
-from app.store.tree import ChunkStage
 from app.store.values import LATEST, Area, Idempotency, PartEntry, Source, Version
 
 MAX_REVERT_ATTEMPTS: Final = 8
@@ -157,16 +158,19 @@ def lock_blobs(connection: Connection, hashes: set[str]) -> None:
         connection.execute(update(tables.blob).where(tables.blob.c.sha256.in_(batch)).values(used=now))
 
 
-class Versions(StoreBase):
+class Versions:
     """Versions of environments."""
 
-    def version(self, environment: str, ref: str | int = LATEST) -> Version:
+    def __init__(self, database: Database, chunks: Chunks, blobs: Blobs) -> None:
+        self._database, self._chunks, self._blobs = database, chunks, blobs
+
+    def get(self, environment: str, ref: str | int = LATEST) -> Version:
         """A version by number, channel or ``latest``; NotFound, or Gone where the environment is deleted."""
         with self._database.read() as connection:
             row = environment_row(connection, environment)
             return read_version(connection, row, resolve(connection, row, ref))
 
-    def versions(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
+    def page(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
         """Newest first; ``before``: only those with a smaller number."""
         table = tables.version
         with self._database.read() as connection:
@@ -178,17 +182,24 @@ class Versions(StoreBase):
             sources = read_sources(connection, row.id, [r.number for r in rows])
         return [as_version(row.name, r, sources[r.number]) for r in rows]
 
+    def get_with_base(self, environment: str, number: int) -> tuple[Version, Version | None]:
+        """A version, also of a deleted environment, and the one before it."""
+        with self._database.read() as connection:
+            row = environment_row(connection, environment, deleted=True)
+            base = read_version(connection, row, number - 1) if number else None
+            return read_version(connection, row, number), base
+
     def prepare(self, base: Version, changes: Changes) -> Prepared:
         """Work out a version on top of a base. Reads and computes only, so it may run in another process.
 
         Raises Invalid where something cannot be stored, NotFound where something to delete is not there.
         """
-        return prepare(ChunkStage(self._chunks), base, changes, self._is_intact)
+        return prepare(self._chunks.stage(), base, changes, self._is_intact)
 
     def _is_intact(self, part: str) -> bool:
         """Whether the database has all chunks of a part, whatever is in memory."""
         try:
-            names, _ = parts.all_chunks(ChunkStage(self._chunks), bytes.fromhex(part), ())
+            names, _ = parts.all_chunks(self._chunks.stage(), bytes.fromhex(part), ())
         except Damaged:
             return False
         return not self._chunks.find_damaged(sorted(names))
@@ -213,7 +224,7 @@ class Versions(StoreBase):
         checked_text(author, "an author")
         checked_text(message, "a message")
         if prepared.blobs:
-            self.blobs.put_many(list(prepared.blobs.values()))
+            self._blobs.put_many(list(prepared.blobs.values()))
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
             previous_number = _previous_version(connection, row, idempotency)
@@ -294,8 +305,8 @@ class Versions(StoreBase):
         expected: StaleParent where the head is another one; without it the head may move meanwhile.
         """
         for attempt in range(MAX_REVERT_ATTEMPTS):
-            target = self.version(environment, to)
-            head = self.version(environment)
+            target = self.get(environment, to)
+            head = self.get(environment)
             if expected is not None and head.number != expected:
                 record = self.idempotent(environment, idempotency.key) if idempotency else None
                 if record is None:
@@ -318,9 +329,9 @@ class Versions(StoreBase):
         changes: dict[str, Any] = {}
         area: Area | Literal[Keep.KEEP] | None = KEEP
         if changed:
-            area = area_after(ChunkStage(self._chunks), head.parts, target.parts, head.datum, target.datum)
+            area = area_after(self._chunks.stage(), head.parts, target.parts, head.datum, target.datum)
             before, after = {e.key: e for e in head.parts}, {e.key: e for e in target.parts}
-            changes, _ = summarise(ChunkStage(self._chunks), before, after)
+            changes, _ = summarise(self._chunks.stage(), before, after)
             changes |= frame_changes(head.datum, target.datum, head.levels, target.levels)
             changes |= template_changes(head.templates, target.templates)
         contents = (target.parts, target.datum, target.levels, target.templates)

@@ -16,6 +16,7 @@ from app.api import channels, maps
 from app.api.auth import Authenticator
 from app.api.single_flight import SingleFlight
 from app.errors import NotFound, Unavailable
+from app.store.channels import Channels
 from app.store.database import Database
 from app.store.store import Store
 from tests.api import samples
@@ -195,7 +196,7 @@ def test_one_look_for_a_fleet_but_none_for_strangers(api: Api, farm: str, monkey
     api.upload(farm, network("next"))
     robots = [api.token_for("robot", robot=f"r{k}", environments=farm) for k in range(6)]
     stranger = api.token_for("viewer", environments="other-*")
-    monkeypatch.setattr(Store, "channel_target", slow)
+    monkeypatch.setattr(Channels, "target", slow)
     with at_once(8) as ask:
         futures = [ask(robot.get, path) for robot in robots]
         assert gate.reached.wait(20)

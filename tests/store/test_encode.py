@@ -138,6 +138,6 @@ def test_adversarial_ids_are_told(sqlite_store: Store):
     shape = shapely.Point(1, 2)
     cell = encode.z_cells(encode.bounds(np.array([shape])), np.array([True])).astype(">u8").tobytes()
     chosen = [i for i in (f"i{k}" for k in range(60_000)) if tree.ends_node(cell + i.encode(), 0, 6)]
-    sqlite_store.create_environment("farm")
+    sqlite_store.environments.create("farm")
     with pytest.raises(Invalid, match="Use other ids"):
         save(sqlite_store, "farm", Replace(TOPOLOGY, features([(i, shape, {}) for i in chosen], "local")))
