@@ -14,7 +14,8 @@ from app.model.templates import template_changes
 from app.store import diff, parts
 from app.store.blobs import Blobs
 from app.store.chunks import Chunks
-from app.store.parts import PartRoot
+from app.store.parts.features import features_from_items, features_in_box, find_places, items_by_id
+from app.store.parts.roots import PartRoot, read_document
 from app.store.prepare import differing_keys, frame_changes, part_names, read_roots
 from app.store.tree import ChunkStage
 from app.store.values import Box, Delta, FeatureDelta, GridDelta, Version
@@ -63,21 +64,21 @@ class ContentReader:
             assert isinstance(loaded, Features)
             return loaded
         if bbox is None:
-            items = parts.items_by_id(draft, root, ids or ())
+            items = items_by_id(draft, root, ids or ())
         else:
             frame = None if version.datum is None else local_frame(version.datum)
-            items = parts.features_in_box(draft, root, bbox, crs, frame)
+            items = features_in_box(draft, root, bbox, crs, frame)
             if ids is not None:
                 selected_ids = set(ids)
                 items = {i: item for i, item in items.items() if i in selected_ids}
-        return parts.features_from_items(items, parts.read_document(draft, root))
+        return features_from_items(items, read_document(draft, root))
 
     def has_ids(self, version: Version, key: PartKey, ids: Collection[str]) -> set[str]:
         """Those of the ids that the part has; none where there is no such part."""
         if version.part(key) is None:
             return set()
         draft = self._chunks.stage()
-        return set(parts.find_places(draft, self._root(draft, version, key), sorted(set(ids))))
+        return set(find_places(draft, self._root(draft, version, key), sorted(set(ids))))
 
     def _root(self, draft: ChunkStage, version: Version, key: PartKey) -> PartRoot:
         if key.layer not in VECTOR_LAYERS:
@@ -125,8 +126,8 @@ class ContentReader:
             if key.layer in VECTOR_LAYERS:
                 changed = diff.features(draft, old, new)
                 items = {i: changed.after[i] for i in (*changed.added, *changed.changed)}
-                document = parts.read_document(draft, new) if new is not None and changed.document else {}
-                features.append(FeatureDelta(key, parts.features_from_items(items, document), tuple(changed.deleted)))
+                document = read_document(draft, new) if new is not None and changed.document else {}
+                features.append(FeatureDelta(key, features_from_items(items, document), tuple(changed.deleted)))
             elif key.layer == "occupancy":
                 grids.append(_grid_delta(draft, key, old, new))
             else:

@@ -31,7 +31,7 @@ from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.extent import geometry as to_geometry
 from app.store.manifest import read_version
-from app.store.parts import split_box
+from app.store.parts.boxes import split_box
 from app.store.prepare import differing_keys, index_rows, read_roots
 from app.store.values import Box, FeatureHit, PartEntry, Version
 
