@@ -18,7 +18,8 @@ from app.api.dependencies import Services, ServicesDep
 from app.api.responses import StrictRoute, json_bytes, json_response
 from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, problem_responses
 from app.errors import Invalid, Problem
-from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
+from app.store.fleet_values import Channel, Robot, Rollout
+from app.store.values import LATEST, rfc3339
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
 """A time that is past by less may lie ahead by the clock of whoever asks: the channel moves at once."""

@@ -35,7 +35,8 @@ from app.fleet import live, overlays
 from app.ingest.edits import parse_geometry
 from app.model.closures import Closures
 from app.model.frame import GROUND
-from app.store.values import Overlay, Version
+from app.store.fleet_values import Overlay
+from app.store.values import Version
 
 MAX_POINTS = 1000
 """Maximum number of points of a reported polygon: it goes to every robot in an event."""

@@ -28,7 +28,8 @@ from app.api.schemas import (
 )
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.audit import set_audit_target
-from app.store.values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport, rfc3339
+from app.store.fleet_values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport
+from app.store.values import rfc3339
 
 router = APIRouter(prefix="/robots", tags=["robots"], route_class=StrictRoute)
 

@@ -30,7 +30,8 @@ from app.api.schemas import (
 )
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
-from app.store.values import Channel, RobotReport, RobotState, Version
+from app.store.fleet_values import Channel, RobotReport, RobotState
+from app.store.values import Version
 
 router = APIRouter(tags=["vda5050"], route_class=StrictRoute)
 

@@ -13,8 +13,9 @@ from app.model import bends
 from app.model.closures import zone_id
 from app.model.features import Feature
 from app.model.layers import PartKey
+from app.store.fleet_values import Overlay
 from app.store.store import Store
-from app.store.values import Overlay, Version
+from app.store.values import Version
 
 BLOCKED, UNTIL = "blocked", "blocked_until"
 

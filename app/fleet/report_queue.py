@@ -18,8 +18,8 @@ from datetime import UTC, datetime
 from app.errors import FleetMapError, Invalid, Unavailable
 from app.events.messages import ROBOT_NAME, RobotStatus
 from app.store.base import ENVIRONMENT_NAME
+from app.store.fleet_values import ReceivedReport, RobotReport
 from app.store.store import Store
-from app.store.values import ReceivedReport, RobotReport
 
 log = logging.getLogger(__name__)
 

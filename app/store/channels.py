@@ -14,11 +14,7 @@ from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
 from app.store.base import CHANNEL_NAME, checked_text, environment_row, nearest_channel, utcnow
 from app.store.database import Database
-from app.store.manifest import read_version
-from app.store.overlays import CHANGE_CLOSURES, read_closures
-from app.store.robots import channel_robots
-from app.store.values import (
-    LATEST,
+from app.store.fleet_values import (
     OPEN_ROLLOUTS,
     Channel,
     ChannelMove,
@@ -27,9 +23,11 @@ from app.store.values import (
     Rollout,
     RolloutState,
     RolloutStep,
-    Version,
-    rfc3339,
 )
+from app.store.manifest import read_version
+from app.store.overlays import CHANGE_CLOSURES, read_closures
+from app.store.robots import channel_robots
+from app.store.values import LATEST, Version, rfc3339
 
 _NO_PLAN: Final[Mapping[str, None]] = {"planned_version": None, "planned_at": None, "planned_author": None}
 

@@ -23,7 +23,7 @@ from app.model.closures import Closures
 from app.store import outbox, tables
 from app.store.base import checked_text, environment_row
 from app.store.database import Database
-from app.store.values import Overlay, OverlayState
+from app.store.fleet_values import Overlay, OverlayState
 
 MAX_PENDING: Final = 1000
 """Maximum number of an environment's overlays that wait for a decision."""

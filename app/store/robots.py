@@ -14,7 +14,7 @@ from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
 from app.store.base import environment_row, storable_text
 from app.store.database import Database
-from app.store.values import NO_ROOT, ActiveMap, ReceivedReport, Robot, RobotReport
+from app.store.fleet_values import NO_ROOT, ActiveMap, ReceivedReport, Robot, RobotReport
 
 HISTORY: Final = 200
 """So many reports of each robot in each environment are kept."""

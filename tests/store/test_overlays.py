@@ -11,8 +11,8 @@ import pytest
 from app.errors import Conflict, NotFound
 from app.model.closures import NO_CLOSURES
 from app.store import overlays
+from app.store.fleet_values import Overlay
 from app.store.store import Store
-from app.store.values import Overlay
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 SQUARE = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1.5], [0, 0]]]}

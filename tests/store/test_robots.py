@@ -13,8 +13,8 @@ from app.errors import Conflict, NotFound
 from app.fleet import channel_convergence, is_online, robot_lag
 from app.store import robots
 from app.store.changes import Replace
+from app.store.fleet_values import NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, RobotReport
 from app.store.store import Store
-from app.store.values import NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, RobotReport
 from tests.store.samples import DATUM, GRID, grid, save
 
 NOW = datetime(2031, 5, 1, 14, 0, tzinfo=UTC)

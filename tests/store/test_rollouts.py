@@ -9,8 +9,8 @@ import pytest
 
 from app.fleet import next_step
 from app.store.changes import Replace
+from app.store.fleet_values import Channel, ReceivedReport, Robot, RobotReport, Rollout
 from app.store.store import Store
-from app.store.values import Channel, ReceivedReport, Robot, RobotReport, Rollout
 from tests.store.samples import GRID, grid, save
 
 

@@ -16,10 +16,10 @@ from alembic.script import ScriptDirectory
 from app.errors import Unavailable
 from app.main import startup_lock
 from app.store.database import Database
+from app.store.fleet_values import ReceivedReport, RobotReport
 from app.store.schema import comparison, config, newest
 from app.store.store import Store
 from app.store.tables import metadata
-from app.store.values import ReceivedReport, RobotReport
 
 
 def test_models_and_migrations_do_not_differ(store: Store, database_url: str):
