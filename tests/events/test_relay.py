@@ -190,7 +190,7 @@ class Deaf:
     def __init__(self) -> None:
         self.put: list[int] = []
 
-    def tend(self) -> bool:
+    def ensure_connected(self) -> bool:
         return True
 
     def publish(self, _: str, body: Any) -> None:
