@@ -65,7 +65,7 @@ def test_authority_of_one_report_lasts(farm: Store):
 
     open_bus = {"vouched": False}
     reported_at = NOW
-    first, second = heard("r1", 0, A, said=reported_at), heard("r1", 1, B, "ready", said=reported_at)
+    first, second = heard("r1", 0, A, reported_at=reported_at), heard("r1", 1, B, "ready", reported_at=reported_at)
     farm.robots.note_reports(
         [replace(first, **open_bus), replace(second, **open_bus), replace(heard("r2", 0), **open_bus)]
     )
@@ -82,7 +82,7 @@ def test_authority_of_one_report_lasts(farm: Store):
 
 def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
     reported_at = NOW - timedelta(hours=5)
-    assert farm.robots.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, said=reported_at)]) == [None]
+    assert farm.robots.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, reported_at=reported_at)]) == [None]
     (robot,) = farm.robots.all("farm")
     assert robot.report == RobotReport("production", 1, A, "active", "ok\ufffd", 4, reported_at)
     assert (robot.environment, robot.robot, robot.time, robot.since) == ("farm", "r1", NOW, NOW)
@@ -105,8 +105,8 @@ def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
 
 
 def test_a_report_that_comes_twice_counts_once(farm: Store):
-    first = heard("r1", 0, B, "downloading", said=NOW)
-    second = heard("r1", 0, B, "ready", said=NOW + timedelta(seconds=1), detail="x")
+    first = heard("r1", 0, B, "downloading", reported_at=NOW)
+    second = heard("r1", 0, B, "ready", reported_at=NOW + timedelta(seconds=1), detail="x")
     farm.robots.note_reports([first, second, replace(first, time=NOW + timedelta(minutes=1)), second])
     assert [r.state for _, r in farm.robots.history("farm", "r1")] == ["ready", "downloading"]
     (robot,) = farm.robots.all("farm")
@@ -114,7 +114,7 @@ def test_a_report_that_comes_twice_counts_once(farm: Store):
     farm.robots.note_reports([replace(first, time=NOW + timedelta(minutes=1))])
     (robot,) = farm.robots.all("farm")
     assert (robot.report.state, robot.time) == ("ready", NOW + timedelta(minutes=1))
-    farm.robots.note_reports([heard("r1", 2, B, "downloading", said=NOW + timedelta(seconds=2))])
+    farm.robots.note_reports([heard("r1", 2, B, "downloading", reported_at=NOW + timedelta(seconds=2))])
     assert farm.robots.all("farm")[0].report.state == "downloading"
 
 
