@@ -47,13 +47,13 @@ from tests.store.samples import TOPOLOGY, GRID, network, grid
 store = Store(sys.argv[1], Path(sys.argv[2]))
 print("ready", flush=True)
 for n in range(1000):
-    head = store.version("farm")
+    head = store.versions.get("farm")
     data = b"upload %d" % head.number + bytes(100_000)
     files = store.blobs.put_many([data, b"small %d" % n, b"other %d" % n])
     operations = (Replace(TOPOLOGY, network(400, seed=head.number)), Replace(GRID, grid(seed=head.number)))
-    prepared = store.prepare(head, Changes(operations))
+    prepared = store.versions.prepare(head, Changes(operations))
     sources = [Source(f"f{k}", 1, sha) for k, sha in enumerate(files)]
-    made = store.commit("farm", prepared, author="child", message=str(head.number), sources=sources)
+    made = store.versions.commit("farm", prepared, author="child", message=str(head.number), sources=sources)
     print("committed", made.number, made.root, flush=True)
 """
 
