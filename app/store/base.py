@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, select
+from sqlalchemy import Connection, Row, Table, select
+from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import Gone, Invalid, NotFound, Problem
 from app.model.frame import Datum
@@ -57,6 +58,13 @@ def check_environment_name(name: str) -> str:
             "letter or digit; 'robots' and 'server' are taken"
         )
     return name
+
+
+def upsert(connection: Connection, table: Table, keys: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Insert a row, or give these values to the row that has the keys."""
+    make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
+    statement = make(table).values(**keys, **values)
+    connection.execute(statement.on_conflict_do_update(index_elements=list(keys), set_=dict(values)))
 
 
 def environment_row(connection: Connection, name: str, *, lock: bool = False, deleted: bool = False) -> Row[Any]:

@@ -10,7 +10,6 @@ from fnmatch import fnmatchcase
 from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Row, Text, cast, delete, func, insert, or_, select, update
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 
 from app.errors import Conflict, Invalid
@@ -25,6 +24,7 @@ from app.store.base import (
     check_tags,
     checked_text,
     environment_row,
+    upsert,
     utcnow,
 )
 from app.store.changes import KEEP
@@ -317,11 +317,7 @@ def _append_event(
 
 def _retire(connection: Connection, name: str, sequence: int) -> None:
     """Remember the last sequence told under a name."""
-    make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
-    statement = make(tables.retired).values(name=name, sequence=sequence)
-    connection.execute(
-        statement.on_conflict_do_update(index_elements=["name"], set_={"sequence": statement.excluded.sequence})
-    )
+    upsert(connection, tables.retired, {"name": name}, {"sequence": sequence})
 
 
 def filters(*, q: str | None, bbox: Box | None, deleted: bool, dialect: str) -> list[ColumnElement[bool]]:

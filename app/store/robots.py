@@ -8,11 +8,10 @@ from fnmatch import fnmatchcase
 from typing import Any, Final
 
 from sqlalchemy import Connection, Row, Select, delete, func, insert, select, tuple_, update
-from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
-from app.store.base import environment_row, storable_text
+from app.store.base import environment_row, storable_text, upsert
 from app.store.database import Database
 from app.store.fleet_values import NO_ROOT, ActiveMap, ReceivedReport, Robot, RobotReport
 
@@ -129,19 +128,12 @@ class Robots:
         table = tables.presence
         with self._database.write(tell=False, upkeep=True) as connection:
             room = MAX_PRESENT - int(connection.execute(select(func.count()).select_from(table)).scalar_one())
-            make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
             rows = sorted([(name, True) for name in present_robots] + [(name, False) for name in absent_robots])
             for name, is_present in rows:
                 if room < len(rows):  # full: who is known stays known
                     connection.execute(update(table).where(table.c.robot == name).values(there=is_present, time=now))
                     continue
-                statement = make(table).values(robot=name, there=is_present, time=now)
-                connection.execute(
-                    statement.on_conflict_do_update(
-                        index_elements=["robot"],
-                        set_={"there": statement.excluded.there, "time": statement.excluded.time},
-                    )
-                )
+                upsert(connection, table, {"robot": name}, {"there": is_present, "time": now})
 
 
 def _note(connection: Connection, environment_id: str, heard: ReceivedReport) -> FleetMapError | None:
@@ -174,11 +166,8 @@ def _note(connection: Connection, environment_id: str, heard: ReceivedReport) ->
         others = select(func.count()).select_from(table).where(table.c.environment_id == environment_id)
         if connection.execute(others).scalar_one() >= MAX_ROBOTS:
             return Conflict(f"{heard.environment} has {MAX_ROBOTS} robots: remove some that are gone")
-        make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
-        statement = make(table).values(environment_id=environment_id, robot=heard.robot, **values)
-        connection.execute(
-            statement.on_conflict_do_update(index_elements=["environment_id", "robot"], set_=values)  # a race's winner
-        )
+        keys = {"environment_id": environment_id, "robot": heard.robot}
+        upsert(connection, table, keys, values)  # in a race the later one wins
     if not again:
         _remember(connection, environment_id, heard, report_columns)
     return None
