@@ -261,7 +261,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         store, run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes, run_trial=run_trial
     )
     service.cache.on_damage = metrics.cache_damaged.inc
-    access = Authenticator(store.find_token, failures=settings.token_failures, insecure=settings.insecure_no_auth)
+    access = Authenticator(store.tokens.find, failures=settings.token_failures, insecure=settings.insecure_no_auth)
 
     keys, secrets = Keys(settings.data_dir / "keys"), LinkSecrets(settings.data_dir / "keys")
     with contextlib.suppress(OSError):  # created now, since later the disk may be full
@@ -297,7 +297,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         intake=intake,
         metrics=metrics,
         keys=keys,
-        links=SignedLinks(secrets, access, store.environment, int(settings.link_seconds)),
+        links=SignedLinks(secrets, access, store.environments.get, int(settings.link_seconds)),
         deltas=Deltas(service.cache),
         fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
         writability=Writability(store.check_writable, intake.check),
@@ -441,10 +441,10 @@ def _ensure_first_token(store: Store, settings: Settings) -> None:
         text = settings.admin_token.get_secret_value()
         if len(text) < 22:
             log.warning("FLEETMAP_ADMIN_TOKEN is short: anybody could guess it. Use 32 random characters")
-        if store.find_token(text) is None:
+        if store.tokens.find(text) is None:
             with contextlib.suppress(Conflict):  # a server that starts at the same time was quicker
-                store.create_token("administrator", "admin", token=text)
-    elif (token := store.create_administrator()) is not None:
+                store.tokens.create("administrator", "admin", token=text)
+    elif (token := store.tokens.create_administrator()) is not None:
         print(f"administrator's token, shown only this once: {token}", file=sys.stdout, flush=True)
 
 
@@ -470,16 +470,16 @@ async def _run_housekeeping(services: Services) -> None:
         try:
             services.response_cache.flush_counters()
             newest = _note_time(newest)
-            await run_in_threadpool(services.store.end_expired_tokens)
-            await run_in_threadpool(services.store.apply_due_moves, datetime.now(UTC))
-            await run_in_threadpool(services.store.advance_rollouts, datetime.now(UTC), next_step)
-            await run_in_threadpool(services.store.end_due_overlays, datetime.now(UTC))
+            await run_in_threadpool(services.store.tokens.end_expired)
+            await run_in_threadpool(services.store.channels.apply_due_moves, datetime.now(UTC))
+            await run_in_threadpool(services.store.channels.advance_rollouts, datetime.now(UTC), next_step)
+            await run_in_threadpool(services.store.overlays.end_due, datetime.now(UTC))
             if beat >= HEARTBEAT_SECONDS:
                 beat = 0.0
                 await run_in_threadpool(services.jobs.send_heartbeats)
             if datetime.now(UTC) >= collect:
                 collect = datetime.now(UTC) + COLLECT_EVERY
-                await run_in_threadpool(services.store.collect, COLLECT_GRACE)
+                await run_in_threadpool(services.store.garbage.collect, COLLECT_GRACE)
         except FleetMapError as error:
             log.warning("housekeeping waits: %s", error.detail)
         except Exception as error:  # noqa: BLE001  the ticker must outlive a database that is away for a while

@@ -420,7 +420,7 @@ def wrong_clock(folder: Path, times: int) -> Outcome:
             if not good:
                 api.post("environments", {"name": "farm", "datum": DATUM})
             good |= survey(api, number)[2]
-            api.app.state.services.store.collect(timedelta(hours=1))
+            api.app.state.services.store.garbage.collect(timedelta(hours=1))
             api.app.state.services.response_cache._entries.clear()
             out.wrong += wrong(api, good)
             out.lost += lost(api, good)

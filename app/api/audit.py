@@ -64,7 +64,7 @@ def list_audit(
     if cursor is not None and not (cursor.isascii() and cursor.isdigit()):
         raise Invalid("cursor must be taken from the Link header of the page before")
     before = None if cursor is None else int(cursor)
-    entries = services.store.audit(environment=environment, token_id=token_id, before=before, limit=limit + 1)
+    entries = services.store.audit.page(environment=environment, token_id=token_id, before=before, limit=limit + 1)
     more = str(entries[limit - 1].id) if len(entries) > limit else None
     return page_response(request, [as_dict(entry) for entry in entries[:limit]], more)
 

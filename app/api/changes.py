@@ -74,7 +74,10 @@ def get_delta(
     of the grid, row 0 at the bottom, `data` row by row, 0…100 and -1 for unknown. `whole`: the grid's frame is another
     one (or most of a large grid changed): fetch it. `other`: parts that have no delta: fetch what is made of them.
     """
-    new, old = services.store.version(env, parse_version_ref(v)), services.store.version(env, parse_version_ref(since))
+    new, old = (
+        services.store.versions.get(env, parse_version_ref(v)),
+        services.store.versions.get(env, parse_version_ref(since)),
+    )
     anchor: Anchor = crs or ("wgs84" if new.datum else "local")
     seed = json_bytes(["delta", old.root, new.root, old.number, new.number, anchor, env])
     headers = {
@@ -84,7 +87,7 @@ def get_delta(
     }
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
-    delta = services.store.delta_parts(old, new)
+    delta = services.store.content.delta_parts(old, new)
     body = {
         "environment": env,
         "since": {"version": old.number, "root": old.root},
@@ -133,7 +136,7 @@ def _all_features(services: Services, new: Version, changes: Sequence[FeatureDel
         if entry.key.layer in VECTOR_LAYERS:
             delta = out.get(entry.key)
             deleted = delta.deleted if delta is not None else ()
-            out[entry.key] = FeatureDelta(entry.key, services.store.features(new, entry.key), deleted)
+            out[entry.key] = FeatureDelta(entry.key, services.store.content.features(new, entry.key), deleted)
     return [out[key] for key in sorted(out)]
 
 
@@ -143,7 +146,7 @@ def _grid(services: Services, new: Version, change: GridDelta) -> dict[str, Any]
     out |= {"whole": complete, "frame": None, "updates": []}
     if change.deleted:
         return out
-    part = services.store.load(new, [change.key]).parts[change.key]
+    part = services.store.content.load(new, [change.key]).parts[change.key]
     assert isinstance(part, OccupancyGrid)
     out["frame"] = {
         "width": part.width,

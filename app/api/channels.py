@@ -19,7 +19,8 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import StrictRoute, json_bytes, json_response
 from app.api.http.schemas import CHANNEL, ApiTime, EnvironmentPath, RequestModel, problem_responses
 from app.errors import Invalid, Problem
-from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
+from app.store.fleet_values import Channel, Robot, Rollout
+from app.store.values import LATEST, rfc3339
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
 """A time that is past by less may lie ahead by the clock of whoever asks: the channel moves at once."""
@@ -152,7 +153,7 @@ def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> 
 
 
 def _channel_as_json(services: Services, env: str, channel: Channel) -> dict[str, Any]:
-    return as_dict(channel, services.store.robots(env), datetime.now(UTC))
+    return as_dict(channel, services.store.robots.all(env), datetime.now(UTC))
 
 
 @router.get("", responses=problem_responses(list[ChannelOut], 404), summary="All channels")
@@ -183,8 +184,8 @@ async def list_channels(
 
 def _list_response(services: Services, env: str, request: Request, robots: bool) -> tuple[dict[str, str], bytes]:
     generation, now = services.response_cache.generation(), datetime.now(UTC)
-    fleet_of = services.store.robots(env) if robots else None
-    data = json_bytes([as_dict(channel, fleet_of, now) for channel in services.store.channels(env)])
+    fleet_of = services.store.robots.all(env) if robots else None
+    data = json_bytes([as_dict(channel, fleet_of, now) for channel in services.store.channels.all(env)])
     headers = {"etag": f'"{hashlib.sha256(data).hexdigest()[:40]}"', "cache-control": "no-cache"}
     if not robots:  # this is what robots ask for, all of them at once
         services.response_cache.store_response(request, env, headers, data, generation)
@@ -212,8 +213,8 @@ def move_channel(
         if body.activate_at <= datetime.now(UTC) - MAX_CLOCK_SKEW:
             raise _invalid_body_error("activate_at is in the past: leave it out to move now")
     rollout = _rollout(body) if body.rollout is not None else None
-    version = services.store.version(env, body.version).number
-    moved = services.store.set_channel(
+    version = services.store.versions.get(env, body.version).number
+    moved = services.store.channels.move(
         env, channel, version, author=principal.name, activate_at=body.activate_at, rollout=rollout
     )
     return json_response(_channel_as_json(services, env, moved))
@@ -252,5 +253,5 @@ def _invalid_body_error(detail: str, location: str = "body.activate_at") -> Inva
 )
 def cancel_planned(env: EnvironmentPath, channel: ChannelPath, services: ServicesDep, principal: Editor) -> Response:
     """The channel stays where it is."""
-    services.store.cancel_planned(env, channel, principal.name)
+    services.store.channels.cancel_planned(env, channel, principal.name)
     return Response(status_code=204)

@@ -77,22 +77,22 @@ def diff(
     ] = "json",
 ) -> Response:
     """By layer: ids added, changed (with the fields) and deleted; for grids how many cells were freed and blocked."""
-    new = services.store.version(env, parse_version_ref(to or "latest"))
+    new = services.store.versions.get(env, parse_version_ref(to or "latest"))
     if from_ is not None:
-        old = services.store.version(env, parse_version_ref(from_))
+        old = services.store.versions.get(env, parse_version_ref(from_))
     else:
         if new.parent is None:
             raise Invalid("version 0 has no parent to compare with: say 'from'")
-        old = services.store.version(env, new.parent)
+        old = services.store.versions.get(env, new.parent)
     if render == "png":
         return Response(_picture(services, old, new), media_type="image/png")
-    layers = services.store.diff(old, new)
+    layers = services.store.content.diff(old, new)
     return json_response({"from": old.number, "to": new.number, "layers": layers})
 
 
 def _picture(services: Services, old: Version, new: Version) -> bytes:
     """At most 1024 × 1024 pixels around what differs, what stayed in grey, +y (or north) on top."""
-    delta = services.store.delta_parts(old, new)
+    delta = services.store.content.delta_parts(old, new)
     groups: list[tuple[tuple[int, int, int], Features]] = []
     for changed in delta.features:
         deleted, was = (
@@ -124,7 +124,7 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
     crs: Anchor = "wgs84" if degrees else "local"
     for changed in delta.features:
         if new.part(changed.key) is not None:
-            around = services.store.features(new, changed.key, bbox=view.box(), crs=crs)
+            around = services.store.content.features(new, changed.key, bbox=view.box(), crs=crs)
             view.draw(pen, SAME, _shapes(around, frame, degrees))
     for colour, shapes in drawn:
         view.draw(pen, colour, shapes)
@@ -133,7 +133,9 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
 
 def _select_features(services: Services, version: Version, key: PartKey, ids: tuple[str, ...]) -> Features:
     """Those of the features that the version has."""
-    return services.store.get(version, key, ids) if version.part(key) is not None else features((), "local")
+    if version.part(key) is None:
+        return features((), "local")
+    return services.store.content.features(version, key, ids=ids)
 
 
 def _png(image: Image.Image) -> bytes:
@@ -155,7 +157,7 @@ def _grids(
 ) -> tuple[OccupancyGrid | None, OccupancyGrid | None]:
     out: list[OccupancyGrid | None] = []
     for version in (old, new):
-        part = services.store.load(version, [key]).parts[key] if version.part(key) else None
+        part = services.store.content.load(version, [key]).parts[key] if version.part(key) else None
         out.append(part if isinstance(part, OccupancyGrid) else None)
     return out[0], out[1]
 

@@ -184,7 +184,7 @@ def list_environments(
     position = None if contains is None else parse_position(contains)
     box = parse_box(bbox) if bbox is not None else None
     if position is not None:
-        hits, following = services.store.locate(
+        hits, following = services.store.areas.locate(
             *position,
             q=q or None,
             bbox=box,
@@ -194,7 +194,7 @@ def list_environments(
             deleted=deleted,
         )
         return page_response(request, [as_dict(e, match) for e, match in hits], following)
-    items, following = services.store.environments(
+    items, following = services.store.environments.page(
         q=q or None, bbox=box, limit=limit, cursor=cursor, allowed=principal.environments, deleted=deleted
     )
     return page_response(request, [as_dict(e) for e in items], following)
@@ -215,9 +215,9 @@ def create_environment(body: EnvironmentBody, services: ServicesDep, principal: 
         if body.datum is not None:
             raise Invalid("a clone has the datum of what it is cloned from: give datum or clone, and PATCH it later")
         principal.require_environment(body.clone.environment)
-        clone = services.store.version(body.clone.environment, body.clone.version)
+        clone = services.store.versions.get(body.clone.environment, body.clone.version)
     set_audit_target(environment=body.name, target=f"environment {body.name}")
-    environment = services.store.create_environment(
+    environment = services.store.environments.create(
         body.name,
         title=body.title,
         description=body.description,
@@ -234,7 +234,7 @@ def create_environment(body: EnvironmentBody, services: ServicesDep, principal: 
 @router.get("/{env}", responses=problem_responses(EnvironmentOut, 404), summary="One environment")
 def get_environment(env: EnvironmentPath, services: ServicesDep, _: Viewer) -> Response:
     """The environment as it is now; its `ETag` is the head's number, for `If-Match`."""
-    environment = services.store.environment(env)
+    environment = services.store.environments.get(env)
     return json_response(as_dict(environment), headers=_headers(environment))
 
 
@@ -253,7 +253,7 @@ def update_environment(
     if set(given) != {"datum"}:
         principal.require_role("admin")
     if if_match is not None:
-        check_if_match(if_match, services.store.version(env))
+        check_if_match(if_match, services.store.versions.get(env))
     if body.name is not None and body.name != env:
         _check_free(services, body.name, principal)
     warnings: list[Any] = []
@@ -261,7 +261,7 @@ def update_environment(
         outcome = services.ingest.set_datum(env, parse_datum(body.datum), author=principal.name, if_match=if_match)
         warnings = outcome.body.get("warnings", []) if outcome.status == "created" else []
     if set(given) != {"datum"}:
-        environment = services.store.update_environment(
+        environment = services.store.environments.update(
             env,
             new_name=body.name if body.name != env else None,
             title=body.title,
@@ -270,7 +270,7 @@ def update_environment(
             author=principal.name,
         )
     else:
-        environment = services.store.environment(env)
+        environment = services.store.environments.get(env)
     headers = {**_headers(environment), "content-location": api_path("environments", environment.name)}
     return json_response({**as_dict(environment), **({"warnings": warnings} if warnings else {})}, headers=headers)
 
@@ -278,21 +278,21 @@ def update_environment(
 @router.delete("/{env}", status_code=204, responses=problem_responses(None, 404), summary="Delete an environment")
 def delete_environment(env: EnvironmentPath, services: ServicesDep, principal: Admin) -> Response:
     """It can be restored until it is purged; its name stays taken until then."""
-    services.store.delete_environment(env, principal.name)
+    services.store.environments.delete(env, principal.name)
     return Response(status_code=204)
 
 
 @router.post("/{env}/restore", responses=problem_responses(EnvironmentOut, 404, 409), summary="Undo a deletion")
 def restore_environment(env: EnvironmentPath, services: ServicesDep, principal: Admin) -> Response:
     """A deleted environment comes back with all its versions and channels."""
-    environment = services.store.restore_environment(env, principal.name)
+    environment = services.store.environments.restore(env, principal.name)
     return json_response(as_dict(environment), headers=_headers(environment))
 
 
 @router.post("/{env}/purge", status_code=204, responses=problem_responses(None, 404, 409), summary="Remove for good")
 def purge_environment(env: EnvironmentPath, services: ServicesDep, _: Admin) -> Response:
     """Removes a deleted environment with all its versions for good; only then its name is free again."""
-    services.store.purge_environment(env)
+    services.store.environments.purge(env)
     return Response(status_code=204)
 
 
@@ -306,7 +306,7 @@ def _check_free(services: Services, name: str, principal: Principal) -> None:
     principal.require_environment(name)
     _check_name(name)
     try:
-        services.store.environment(name, deleted=True)
+        services.store.environments.get(name, deleted=True)
     except Gone:
         pass
     except NotFound:

@@ -90,7 +90,7 @@ class EventFeed:
 
     def _read(self, environment: str | None, start: int) -> list[StreamEvent]:
         out = []
-        for event in self._services.store.events(environment, start, PAGE):
+        for event in self._services.store.events.page(environment, start, PAGE):
             number = event.sequence if environment is not None else event.position
             out.append(StreamEvent(number, event.environment, _line(event, number)))
         return out
@@ -173,9 +173,13 @@ def _start_position(services: Services, environment: str | None, start: int | No
     miss all that happens until then.
     """
     try:
-        newest = services.store.last_position() if environment is None else services.store.last_sequence(environment)
+        newest = (
+            services.store.events.last_position()
+            if environment is None
+            else services.store.events.last_sequence(environment)
+        )
     except NotFound:
-        if start is None or environment is None or not services.store.events(environment, start, 1):
+        if start is None or environment is None or not services.store.events.page(environment, start, 1):
             raise
         return start
     if start is not None and start > newest:
@@ -275,7 +279,7 @@ def answer_zenoh_query(
         return _locate(services, parameters)
     pieces = rest.split("/")
     if pieces[1:] == ["version"]:
-        version = services.store.version(environment, parse_version_ref(pieces[0]))
+        version = services.store.versions.get(environment, parse_version_ref(pieces[0]))
         _no_parameters(parameters)
         return Reply(orjson.dumps(version.as_dict()), "application/json")
     if len(pieces) < 3 or pieces[1] != "maps":
@@ -285,7 +289,7 @@ def answer_zenoh_query(
     if derive not in ("true", "false"):
         raise Invalid("derive must be true or false", [Problem("true or false", where="derive")])
     mode = closure_mode(values.pop("closures", None))
-    version, _ = services.store.channel_target(environment, parse_version_ref(pieces[0]), mode)
+    version, _ = services.store.channels.target(environment, parse_version_ref(pieces[0]), mode)
     name, file = pieces[2], "/".join(pieces[3:]) or None
     recipe = services.maps.recipe(version, name, values, derive=derive == "true", file=file)
     cached_map = services.maps.get_cached(recipe)
@@ -305,7 +309,7 @@ def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
             "a position needs lat and lon in degrees and nothing else: server/where?lat=53.2687;lon=-0.5244",
             [Problem("lat and lon", where="parameters")],
         )
-    hits, _ = services.store.locate(*parse_position(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
+    hits, _ = services.store.areas.locate(*parse_position(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
     return Reply(orjson.dumps([as_dict(environment, match) for environment, match in hits]), "application/json")
 
 

@@ -39,7 +39,7 @@ router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=StrictRoute)
 
 def _require_job_owner(services: ServicesDep, principal: Principal, id: str) -> Job:
     """A job that the caller may see; NotFound for all others, as if there were none."""
-    job = services.store.job(id)
+    job = services.store.jobs.get(id)
     if job.owner != principal.id and not (principal.has_role("admin") and principal.environments is None):
         raise NotFound(f"there is no job {id[:80]!r}")
     return job
@@ -54,7 +54,7 @@ def list_jobs(
 ) -> Response:
     """List the jobs of the own token, newest first; administrators whose token is for all environments see all."""
     every = principal.role == "admin" and principal.environments is None
-    visible_jobs = (job for job in reversed(services.store.jobs()) if every or job.owner == principal.id)
+    visible_jobs = (job for job in reversed(services.store.jobs.all()) if every or job.owner == principal.id)
     bodies = (body for body in map(job_as_json, visible_jobs) if state in (None, body["state"]))
     return json_response(list(itertools.islice(bodies, limit)))
 
@@ -74,8 +74,8 @@ def delete_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Respons
     """
     job = _require_job_owner(services, principal, id)
     if job_as_json(job)["state"] in ("queued", "running"):
-        services.store.update_job(id, state="cancelled", detail="cancelled")
+        services.store.jobs.update(id, state="cancelled", detail="cancelled")
         services.jobs.cancel(id)  # where another process is at it, that one notices within seconds
     else:
-        services.store.delete_job(id)
+        services.store.jobs.delete(id)
     return Response(status_code=204)

@@ -92,7 +92,7 @@ def entry_dict(entry: PartEntry) -> dict[str, Any]:
 @router.get("", responses=problem_responses(list[LayerOut], 404), summary="What a version holds")
 def list_layers(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """Every part: layer, level and name, how much it holds, where, and where it comes from."""
-    version = services.store.version(env, parse_version_ref(v))
+    version = services.store.versions.get(env, parse_version_ref(v))
     return json_response([entry_dict(entry) for entry in version.parts if entry.key.layer != "resources"])
 
 
@@ -131,7 +131,7 @@ def get_layer(
     `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`; `voxels` are JSON (`counts` in
     smallest voxels, however leaves were merged), or the `.bt` with `Accept: application/octet-stream`.
     """
-    version = services.store.version(env, parse_version_ref(v))
+    version = services.store.versions.get(env, parse_version_ref(v))
     accept = request.headers.get("accept", "*/*")
     seed = [version.root, layer, level, name, bbox, crs, accept]
     etag = f'"{hashlib.sha256(json_bytes(seed)).hexdigest()[:32]}"'
@@ -154,13 +154,13 @@ def get_layer(
             response = _voxels(services, version, key, _local_box(version, bbox, crs), accept)
         elif layer == "occupancy":
             box = _local_box(version, bbox, crs)
-            part = services.store.load(version, [key]).parts[key]
+            part = services.store.content.load(version, [key]).parts[key]
             assert isinstance(part, OccupancyGrid)
             response = _grid(key, part, box, accept)
         elif bbox is not None:
             raise Invalid(f"{layer} cannot be cut to a bbox", [Problem("not for this layer", where="bbox")])
         else:
-            part = services.store.load(version, [key]).parts[key]
+            part = services.store.content.load(version, [key]).parts[key]
             assert isinstance(part, GeoImage)
             response = _picture(key, part, accept)
     for header, value in headers.items():
@@ -186,7 +186,7 @@ def _vector(
     if not keys and (level is not None or name is not None):
         raise _no_such_part_error(version, layer, level, name)
     frame = local_frame(version.datum) if version.datum else None
-    parts = [(key, services.store.features(version, key, bbox=box, crs=crs)) for key in keys]
+    parts = [(key, services.store.content.features(version, key, bbox=box, crs=crs)) for key in keys]
     if frame is None and any(len(part) and bool((part.local != (crs == "local")).any()) for _, part in parts):
         raise _no_datum(version.environment)
     fences = [e for e in version.parts if e.key.layer == "location" and e.count]
@@ -330,7 +330,7 @@ def _voxels(services: Services, version: Version, key: PartKey, box: Box | None,
             options["bbox"] = ",".join(map(repr, column))
         cached_map = services.maps.get_blocking(version, "octomap", options)
         return Response(cached_map.single_file().read(), media_type=kind)
-    part = services.store.load(version, [key]).parts[key]
+    part = services.store.content.load(version, [key]).parts[key]
     assert isinstance(part, VoxelMap)
     if column is not None:
         part = cut_voxels(part, column)

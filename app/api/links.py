@@ -79,13 +79,13 @@ async def create_link(
     link.
     """
     services.links.check_life(body.seconds)
-    version = await run_in_threadpool(services.store.version, env, parse_version_ref(v))
+    version = await run_in_threadpool(services.store.versions.get, env, parse_version_ref(v))
     values = {name: _text(value) for name, value in body.parameters.items()}
     linked = await link_to(services, request, principal, version, body.format, body.file, values, body.seconds)
     if isinstance(linked, JobStarted):
         return job_started_response(linked.job)
     set_audit_target(target=f"link to {body.format} of version {version.number}, until {linked.expires}")
-    await run_in_threadpool(services.store.record_change)
+    await run_in_threadpool(services.store.audit.record_change)
     out = {
         "url": linked.url,
         "expires": linked.expires,
@@ -144,7 +144,7 @@ async def link_to(
         return LinkedFile(base + quote(path, safe="/") + (f"?{query}" if query else ""), None, map_file)
 
     def sign() -> Grant:
-        environment = services.store.environment(version.environment)
+        environment = services.store.environments.get(version.environment)
         return services.links.create(environment, path, values, seconds or services.links.max_seconds, principal)
 
     grant = await run_in_threadpool(sign)

@@ -143,7 +143,7 @@ def rotate_key(services: ServicesDep, _: ServerAdmin) -> Response:
     Signed links get a new secret as well; links that were made before stay valid until they expire.
     """
     try:
-        with services.store.changing():
+        with services.store.audit.changing():
             key = services.keys.rotate()
             services.links.rotate()
     finally:
@@ -252,7 +252,7 @@ def _sign_manifest(
     """
     channel = None if isinstance(parse_version_ref(v), int) else v
     generation = services.response_cache.generation()
-    version, sequence = services.store.channel_target(env, parse_version_ref(v), mode)
+    version, sequence = services.store.channels.target(env, parse_version_ref(v), mode)
     closures = version.closures or NO_CLOSURES
     listed = _list_files(services, version, entries, cached_maps)
     if isinstance(listed, _PendingConversion):
@@ -329,7 +329,7 @@ def _recipe(services: Services, version: Version, entry: _Entry) -> Recipe:
     """Plan the whole site in a format, or what the entry's parameters select of it."""
     values = {**site.whole_site_options(formats.get_format(entry.format)), **entry.values}
     if entry.closures is not None:
-        in_force = version.closures or services.store.closures(version.environment)
+        in_force = version.closures or services.store.overlays.closures(version.environment)
         version = replace(version, closures=in_force.for_mode(entry.closures))
     return services.maps.recipe(version, entry.format, values, derive=entry.derive, listed=True)
 

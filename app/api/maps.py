@@ -326,7 +326,7 @@ router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], rou
 @router.get("/maps", responses=problem_responses(list[CoverageOut], 404), summary="Which formats can be had")
 def coverage(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """For every format: whether it can be written as it is, by deriving what lacks, or what to supply."""
-    return json_response(services.maps.coverage(services.store.version(env, parse_version_ref(v))))
+    return json_response(services.maps.coverage(services.store.versions.get(env, parse_version_ref(v))))
 
 
 @router.get(

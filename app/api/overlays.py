@@ -27,7 +27,8 @@ from app.fleet import live, overlays
 from app.ingest.edits import parse_geometry
 from app.model.closures import Closures
 from app.model.frame import GROUND
-from app.store.values import Overlay, Version
+from app.store.fleet_values import Overlay
+from app.store.values import Version
 
 MAX_POINTS = 1000
 """Maximum number of points of a reported polygon: it goes to every robot in an event."""
@@ -160,7 +161,7 @@ def list_overlays(
     """Oldest first. `pending` waits for a decision, `accepted` is in force on every channel, `expired` was never
     decided on, `ended` is over.
     """
-    return json_response([overlay.as_dict() for overlay in services.store.overlays(env, state)])
+    return json_response([overlay.as_dict() for overlay in services.store.overlays.all(env, state)])
 
 
 @router.post(
@@ -207,7 +208,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
         decided=now if body.state == "accepted" else None,
     )
     _check_place(reported, versions)
-    overlay, new = services.store.add_overlay(reported)
+    overlay, new = services.store.overlays.add(reported)
     return json_response(overlay.as_dict(), 201 if new else 200)
 
 
@@ -241,11 +242,11 @@ def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
 
 def _shown_versions(services: Services, env: str) -> Iterator[Version]:
     """The newest version, then those that channels stand on: robots report from any of them."""
-    head = services.store.version(env)
+    head = services.store.versions.get(env)
     yield head
-    numbers = {channel.version for channel in services.store.channels(env)} - {None, head.number}
+    numbers = {channel.version for channel in services.store.channels.all(env)} - {None, head.number}
     for number in sorted((n for n in numbers if n is not None), reverse=True):
-        yield services.store.version(env, number)
+        yield services.store.versions.get(env, number)
 
 
 def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -266,7 +267,7 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
 def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """Put it in force on every channel until its end: areas become keepout, edges are closed. No version changes."""
     now = datetime.now(UTC)
-    overlay = services.store.overlay(env, id)
+    overlay = services.store.overlays.get(env, id)
     if overlay.state == "pending" and overlay.expires <= now:
         raise Conflict(f"the overlay {id} has expired: report it again")
     if overlay.state == "pending":
@@ -274,13 +275,13 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep,
         if overlay.edge is not None:
             overlays.find_edge(services.store, versions, overlay.edge)
         _check_place(overlay, versions)
-    return json_response(services.store.decide_overlay(env, id, "pending", "accepted", principal.name, now).as_dict())
+    return json_response(services.store.overlays.decide(env, id, "pending", "accepted", principal.name, now).as_dict())
 
 
 @router.post("/{id}/reject", responses=problem_responses(OverlayOut, 404, 409), summary="Reject an overlay")
 def reject_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """It stays in the list, and nothing changes."""
-    decided = services.store.decide_overlay(env, id, "pending", "rejected", principal.name, datetime.now(UTC))
+    decided = services.store.overlays.decide(env, id, "pending", "rejected", principal.name, datetime.now(UTC))
     return json_response(decided.as_dict())
 
 
@@ -288,7 +289,7 @@ def reject_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep,
 def end_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
     """Open the area or edge again, on every channel at once."""
     return json_response(
-        services.store.decide_overlay(env, id, "accepted", "ended", principal.name, datetime.now(UTC)).as_dict()
+        services.store.overlays.decide(env, id, "accepted", "ended", principal.name, datetime.now(UTC)).as_dict()
     )
 
 
@@ -301,7 +302,7 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, p
     """A new version holds it: an area as a keepout zone, an edge with `blocked: true`. The overlay stays in force until
     its end; promote the version before that to keep robots out for good.
     """
-    overlay = services.store.overlay(env, id)
+    overlay = services.store.overlays.get(env, id)
     if overlay.state != "accepted":
         raise Conflict(f"the overlay {id} is {overlay.state}: only accepted ones can be kept")
     obstruction = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
@@ -312,7 +313,7 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, p
         author=principal.name,
     )
     assert outcome.version is not None
-    return json_response(services.store.note_kept_overlay(env, id, outcome.version.number).as_dict())
+    return json_response(services.store.overlays.note_kept(env, id, outcome.version.number).as_dict())
 
 
 # --- ready-made for planners that take closures live ---
@@ -399,10 +400,10 @@ def _as_json(services: Services, env: str, ref: str | None) -> Version:
     refs: list[str | int] = ["production", "latest"] if ref is None else [int(ref) if ref.isdigit() else ref]
     for name in refs[:-1]:
         try:
-            return services.store.channel_target(env, name, "mark")[0]
+            return services.store.channels.target(env, name, "mark")[0]
         except NotFound:
             continue
-    return services.store.channel_target(env, refs[-1], "mark")[0]
+    return services.store.channels.target(env, refs[-1], "mark")[0]
 
 
 async def _files_with_marks(
@@ -410,7 +411,7 @@ async def _files_with_marks(
 ) -> list[dict[str, bytes]] | JobStarted:
     """A map's files twice, with marks: of the closures in force, and of those that ended."""
     shown = await run_in_threadpool(_as_json, services, env, ref)
-    ended = [o for o in await run_in_threadpool(services.store.overlays, env) if o.state == "ended"]
+    ended = [o for o in await run_in_threadpool(services.store.overlays.all, env) if o.state == "ended"]
     out = []
     for closures in (shown.closures, Closures(tuple(o.closure for o in ended), "mark")):
         plan = partial(services.maps.recipe, live.with_closures(shown, closures), name)

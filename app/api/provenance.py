@@ -197,7 +197,7 @@ def _short(text: str, limit: int) -> str:
 )
 def provenance(env: EnvironmentPath, v: VersionPath, request: Request, services: ServicesDep, _: Viewer) -> Response:
     """An SVG picture, or the same as JSON with `Accept: application/json`. What is stale is marked."""
-    version = services.store.version(env, parse_version_ref(v))
+    version = services.store.versions.get(env, parse_version_ref(v))
     lineage = graph(services.maps, version)
     if "application/json" in request.headers.get("accept", ""):
         return json_response({"environment": env, "version": version.number, **lineage})

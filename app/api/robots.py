@@ -19,7 +19,8 @@ from app.api.http.responses import StrictRoute, json_response, page_response
 from app.api.http.schemas import CHANNEL, NAME, ApiTime, Cursor, Limit, RequestModel, problem_responses
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.audit import set_audit_target
-from app.store.values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport, rfc3339
+from app.store.fleet_values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport
+from app.store.values import rfc3339
 
 
 class StatusHoldsBody(RequestModel):
@@ -135,7 +136,7 @@ def list_robots(
     """
     if environment is not None:
         principal.require_environment(environment)
-    robots, following = services.store.robots_page(
+    robots, following = services.store.robots.page(
         environment, channel=channel, limit=limit, cursor=cursor, allowed=principal.environments
     )
     return page_response(request, _robots_as_json(services, robots), following)
@@ -152,7 +153,7 @@ def get_robot(
     """In the environment where it reported last, unless one is named. `history`: newest first, each time that it said
     something new; `environments`: all in which it reported.
     """
-    robots = [r for r in services.store.robots(None, robot) if principal.can_access(r.environment)]
+    robots = [r for r in services.store.robots.all(None, robot) if principal.can_access(r.environment)]
     if environment is not None:
         principal.require_environment(environment)
     chosen = [r for r in robots if environment is None or r.environment == environment]
@@ -160,7 +161,7 @@ def get_robot(
         scope = "" if environment is None else f" in {environment}"
         raise NotFound(f"no robot {robot[:80]!r} has reported{scope}")
     newest = max(chosen, key=lambda r: r.time)
-    history = services.store.robot_history(newest.environment, robot, limit)
+    history = services.store.robots.history(newest.environment, robot, limit)
     body = _only_robot(services, [newest])
     body["environments"] = [r.environment for r in robots]
     body["history"] = [{**_report(report, time), "received": rfc3339(time)} for time, report in history]
@@ -197,7 +198,7 @@ async def put_status(
     if prefer is not None and prefer.strip().lower() == "return=minimal":
         return Response(status_code=204, headers={"preference-applied": "return=minimal"})
     return json_response(
-        await run_in_threadpool(lambda: _only_robot(services, services.store.robots(body.environment, robot)))
+        await run_in_threadpool(lambda: _only_robot(services, services.store.robots.all(body.environment, robot)))
     )
 
 
@@ -213,7 +214,7 @@ def forget_robot(
     """It no longer counts among its channel's robots. It comes back with its next report."""
     principal.require_environment(environment)
     set_audit_target(environment=environment)
-    services.store.forget_robot(environment, robot)
+    services.store.robots.forget(environment, robot)
     return Response(status_code=204)
 
 
@@ -228,7 +229,7 @@ def require_report_permission(principal: Principal, robot: str) -> None:
 def store_report(services: Services, environment: str, robot: str, report: RobotReport) -> dict[str, Any]:
     """Store a report; the robot as it is now."""
     services.fleet.store_report(ReceivedReport(environment, robot, report, datetime.now(UTC)))
-    return _only_robot(services, services.store.robots(environment, robot))
+    return _only_robot(services, services.store.robots.all(environment, robot))
 
 
 def _only_robot(services: Services, robots: Sequence[Robot]) -> dict[str, Any]:
@@ -248,13 +249,13 @@ def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[st
         name = robot.report.channel
         try:
             if robot.environment not in channels:
-                channels[robot.environment] = {c.name: c for c in services.store.channels(robot.environment)}
+                channels[robot.environment] = {c.name: c for c in services.store.channels.all(robot.environment)}
             channel = channels[robot.environment].get(name)
             behind = channel is not None and (
                 robot.held is None or not robot.held.shows(channel.root, channel.closures.digest)
             )
             if behind and (robot.environment, name) not in moves:
-                moves[robot.environment, name] = services.store.moves(robot.environment, name)
+                moves[robot.environment, name] = services.store.channels.moves(robot.environment, name)
         except NotFound:
             continue  # its environment went since
         lag = None

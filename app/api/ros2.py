@@ -34,7 +34,7 @@ def channel_versions(services: Services, chosen: tuple[EnvironmentSelector, ...]
     for name in dict.fromkeys(names):
         for ref in [channel] if channel else [PRODUCTION, LATEST]:
             try:
-                out[name], _ = services.store.channel_target(name, ref)
+                out[name], _ = services.store.channels.target(name, ref)
                 break
             except NotFound:
                 continue
@@ -45,7 +45,7 @@ def _all_names(services: Services) -> list[str]:
     names: list[str] = []
     cursor: str | None = None
     while True:
-        page, cursor = services.store.environments(limit=PAGE, cursor=cursor)
+        page, cursor = services.store.environments.page(limit=PAGE, cursor=cursor)
         names += [environment.name for environment in page]
         if cursor is None:
             return names

@@ -42,7 +42,7 @@ def stored(
         if kind == "blobs" and (size := services.store.blobs.size(sha256)) > IN_MEMORY:
             headers = [(b"content-type", TYPE.encode()), (b"content-length", str(size).encode())]
             return stream_file(services.store.blobs.open(sha256), 0, size, 200, headers)
-        data = services.store.blobs.get(sha256) if kind == "blobs" else services.store.chunk(sha256)
+        data = services.store.blobs.get(sha256) if kind == "blobs" else services.store.chunks.read(sha256)
     except Damaged as error:  # a chunk that was never here is the same as a lost one
         raise NotFound(f"there are no such {kind}: {sha256}") from error
     return Response(data, media_type=TYPE)

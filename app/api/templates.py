@@ -144,7 +144,7 @@ def get_templates(
     A parameter of a request goes before the environment's values, these before the set's, these before the format's
     defaults.
     """
-    stored_version = services.store.version(env, parse_version_ref(version))
+    stored_version = services.store.versions.get(env, parse_version_ref(version))
     fmts = [f for f in formats.all_formats().values() if f.write is not None and templates.has_parameters(f)]
     body = {
         "environment": env,
@@ -197,7 +197,7 @@ def get_format_templates(
     """`values`: the environment's own. `effective`: each parameter's value, and `from`: `environment`, `set NAME` or
     `default`."""
     fmt = templates.check_format(format)
-    stored_version = services.store.version(env, parse_version_ref(version))
+    stored_version = services.store.versions.get(env, parse_version_ref(version))
     body = {"environment": env, "version": stored_version.number, **_line(stored_version.templates, fmt)}
     return json_response(body, headers=version_headers(stored_version))
 

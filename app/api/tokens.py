@@ -82,7 +82,7 @@ def as_dict(token: Token) -> dict[str, Any]:
 @router.get("", responses=problem_responses(list[TokenOut]), summary="All tokens, without their secrets")
 def list_tokens(services: ServicesDep, _: ServerAdmin) -> Response:
     """Oldest first."""
-    return json_response([as_dict(token) for token in services.store.tokens()])
+    return json_response([as_dict(token) for token in services.store.tokens.all()])
 
 
 @router.post(
@@ -104,7 +104,7 @@ def create_token(body: TokenBody, services: ServicesDep, _: ServerAdmin) -> Resp
     if body.robot is not None and body.role != "robot":
         raise Invalid("only a token with the role robot names a robot", [Problem("role is not robot", where="robot")])
     robot = _robot_name(body)
-    token, secret = services.store.create_token(body.name, body.role, body.environments, robot, body.expires)
+    token, secret = services.store.tokens.create(body.name, body.role, body.environments, robot, body.expires)
     return json_response({**as_dict(token), "token": secret}, 201, {"cache-control": "no-store"})
 
 
@@ -126,12 +126,12 @@ def _robot_name(body: TokenBody) -> str | None:
 @router.delete("/{id}", status_code=204, responses=problem_responses(None, 404, 409), summary="Revoke a token")
 def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Response:
     """It is refused from now on (within a second by other worker processes). The last administrator's stays."""
-    tokens = {token.id: token for token in services.store.tokens()}
+    tokens = {token.id: token for token in services.store.tokens.all()}
     if id not in tokens:
         raise NotFound("there is no token with this id")
     if _is_full_admin(tokens[id]) and not any(_is_full_admin(t) for t in tokens.values() if t.id != id):
         raise Conflict("this is the last administrator's token: make another one first")
-    services.store.delete_token(id)
+    services.store.tokens.delete(id)
     services.access.invalidate()
     return Response(status_code=204)
 

@@ -51,7 +51,7 @@ def transform(
     """Give ``latlon`` or ``xy``; the answer has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
     if (latlon is None) == (xy is None):
         raise Invalid("give either latlon=LAT,LON or xy=X,Y", [Problem("one of latlon and xy", where="query")])
-    datum = services.store.version(env, parse_version_ref(version)).datum
+    datum = services.store.versions.get(env, parse_version_ref(version)).datum
     if datum is None:
         raise MissingDatum(f'{env} has no datum: PATCH it with {{"datum": {{…}}}} or upload a datum.yaml')
     frame = local_frame(datum)

@@ -23,7 +23,8 @@ from app.api.links import LinkedFile, link_to
 from app.api.robots import RobotOut, RobotPath, require_report_permission, store_report
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
-from app.store.values import Channel, RobotReport, RobotState, Version
+from app.store.fleet_values import Channel, RobotReport, RobotState
+from app.store.values import Version
 
 
 class FloorActionsOut(BaseModel):
@@ -133,7 +134,7 @@ async def get_actions(
     """
     reserved_names = {"mapId", "format", "level", "signed", "seconds"}
     values = {name: text for name, text in request.query_params.multi_items() if name not in reserved_names}
-    version = await run_in_threadpool(services.store.version, env, parse_version_ref(v))
+    version = await run_in_threadpool(services.store.versions.get, env, parse_version_ref(v))
     _check_format(format, by_level=level is not None)
     services.links.check_life(seconds)
     maps: list[dict[str, Any]] = []
@@ -273,8 +274,8 @@ def _collect_reports(
     try:
         if not principal.can_access(env):
             raise NotFound("your token does not reach it, or it is none of this server's environments")
-        stored_robot = next(iter(services.store.robots(env, robot)), None)
-        channels = {c.name: c for c in services.store.channels(env)}
+        stored_robot = next(iter(services.store.robots.all(env, robot)), None)
+        channels = {c.name: c for c in services.store.channels.all(env)}
     except NotFound as error:
         out["ignored"] += [{"mapId": floor.map_id, "why": error.detail} for floor in floors]
         return
@@ -326,7 +327,7 @@ def _report(
     try:
         if not (text.isascii() and text.isdigit() and len(text) < 10):
             raise NotFound("its mapVersion is no version's number")
-        version = services.store.version(env, int(text))
+        version = services.store.versions.get(env, int(text))
     except NotFound as error:
         out["ignored"].append({"mapId": map_id, "mapVersion": text, "why": error.detail})
         return []

@@ -195,7 +195,7 @@ def list_versions(
     if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) <= 18):
         raise Invalid("the cursor is not one that a page's Link header gave", [Problem("unknown", where="cursor")])
     before = int(cursor) if cursor is not None else None
-    versions = services.store.versions(env, limit=limit + 1, before=before)
+    versions = services.store.versions.page(env, limit=limit + 1, before=before)
     following = str(versions[limit - 1].number) if len(versions) > limit else None
     return page_response(request, [version.as_dict() for version in versions[:limit]], following)
 
@@ -285,7 +285,7 @@ def create_edit(
 @router.get("/versions/{v}", responses=problem_responses(VersionOut, 404), summary="One version")
 def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """A version by number, by channel, or the newest."""
-    version = services.store.version(env, parse_version_ref(v))
+    version = services.store.versions.get(env, parse_version_ref(v))
     return json_response(version.as_dict(), headers=version_headers(version))
 
 
@@ -297,7 +297,9 @@ def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: 
 )
 def list_sources(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
     """The files that made a version, also those that were not used."""
-    return json_response([source.as_dict() for source in services.store.version(env, parse_version_ref(v)).sources])
+    return json_response(
+        [source.as_dict() for source in services.store.versions.get(env, parse_version_ref(v)).sources]
+    )
 
 
 @router.get(
@@ -326,7 +328,7 @@ def get_source(
     ] = None,
 ) -> Response:
     """Always as an attachment, never to be shown by a browser as what it says it is."""
-    source = _source(services.store.version(env, parse_version_ref(v)).sources, name, sha256)
+    source = _source(services.store.versions.get(env, parse_version_ref(v)).sources, name, sha256)
     etag = f'"{source.sha256}"'
     headers = [
         (b"content-type", b"application/octet-stream"),

@@ -79,7 +79,8 @@ def verify(
             donors = [_donor(place, token, left, stack) for place in sources or ()]
             fresh = _repair(store, left, donors, settings)
             if not fresh and not any(f.versions or f.kind != "chunk" for f in left):
-                fresh = {("chunk", name): REMOVED for name in store.remove_unused_chunks(latest)}
+                removed = store.chunks.remove_damaged(latest.unused_chunks, latest.started)
+                fresh = {("chunk", name): REMOVED for name in removed}
             if not fresh:
                 break
             healed |= fresh
@@ -176,7 +177,7 @@ class StoreDonor:
     def chunk(self, sha256: str) -> bytes | None:
         """The bytes, if they are there and intact."""
         try:
-            return self._store.chunk(sha256)
+            return self._store.chunks.read(sha256)
         except FleetMapError:
             return None
 

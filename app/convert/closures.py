@@ -66,7 +66,7 @@ def drop_areas(version: Version) -> Version:
 def load(store: Store, version: Version, keys: Collection[PartKey]) -> Layers:
     """Load parts of a version, with its closed areas and without marks that an earlier release put into versions."""
     areas = {} if version.closures is None else {k: closed for k, closed in _areas(version).items() if k in keys}
-    loaded = store.load(version, [key for key in keys if key not in areas])
+    loaded = store.content.load(version, [key for key in keys if key not in areas])
     parts: dict[PartKey, Part] = {**loaded.parts, **{key: _zones(closed) for key, closed in areas.items()}}
     return drop_timed_marks(replace(loaded, parts=parts), areas)
 

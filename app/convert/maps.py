@@ -313,7 +313,7 @@ class Maps:
         """What the place is called (``FARM_NAME`` …): an environment_template's literal variables, by name."""
         keys = [e.key for e in version.parts if e.key.layer == "objects" and e.key.name == environment.NAME]
         out: dict[str, str] = {}
-        for part in self._store.load(version, keys).vector("objects").values() if keys else ():
+        for part in self._store.content.load(version, keys).vector("objects").values() if keys else ():
             stored = part.document.get(environment.NAME)
             out |= shell.exported_variables(stored.get("variables") if isinstance(stored, Mapping) else None)[0]
         return dict(sorted(out.items()))

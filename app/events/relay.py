@@ -59,9 +59,9 @@ class Relay(LeaderThread):
                 return
 
     def _publish_new(self) -> None:
-        position = self._store.relay_position()
+        position = self._store.events.relay_position()
         while not self._stopping.is_set():
-            page = self._store.events(None, position, PAGE)
+            page = self._store.events.page(None, position, PAGE)
             if not page:
                 return
             for event in page:
@@ -69,12 +69,12 @@ class Relay(LeaderThread):
                     return
                 self._publish(event)
                 position = event.position
-            self._store.set_relayed(position)
+            self._store.events.set_relayed(position)
 
     def _replay(self) -> None:
         """A new session's caches are empty: put the last events of each environment again, oldest first."""
-        position = self._store.relay_position()
-        for event in self._store.last_events(position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS):
+        position = self._store.events.relay_position()
+        for event in self._store.events.last(position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS):
             if self._stopping.is_set():
                 return
             self._publish(event)

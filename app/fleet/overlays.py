@@ -13,8 +13,9 @@ from app.model import bends
 from app.model.closures import zone_id
 from app.model.features import Feature
 from app.model.layers import PartKey
+from app.store.fleet_values import Overlay
 from app.store.store import Store
-from app.store.values import Overlay, Version
+from app.store.values import Version
 
 BLOCKED, UNTIL = "blocked", "blocked_until"
 
@@ -50,7 +51,7 @@ def find_edge(store: Store, versions: Iterable[Version], edge: str) -> tuple[Par
         for name, number in names:
             for entry in version.parts:
                 if entry.key.layer == "topology":
-                    for feature in store.get(version, entry.key, [name]):
+                    for feature in store.content.features(version, entry.key, ids=[name]):
                         pieces = shapely.get_num_coordinates(feature.geometry) - 1
                         if feature.properties.get("kind") == "edge" and (not number or number <= pieces > 1):
                             return entry.key, feature

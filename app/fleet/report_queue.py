@@ -18,8 +18,8 @@ from datetime import UTC, datetime
 from app.errors import FleetMapError, Invalid, Unavailable
 from app.events.messages import ROBOT_NAME, RobotStatus
 from app.store.base import ENVIRONMENT_NAME
+from app.store.fleet_values import ReceivedReport, RobotReport
 from app.store.store import Store
-from app.store.values import ReceivedReport, RobotReport
 
 log = logging.getLogger(__name__)
 
@@ -197,7 +197,9 @@ class ReportQueue:
         if not batch:
             return
         unheard: list[str] = []
-        for queued, refused in zip(batch, self._store.note_reports([queued.report for queued in batch]), strict=True):
+        for queued, refused in zip(
+            batch, self._store.robots.note_reports([queued.report for queued in batch]), strict=True
+        ):
             if refused is not None and queued.result is None:
                 unheard.append(f"a report of {queued.report.robot} was left out: {refused.detail}")
             _resolve_futures(queued, refused)
@@ -223,7 +225,7 @@ class ReportQueue:
             absent_robots = set(self._departed)
         if not present_robots and not absent_robots:
             return
-        self._store.note_presence(present_robots, absent_robots, self._clock())
+        self._store.robots.note_presence(present_robots, absent_robots, self._clock())
         with self._lock:
             self._has_news -= present_robots
             self._departed -= absent_robots

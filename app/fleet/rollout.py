@@ -14,7 +14,8 @@ from datetime import datetime, timedelta
 from fractions import Fraction
 
 from app.fleet.status import is_online, is_ready
-from app.store.values import Robot, Rollout, RolloutStep, rfc3339
+from app.store.fleet_values import Robot, Rollout, RolloutStep
+from app.store.values import rfc3339
 
 
 def next_step(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> RolloutStep | None:

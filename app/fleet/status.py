@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from app.store.values import Channel, ChannelMove, Robot, rfc3339
+from app.store.fleet_values import Channel, ChannelMove, Robot
+from app.store.values import rfc3339
 
 REPORT_FRESH = timedelta(seconds=180)
 """A robot that is not on the bus is online for so long after a report."""

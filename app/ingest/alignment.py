@@ -78,7 +78,7 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
         target_keys = [k for k in entries if k.layer in (request.layer, "resources", "location")]
     else:
         target_keys = [] if request.pairs else [target]
-    loaded = store.load(base, sorted({key, *target_keys}))
+    loaded = store.content.load(base, sorted({key, *target_keys}))
     grid = loaded.parts[key]
     assert isinstance(grid, OccupancyGrid)
     notes = DerivationNotes()
@@ -115,7 +115,7 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
         return AlignmentResult(report, tuple(notes.warnings), None)
     old = entries[key].provenance.with_edit_step()
     provenance = replace(old, steps=(*old.steps, {"step": ALIGNED, "parameters": report}))
-    prepared = store.prepare(base, Changes((Replace(key, moved, provenance),)))
+    prepared = store.versions.prepare(base, Changes((Replace(key, moved, provenance),)))
     return AlignmentResult(report, tuple(notes.warnings), prepared)
 
 

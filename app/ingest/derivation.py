@@ -73,7 +73,7 @@ def prepare_derivation(
             if derivation.gives in needed or (derivation.part_names and k.name == MAP)
         }
         # Not only the layers that are needed: a derivation may look at others where they are there (a fence).
-        loaded = store.load(base, sorted(used))
+        loaded = store.content.load(base, sorted(used))
         notes = DerivationNotes()
         chain = derive.with_parameters(steps, request.values)
         before = derive.run(chain[:-1], Layers(loaded.parts, base.datum, base.levels), notes)
@@ -102,7 +102,7 @@ def prepare_derivation(
     operations = tuple(Replace(key, part, provenance) for key, part in sorted(fresh.items()))
     warnings = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
     warnings += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
-    return store.prepare(base, Changes(operations)), (*notes.warnings, *warnings)
+    return store.versions.prepare(base, Changes(operations)), (*notes.warnings, *warnings)
 
 
 def _is_display_only(entry: PartEntry) -> bool:

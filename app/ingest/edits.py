@@ -236,7 +236,7 @@ class _Session:
 
     def _draft(self, key: PartKey) -> _Draft:
         if key not in self._drafts:
-            stored = self._store.load(self._base, [key]).parts.get(key) if key in self._keys else None
+            stored = self._store.content.load(self._base, [key]).parts.get(key) if key in self._keys else None
             self._drafts[key] = _Draft(stored if isinstance(stored, Features) else None)
         return self._drafts[key]
 
@@ -400,7 +400,7 @@ class _Session:
     def _apply_cells(self, change: Mapping[str, Any]) -> None:
         key = self._grid_key(change)
         if key not in self._grids:
-            stored = self._store.load(self._base, [key]).parts[key]
+            stored = self._store.content.load(self._base, [key]).parts[key]
             assert isinstance(stored, OccupancyGrid)
             self._grids[key] = stored
         grid, value = self._grids[key], change.get("value")

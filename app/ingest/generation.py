@@ -39,7 +39,7 @@ def prepare_generation(
     used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in generator.reads}
     if not generator.editable_layers:
         used = {k: e for k, e in used.items() if not _is_generated(e)}
-    loaded = store.load(base, sorted(used))
+    loaded = store.content.load(base, sorted(used))
     given = Layers(loaded.parts, base.datum, base.levels)
     notes = DerivationNotes()
     generated_layers = generate.run(order.generator, order.seed, order.values, given, notes)
@@ -63,7 +63,7 @@ def prepare_generation(
     levels = generated_layers.levels if generated_layers.levels != base.levels else KEEP
     warnings = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
     warnings += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
-    return store.prepare(base, Changes(tuple(operations), datum, levels)), (*notes.warnings, *warnings)
+    return store.versions.prepare(base, Changes(tuple(operations), datum, levels)), (*notes.warnings, *warnings)
 
 
 def _is_generated(entry: PartEntry) -> bool:

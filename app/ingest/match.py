@@ -24,7 +24,7 @@ def match_ids(store: Store, base: Version, key: PartKey, new: Features) -> Featu
     not name, if kind, anchor and geometry are equal and the pair is the only one of its place; an edge must join the
     same nodes, too.
     """
-    stored = store.load(base, [key]).parts.get(key)
+    stored = store.content.load(base, [key]).parts.get(key)
     if not isinstance(stored, Features) or not len(stored) or not len(new):
         return new
     stored_ids, present = set(stored.ids), set(new.ids)

@@ -485,7 +485,9 @@ def prepare_picture(
     inputs = (*fetched.site, {"datum": base.datum.as_dict() if base.datum else None})
     provenance = Provenance("derived", None, (), None, (dict(fetched.provenance_step),), fetched.attribution, inputs)
     store = open_store(database_url, blob_dir)
-    return store.prepare(base, Changes((Replace(fetched.parameters.key, picture, provenance),))), tuple(warnings)
+    return store.versions.prepare(base, Changes((Replace(fetched.parameters.key, picture, provenance),))), tuple(
+        warnings
+    )
 
 
 def assemble_image(

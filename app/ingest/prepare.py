@@ -93,7 +93,7 @@ def prepare_upload(
     )
     if joined_levels != base.levels:
         levels = joined_levels
-    prepared = store.prepare(base, Changes(tuple(operations), datum, levels))
+    prepared = store.versions.prepare(base, Changes(tuple(operations), datum, levels))
     notes = [FileNote(name, use.format, use.used) for name, use in upload_bundle.files.items()]
     notes += [FileNote(name, "zip", True) for name in uploaded.keys() - files.keys()]
     members = {name: files[name] for name in files.keys() - uploaded.keys()}
@@ -123,7 +123,7 @@ def _unused_hints(hints: UploadHints, upload_bundle: Bundle) -> list[Problem]:
 
 def prepare_changes(database_url: str, blob_dir: str, base: Version, changes: Changes) -> Prepared:
     """In a worker: what these changes would make of a version."""
-    return open_store(database_url, blob_dir).prepare(base, changes)
+    return open_store(database_url, blob_dir).versions.prepare(base, changes)
 
 
 MAX_USUAL_METRES = 100_000.0
@@ -185,7 +185,7 @@ def read_fence(store: Store, base: Version) -> shapely.Polygon | None:
     """The fence of a version's location."""
     keys = [e.key for e in base.parts if e.key.layer == "location" and e.count]
     with contextlib.suppress(Damaged):  # the upload may be the one that heals it
-        for part in store.load(base, keys).parts.values() if keys else ():
+        for part in store.content.load(base, keys).parts.values() if keys else ():
             if isinstance(part, Features) and len(part):
                 polygon: shapely.Polygon = part.geometry[0]
                 return polygon
@@ -224,7 +224,7 @@ def operation_for(
         if mode == "merge":
             return Put(key, _merge_with_stored(store, base, key, part) if is_stored else part, provenance)
     elif mode == "merge" and is_stored:
-        old = store.load(base, [key]).parts[key]
+        old = store.content.load(base, [key]).parts[key]
         if isinstance(part, OccupancyGrid) and isinstance(old, OccupancyGrid):
             part = merge_grids(old, part, key.name)
         elif isinstance(part, Resources) and isinstance(old, Resources):
@@ -243,7 +243,7 @@ def _rename_drawn_from(part: Features, renamed: Mapping[str, str]) -> Features:
 def _merge_with_stored(store: Store, base: Version, key: PartKey, part: Features) -> Features:
     """An upload to be merged, with a document that says what the stored part's and its own say: credits of both,
     bounds around both, and the drawings of both with their styles, also where two have one name."""
-    old = store.load(base, [key]).parts[key]
+    old = store.content.load(base, [key]).parts[key]
     assert isinstance(old, Features)
     for family, new_document in part.document.items():
         stored, new = (

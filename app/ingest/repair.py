@@ -72,7 +72,7 @@ def repair(
             raw = donor.chunk(name)
             with contextlib.suppress(Damaged):
                 if raw is not None:
-                    store.heal_chunks({name: raw})
+                    store.chunks.heal({name: raw})
                     healed["chunk", name] = donor.name
     for environment, number in sorted({v for f in (*blobs.values(), *chunks.values()) for v in f.versions}):
         place = (environment, number)
@@ -89,7 +89,7 @@ def repair(
             continue  # its uploads cannot be read: the finding stays
         for data in rebuilt.blobs.values():
             healed["blob", store.blobs.put(data)] = origin
-        store.heal_chunks(rebuilt.chunks)
+        store.chunks.heal(rebuilt.chunks)
         healed |= {("chunk", name): origin for name in rebuilt.chunks}
     return healed
 
@@ -109,7 +109,7 @@ def recover_from_uploads(
     tried until nothing is lost.
     """
     store = open_store(database_url, blob_dir)
-    version, base = store.version_and_base(environment, number)
+    version, base = store.versions.get_with_base(environment, number)
     files, contents = _uploads(store, version, lost_blobs)
     chunks: dict[str, bytes] = {}
     for hints in _possible_hints(version.parts):
@@ -187,7 +187,7 @@ def _compose_parts(
         for key in sorted(upload_bundle.parts):
             with contextlib.suppress(FleetMapError):
                 operation = operation_for(store, start, upload_bundle, key, mode, files, renamed)
-                draft = store.draft()
+                draft = store.chunks.stage()
                 stored_entries = {key: entries[key]} if isinstance(operation, Put) and key in entries else {}
                 encoded_part = compose_operation(draft, dict(stored_entries), operation)
                 yield draft, encoded_part.blobs if encoded_part is not None else {}

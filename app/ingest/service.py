@@ -245,7 +245,7 @@ class Ingest:
         def once(base: Version) -> CommitResult:
             online.check_free(base, chosen, replace=request.replace)
             fences = sorted((e for e in base.parts if e.key.layer == "location" and e.count), key=lambda e: e.key)
-            site = self._store.load(base, [e.key for e in fences])
+            site = self._store.content.load(base, [e.key for e in fences])
             sheet = online.plan_mosaic(provider, online.site_box(site, chosen), chosen.resolution)
             if not fetches or fetches[-1][0] != sheet:  # the same site again: what was fetched still holds
                 fetches.append((sheet, tuple(online.Fetcher(provider).fetch(sheet.blocks))))
@@ -307,9 +307,9 @@ class Ingest:
         text = message or f"Revert to version {to}"
 
         def once(base: Version) -> CommitResult:
-            same = self._store.version(environment, to).root == base.root
+            same = self._store.versions.get(environment, to).root == base.root
             noted = Idempotency(key.key, UNCHANGED + key.fingerprint) if same and key is not None else key
-            version = self._store.revert(
+            version = self._store.versions.revert(
                 environment, to, author=author, message=text, expected=base.number, idempotency=noted
             )
             return CommitResult("unchanged" if same else "created", version, version.as_dict())
@@ -324,7 +324,7 @@ class Ingest:
         def once(base: Version) -> CommitResult:
             if base.datum == datum:
                 return CommitResult("unchanged", base, base.as_dict())
-            prepared = self._store.prepare(base, Changes((), datum, KEEP))
+            prepared = self._store.versions.prepare(base, Changes((), datum, KEEP))
             text = message or "Set the datum"
             return self._commit(environment, base, prepared, author, text, (), datum_moved_warnings(base, datum), None)
 
@@ -348,7 +348,7 @@ class Ingest:
         text = message or update.summary()
 
         def once(base: Version) -> CommitResult:
-            prepared = self._store.prepare(base, Changes(templates=update.apply_to(base.templates)))
+            prepared = self._store.versions.prepare(base, Changes(templates=update.apply_to(base.templates)))
             if update.dry_run:
                 return CommitResult("dry_run", None, self._preview(base, prepared, (), (), author, text))
             return self._commit(environment, base, prepared, author, text, (), (), key)
@@ -371,7 +371,7 @@ class Ingest:
         if replayed is not None:
             return replayed
         for last in _tries(if_match):
-            base = self._store.version(environment)
+            base = self._store.versions.get(environment)
             check_if_match(if_match, base)
             try:
                 return once(base)
@@ -396,11 +396,11 @@ class Ingest:
             noted = None if key is None else Idempotency(key.key, UNCHANGED + key.fingerprint)
             same = base
             if noted is not None or sources or prepared.chunks:
-                same = self._store.commit(
+                same = self._store.versions.commit(
                     environment, prepared, author=author, message=message, sources=tuple(sources), idempotency=noted
                 )
             return CommitResult("unchanged", same, {**same.as_dict(), "warnings": [w.as_dict() for w in warnings]})
-        version = self._store.commit(
+        version = self._store.versions.commit(
             environment,
             prepared,
             author=author,
@@ -415,13 +415,13 @@ class Ingest:
         """The answer that was given to this key before; Conflict where it came with another request."""
         if key is None:
             return None
-        record = self._store.idempotent(environment, key.key)
+        record = self._store.versions.idempotent(environment, key.key)
         if record is None:
             return None
         fingerprint, number = record
         if fingerprint.removeprefix(UNCHANGED) != key.fingerprint:
             raise Conflict(f"the Idempotency-Key {key.key!r} was used for another request: choose a new one")
-        version = self._store.version(environment, number)
+        version = self._store.versions.get(environment, number)
         same = fingerprint.startswith(UNCHANGED)
         return CommitResult("unchanged" if same else "replayed", version, version.as_dict())
 

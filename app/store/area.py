@@ -32,7 +32,8 @@ from app.model.layers import Layer, PartKey
 from app.store import parts, tables, tree
 from app.store.changes import KEEP, Keep
 from app.store.encode import to_wkb
-from app.store.parts import PartRoot
+from app.store.parts.rasters import tile_cells, tile_leaf, tile_shape
+from app.store.parts.roots import TILE_BATCH, PartRoot, read_root
 from app.store.tree import ChunkStage
 from app.store.values import NO_AREA, Area, Box, PartEntry
 
@@ -163,7 +164,7 @@ def _estimate_extent(draft: ChunkStage, entries: Sequence[PartEntry], datum: Dat
     shapes: list[Any] = []
     for entry in _floors(entries, datum):
         if entry.key.layer == "occupancy":
-            root = parts.read_root(draft, bytes.fromhex(entry.hash))
+            root = read_root(draft, bytes.fromhex(entry.hash))
             shapes.append(None if masks.NAME in root.header["properties"] else free_rectangle(draft, root))
             continue
         for part in _load(draft, [entry]):
@@ -216,13 +217,13 @@ def free_rectangle(draft: ChunkStage, grid: PartRoot) -> Any:
     raws = draft.read_many(leaves)
     codes: dict[bytes, list[int]] = {}
     for leaf in leaves:
-        for code, name in parts.tile_leaf(raws[leaf]):
+        for code, name in tile_leaf(raws[leaf]):
             codes.setdefault(name, []).append(code)
     boxes: list[tuple[int, int, int, int]] = []
     names = list(codes)
-    for start in range(0, len(names), parts.TILE_BATCH):
-        for name, raw in draft.stream(names[start : start + parts.TILE_BATCH]).items():
-            boxes += _free_boxes(header, parts.tile_cells(raw) == FREE, codes[name])
+    for start in range(0, len(names), TILE_BATCH):
+        for name, raw in draft.stream(names[start : start + TILE_BATCH]).items():
+            boxes += _free_boxes(header, tile_cells(raw) == FREE, codes[name])
     if not boxes:
         return None
     bounds = np.array(boxes, np.float64)
@@ -240,7 +241,7 @@ def _free_boxes(header: Mapping[str, Any], free: NDArray[np.bool_], codes: Seque
     if not free.any():
         return out
     for code in codes:
-        row, column, height, width = parts.tile_shape(header, code)
+        row, column, height, width = tile_shape(header, code)
         cells = free.reshape(height, width)
         rows, columns = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
         out.append((column + columns[0], row + rows[0], column + columns[-1] + 1, row + rows[-1] + 1))

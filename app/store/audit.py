@@ -12,7 +12,8 @@ from typing import Any
 from sqlalchemy import Connection, Row, insert, select
 
 from app.store import tables
-from app.store.base import StoreBase, utcnow
+from app.store.base import utcnow
+from app.store.database import Database
 
 MAX_PATH = 1000
 """Characters of an address that are kept."""
@@ -92,8 +93,11 @@ def record(connection: Connection) -> Caller | None:
     return caller
 
 
-class Audit(StoreBase):
+class Audit:
     """Reading the audit log."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
 
     def record_change(self) -> None:
         """Record the current request, which gives somebody access and changes nothing that is stored."""
@@ -106,7 +110,7 @@ class Audit(StoreBase):
         with self._database.write():
             yield
 
-    def audit(
+    def page(
         self,
         *,
         environment: str | None = None,

@@ -1,22 +1,19 @@
-"""What all parts of the store share: where it is, rows as values, texts that both databases take."""
+"""What all services of the store share: rows as values, names, texts that both databases take."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, select
+from sqlalchemy import Connection, Row, Table, select
+from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import Gone, Invalid, NotFound, Problem
 from app.model.frame import Datum
 from app.model.names import did_you_mean
 from app.store import tables
-from app.store.blobs import Blobs
-from app.store.chunks import Chunks
-from app.store.database import Database
 from app.store.values import LATEST, Environment
 
 ENVIRONMENT_NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
@@ -24,17 +21,6 @@ RESERVED: Final = frozenset({"robots", "server"})
 CHANNEL_NAME: Final = re.compile(r"[a-z][a-z0-9_-]{0,62}")
 
 MAX_TEXT: Final = 64 * 2**10
-
-
-class StoreBase:
-    """One database and one blob folder."""
-
-    database_url: str
-    blob_dir: Path
-    readonly: bool
-    blobs: Blobs
-    _database: Database
-    _chunks: Chunks
 
 
 def utcnow() -> datetime:
@@ -72,6 +58,13 @@ def check_environment_name(name: str) -> str:
             "letter or digit; 'robots' and 'server' are taken"
         )
     return name
+
+
+def upsert(connection: Connection, table: Table, keys: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Insert a row, or give these values to the row that has the keys."""
+    make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
+    statement = make(table).values(**keys, **values)
+    connection.execute(statement.on_conflict_do_update(index_elements=list(keys), set_=dict(values)))
 
 
 def environment_row(connection: Connection, name: str, *, lock: bool = False, deleted: bool = False) -> Row[Any]:

@@ -12,30 +12,36 @@ from sqlalchemy import Connection, Row, insert, select, update
 from app.errors import Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
-from app.store.base import CHANNEL_NAME, StoreBase, checked_text, environment_row, nearest_channel, utcnow
-from app.store.manifest import read_version
-from app.store.overlays import read_closures
-from app.store.robots import channel_robots
-from app.store.values import (
-    LATEST,
+from app.store.base import CHANNEL_NAME, checked_text, environment_row, nearest_channel, utcnow
+from app.store.database import Database
+from app.store.fleet_values import (
     OPEN_ROLLOUTS,
     Channel,
+    ChannelMove,
     PlannedMove,
     Robot,
     Rollout,
     RolloutState,
     RolloutStep,
-    Version,
-    rfc3339,
 )
+from app.store.manifest import read_version
+from app.store.overlays import CHANGE_CLOSURES, read_closures
+from app.store.robots import channel_robots
+from app.store.values import LATEST, Version, rfc3339
 
 _NO_PLAN: Final[Mapping[str, None]] = {"planned_version": None, "planned_at": None, "planned_author": None}
 
+MAX_MOVES: Final = 1000
+"""So many moves of a channel are looked back on."""
 
-class Channels(StoreBase):
+
+class Channels:
     """The channels of environments."""
 
-    def channels(self, environment: str) -> list[Channel]:
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def all(self, environment: str) -> list[Channel]:
         """``latest`` first, then the others by name."""
         table, version = tables.channel, tables.version
         with self._database.read() as connection:
@@ -66,9 +72,7 @@ class Channels(StoreBase):
         latest = Channel(LATEST, row.head, row.root, head.sequence, None, head.author, head.time)
         return [replace(latest, closures=closures, closures_sequence=row.closures_sequence), *others]
 
-    def channel_target(
-        self, environment: str, ref: str | int, closures: ClosureMode | None = None
-    ) -> tuple[Version, int]:
+    def target(self, environment: str, ref: str | int, closures: ClosureMode | None = None) -> tuple[Version, int]:
         """Read a version by number or channel as maps of it are made, and the sequence of what it shows.
 
         closures: how its maps show the closures in force; default: applied for a channel, ignored for a number, which
@@ -99,7 +103,7 @@ class Channels(StoreBase):
             in_force = read_closures(connection, row).for_mode(mode)
             return replace(stored_version, closures=in_force), max(sequence, int(row.closures_sequence))
 
-    def set_channel(
+    def move(
         self,
         environment: str,
         channel: str,
@@ -129,6 +133,27 @@ class Channels(StoreBase):
             else:
                 _plan(connection, row, channel, version, author_name, activate_at, rollout)
             return _read(connection, row, channel)
+
+    def moves(self, environment: str, channel: str) -> list[ChannelMove]:
+        """The newest events that brought a channel somewhere, oldest first; of ``latest`` each new version.
+
+        Events that changed which closures are in force are among them, with an empty root: they move no channel.
+        """
+        table = tables.event
+        kind = table.c.body["type"].as_string()
+        with self._database.read() as connection:
+            row = environment_row(connection, environment)
+            moved = kind == "version.created"
+            if channel != LATEST:
+                moved = (kind == "channel.moved") & (table.c.body["channel"].as_string() == channel)
+            query = select(table.c.sequence, table.c.body, table.c.time).where(
+                table.c.environment_id == row.id, moved | kind.in_(CHANGE_CLOSURES)
+            )
+            rows = connection.execute(query.order_by(table.c.sequence.desc()).limit(MAX_MOVES)).all()
+        return [
+            ChannelMove(r.sequence, r.body["version"], "" if "overlay" in r.body else r.body["root"], r.time)
+            for r in reversed(rows)
+        ]
 
     def cancel_planned(self, environment: str, channel: str, author: str) -> Channel:
         """Forget a planned move; NotFound where there is none."""

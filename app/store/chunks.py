@@ -12,7 +12,8 @@ from sqlalchemy import Connection, select
 from app.errors import Damaged
 from app.store import tables
 from app.store.database import Database
-from app.store.encode import decompress, digest
+from app.store.encode import compress, decompress, digest
+from app.store.tree import ChunkStage
 
 BATCH = 500
 REPAIR = "run `fleetmap verify --repair`, or restore a backup"
@@ -45,6 +46,30 @@ class Chunks:
             out.update(read)
             self._cache_chunks(read)
         return out
+
+    def read(self, sha256: str) -> bytes:
+        """A chunk's canonical bytes by its hash in hex, hashed again; Damaged where it is lost or damaged."""
+        name = bytes.fromhex(sha256)
+        return self.read_many([name])[name]
+
+    def stage(self) -> ChunkStage:
+        """Chunks in the making over the stored ones."""
+        return ChunkStage(self)
+
+    def heal(self, chunks: Mapping[str, bytes]) -> None:
+        """Store chunks (hash in hex -> canonical bytes) in place of damaged or lost ones. Damaged for a wrong hash."""
+        for name, raw in chunks.items():
+            if digest(raw).hex() != name:
+                raise Damaged(f"these are not the bytes of chunk {name}")
+        with self._database.write() as connection:
+            insert(connection, {name: compress(raw) for name, raw in chunks.items()})
+
+    def remove_damaged(self, hashes: Iterable[str], before: float) -> set[str]:
+        """Remove those of the chunks (hashes in hex) that are damaged and were last used before this second; which."""
+        names = [bytes.fromhex(name) for name in hashes]
+        with self._database.write() as connection:
+            damaged = [name for name, data in select_rows(connection, names) if problem(name, data) is not None]
+            return {name.hex() for name in delete(connection, damaged, int(before))}
 
     def find_damaged(self, hashes: Sequence[bytes]) -> dict[bytes, str]:
         """Those that the database has not whole, whatever is in memory: hash -> ``lost`` or ``damaged``."""

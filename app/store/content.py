@@ -12,15 +12,20 @@ from app.model.geodesy import local_frame
 from app.model.layers import VECTOR_LAYERS, Layers, PartKey
 from app.model.templates import template_changes
 from app.store import diff, parts
-from app.store.base import StoreBase
-from app.store.parts import PartRoot
+from app.store.blobs import Blobs
+from app.store.chunks import Chunks
+from app.store.parts.features import features_from_items, features_in_box, find_places, items_by_id
+from app.store.parts.roots import PartRoot, read_document
 from app.store.prepare import differing_keys, frame_changes, part_names, read_roots
 from app.store.tree import ChunkStage
 from app.store.values import Box, Delta, FeatureDelta, GridDelta, Version
 
 
-class ContentReader(StoreBase):
+class ContentReader:
     """Reading layers. Any version costs the same."""
+
+    def __init__(self, chunks: Chunks, blobs: Blobs) -> None:
+        self._chunks, self._blobs = chunks, blobs
 
     def load(self, version: Version, keys: Collection[PartKey] | None = None) -> Layers:
         """A version's content, or some parts of it; NotFound where a key is not there.
@@ -33,7 +38,7 @@ class ContentReader(StoreBase):
             if key not in entries:
                 raise NotFound(_missing(version, key))
         hashes = {key: bytes.fromhex(entries[key].hash) for key in chosen}
-        loaded = parts.load(ChunkStage(self._chunks), hashes, self.blobs.get_many) if hashes else {}
+        loaded = parts.load(self._chunks.stage(), hashes, self._blobs.get_many) if hashes else {}
         return Layers(loaded, version.datum, version.levels)
 
     def features(
@@ -46,38 +51,34 @@ class ContentReader(StoreBase):
         ids: Collection[str] | None = None,
     ) -> Features:
         """Features of a vector part, as they are anchored, by id: all; those whose box meets ``bbox``; those with
-        these ids; or those with both.
+        these ids, of which only the leaves they are in are read; or those with both.
 
         bbox: (minimum x, minimum y, maximum x, maximum y) in metres (crs ``local``) or degrees (``wgs84``, where west >
         east crosses the antimeridian); features without coordinates are in no box. MissingDatum where the part has
         items anchored otherwise than ``crs`` and the version has no datum.
         """
-        draft = ChunkStage(self._chunks)
+        draft = self._chunks.stage()
         root = self._root(draft, version, key)
         if bbox is None and ids is None:
             loaded = self.load(version, [key]).parts[key]
             assert isinstance(loaded, Features)
             return loaded
         if bbox is None:
-            items = parts.items_by_id(draft, root, ids or ())
+            items = items_by_id(draft, root, ids or ())
         else:
             frame = None if version.datum is None else local_frame(version.datum)
-            items = parts.features_in_box(draft, root, bbox, crs, frame)
+            items = features_in_box(draft, root, bbox, crs, frame)
             if ids is not None:
                 selected_ids = set(ids)
                 items = {i: item for i, item in items.items() if i in selected_ids}
-        return parts.features_from_items(items, parts.read_document(draft, root))
-
-    def get(self, version: Version, key: PartKey, ids: Collection[str]) -> Features:
-        """The features with these ids, as far as they exist; reads only the leaves they are in."""
-        return self.features(version, key, ids=ids)
+        return features_from_items(items, read_document(draft, root))
 
     def has_ids(self, version: Version, key: PartKey, ids: Collection[str]) -> set[str]:
         """Those of the ids that the part has; none where there is no such part."""
         if version.part(key) is None:
             return set()
-        draft = ChunkStage(self._chunks)
-        return set(parts.find_places(draft, self._root(draft, version, key), sorted(set(ids))))
+        draft = self._chunks.stage()
+        return set(find_places(draft, self._root(draft, version, key), sorted(set(ids))))
 
     def _root(self, draft: ChunkStage, version: Version, key: PartKey) -> PartRoot:
         if key.layer not in VECTOR_LAYERS:
@@ -95,7 +96,7 @@ class ContentReader(StoreBase):
         resources: ``{name: {added, changed, deleted, fields?}}``, counts of voxels, tiles or files. ``datum`` and
         ``levels``: ``{from, to}``; ``templates`` as ``template_changes`` says them.
         """
-        draft = ChunkStage(self._chunks)
+        draft = self._chunks.stage()
         before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
         names = part_names(sorted(before.keys() | after.keys()))
         out: dict[str, Any] = {}
@@ -117,7 +118,7 @@ class ContentReader(StoreBase):
 
     def delta_parts(self, a: Version, b: Version) -> Delta:
         """What turns version a into version b: features put and deleted, changed rectangles of grids."""
-        draft = ChunkStage(self._chunks)
+        draft = self._chunks.stage()
         before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
         features, grids, other = [], [], []
         for key in differing_keys(before, after):
@@ -125,8 +126,8 @@ class ContentReader(StoreBase):
             if key.layer in VECTOR_LAYERS:
                 changed = diff.features(draft, old, new)
                 items = {i: changed.after[i] for i in (*changed.added, *changed.changed)}
-                document = parts.read_document(draft, new) if new is not None and changed.document else {}
-                features.append(FeatureDelta(key, parts.features_from_items(items, document), tuple(changed.deleted)))
+                document = read_document(draft, new) if new is not None and changed.document else {}
+                features.append(FeatureDelta(key, features_from_items(items, document), tuple(changed.deleted)))
             elif key.layer == "occupancy":
                 grids.append(_grid_delta(draft, key, old, new))
             else:

@@ -140,7 +140,7 @@ class Database:
         self._damage: tuple[float, str] | None = None
         self._checking = threading.Lock()
         self._gone = ""
-        self._readonly = readonly
+        self.readonly = readonly
         # SQLite lets whoever happens to look at the right moment write: among many, one may never come to it.
         self._turn = threading.Lock()
         if self.file is not None:
@@ -295,7 +295,7 @@ class Database:
     def _before_connect(self, *_: object) -> None:
         """SQLite would make an empty file where there is none any more."""
         self._check_file()
-        if self._readonly and self.file is not None and not self.file.exists():
+        if self.readonly and self.file is not None and not self.file.exists():
             raise _FileGone(f"the database {self._name} is missing: restore a backup")
 
     def _after_connect(self, *_: object) -> None:

@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 
 from app.model.grid import FREE, OCCUPIED, UNKNOWN
 from app.model.voxels import DEPTH
-from app.store import parts, tree
+from app.store import tree
 from app.store.encode import pack
-from app.store.parts import TILE, Item, PartRoot
+from app.store.gc_pause import gc_paused
+from app.store.parts.features import Item, leaf_items
+from app.store.parts.rasters import TILE, grid_cells, tile_cells, tile_leaf, tile_shape
+from app.store.parts.resources import file_leaf
+from app.store.parts.roots import TILE_BATCH, PartRoot
+from app.store.parts.voxels import voxel_leaf
 from app.store.tree import ChunkStage
 from app.store.values import Box, ChangedCells
 
@@ -63,11 +68,11 @@ def features(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> Featu
     """Changes between two collections; None is one without items."""
     before: dict[str, Item] = {}
     after: dict[str, Item] = {}
-    with parts.gc_paused():
+    with gc_paused():
         for anchor, name in enumerate(("local", "wgs84")):
             left, right = tree.differing(draft, a.trees[name] if a else None, b.trees[name] if b else None)
-            before.update(parts.leaf_items(draft, left, anchor))
-            after.update(parts.leaf_items(draft, right, anchor))
+            before.update(leaf_items(draft, left, anchor))
+            after.update(leaf_items(draft, right, anchor))
     return FeatureChanges(
         sorted(after.keys() - before.keys()),
         sorted(i for i in after.keys() & before.keys() if before[i] != after[i]),
@@ -102,19 +107,19 @@ def diff_tiles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> Iterator[TileChan
     """The tiles that differ between two grids of the same frame."""
     left, right = tree.differing(draft, a.trees["tiles"], b.trees["tiles"])
     raws = draft.read_many([*left, *right])
-    before = {code: name for leaf in left for code, name in parts.tile_leaf(raws[leaf])}
-    after = {code: name for leaf in right for code, name in parts.tile_leaf(raws[leaf])}
+    before = {code: name for leaf in left for code, name in tile_leaf(raws[leaf])}
+    after = {code: name for leaf in right for code, name in tile_leaf(raws[leaf])}
     codes = [code for code in sorted(after) if before.get(code) != after[code]]
-    for start in range(0, len(codes), parts.TILE_BATCH):
-        some = codes[start : start + parts.TILE_BATCH]
+    for start in range(0, len(codes), TILE_BATCH):
+        some = codes[start : start + TILE_BATCH]
         raw = draft.stream([*(before[c] for c in some), *(after[c] for c in some)])
         for code in some:
-            row, column, height, width = parts.tile_shape(b.header, code)
+            row, column, height, width = tile_shape(b.header, code)
             yield TileChange(
                 row,
                 column,
-                parts.tile_cells(raw[before[code]]).reshape(height, width),
-                parts.tile_cells(raw[after[code]]).reshape(height, width),
+                tile_cells(raw[before[code]]).reshape(height, width),
+                tile_cells(raw[after[code]]).reshape(height, width),
             )
 
 
@@ -223,7 +228,7 @@ def _window(
 
 
 def _read_all_cells(draft: ChunkStage, root: PartRoot | None) -> NDArray[np.uint8]:
-    return parts.grid_cells(draft, root) if root else np.empty((0, 0), np.uint8)
+    return grid_cells(draft, root) if root else np.empty((0, 0), np.uint8)
 
 
 def _offset(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[int, int] | None:
@@ -295,14 +300,14 @@ def diff_other_parts(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) 
 
 def _rows(draft: ChunkStage, names: Sequence[bytes], kind: str) -> dict[Any, Any]:
     rows: dict[Any, Any] = {}
-    for start in range(0, len(names), parts.TILE_BATCH):
-        some = names[start : start + parts.TILE_BATCH]
+    for start in range(0, len(names), TILE_BATCH):
+        some = names[start : start + TILE_BATCH]
         raws = draft.stream(some)
         for name in some:
             if kind == "picture":
-                rows.update(parts.tile_leaf(raws[name]))
+                rows.update(tile_leaf(raws[name]))
             else:
-                rows.update((path, sha) for path, _, sha in parts.file_leaf(raws[name]))
+                rows.update((path, sha) for path, _, sha in file_leaf(raws[name]))
     return rows
 
 
@@ -317,11 +322,11 @@ def _voxels(draft: ChunkStage, names: Sequence[bytes], root: PartRoot | None) ->
     colour = root is not None and bool(root.header["colour"])
     record = np.dtype([("odds", "<f4"), ("colour", "u1", 3), ("coloured", "u1")])
     keys, records = [np.empty(0, np.uint64)], [np.empty(0, record)]
-    for start in range(0, len(names), parts.TILE_BATCH):
-        some = names[start : start + parts.TILE_BATCH]
+    for start in range(0, len(names), TILE_BATCH):
+        some = names[start : start + TILE_BATCH]
         raws = draft.stream(some)
         for name in some:
-            depth, code, log_odds, shades = parts.voxel_leaf(raws[name], colour)
+            depth, code, log_odds, shades = voxel_leaf(raws[name], colour)
             below = np.multiply(np.uint8(DEPTH) - depth, np.uint8(3), dtype=np.uint64)
             keys.append(code << below << np.uint64(5) | depth)
             rows = np.zeros(len(code), record)

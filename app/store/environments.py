@@ -4,43 +4,48 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from fnmatch import fnmatchcase
 from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Row, Text, cast, delete, func, insert, or_, select, update
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 
 from app.errors import Conflict, Invalid
+from app.event_types import EventType
 from app.model.frame import Datum, Level
 from app.model.templates import NO_TEMPLATES, template_changes
 from app.store import outbox, tables
 from app.store.area import area_after
 from app.store.base import (
-    StoreBase,
     as_environment,
     check_environment_name,
     check_tags,
     checked_text,
     environment_row,
+    upsert,
     utcnow,
 )
 from app.store.changes import KEEP
+from app.store.chunks import Chunks
+from app.store.database import Database
 from app.store.index import intersects
 from app.store.manifest import read_version
 from app.store.prepare import frame_changes, summarise, version_root
-from app.store.tree import ChunkStage
 from app.store.values import Box, Environment, Version
-from app.store.versions import insert_version
+from app.store.versions import append_version_event, insert_version
 
 PAGE: Final = 500
 
 
-class Environments(StoreBase):
+class Environments:
     """The mapped places."""
 
-    def create_environment(
+    def __init__(self, database: Database, chunks: Chunks) -> None:
+        self._database, self._chunks = database, chunks
+
+    def create(
         self,
         name: str,
         *,
@@ -60,17 +65,13 @@ class Environments(StoreBase):
         empty = version_root((), None, (Level(),))
         changes = self._initial_changes(datum, clone)
         area = area_after(
-            ChunkStage(self._chunks), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
+            self._chunks.stage(), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
         )
         now = utcnow()
         with self._database.write() as connection:
-            new = secrets.token_hex(16)
-            last_sequence = connection.execute(
-                select(tables.retired.c.sequence).where(tables.retired.c.name == name)
-            ).scalar_one_or_none()
-            sequence = int(last_sequence or 0) + 1
+            sequence = _last_sequence(connection, name) + 1
             values = {
-                "id": new,
+                "id": secrets.token_hex(16),
                 "name": name,
                 "title": checked_text(title, "a title"),
                 "description": checked_text(description, "a description"),
@@ -86,80 +87,32 @@ class Environments(StoreBase):
             }
             _insert_environment(connection, name, values)
             row = environment_row(connection, name)
-            frame: dict[str, Any] = {
-                "author": checked_text(author, "an author"),
-                "time": now,
-                "sources": (),
-                "warnings": (),
-            }
-            insert_version(
-                connection,
-                row,
-                number=0,
-                root=empty,
-                datum=None,
-                levels=(Level(),),
-                parts=(),
-                templates=NO_TEMPLATES,
-                changes={},
-                message="",
-                sequence=sequence,
-                indexed=0,
-                area=KEEP,
-                **frame,
-            )
-            events: list[dict[str, Any]] = [
-                {"sequence": sequence, "kind": "environment.created", "version": 0, "root": empty}
-            ]
-            events[0] |= {"previous": None, "layers": [], "message": ""}
+            start = _empty_version(name, empty, checked_text(author, "an author"), now)
+            insert_version(connection, row, start, sequence=sequence, indexed=0, area=KEEP)
+            first = None
             if datum is not None or clone is not None:
-                first, message = _insert_first_version(connection, row, datum, clone)
-                frame["sources"] = first.sources
-                insert_version(
-                    connection,
-                    row,
-                    number=1,
-                    root=first.root,
-                    datum=first.datum,
-                    levels=first.levels,
-                    parts=first.parts,
-                    templates=first.templates,
-                    changes=changes,
-                    message=message,
-                    sequence=sequence + 1,
-                    indexed=1 if not first.parts else 0,
-                    area=area,
-                    **frame,
-                )
-                events.append(
-                    {
-                        "sequence": sequence + 1,
-                        "kind": "version.created",
-                        "version": 1,
-                        "root": first.root,
-                        "previous": (0, empty),
-                        "layers": outbox.layer_changes((), first.parts),
-                        "message": message,
-                    }
-                )
-            for one in events:
-                outbox.append_event(connection, environment_id=new, environment=name, author=author, time=now, **one)
+                first = replace(_first_version(connection, start, datum, clone), changes=changes)
+                indexed = 0 if first.parts else 1
+                insert_version(connection, row, first, sequence=sequence + 1, indexed=indexed, area=area)
+            _append_event(connection, row, "environment.created", sequence, name, author, now, previous=None)
+            if first is not None:
+                append_version_event(connection, row, start, first, sequence + 1)
             return as_environment(environment_row(connection, name))
 
     def _initial_changes(self, datum: Datum | None, clone: Version | None) -> dict[str, Any]:
         changes: dict[str, Any] = {}
         if clone is not None:
-            changes, _ = summarise(ChunkStage(self._chunks), {}, {e.key: e for e in clone.parts})
+            changes, _ = summarise(self._chunks.stage(), {}, {e.key: e for e in clone.parts})
         place = datum or (clone.datum if clone else None)
         changes |= template_changes(NO_TEMPLATES, clone.templates if clone else NO_TEMPLATES)
         return changes | frame_changes(None, place, (Level(),), clone.levels if clone else (Level(),))
 
-    def environment(self, name: str, *, deleted: bool = False) -> Environment:
+    def get(self, name: str, *, deleted: bool = False) -> Environment:
         """The environment; Gone where it is deleted (unless asked for), NotFound where it never was."""
         with self._database.read() as connection:
             return as_environment(environment_row(connection, name, deleted=deleted))
 
-    def environments(
+    def page(
         self,
         *,
         q: str | None = None,
@@ -192,7 +145,7 @@ class Environments(StoreBase):
                 after = rows[-1].name
         return out[:limit], out[limit - 1].name if len(out) > limit else None
 
-    def update_environment(
+    def update(
         self,
         name: str,
         *,
@@ -225,34 +178,21 @@ class Environments(StoreBase):
             raise Conflict(f"the name {new_name!r} is taken, or its environment is deleted and not yet purged")
         ended = row.sequence + 1
         _retire(connection, row.name, ended)
-        used = connection.execute(
-            select(tables.retired.c.sequence).where(tables.retired.c.name == new_name)
-        ).scalar_one_or_none()
-        begun = max(ended, int(used or 0)) + 1
+        begun = max(ended, _last_sequence(connection, new_name)) + 1
         try:
             connection.execute(update(table).where(table.c.id == row.id).values(name=new_name, sequence=begun))
         except IntegrityError as error:
             raise Conflict(f"the name {new_name!r} is taken") from error
-        for sequence, name, kind in (
-            (ended, row.name, "environment.deleted"),
-            (begun, new_name, "environment.created"),
-        ):
-            _append_event(
-                connection,
-                row,
-                kind,
-                sequence=sequence,
-                name=name,
-                author=author,
-                time=now,
-                message="renamed",  # to which name is not for everybody who may see one of them
-            )
+        head = (row.head, row.root)
+        # To which name is not for everybody who may see one of them.
+        _append_event(connection, row, "environment.deleted", ended, row.name, author, now, "renamed", previous=head)
+        _append_event(connection, row, "environment.created", begun, new_name, author, now, "renamed", previous=head)
 
-    def delete_environment(self, name: str, author: str = "") -> Environment:
+    def delete(self, name: str, author: str = "") -> Environment:
         """Recoverable until purged; the name stays taken."""
         return self._mark(name, author, deleted=True)
 
-    def restore_environment(self, name: str, author: str = "") -> Environment:
+    def restore(self, name: str, author: str = "") -> Environment:
         """Undo a deletion; Conflict where it is not deleted."""
         return self._mark(name, author, deleted=False)
 
@@ -269,12 +209,13 @@ class Environments(StoreBase):
                 .where(table.c.id == row.id)
                 .values(deleted=now if deleted else None, updated=now, sequence=sequence)
             )
-            kind = "environment.deleted" if deleted else "environment.created"
+            kind: EventType = "environment.deleted" if deleted else "environment.created"
             message = "deleted" if deleted else "restored"
-            _append_event(connection, row, kind, sequence=sequence, name=name, author=author, time=now, message=message)
+            head = (row.head, row.root)
+            _append_event(connection, row, kind, sequence, name, author, now, message, previous=head)
             return as_environment(environment_row(connection, name, deleted=True))
 
-    def purge_environment(self, name: str) -> None:
+    def purge(self, name: str) -> None:
         """Remove a deleted environment for good; Conflict where it is not deleted. Its chunks and files go with the
         next collection, its events stay in the log until they were surely read.
         """
@@ -300,47 +241,63 @@ def _insert_environment(connection: Connection, name: str, values: dict[str, Any
         raise Conflict(f"the name {name!r} is taken") from error
 
 
-def _insert_first_version(
-    connection: Connection, row: Row[Any], datum: Datum | None, clone: Version | None
-) -> tuple[Version, str]:
+def _last_sequence(connection: Connection, name: str) -> int:
+    """The last sequence told under a name that an environment had before; 0 where it is new."""
+    table = tables.retired
+    return int(connection.execute(select(table.c.sequence).where(table.c.name == name)).scalar_one_or_none() or 0)
+
+
+def _empty_version(environment: str, root: str, author: str, time: datetime) -> Version:
+    return Version(
+        environment=environment,
+        number=0,
+        root=root,
+        parent=None,
+        author=author,
+        message="",
+        time=time,
+        changes={},
+        sources=(),
+        warnings=(),
+        datum=None,
+        levels=(Level(),),
+        parts=(),
+    )
+
+
+def _first_version(connection: Connection, start: Version, datum: Datum | None, clone: Version | None) -> Version:
     """What version 1 holds. A clone is read again in this transaction, so that its chunks are surely still there."""
-    if clone is None:
-        base = read_version(connection, row, 0)
-        place, parts, levels, sources, message = datum, base.parts, base.levels, base.sources, "datum set"
-    else:
+    base, message = start, "datum set"
+    if clone is not None:
         origin = environment_row(connection, clone.environment, lock=True)
         base = read_version(connection, origin, clone.number)
-        place, parts, levels, sources = datum or base.datum, base.parts, base.levels, base.sources
         message = f"cloned from {clone.environment}, version {clone.number}"
-    version = Version(
-        environment=row.name,
+    place = datum or base.datum
+    return replace(
+        start,
         number=1,
-        root=version_root(parts, place, levels, base.templates),
+        root=version_root(base.parts, place, base.levels, base.templates),
         parent=0,
-        author="",
         message=message,
-        time=base.time,
-        changes={},
-        sources=sources,
-        warnings=(),
+        sources=base.sources,
         datum=place,
-        levels=levels,
-        parts=parts,
+        levels=base.levels,
+        parts=base.parts,
         templates=base.templates,
     )
-    return version, message
 
 
 def _append_event(
     connection: Connection,
     row: Row[Any],
-    kind: Any,
-    *,
+    kind: EventType,
     sequence: int,
     name: str,
     author: str,
     time: datetime,
-    message: str,
+    message: str = "",
+    *,
+    previous: tuple[int, str] | None,
 ) -> None:
     outbox.append_event(
         connection,
@@ -350,7 +307,7 @@ def _append_event(
         kind=kind,
         version=row.head,
         root=row.root,
-        previous=(row.head, row.root),
+        previous=previous,
         layers=(),
         message=message,
         author=checked_text(author, "an author"),
@@ -360,15 +317,11 @@ def _append_event(
 
 def _retire(connection: Connection, name: str, sequence: int) -> None:
     """Remember the last sequence told under a name."""
-    make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
-    statement = make(tables.retired).values(name=name, sequence=sequence)
-    connection.execute(
-        statement.on_conflict_do_update(index_elements=["name"], set_={"sequence": statement.excluded.sequence})
-    )
+    upsert(connection, tables.retired, {"name": name}, {"sequence": sequence})
 
 
 def filters(*, q: str | None, bbox: Box | None, deleted: bool, dialect: str) -> list[ColumnElement[bool]]:
-    """The conditions on an environment's row that ``environments`` describes."""
+    """The conditions on an environment's row that ``Environments.page`` describes."""
     table = tables.environment
     out: list[ColumnElement[bool]] = [table.c.deleted.is_not(None) if deleted else table.c.deleted.is_(None)]
     if q:

@@ -9,7 +9,7 @@ import shapely
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from app.store.encode import to_wkb
-from app.store.parts import local_box_to_wgs84, split_box, wrap
+from app.store.parts.boxes import local_box_to_wgs84, split_box, wrap
 from app.store.values import Box, PartEntry
 
 

@@ -14,9 +14,11 @@ from typing import Final
 from sqlalchemy import delete, select
 
 from app.store import chunks, parts, tables
-from app.store.base import StoreBase, utcnow
+from app.store.base import utcnow
+from app.store.blobs import Blobs
+from app.store.chunks import Chunks
+from app.store.database import Database
 from app.store.manifest import unpack_manifest
-from app.store.tree import ChunkStage
 
 IDEMPOTENCY_DAYS: Final = 7
 EVENT_DAYS: Final = 30
@@ -27,8 +29,11 @@ ROBOT_DAYS: Final = 90
 PAGE: Final = 500
 
 
-class GarbageCollector(StoreBase):
+class GarbageCollector:
     """Upkeep."""
+
+    def __init__(self, database: Database, chunks: Chunks, blobs: Blobs) -> None:
+        self._database, self._chunks, self._blobs = database, chunks, blobs
 
     def collect(self, grace: timedelta) -> dict[str, int]:
         """Remove chunks and blobs that no version refers to and that were not written or used within ``grace``.
@@ -43,8 +48,8 @@ class GarbageCollector(StoreBase):
         before = int(time.time() - grace.total_seconds()) + (1 if not grace else 0)
         live_chunks, live_blobs = self._live()
         removed = self._sweep(live_chunks, before)
-        blobs, size = self.blobs.collect(live_blobs, before)
-        temporary = self.blobs.recover(max(grace.total_seconds(), 0.0))
+        blobs, size = self._blobs.collect(live_blobs, before)
+        temporary = self._blobs.recover(max(grace.total_seconds(), 0.0))
         self._tidy()
         return {"chunks": removed, "blobs": blobs, "bytes": size, "temporary": temporary}
 
@@ -61,7 +66,7 @@ class GarbageCollector(StoreBase):
             blobs = set(connection.execute(select(tables.source.c.sha256).distinct()).scalars())
         live: set[bytes] = set()
         for name in hashes:
-            chunks_of, files = parts.all_chunks(ChunkStage(self._chunks), bytes.fromhex(name), live)
+            chunks_of, files = parts.all_chunks(self._chunks.stage(), bytes.fromhex(name), live)
             live |= chunks_of
             blobs |= files
         return live, blobs

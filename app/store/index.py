@@ -26,13 +26,13 @@ from sqlalchemy import (
 
 from app.model.layers import VECTOR_LAYERS, Layer, PartKey
 from app.store import diff, tables
-from app.store.base import StoreBase
 from app.store.changes import IndexRows
+from app.store.chunks import Chunks
+from app.store.database import Database
 from app.store.extent import geometry as to_geometry
 from app.store.manifest import read_version
-from app.store.parts import split_box
+from app.store.parts.boxes import split_box
 from app.store.prepare import differing_keys, index_rows, read_roots
-from app.store.tree import ChunkStage
 from app.store.values import Box, FeatureHit, PartEntry, Version
 
 BATCH: Final = 500
@@ -88,15 +88,18 @@ def intersects(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str)
     return or_(*conditions)
 
 
-class SpatialIndex(StoreBase):
+class SpatialIndex:
     """Questions across environments."""
+
+    def __init__(self, database: Database, chunks: Chunks) -> None:
+        self._database, self._chunks = database, chunks
 
     def find(self, bbox: Box, *, layer: Layer | None = None, limit: int = 1000) -> list[FeatureHit]:
         """Features of all environments' heads that meet ``bbox`` (west, south, east, north; west > east crosses the
         antimeridian): by their box on SQLite, by their geometry on PostgreSQL. Sorted by environment, part and id.
         """
-        if not self.readonly:
-            self.refresh_index()
+        if not self._database.readonly:
+            self.refresh()
         table, owner = tables.place, tables.environment
         query = (
             select(table, owner.c.name.label("environment"))
@@ -116,7 +119,7 @@ class SpatialIndex(StoreBase):
             for r in rows
         ]
 
-    def refresh_index(self) -> int:
+    def refresh(self) -> int:
         """Bring the index of every environment to its head; how many were behind."""
         table = tables.environment
         with self._database.read() as connection:
@@ -143,16 +146,16 @@ class SpatialIndex(StoreBase):
         else:
             connection.execute(delete(tables.place).where(tables.place.c.environment_id == row.id))
         new = {e.key: e for e in head.parts}
-        draft = ChunkStage(self._chunks)
+        draft = self._chunks.stage()
         for key in differing_keys(old, new):
             if key.layer not in VECTOR_LAYERS:
                 continue
             changed = diff.features(draft, read_roots(draft, key, old), read_roots(draft, key, new))
             apply(connection, row.id, index_rows({key: changed}, head.datum, None) or ())
 
-    def rebuild_index(self) -> None:
+    def rebuild(self) -> None:
         """Throw the index away and make it anew from the trees."""
         with self._database.write(upkeep=True) as connection:
             connection.execute(delete(tables.place))
             connection.execute(update(tables.environment).values(indexed=-1))
-        self.refresh_index()
+        self.refresh()

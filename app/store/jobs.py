@@ -9,14 +9,18 @@ from sqlalchemy import Row, delete, insert, select, update
 
 from app.errors import NotFound
 from app.store import tables
-from app.store.base import StoreBase, checked_text, storable_text, utcnow
+from app.store.base import checked_text, storable_text, utcnow
+from app.store.database import Database
 from app.store.values import Job, State
 
 
-class Jobs(StoreBase):
+class Jobs:
     """The queue's memory."""
 
-    def create_job(self, owner: str = "", detail: str = "") -> Job:
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(self, owner: str = "", detail: str = "") -> Job:
         """A queued job."""
         now = utcnow()
         new = secrets.token_hex(16)
@@ -34,9 +38,9 @@ class Jobs(StoreBase):
                     updated=now,
                 )
             )
-        return self.job(new)
+        return self.get(new)
 
-    def update_job(
+    def update(
         self,
         id: str,
         *,
@@ -64,7 +68,7 @@ class Jobs(StoreBase):
                 connection.execute(update(table).where(table.c.id == id).values(updated=utcnow(), **values))
             return _as_job(connection.execute(select(table).where(table.c.id == id)).one())
 
-    def job(self, id: str) -> Job:
+    def get(self, id: str) -> Job:
         """A job; NotFound."""
         with self._database.read() as connection:
             row = connection.execute(select(tables.job).where(tables.job.c.id == id)).one_or_none()
@@ -72,7 +76,7 @@ class Jobs(StoreBase):
             raise NotFound(f"there is no job {id[:80]!r}")
         return _as_job(row)
 
-    def jobs(self, *, state: State | None = None) -> list[Job]:
+    def all(self, *, state: State | None = None) -> list[Job]:
         """Jobs, oldest first."""
         table = tables.job
         query = select(table).order_by(table.c.created, table.c.id)
@@ -81,7 +85,7 @@ class Jobs(StoreBase):
         with self._database.read() as connection:
             return [_as_job(r) for r in connection.execute(query)]
 
-    def delete_job(self, id: str) -> None:
+    def delete(self, id: str) -> None:
         """Forget a job; NotFound."""
         with self._database.write() as connection:
             if not connection.execute(delete(tables.job).where(tables.job.c.id == id)).rowcount:

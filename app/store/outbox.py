@@ -11,7 +11,8 @@ from sqlalchemy import Connection, func, insert, select, update
 from app.errors import NotFound
 from app.event_types import EventType, check_members
 from app.store import tables
-from app.store.base import StoreBase, environment_row
+from app.store.base import environment_row
+from app.store.database import Database
 from app.store.values import Event, PartEntry, rfc3339
 
 LOG_SEARCH_WINDOW = 100_000
@@ -91,10 +92,13 @@ def _reach(connection: Connection) -> int:
     )
 
 
-class Outbox(StoreBase):
+class Outbox:
     """Reading the log."""
 
-    def events(self, environment: str | None, since: int = 0, limit: int = 1000) -> list[Event]:
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def page(self, environment: str | None, since: int = 0, limit: int = 1000) -> list[Event]:
         """Events after ``since``, oldest first: a sequence with an environment, else a position of the whole log.
 
         Under a name that an environment had (it was renamed, or purged) what was told until then; NotFound where that
@@ -137,7 +141,7 @@ class Outbox(StoreBase):
             elif stored_position < position:
                 connection.execute(update(table).where(table.c.id == 1).values(position=position))
 
-    def last_events(self, position: int, each: int, limit: int) -> list[Event]:
+    def last(self, position: int, each: int, limit: int) -> list[Event]:
         """The last ``each`` events up to a position of all environments, purged ones too, in the order of the log.
 
         Where those are more than ``limit``, each environment has fewer; where not even the last one of each fits, the

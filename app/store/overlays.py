@@ -21,8 +21,9 @@ from app.errors import Conflict, NotFound
 from app.event_types import EventType
 from app.model.closures import Closures
 from app.store import outbox, tables
-from app.store.base import StoreBase, checked_text, environment_row
-from app.store.values import Overlay, OverlayState
+from app.store.base import checked_text, environment_row
+from app.store.database import Database
+from app.store.fleet_values import Overlay, OverlayState
 
 MAX_PENDING: Final = 1000
 """Maximum number of an environment's overlays that wait for a decision."""
@@ -51,10 +52,13 @@ MAX_ENDED_PER_CALL: Final = 100
 """Maximum number of overlays that are ended in one call."""
 
 
-class Overlays(StoreBase):
+class Overlays:
     """Pending and decided overlays."""
 
-    def add_overlay(self, overlay: Overlay) -> tuple[Overlay, bool]:
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add(self, overlay: Overlay) -> tuple[Overlay, bool]:
         """Store a pending or accepted overlay: (the stored one, whether it is new). The id is set here.
 
         The same report again by the same reporter, while it is pending, only moves its end. Raises NotFound for an
@@ -94,7 +98,7 @@ class Overlays(StoreBase):
             _append_event(connection, row, stored, event, stored.reporter, stored.created)
             return stored, True
 
-    def overlays(self, environment: str, state: OverlayState | None = None) -> list[Overlay]:
+    def all(self, environment: str, state: OverlayState | None = None) -> list[Overlay]:
         """List an environment's overlays, oldest first (if there are very many, the newest). Raises NotFound."""
         table = tables.overlay
         newest = (table.c.created.desc(), table.c.id.desc())
@@ -106,7 +110,7 @@ class Overlays(StoreBase):
             rows = connection.execute(query.limit(MAX_LISTED)).all()
         return [_as_overlay(environment, r) for r in reversed(rows)]
 
-    def overlay(self, environment: str, id: str) -> Overlay:
+    def get(self, environment: str, id: str) -> Overlay:
         """Read one overlay. Raises NotFound."""
         with self._database.read() as connection:
             return _read(connection, environment_row(connection, environment), id)
@@ -116,7 +120,7 @@ class Overlays(StoreBase):
         with self._database.read() as connection:
             return read_closures(connection, environment_row(connection, environment))
 
-    def decide_overlay(
+    def decide(
         self,
         environment: str,
         id: str,
@@ -141,7 +145,7 @@ class Overlays(StoreBase):
                 _append_event(connection, row, decided, event, author, now)
             return decided
 
-    def end_due_overlays(self, now: datetime) -> None:
+    def end_due(self, now: datetime) -> None:
         """End what is due: pending overlays expire, closures are lifted, each with its event."""
         table, owner = tables.overlay, tables.environment
         query = (
@@ -164,7 +168,7 @@ class Overlays(StoreBase):
                 connection.execute(update(table).where(table.c.id == due_row.id).values(state=state, decided=now))
                 _append_event(connection, row, _read(connection, row, due_row.id), event, stored.decided_by or "", now)
 
-    def note_kept_overlay(self, environment: str, id: str, version: int) -> Overlay:
+    def note_kept(self, environment: str, id: str, version: int) -> Overlay:
         """Record the version that made an overlay permanent. It stays in force until its end."""
         table = tables.overlay
         with self._database.write() as connection:

@@ -15,11 +15,12 @@ from app.errors import Damaged, Invalid, Problem
 from app.model.geodesy import distance
 from app.store import tables
 from app.store.area import compute_area, write_area
-from app.store.base import StoreBase, as_environment, datum_from_row
+from app.store.base import as_environment, datum_from_row
+from app.store.chunks import Chunks
+from app.store.database import Database
 from app.store.encode import from_wkb, to_wkb
 from app.store.environments import filters, reaches
 from app.store.manifest import read_version
-from app.store.tree import ChunkStage
 from app.store.values import Area, Box, Environment, Match
 
 log = logging.getLogger(__name__)
@@ -40,8 +41,11 @@ class _Hit:
     match: Match
 
 
-class Position(StoreBase):
+class Areas:
     """Queries by position."""
+
+    def __init__(self, database: Database, chunks: Chunks) -> None:
+        self._database, self._chunks = database, chunks
 
     def locate(
         self,
@@ -59,7 +63,7 @@ class Position(StoreBase):
 
         Args:
             latitude, longitude: degrees.
-            q, bbox, allowed, deleted: as for ``environments``.
+            q, bbox, allowed, deleted: as for ``Environments.page``.
 
         Fences come first, then the smallest area, then the nearest datum. Raises Invalid for a position that is none.
         """
@@ -83,9 +87,9 @@ class Position(StoreBase):
             return [(environments[h.id], h.match) for h in hits[:limit] if h.id in environments], following
 
         with self._database.read() as connection:
-            if self.readonly or not _stale(connection):
+            if self._database.readonly or not _stale(connection):
                 return page(connection)
-        self.refresh_areas()
+        self.refresh()
         with self._database.read() as connection:
             return page(connection)
 
@@ -124,7 +128,7 @@ class Position(StoreBase):
         wkb = bytes(to_wkb(np.array([shapely.Point(place)], object))[0])
         return func.ST_Covers(area.c.geometry, tables.from_wkb(literal(wkb, LargeBinary)), type_=Boolean)
 
-    def refresh_areas(self) -> int:
+    def refresh(self) -> int:
         """Compute the areas that no commit has computed; returns how many environments were behind.
 
         Safe beside other servers: an area is written only if the head is the one it was computed from. An environment
@@ -151,7 +155,7 @@ class Position(StoreBase):
             if head is None:
                 continue
             try:
-                computed[environment_id] = head.number, compute_area(ChunkStage(self._chunks), head.parts, head.datum)
+                computed[environment_id] = head.number, compute_area(self._chunks.stage(), head.parts, head.datum)
             except Damaged as error:
                 log.critical("area of %s: not computed, its last one stays: %s", head.environment, error.detail)
         moved: list[str] = []

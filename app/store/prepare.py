@@ -20,7 +20,10 @@ from app.store.area import area_after
 from app.store.changes import KEEP, Changes, Delete, Drop, IndexRows, Operation, Prepared, Replace
 from app.store.diff import CellChanges, FeatureChanges
 from app.store.encode import bounds, compress, from_wkb, pack, root_hash, to_wkb
-from app.store.parts import EncodedPart, Item, PartRoot
+from app.store.gc_pause import gc_paused
+from app.store.parts.boxes import coordinates, crossing_box
+from app.store.parts.features import Item, edit_features, empty_features
+from app.store.parts.roots import EncodedPart, PartRoot, read_root
 from app.store.tree import ChunkStage
 from app.store.values import PartEntry, Provenance, Version
 
@@ -34,7 +37,7 @@ IsIntact = Callable[[str], bool]
 
 def prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
     """A version on top of a base. What is damaged of a part that is replaced is stored again."""
-    with parts.gc_paused():
+    with gc_paused():
         return _prepare(draft, base, changes, is_intact)
 
 
@@ -138,7 +141,7 @@ def compose_operation(draft: ChunkStage, entries: dict[PartKey, PartEntry], oper
             raise NotFound(f"there is no {label}")
         del entries[key]
         return None
-    root = parts.read_root(draft, bytes.fromhex(entry.hash)) if entry else None
+    root = read_root(draft, bytes.fromhex(entry.hash)) if entry else None
     if isinstance(operation, Replace):
         if not isinstance(operation.part, PART_TYPES[key.layer]):
             raise Invalid(f"{label} must be {PART_TYPES[key.layer].__name__}, got {type(operation.part).__name__}")
@@ -161,11 +164,11 @@ def compose_operation(draft: ChunkStage, entries: dict[PartKey, PartEntry], oper
     if isinstance(operation, Delete):
         if entry is None or root is None:
             raise NotFound(f"there is no {label}")
-        encoded_part = parts.edit_features(draft, root, None, set(operation.ids), label)
+        encoded_part = edit_features(draft, root, None, set(operation.ids), label)
         provenance = entry.provenance.with_edit_step()
     else:
-        root = root or parts.read_root(draft, parts.empty_features(draft))
-        encoded_part = parts.edit_features(draft, root, operation.features, (), label)
+        root = root or read_root(draft, empty_features(draft))
+        encoded_part = edit_features(draft, root, operation.features, (), label)
         provenance = merge_provenance(entry.provenance, operation.provenance) if entry else operation.provenance
     digest = entry.digest if entry and encoded_part.hash.hex() == entry.hash else ""
     entries[key] = PartEntry(
@@ -193,7 +196,7 @@ def merge_provenance(old: Provenance, new: Provenance) -> Provenance:
 def read_roots(draft: ChunkStage, key: PartKey, entries: Mapping[PartKey, PartEntry]) -> PartRoot | None:
     """The decoded root of a part, or None."""
     entry = entries.get(key)
-    return parts.read_root(draft, bytes.fromhex(entry.hash)) if entry else None
+    return read_root(draft, bytes.fromhex(entry.hash)) if entry else None
 
 
 def differing_keys(before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry]) -> list[PartKey]:
@@ -327,7 +330,7 @@ def located_items(
     for k in np.flatnonzero(np.isfinite(boxes).all(axis=1)).tolist():
         west, south, east, north = boxes[k].tolist()
         if east - west > 180.0:
-            west, south, east, north = parts.crossing_box(parts.coordinates(geometry[k]))
+            west, south, east, north = crossing_box(coordinates(geometry[k]))
         out.append((chosen[k], (west, south, east, north), bytes(wkb[k])))
     return tuple(out)
 

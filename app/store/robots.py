@@ -8,13 +8,12 @@ from fnmatch import fnmatchcase
 from typing import Any, Final
 
 from sqlalchemy import Connection, Row, Select, delete, func, insert, select, tuple_, update
-from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
-from app.store.base import StoreBase, environment_row, storable_text
-from app.store.overlays import CHANGE_CLOSURES
-from app.store.values import LATEST, NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, Robot, RobotReport
+from app.store.base import environment_row, storable_text, upsert
+from app.store.database import Database
+from app.store.fleet_values import NO_ROOT, ActiveMap, ReceivedReport, Robot, RobotReport
 
 HISTORY: Final = 200
 """So many reports of each robot in each environment are kept."""
@@ -23,12 +22,13 @@ MAX_ROBOTS: Final = 10_000
 """So many robots report in one environment; on an open router anybody can make up names."""
 
 MAX_PRESENT: Final = 100_000
-MAX_MOVES: Final = 1000
-"""So many moves of a channel are looked back on."""
 
 
-class Robots(StoreBase):
+class Robots:
     """The fleet's memory."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
 
     def note_reports(self, heard: Sequence[ReceivedReport]) -> list[FleetMapError | None]:
         """Take in what robots say, in the order given, in one transaction: for each None, or why it was refused.
@@ -51,7 +51,7 @@ class Robots(StoreBase):
                 out[k] = owner if isinstance(owner, FleetMapError) else _note(connection, owner, heard[k])
         return out
 
-    def robots(self, environment: str | None = None, robot: str | None = None) -> list[Robot]:
+    def all(self, environment: str | None = None, robot: str | None = None) -> list[Robot]:
         """Robots by environment and name, of environments that are not deleted; NotFound for an unknown environment."""
         table, owner = tables.robot, tables.environment
         with self._database.read() as connection:
@@ -62,7 +62,7 @@ class Robots(StoreBase):
                 query = query.where(table.c.robot == robot)
             return [_as_robot(row) for row in connection.execute(query)]
 
-    def robots_page(
+    def page(
         self,
         environment: str | None = None,
         *,
@@ -99,7 +99,7 @@ class Robots(StoreBase):
                 cursor = _cursor(robots[-1])
         return out[:limit], _cursor(out[limit - 1]) if len(out) > limit else None
 
-    def robot_history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, RobotReport]]:
+    def history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, RobotReport]]:
         """What a robot said in an environment and when it was heard, newest first, each time it was something new."""
         table = tables.robot_history
         with self._database.read() as connection:
@@ -112,7 +112,7 @@ class Robots(StoreBase):
             )
             return [(r.time, _as_report(r)) for r in connection.execute(query)]
 
-    def forget_robot(self, environment: str, robot: str) -> None:
+    def forget(self, environment: str, robot: str) -> None:
         """Remove a robot and its history from an environment; NotFound. It comes back with its next report."""
         with self._database.write(tell=False) as connection:
             row = environment_row(connection, environment)
@@ -128,40 +128,12 @@ class Robots(StoreBase):
         table = tables.presence
         with self._database.write(tell=False, upkeep=True) as connection:
             room = MAX_PRESENT - int(connection.execute(select(func.count()).select_from(table)).scalar_one())
-            make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
             rows = sorted([(name, True) for name in present_robots] + [(name, False) for name in absent_robots])
             for name, is_present in rows:
                 if room < len(rows):  # full: who is known stays known
                     connection.execute(update(table).where(table.c.robot == name).values(there=is_present, time=now))
                     continue
-                statement = make(table).values(robot=name, there=is_present, time=now)
-                connection.execute(
-                    statement.on_conflict_do_update(
-                        index_elements=["robot"],
-                        set_={"there": statement.excluded.there, "time": statement.excluded.time},
-                    )
-                )
-
-    def moves(self, environment: str, channel: str) -> list[ChannelMove]:
-        """The newest events that brought a channel somewhere, oldest first; of ``latest`` each new version.
-
-        Events that changed which closures are in force are among them, with an empty root: they move no channel.
-        """
-        table = tables.event
-        kind = table.c.body["type"].as_string()
-        with self._database.read() as connection:
-            row = environment_row(connection, environment)
-            moved = kind == "version.created"
-            if channel != LATEST:
-                moved = (kind == "channel.moved") & (table.c.body["channel"].as_string() == channel)
-            query = select(table.c.sequence, table.c.body, table.c.time).where(
-                table.c.environment_id == row.id, moved | kind.in_(CHANGE_CLOSURES)
-            )
-            rows = connection.execute(query.order_by(table.c.sequence.desc()).limit(MAX_MOVES)).all()
-        return [
-            ChannelMove(r.sequence, r.body["version"], "" if "overlay" in r.body else r.body["root"], r.time)
-            for r in reversed(rows)
-        ]
+                upsert(connection, table, {"robot": name}, {"there": is_present, "time": now})
 
 
 def _note(connection: Connection, environment_id: str, heard: ReceivedReport) -> FleetMapError | None:
@@ -194,11 +166,8 @@ def _note(connection: Connection, environment_id: str, heard: ReceivedReport) ->
         others = select(func.count()).select_from(table).where(table.c.environment_id == environment_id)
         if connection.execute(others).scalar_one() >= MAX_ROBOTS:
             return Conflict(f"{heard.environment} has {MAX_ROBOTS} robots: remove some that are gone")
-        make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
-        statement = make(table).values(environment_id=environment_id, robot=heard.robot, **values)
-        connection.execute(
-            statement.on_conflict_do_update(index_elements=["environment_id", "robot"], set_=values)  # a race's winner
-        )
+        keys = {"environment_id": environment_id, "robot": heard.robot}
+        upsert(connection, table, keys, values)  # in a race the later one wins
     if not again:
         _remember(connection, environment_id, heard, report_columns)
     return None

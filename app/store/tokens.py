@@ -15,7 +15,8 @@ from sqlalchemy.exc import IntegrityError
 from app.errors import Conflict, Invalid, NotFound, Unavailable
 from app.store import tables
 from app.store.audit import set_audit_target
-from app.store.base import StoreBase, checked_text, utcnow
+from app.store.base import checked_text, utcnow
+from app.store.database import Database
 from app.store.values import Role, Token, rfc3339
 
 log = logging.getLogger(__name__)
@@ -23,10 +24,13 @@ log = logging.getLogger(__name__)
 SECRET_BYTES: Final = 32
 
 
-class Tokens(StoreBase):
+class Tokens:
     """Who may do what."""
 
-    def create_token(
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def create(
         self,
         name: str,
         role: Role,
@@ -82,20 +86,20 @@ class Tokens(StoreBase):
             connection.execute(insert(table).values(hash=_hash(secret), **values))
         return secret
 
-    def tokens(self) -> list[Token]:
+    def all(self) -> list[Token]:
         """All tokens, oldest first."""
         table = tables.token
         with self._database.read() as connection:
             rows = connection.execute(select(table).order_by(table.c.created, table.c.id)).all()
         return [_as_token(r) for r in rows]
 
-    def delete_token(self, id: str) -> None:
+    def delete(self, id: str) -> None:
         """Revoke a token; NotFound."""
         with self._database.write() as connection:
             if not connection.execute(delete(tables.token).where(tables.token.c.id == id)).rowcount:
                 raise NotFound(f"there is no token {id[:80]!r}")
 
-    def find_token(self, text: str) -> Token | None:
+    def find(self, text: str) -> Token | None:
         """The token with this secret, unless unknown or expired."""
         if len(text) > 4096:
             return None
@@ -107,13 +111,13 @@ class Tokens(StoreBase):
         token = _as_token(row)
         if token.ended is None and token.expires is not None and token.expires <= utcnow():
             try:
-                self.end_expired_tokens()
+                self.end_expired()
             except Unavailable as error:  # it is refused all the same, and noted when it is seen again
                 log.warning("tokens: the end of an expired token could not be stored (%s)", error.detail)
             return None
         return None if token.ended is not None else token
 
-    def end_expired_tokens(self) -> int:
+    def end_expired(self) -> int:
         """Note which tokens have expired, and return how many: they stay so, also where the clock is set back."""
         table, now = tables.token, utcnow()
         expired = table.c.ended.is_(None) & (table.c.expires <= now)

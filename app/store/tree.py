@@ -404,27 +404,7 @@ def edit(
     paths(draft, root, touched)
 
     def regroup_leaves(old: Sequence[Node], lo: bytes | None, hi: bytes | None) -> list[Node]:
-        merged: dict[bytes, Any] = {}
-        for name, raw in draft.read_many([n.hash for n in old]).items():
-            del name
-            merged.update(zip(*codec.decode(raw), strict=True))
-        for key in _between(touched, lo, hi):
-            if key in put:
-                merged[key] = put[key]
-            else:
-                merged.pop(key, None)
-        if not merged:
-            return []
-        keys = sorted(merged)
-        items = [merged[k] for k in keys]
-        ends = cut(key_hashes(keys, 0), codec.bits)
-        starts = [0, *ends[:-1]]
-        boxes = codec.boxes(items)
-        around = join_boxes(boxes, starts) if boxes is not None else [EMPTY_BOX] * len(ends)
-        return [
-            Node(draft.put(codec.encode(keys[s:e], items[s:e])), 0, e - s, 1, box, key=keys[e - 1])
-            for s, e, box in zip(starts, ends, around, strict=True)
-        ]
+        return _edited_leaves(draft, codec, old, put, _between(touched, lo, hi))
 
     new, old_keys, all_nodes = _edit_level(draft, root, 0, codec.bits, touched, deletions, regroup_leaves)
     level = 0
@@ -445,11 +425,7 @@ def edit(
             at: int = at,
         ) -> list[Node]:
             merged = {c.key: c for n in old for c in draft.inner(n.hash).children()}
-            for key in _between(touched_now, lo, hi):
-                if key in fresh:
-                    merged[key] = fresh[key]
-                else:
-                    merged.pop(key, None)
+            _update(merged, fresh, _between(touched_now, lo, hi))
             return inner_nodes(draft, [merged[k] for k in sorted(merged)], at) if merged else []
 
         new, old_keys, all_nodes = _edit_level(draft, root, level, FANOUT_BITS, touched_now, lost, regroup_inner)
@@ -464,6 +440,37 @@ def edit(
         top = inner.child(0)
     check_leaves(top)
     return top
+
+
+def _edited_leaves(
+    draft: ChunkStage, codec: LeafCodec, old: Sequence[Node], put: Mapping[bytes, Any], touched: Sequence[bytes]
+) -> list[Node]:
+    """The leaves that stand for old ones after these keys were put, or removed where nothing is put."""
+    merged: dict[bytes, Any] = {}
+    for raw in draft.read_many([n.hash for n in old]).values():
+        merged.update(zip(*codec.decode(raw), strict=True))
+    _update(merged, put, touched)
+    if not merged:
+        return []
+    keys = sorted(merged)
+    items = [merged[k] for k in keys]
+    ends = cut(key_hashes(keys, 0), codec.bits)
+    starts = [0, *ends[:-1]]
+    boxes = codec.boxes(items)
+    around = join_boxes(boxes, starts) if boxes is not None else [EMPTY_BOX] * len(ends)
+    return [
+        Node(draft.put(codec.encode(keys[s:e], items[s:e])), 0, e - s, 1, box, key=keys[e - 1])
+        for s, e, box in zip(starts, ends, around, strict=True)
+    ]
+
+
+def _update(merged: dict[bytes, Any], put: Mapping[bytes, Any], touched: Sequence[bytes]) -> None:
+    """Put the touched keys that have an item, remove the others."""
+    for key in touched:
+        if key in put:
+            merged[key] = put[key]
+        else:
+            merged.pop(key, None)
 
 
 def _between(keys: Sequence[bytes], lo: bytes | None, hi: bytes | None) -> Sequence[bytes]:

@@ -14,11 +14,14 @@ from typing import Any, Final, Literal
 from sqlalchemy import select
 
 from app.errors import Damaged, Unavailable
-from app.store import parts, tables
+from app.store import tables
 from app.store.blobs import Blobs
 from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.manifest import unpack_manifest
+from app.store.parts.rasters import tile_leaf
+from app.store.parts.resources import file_leaf
+from app.store.parts.roots import document_chunks, read_root
 from app.store.prepare import version_root
 from app.store.tree import ChunkStage, Node
 from app.store.values import PartEntry
@@ -59,6 +62,11 @@ class VerifyResult:
     size: int = 0
     findings: list[Finding] = field(default_factory=list)
     started: float = field(default_factory=time.time)
+
+    @property
+    def unused_chunks(self) -> list[str]:
+        """The damaged chunks that no version has, to be removed when all others are healed."""
+        return [f.name for f in self.findings if f.kind == "chunk" and not f.versions]
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,9 +212,9 @@ class _Walk:
         if self._is_bad(name):
             return _PartReferences(frozenset({name.hex()}), _NOTHING)
         draft = ChunkStage(self._chunks)
-        root = parts.read_root(draft, name)
+        root = read_root(draft, name)
         subtrees = [self._node(draft, node, root.type) for node in root.trees.values() if node is not None]
-        documents = {h.hex() for h in parts.document_chunks(root) if self._is_bad(h)}
+        documents = {h.hex() for h in document_chunks(root) if self._is_bad(h)}
         return _merge_references(subtrees, documents)
 
     def _node(self, draft: ChunkStage, node: Node, kind: str) -> _PartReferences:
@@ -220,10 +228,10 @@ class _Walk:
             below = _merge_references([self._node(draft, child, kind) for child in children], set())
         elif kind in ("grid", "picture"):
             (raw,) = draft.stream([node.hash]).values()
-            below = _merge_references([], {tile.hex() for _, tile in parts.tile_leaf(raw) if self._is_bad(tile)})
+            below = _merge_references([], {tile.hex() for _, tile in tile_leaf(raw) if self._is_bad(tile)})
         elif kind == "resources":
             (raw,) = draft.stream([node.hash]).values()
-            below = _PartReferences(_NOTHING, frozenset(h for _, _, h in parts.file_leaf(raw)))
+            below = _PartReferences(_NOTHING, frozenset(h for _, _, h in file_leaf(raw)))
         else:
             below = _PartReferences(_NOTHING, _NOTHING)
         self._nodes[node.hash] = below

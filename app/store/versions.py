@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
 from typing import Any, Final, Literal
@@ -10,13 +10,11 @@ from typing import Any, Final, Literal
 from sqlalchemy import Connection, Row, func, insert, select, update
 
 from app.errors import Conflict, Damaged, Invalid, NotFound, Problem, StaleParent, Unavailable
-from app.model.frame import Datum, Level
-from app.model.templates import Templates, template_changes
+from app.model.templates import template_changes
 from app.store import chunks, index, outbox, parts, tables
 from app.store.area import area_after, write_area
 from app.store.audit import skip_audit
 from app.store.base import (
-    StoreBase,
     checked_text,
     clean_problem,
     environment_row,
@@ -24,12 +22,14 @@ from app.store.base import (
     storable_text,
     utcnow,
 )
+from app.store.blobs import Blobs
 from app.store.changes import KEEP, Changes, Keep, Prepared
+from app.store.chunks import Chunks
+from app.store.database import Database
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
 from app.store.prepare import frame_changes, prepare, summarise
-from app.store.tree import ChunkStage
-from app.store.values import LATEST, Area, Idempotency, PartEntry, Source, Version
+from app.store.values import LATEST, Area, Idempotency, Source, Version
 
 MAX_REVERT_ATTEMPTS: Final = 8
 
@@ -57,19 +57,8 @@ def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> in
 def insert_version(
     connection: Connection,
     environment: Row[Any],
+    version: Version,
     *,
-    number: int,
-    root: str,
-    datum: Datum | None,
-    levels: Sequence[Level],
-    parts: Sequence[PartEntry],
-    templates: Templates,
-    changes: Mapping[str, Any],
-    sources: Sequence[Source],
-    warnings: Sequence[Problem],
-    author: str,
-    message: str,
-    time: datetime,
     sequence: int,
     indexed: int,
     area: Area | Literal[Keep.KEEP] | None,
@@ -81,31 +70,31 @@ def insert_version(
     connection.execute(
         insert(tables.version).values(
             environment_id=environment.id,
-            number=number,
-            root=root,
-            parent=number - 1 if number else None,
-            author=author,
-            message=message,
-            time=time,
+            number=version.number,
+            root=version.root,
+            parent=version.parent,
+            author=version.author,
+            message=version.message,
+            time=version.time,
             sequence=sequence,
-            changes=dict(changes),
-            warnings=[clean_problem(w).as_dict() for w in warnings],
-            manifest=pack_manifest(datum, levels, parts, templates),
+            changes=dict(version.changes),
+            warnings=[clean_problem(w).as_dict() for w in version.warnings],
+            manifest=pack_manifest(version.datum, version.levels, version.parts, version.templates),
         )
     )
-    insert_sources(connection, environment.id, number, sources, first=0)
-    box = extent(parts, datum)
+    insert_sources(connection, environment.id, version.number, version.sources, first=0)
+    box = extent(version.parts, version.datum)
     west, south, east, north = box or (None, None, None, None)
     connection.execute(
         update(tables.environment)
         .where(tables.environment.c.id == environment.id)
         .values(
-            head=number,
-            root=root,
+            head=version.number,
+            root=version.root,
             sequence=sequence,
-            datum=datum.as_dict() if datum else None,
+            datum=version.datum.as_dict() if version.datum else None,
             indexed=indexed,
-            updated=time,
+            updated=version.time,
             west=west,
             south=south,
             east=east,
@@ -116,6 +105,26 @@ def insert_version(
     )
     if isinstance(area, Area):
         write_area(connection, environment.id, area)
+
+
+def append_version_event(
+    connection: Connection, environment: Row[Any], before: Version, version: Version, sequence: int
+) -> None:
+    """The event of a new version. Call it last, see ``outbox.append_event``."""
+    outbox.append_event(
+        connection,
+        environment_id=environment.id,
+        environment=environment.name,
+        sequence=sequence,
+        kind="version.created",
+        version=version.number,
+        root=version.root,
+        previous=(before.number, before.root),
+        layers=outbox.layer_changes(before.parts, version.parts),
+        message=version.message,
+        author=version.author,
+        time=version.time,
+    )
 
 
 def insert_sources(
@@ -157,16 +166,19 @@ def lock_blobs(connection: Connection, hashes: set[str]) -> None:
         connection.execute(update(tables.blob).where(tables.blob.c.sha256.in_(batch)).values(used=now))
 
 
-class Versions(StoreBase):
+class Versions:
     """Versions of environments."""
 
-    def version(self, environment: str, ref: str | int = LATEST) -> Version:
+    def __init__(self, database: Database, chunks: Chunks, blobs: Blobs) -> None:
+        self._database, self._chunks, self._blobs = database, chunks, blobs
+
+    def get(self, environment: str, ref: str | int = LATEST) -> Version:
         """A version by number, channel or ``latest``; NotFound, or Gone where the environment is deleted."""
         with self._database.read() as connection:
             row = environment_row(connection, environment)
             return read_version(connection, row, resolve(connection, row, ref))
 
-    def versions(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
+    def page(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
         """Newest first; ``before``: only those with a smaller number."""
         table = tables.version
         with self._database.read() as connection:
@@ -178,17 +190,24 @@ class Versions(StoreBase):
             sources = read_sources(connection, row.id, [r.number for r in rows])
         return [as_version(row.name, r, sources[r.number]) for r in rows]
 
+    def get_with_base(self, environment: str, number: int) -> tuple[Version, Version | None]:
+        """A version, also of a deleted environment, and the one before it."""
+        with self._database.read() as connection:
+            row = environment_row(connection, environment, deleted=True)
+            base = read_version(connection, row, number - 1) if number else None
+            return read_version(connection, row, number), base
+
     def prepare(self, base: Version, changes: Changes) -> Prepared:
         """Work out a version on top of a base. Reads and computes only, so it may run in another process.
 
         Raises Invalid where something cannot be stored, NotFound where something to delete is not there.
         """
-        return prepare(ChunkStage(self._chunks), base, changes, self._is_intact)
+        return prepare(self._chunks.stage(), base, changes, self._is_intact)
 
     def _is_intact(self, part: str) -> bool:
         """Whether the database has all chunks of a part, whatever is in memory."""
         try:
-            names, _ = parts.all_chunks(ChunkStage(self._chunks), bytes.fromhex(part), ())
+            names, _ = parts.all_chunks(self._chunks.stage(), bytes.fromhex(part), ())
         except Damaged:
             return False
         return not self._chunks.find_damaged(sorted(names))
@@ -213,63 +232,46 @@ class Versions(StoreBase):
         checked_text(author, "an author")
         checked_text(message, "a message")
         if prepared.blobs:
-            self.blobs.put_many(list(prepared.blobs.values()))
+            self._blobs.put_many(list(prepared.blobs.values()))
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            previous_number = _previous_version(connection, row, idempotency)
-            if previous_number is not None:
+            if (previous := _previous_version(connection, row, idempotency)) is not None:
                 skip_audit()
-                return read_version(connection, row, previous_number)
+                return read_version(connection, row, previous)
             _check_head(row, prepared.base)
             now = utcnow()
+            chunks.insert(connection, prepared.chunks)  # where nothing changed, what was found damaged
             if not prepared.changed:
-                chunks.insert(connection, prepared.chunks)  # what was found damaged
                 _append_sources(connection, row.id, row.head, sources)
                 _remember(connection, row.id, idempotency, row.head, now)
                 return read_version(connection, row, row.head)
             before = read_version(connection, row, row.head)
-            chunks.insert(connection, prepared.chunks)
             lock_blobs(connection, set(prepared.blobs))
-            number, sequence = row.head + 1, row.sequence + 1
-            in_step = prepared.index is not None and row.indexed == row.head
-            if in_step and prepared.index:
+            sequence, indexed = row.sequence + 1, row.indexed
+            if prepared.index is not None and row.indexed == row.head:
                 index.apply(connection, row.id, prepared.index)
-            insert_version(
-                connection,
-                row,
-                number=number,
+                indexed = row.head + 1
+            version = Version(
+                environment=row.name,
+                number=row.head + 1,
                 root=prepared.root,
+                parent=row.head,
+                author=author,
+                message=message,
+                time=now,
+                changes=prepared.changes,
+                sources=tuple(sources),
+                warnings=tuple(warnings),
                 datum=prepared.datum,
                 levels=prepared.levels,
                 parts=prepared.parts,
                 templates=prepared.templates,
-                changes=prepared.changes,
-                sources=sources,
-                warnings=warnings,
-                author=author,
-                message=message,
-                time=now,
-                sequence=sequence,
-                indexed=number if in_step else row.indexed,
-                area=prepared.area,
             )
-            _remember(connection, row.id, idempotency, number, now)
-            version = read_version(connection, row, number)
-            outbox.append_event(
-                connection,
-                environment_id=row.id,
-                environment=row.name,
-                sequence=sequence,
-                kind="version.created",
-                version=number,
-                root=prepared.root,
-                previous=(before.number, before.root),
-                layers=outbox.layer_changes(before.parts, prepared.parts),
-                message=message,
-                author=author,
-                time=now,
-            )
-        return version
+            insert_version(connection, row, version, sequence=sequence, indexed=indexed, area=prepared.area)
+            _remember(connection, row.id, idempotency, version.number, now)
+            stored = read_version(connection, row, version.number)
+            append_version_event(connection, row, before, version, sequence)
+        return stored
 
     def add_sources(self, environment: str, version: int, sources: Sequence[Source]) -> Version:
         """Keep further files with a version: what was uploaded but changed nothing. The version with all of them."""
@@ -294,8 +296,8 @@ class Versions(StoreBase):
         expected: StaleParent where the head is another one; without it the head may move meanwhile.
         """
         for attempt in range(MAX_REVERT_ATTEMPTS):
-            target = self.version(environment, to)
-            head = self.version(environment)
+            target = self.get(environment, to)
+            head = self.get(environment)
             if expected is not None and head.number != expected:
                 record = self.idempotent(environment, idempotency.key) if idempotency else None
                 if record is None:
@@ -318,9 +320,9 @@ class Versions(StoreBase):
         changes: dict[str, Any] = {}
         area: Area | Literal[Keep.KEEP] | None = KEEP
         if changed:
-            area = area_after(ChunkStage(self._chunks), head.parts, target.parts, head.datum, target.datum)
+            area = area_after(self._chunks.stage(), head.parts, target.parts, head.datum, target.datum)
             before, after = {e.key: e for e in head.parts}, {e.key: e for e in target.parts}
-            changes, _ = summarise(ChunkStage(self._chunks), before, after)
+            changes, _ = summarise(self._chunks.stage(), before, after)
             changes |= frame_changes(head.datum, target.datum, head.levels, target.levels)
             changes |= template_changes(head.templates, target.templates)
         contents = (target.parts, target.datum, target.levels, target.templates)

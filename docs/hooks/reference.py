@@ -398,7 +398,8 @@ def metrics() -> str:
     hits = own.registry._names_to_collectors["fleetmap_cache_hits"]
     rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
     with tempfile.TemporaryDirectory() as folder:
-        empty: Any = SimpleNamespace(environments=lambda **_: ([], None), blob_dir=Path(folder))
+        environments = SimpleNamespace(page=lambda **_: ([], None))
+        empty: Any = SimpleNamespace(environments=environments, blob_dir=Path(folder))
         for collector in (_HeadVersionCollector(empty), _Scrubs(empty)):
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())

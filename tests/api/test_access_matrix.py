@@ -116,7 +116,7 @@ class Site:
     def send(self, row: Row, caller: str, env: str, method: str | None = None) -> httpx.Response:
         job = ""
         if "{job}" in row.request:
-            job = self.api.app.state.services.store.create_job("another token").id
+            job = self.api.app.state.services.store.jobs.create("another token").id
         row_method, path = row.request.split(" ")
         values = {**VALUES, "env": env, "job": job}
         path = re.sub(r"\{(\w+)\}", lambda match: values[match[1]], path)
@@ -137,12 +137,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         api.upload(FARM, {"n.tmap2.yaml": samples.tmap2()})
         store = api.app.state.services.store
         past = datetime.now(UTC) - timedelta(seconds=1)
-        bearer = {"garbage": "x" * 43, "expired": store.create_token("expired", "admin", expires=past)[1]}
+        bearer = {"garbage": "x" * 43, "expired": store.tokens.create("expired", "admin", expires=past)[1]}
         for pattern, suffix in ((None, ""), (OTHERS, LIMITED)):
             for name, robot in (("viewer", None), ("robot", "r1"), ("robot", "r2"), ("editor", None), ("admin", None)):
                 caller = f"{name} {robot}" if robot else name
-                bearer[caller + suffix] = store.create_token(caller, name, pattern, robot)[1]
-        revoked, bearer["revoked"] = store.create_token("revoked", "admin")
+                bearer[caller + suffix] = store.tokens.create(caller, name, pattern, robot)[1]
+        revoked, bearer["revoked"] = store.tokens.create("revoked", "admin")
         api.get("formats", headers={"Authorization": f"Bearer {bearer['revoked']}"})
         api("DELETE", f"tokens/{revoked.id}", 204)
         yield Site(api, api.as_(None).http, bearer)
@@ -228,14 +228,14 @@ def test_answers_do_not_tell_whether_a_foreign_environment_exists(site: Site) ->
 
 def test_foreign_jobs_are_not_found(site: Site) -> None:
     store = site.api.app.state.services.store
-    job = store.create_job("another token").id
+    job = store.jobs.create("another token").id
     for caller in ("viewer", "editor", "admin" + LIMITED):
         header = {"Authorization": f"Bearer {site.bearer[caller]}"}
         foreign, absent = (site.nobody.get(f"{API}/jobs/{number}", headers=header) for number in (job, "0" * 32))
         assert (
             (foreign.status_code, foreign.text.replace(job, "0" * 32)) == (absent.status_code, absent.text) != (200, "")
         )
-    assert store.job(job)
+    assert store.jobs.get(job)
 
 
 def test_unknown_addresses_need_a_token_as_well(site: Site) -> None:

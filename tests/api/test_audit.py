@@ -86,14 +86,14 @@ def test_entry_and_change_are_one_transaction(tmp_path: Path) -> None:
     try:
         with pytest.raises(ZeroDivisionError), store._database.write():
             raise ZeroDivisionError
-        assert store.audit() == []
+        assert store.audit.page() == []
         assert not caller.recorded
-        store.create_environment("a")
-        store.create_environment("b")  # of the same request
+        store.environments.create("a")
+        store.environments.create("b")  # of the same request
     finally:
         CALLER.reset(reset)
-    store.create_environment("c")  # of the server itself
-    assert [(e.token, e.address) for e in store.audit()] == [("name", "10.0.0.1")]
+    store.environments.create("c")  # of the server itself
+    assert [(e.token, e.address) for e in store.audit.page()] == [("name", "10.0.0.1")]
     store.close()
 
 

@@ -54,7 +54,7 @@ def forget(api: Api) -> None:
     """What is in the server's memory, as after a start."""
     services = api.app.state.services
     services.response_cache._entries.clear()
-    services.store._chunks.forget()
+    services.store.chunks.forget()
 
 
 def test_damaged_cached_maps_are_made_again(own: tuple[Api, Path]) -> None:

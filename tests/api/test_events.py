@@ -92,8 +92,8 @@ def test_a_stream_ends_with_its_token(api: Api, bare: str) -> None:
 
 
 def test_streams_at_one_place_share_a_look(api: Api, bare: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = type(api.app.state.services.store)
-    looks, quick = [], store.events
+    events = type(api.app.state.services.store.events)
+    looks, quick = [], events.page
 
     def counted(self: Any, environment: Any, since: int = 0, limit: int = 1000) -> Any:
         looks.append((environment, since))
@@ -112,7 +112,7 @@ def test_streams_at_one_place_share_a_look(api: Api, bare: str, monkeypatch: pyt
     for thread in threads:
         thread.start()
     begun.wait(30)
-    monkeypatch.setattr(store, "events", counted)
+    monkeypatch.setattr(events, "page", counted)
     api.upload(bare, samples.grid())
     for thread in threads:
         thread.join(30)

@@ -191,7 +191,7 @@ def test_link_needs_no_token(api: Api, farm: str) -> None:
 
 def test_short_address_can_be_signed(api: Api, farm: str) -> None:
     services = api.app.state.services
-    environment = services.store.environment(farm)
+    environment = services.store.environments.get(farm)
     creator = services.access.authenticate(f"Bearer {api.token}".encode(), None)
     for path in (f"/maps/{farm}/tmap2", f"/maps/{farm}/tmap2/network.tmap2.yaml"):
         grant = services.links.create(environment, path, {}, 60, creator)
@@ -362,7 +362,7 @@ def test_slow_map_by_link_returns_503_and_keeps_no_signature(tmp_path: Path) -> 
         services = api.app.state.services
         creator = services.access.authenticate(f"Bearer {api.token}".encode(), None)
         path = "/api/v1/environments/farm/versions/1/maps/geojson"
-        grant = services.links.create(services.store.environment("farm"), path, {"derive": "false"}, 600, creator)
+        grant = services.links.create(services.store.environments.get("farm"), path, {"derive": "false"}, 600, creator)
         nobody = api.as_(None)
         answer = nobody("GET", grant.url, 503)
         assert int(answer.headers["retry-after"]) > 0

@@ -78,7 +78,8 @@ def test_the_same_again_is_304(api: Api, farm: str) -> None:
 def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """For a second neither database nor disk is asked; then the answer must be confirmed."""
     from app.errors import Unavailable
-    from app.store.store import Store
+    from app.store.channels import Channels
+    from app.store.tokens import Tokens
 
     def away(*_: object) -> None:
         raise Unavailable("the database is away")
@@ -87,8 +88,8 @@ def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeyp
     api.get(path)
     time.sleep(1.1)
     first = api.get(path)
-    monkeypatch.setattr(Store, "channel_target", away)
-    monkeypatch.setattr(Store, "find_token", away)
+    monkeypatch.setattr(Channels, "target", away)
+    monkeypatch.setattr(Tokens, "find", away)
     for _ in range(5):
         again = api.get(path)
         assert again.content == first.content
@@ -478,7 +479,7 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
         job = api.get("/maps/farm/tmap2", 202).json()["id"]
         services = api.app.state.services
-        services.store.update_job(job, state="cancelled", detail="cancelled")
+        services.store.jobs.update(job, state="cancelled", detail="cancelled")
         assert not stopped.is_set()
         services.jobs.send_heartbeats()
         assert stopped.wait(10)

@@ -179,7 +179,7 @@ def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]
 
 def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -> None:
     resource_ids: dict[str, str] = {}
-    job = api.app.state.services.store.create_job(owner="", detail="an example")
+    job = api.app.state.services.store.jobs.create(owner="", detail="an example")
     resource_ids["/api/v1/jobs/{id}"] = job.id
     resource_ids["/api/v1/stored/{kind}/{sha256}"] = api.app.state.services.store.blobs.put(b"an example")
     calls = operations(schema)

@@ -199,7 +199,7 @@ def test_overlay_of_an_earlier_release_goes_on_as_a_closure(api: Api, farm: str,
 
     assert blocked()
     assert api.get(f"/maps/{farm}/geojson").text.count(f'"overlay-{overlay["id"]}"') <= 1
-    api.app.state.services.store.end_due_overlays(datetime.now(UTC) + timedelta(hours=2))
+    api.app.state.services.store.overlays.end_due(datetime.now(UTC) + timedelta(hours=2))
     assert api.get(f"{url}?state=ended").json()[0]["id"] == overlay["id"]
     assert not blocked(), "production still stands on version 4"
     assert "blocked_until" not in api.get(f"/maps/{farm}/geojson").text

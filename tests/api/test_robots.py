@@ -46,15 +46,15 @@ def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
 
 
 def test_many_reports_at_once_are_few_transactions(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    store, sizes = type(api.app.state.services.store), []
-    quick = store.note_reports
+    robots, sizes = type(api.app.state.services.store.robots), []
+    quick = robots.note_reports
 
     def counted(self: Any, heard: Any) -> Any:
         sizes.append(len(heard))
         time.sleep(0.2)
         return quick(self, heard)
 
-    monkeypatch.setattr(store, "note_reports", counted)
+    monkeypatch.setattr(robots, "note_reports", counted)
 
     def report(k: int) -> int:
         body = status(farm if k else "nowhere", "a" * 64)
@@ -73,7 +73,7 @@ def test_a_report_that_cannot_be_stored_is_told(api: Api, farm: str, monkeypatch
         raise Unavailable("the database is away")
 
     with monkeypatch.context() as patch:
-        patch.setattr(type(api.app.state.services.store), "note_reports", away)
+        patch.setattr(type(api.app.state.services.store.robots), "note_reports", away)
         api.problem("PUT", "robots/late/status", 503, json=status(farm, "a" * 64))
     api("PUT", "robots/late/status", 200, json=status(farm, "a" * 64))
 
@@ -81,8 +81,8 @@ def test_a_report_that_cannot_be_stored_is_told(api: Api, farm: str, monkeypatch
 def test_one_report_that_cannot_be_taken_harms_no_other(
     api: Api, farm: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    store = type(api.app.state.services.store)
-    quick = store.note_reports
+    robots = type(api.app.state.services.store.robots)
+    quick = robots.note_reports
 
     def picky(self: Any, heard: Any) -> Any:
         time.sleep(0.1)
@@ -90,7 +90,7 @@ def test_one_report_that_cannot_be_taken_harms_no_other(
             raise ValueError("a mistake")
         return quick(self, heard)
 
-    monkeypatch.setattr(store, "note_reports", picky)
+    monkeypatch.setattr(robots, "note_reports", picky)
 
     def report(k: int) -> int:
         return api("PUT", f"robots/odd-{k}/status", None, json=status(farm, "a" * 64)).status_code
@@ -132,15 +132,15 @@ def test_an_environment_that_goes_meanwhile_takes_its_robots_along(
     root = root_of(api, farm, 2)
     for env in (farm, bare):
         api("PUT", "robots/goer/status", 200, json=status(env, root))
-    store = type(api.app.state.services.store)
-    quick = store.channels
+    store = api.app.state.services.store
+    quick = store.channels.all
 
-    def delete_first(self: Any, environment: str) -> Any:
-        if environment == farm and self.environment(farm, deleted=True).deleted is None:
-            self.delete_environment(farm)
-        return quick(self, environment)
+    def delete_first(environment: str) -> Any:
+        if environment == farm and store.environments.get(farm, deleted=True).deleted is None:
+            store.environments.delete(farm)
+        return quick(environment)
 
-    monkeypatch.setattr(store, "channels", delete_first)
+    monkeypatch.setattr(store.channels, "all", delete_first)
     assert farm not in {r["environment"] for r in api.get("robots?limit=1000").json()}
     for method, path in (("GET", f"robots/goer?environment={farm}"), ("PUT", "robots/goer/status")):
         api("POST", f"environments/{farm}/restore", 200)

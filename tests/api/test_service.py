@@ -409,12 +409,12 @@ def test_errors_have_one_shape(api: Api, method: str, path: str, status: int, mo
 def test_a_bug_tells_nothing(
     api: Api, bare: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from app.store.store import Store
+    from app.store.channels import Channels
 
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("secret /etc/path and token")
 
-    monkeypatch.setattr(Store, "channels", broken)
+    monkeypatch.setattr(Channels, "all", broken)
     body = api.problem("GET", f"environments/{bare}/channels", 500)
     assert "secret" not in str(body)
     assert "RuntimeError at " in caplog.text

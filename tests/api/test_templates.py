@@ -230,7 +230,9 @@ def test_what_this_release_does_not_know_is_told_and_no_robot_stands_without_a_m
 
     store = api.app.state.services.store
     templates = Templates("of-tomorrow", {"tmap2": FormatTemplate(None, {"colour": "red", "xy_goal_tolerance": 0.4})})
-    store.commit(env, store.prepare(store.version(env), Changes(templates=templates)), author="", message="")
+    store.versions.commit(
+        env, store.versions.prepare(store.versions.get(env), Changes(templates=templates)), author="", message=""
+    )
     assert tolerance(api, env) == 0.4
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
     problems = [w["problem"] for w in report["warnings"]]

@@ -16,8 +16,9 @@ from app.api import channels, maps
 from app.api.http.auth import Authenticator
 from app.api.http.single_flight import SingleFlight
 from app.errors import NotFound, Unavailable
+from app.store.channels import Channels
 from app.store.database import Database
-from app.store.store import Store
+from app.store.tokens import Tokens
 from tests.api import samples
 from tests.api.conftest import Api
 
@@ -184,9 +185,9 @@ def test_what_robots_say_is_in_the_next_answer(api: Api, farm: str, monkeypatch:
 
 
 def test_one_look_for_a_fleet_but_none_for_strangers(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    gate, quick = Gate(), Store.channel_target
+    gate, quick = Gate(), Channels.target
 
-    def slow(self: Store, *args: Any) -> Any:
+    def slow(self: Channels, *args: Any) -> Any:
         gate()
         return quick(self, *args)
 
@@ -195,7 +196,7 @@ def test_one_look_for_a_fleet_but_none_for_strangers(api: Api, farm: str, monkey
     api.upload(farm, network("next"))
     robots = [api.token_for("robot", robot=f"r{k}", environments=farm) for k in range(6)]
     stranger = api.token_for("viewer", environments="other-*")
-    monkeypatch.setattr(Store, "channel_target", slow)
+    monkeypatch.setattr(Channels, "target", slow)
     with at_once(8) as ask:
         futures = [ask(robot.get, path) for robot in robots]
         assert gate.reached.wait(20)
@@ -233,10 +234,10 @@ def test_an_environment_that_is_not_there_is_told_to_each(
 
 
 def test_a_token_is_looked_up_once_and_each_its_own(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    gate, quick = Gate(), Store.find_token
+    gate, quick = Gate(), Tokens.find
     asked_for: list[str] = []
 
-    def slow(self: Store, text: str) -> Any:
+    def slow(self: Tokens, text: str) -> Any:
         asked_for.append(text)
         gate()
         return quick(self, text)
@@ -244,7 +245,7 @@ def test_a_token_is_looked_up_once_and_each_its_own(api: Api, farm: str, monkeyp
     tokens = [api.token_for("viewer").token, api.token_for("viewer", environments="other-*").token, "x" * 40]
     access = api.app.state.services.access
     access.invalidate()
-    monkeypatch.setattr(access, "_find_token", lambda text: slow(api.app.state.services.store, text))
+    monkeypatch.setattr(access, "_find_token", lambda text: slow(api.app.state.services.store.tokens, text))
     clients = [api.as_(token) for token in tokens for _ in range(3)]
     with at_once(len(clients)) as ask:
         futures = [ask(client.get, f"environments/{farm}", None) for client in clients]

@@ -67,7 +67,7 @@ def damage_chunks(api: Api, folder: Path) -> None:
     with contextlib.closing(sqlite3.connect(folder / "fleetmap.sqlite3", timeout=30)) as database, database:
         database.execute("DELETE FROM chunk WHERE rowid % 3 = 0")
         database.execute("UPDATE chunk SET data = zeroblob(length(data)) WHERE rowid % 3 = 1")
-    api.app.state.services.store._chunks.forget()
+    api.app.state.services.store.chunks.forget()
 
 
 def damage_blobs(folder: Path) -> None:

@@ -111,7 +111,7 @@ def version(api: Api, fresh: Callable[[], str]) -> Any:
     env = fresh()
     api.post("environments", {"name": env})
     api.upload(env, samples.grid())
-    return api.app.state.services.store.version(env, 1)
+    return api.app.state.services.store.versions.get(env, 1)
 
 
 def test_coverage_after_a_restart_tries_nothing(api: Api, version: Any, tmp_path: Path) -> None:

@@ -109,8 +109,8 @@ def test_a_robot_that_vanished_with_the_router_is_not_there(api: Api, port: int)
 
 def test_reports_wait_for_a_database_that_is_away(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     store: Store = api.app.state.services.store
-    store.create_environment("farm")
-    note, calls = store.note_reports, []
+    store.environments.create("farm")
+    note, calls = store.robots.note_reports, []
 
     def away(batch: Any) -> Any:
         calls.append(len(batch))
@@ -118,16 +118,16 @@ def test_reports_wait_for_a_database_that_is_away(api: Api, monkeypatch: pytest.
             raise Unavailable("away")
         return note(batch)
 
-    monkeypatch.setattr(store, "note_reports", away)
+    monkeypatch.setattr(store.robots, "note_reports", away)
     intake = ReportQueue(store)
     intake.start()
     intake.enqueue_status("farm", "r1", said(1))
     intake.enqueue_status("farm", "r1", said(2))
-    eventually(lambda: len(store.robot_history("farm", "r1")) == 2)
+    eventually(lambda: len(store.robots.history("farm", "r1")) == 2)
     assert len(calls) >= 3
     intake.enqueue_status("farm", "r1", said(3))
     intake.close()
-    assert [r.version for _, r in store.robot_history("farm", "r1")] == [3, 2, 1], "what waits is written at the end"
+    assert [r.version for _, r in store.robots.history("farm", "r1")] == [3, 2, 1], "what waits is written at the end"
 
 
 def test_what_comes_too_fast_is_told(
@@ -135,13 +135,13 @@ def test_what_comes_too_fast_is_told(
 ) -> None:
     monkeypatch.setattr("app.fleet.report_queue.QUEUE_SIZE", 2)
     store: Store = api.app.state.services.store
-    store.create_environment("farm")
+    store.environments.create("farm")
     intake = ReportQueue(store)
     for n in range(5):
         intake.enqueue_status("farm", "r1", said(n))
     intake.start()
     intake.close()
-    assert [r.version for _, r in store.robot_history("farm", "r1")] == [1, 0]
+    assert [r.version for _, r in store.robots.history("farm", "r1")] == [1, 0]
     assert "3 reports of robots were left out" in caplog.text
 
 
@@ -151,7 +151,7 @@ def test_who_says_too_much_displaces_nobody(
     monkeypatch.setattr("app.fleet.report_queue.MAX_QUEUED_PER_ROBOT", 3)
     monkeypatch.setattr("app.fleet.report_queue.QUEUE_SIZE", 20)
     store: Store = api.app.state.services.store
-    store.create_environment("farm")
+    store.environments.create("farm")
     intake = ReportQueue(store)
     for n in range(100):
         intake.enqueue_status("farm", "loud", said(n))
@@ -159,14 +159,14 @@ def test_who_says_too_much_displaces_nobody(
     for n in range(3):
         intake.enqueue_status("farm", "calm", said(n))
     intake.start()
-    eventually(lambda: len(store.robot_history("farm", "calm")) == 3)
-    assert [r.version for _, r in store.robot_history("farm", "loud")] == [2, 1, 0]
+    eventually(lambda: len(store.robots.history("farm", "calm")) == 3)
+    assert [r.version for _, r in store.robots.history("farm", "loud")] == [2, 1, 0]
     assert "194 reports of robots were left out" in caplog.text
     assert caplog.text.count("of lost was left out") == 1, "one line for all three"
     assert "(and 2 others)" in caplog.text
     intake.enqueue_status("farm", "loud", said(7))
     intake.close()
-    assert [r.version for _, r in store.robot_history("farm", "loud")] == [7, 2, 1, 0], "who is quiet again is heard"
+    assert [r.version for _, r in store.robots.history("farm", "loud")] == [7, 2, 1, 0], "who is quiet again is heard"
 
 
 def test_nonsense_keeps_nothing_from_being_renewed(
@@ -176,7 +176,7 @@ def test_nonsense_keeps_nothing_from_being_renewed(
     monkeypatch.setattr("app.fleet.report_queue.PRESENCE_REFRESH_SECONDS", 0.2)
     store: Store = api.app.state.services.store
     intake, renewed, stop = ReportQueue(store), [], threading.Event()
-    monkeypatch.setattr(store, "note_presence", lambda on_bus, absent, now: renewed.append(on_bus))
+    monkeypatch.setattr(store.robots, "note_presence", lambda on_bus, absent, now: renewed.append(on_bus))
     intake.set_presence("calm", on_bus=True)
 
     def shout() -> None:

@@ -185,7 +185,7 @@ def test_damaged_data_is_an_alarm_over_zenoh_too(
             raise error
 
         with monkeypatch.context() as patch:
-            patch.setattr(api.app.state.services.store, "version", fail)
+            patch.setattr(api.app.state.services.store.versions, "get", fail)
             reply = next(iter(session.get("fleetmap/rotten/0/version", timeout=20.0)))
         assert json.loads(bytes(reply.err.payload))["status"] == 500
         assert [r.levelname for r in caplog.records if r.levelname == level]

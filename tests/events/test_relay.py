@@ -55,7 +55,7 @@ def test_late_joiners_get_history(api: Api, session: zenoh.Session) -> None:
         api.upload("late", {"n.tmap2.yaml": network(k)})
     # Who joins in the very milliseconds in which Zenoh first learns of a publisher may miss its first samples.
     services = api.app.state.services
-    eventually(lambda: services.store.relay_position() == services.store.last_position())
+    eventually(lambda: services.store.events.relay_position() == services.store.events.last_position())
     first = Listener(session, "fleetmap/late/events")
     first.wait(lambda e: len(e.sequences()) == 6)
     assert first.sequences() == [1, 2, 3, 4, 5, 6]
@@ -206,8 +206,8 @@ def test_a_database_that_is_away_is_told_once(
     monkeypatch.setattr("app.events.leader.POLL_SECONDS", 0.01)
     store = Store(f"sqlite:///{tmp_path / 'store.sqlite'}", tmp_path / "blobs")
     store.migrate()
-    store.create_environment("farm")
-    relayed, reads = store.relay_position, []
+    store.environments.create("farm")
+    relayed, reads = store.events.relay_position, []
 
     def away() -> int:
         reads.append(1)
@@ -215,7 +215,7 @@ def test_a_database_that_is_away_is_told_once(
             raise Unavailable("the database is away")
         return relayed()
 
-    monkeypatch.setattr(store, "relay_position", away)
+    monkeypatch.setattr(store.events, "relay_position", away)
     bus = Deaf()
     relay = Relay(store, bus, tmp_path)  # type: ignore[arg-type]
     relay.start()

@@ -70,7 +70,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 def store(tmp_path: Path) -> Iterator[Store]:
     new_store = Store(f"sqlite:///{tmp_path / 'a.sqlite'}", tmp_path / "blobs")
     new_store.migrate()
-    new_store.create_environment("here", author="a")
+    new_store.environments.create("here", author="a")
     yield new_store
     new_store.close()
 
@@ -135,9 +135,9 @@ def test_a_new_site_takes_the_place_of_an_earlier_one_and_of_nothing_else(ingest
 
 def test_whose_the_datum_is(ingest: Ingest, store: Store) -> None:
     ingest.generate("here", order(fence=False), message="", author="a")
-    assert store.version("here").information["location"] == "generated"
+    assert store.versions.get("here").information["location"] == "generated"
     ingest.set_datum("here", Datum(53.0, 6.0), author="a")
-    assert store.version("here").information["location"] == "raw"
+    assert store.versions.get("here").information["location"] == "raw"
     version = ingest.generate("here", order(fence=False, seed=8), message="", author="a").version
     assert version is not None
     assert version.datum == Datum(53.0, 6.0)

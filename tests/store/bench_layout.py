@@ -50,13 +50,13 @@ def network(n: int) -> Features:
 def bench(store: Store, n: int) -> None:
     """All rows of the table."""
     store.migrate()
-    store.create_environment("farm", datum=Datum(53.2, -0.5))
+    store.environments.create("farm", datum=Datum(53.2, -0.5))
     network_part = network(n)
     commit(store, "upload", Replace(KEY, network_part))
-    first = store.version("farm")
+    first = store.versions.get("farm")
     row(
         "the same upload again",
-        shortest_time(lambda: store.prepare(first, Changes((Replace(KEY, network_part),))), 3, store),
+        shortest_time(lambda: store.versions.prepare(first, Changes((Replace(KEY, network_part),))), 3, store),
     )
     nodes = np.arange(n // 2)
     xy = shapely.get_coordinates(network_part.geometry[nodes])
@@ -71,18 +71,18 @@ def bench(store: Store, n: int) -> None:
         commit(store, f"commit {name}", Put(KEY, edited(network_part, some, metres, 0)))
         for k in range(1, 4):
             commit(store, "", Put(KEY, edited(network_part, some, metres, k)))
-    head = store.version("farm")
+    head = store.versions.get("farm")
     for name, version in (("head", head), ("first version", first)):
-        row(f"read, {name}", shortest_time(lambda version=version: store.load(version), 4, store))  # type: ignore[misc]
+        row(f"read, {name}", shortest_time(lambda version=version: store.content.load(version), 4, store))  # type: ignore[misc]
         row(
             f"box of 1 %, {name}",
-            shortest_time(lambda version=version: store.features(version, KEY, bbox=BOX), 4, store),  # type: ignore[misc]
+            shortest_time(lambda version=version: store.content.features(version, KEY, bbox=BOX), 4, store),  # type: ignore[misc]
         )
     row(
         "diff, near (one feature)",
-        shortest_time(lambda: store.diff(first, store.version("farm", first.number + 1)), 4, store),
+        shortest_time(lambda: store.content.diff(first, store.versions.get("farm", first.number + 1)), 4, store),
     )
-    row("diff, far (first to head)", shortest_time(lambda: store.diff(first, head), 3, store))
+    row("diff, far (first to head)", shortest_time(lambda: store.content.diff(first, head), 3, store))
     changed = Features(
         network_part.ids,
         network_part.geometry,
@@ -101,12 +101,12 @@ def edited(original: Features, some: Any, metres: float, k: int) -> Features:
 
 def commit(store: Store, name: str, *operations: Operation) -> None:
     """Prepare and commit; a row where it has a name."""
-    store._chunks.forget()
-    head = store.version("farm")
+    store.chunks.forget()
+    head = store.versions.get("farm")
     start = time.perf_counter()
-    prepared = store.prepare(head, Changes(operations))
+    prepared = store.versions.prepare(head, Changes(operations))
     middle = time.perf_counter()
-    store.commit("farm", prepared, author="bench", message=name)
+    store.versions.commit("farm", prepared, author="bench", message=name)
     end = time.perf_counter()
     if name:
         size = sum(map(len, prepared.chunks.values()))
@@ -118,7 +118,7 @@ def shortest_time(run: Callable[[], object], times: int, store: Store) -> float:
     """The least milliseconds of several runs, each with empty memory."""
     out = []
     for _ in range(times):
-        store._chunks.forget()
+        store.chunks.forget()
         start = time.perf_counter()
         result = run()
         out.append((time.perf_counter() - start) * 1e3)

@@ -123,8 +123,8 @@ def replaces(parts: dict[PartKey, Part]) -> tuple[Operation, ...]:
 
 def save(store: Store, environment: str, *operations: Operation, base: Version | None = None, **frame: Any) -> Version:
     """Prepare on the head and commit."""
-    prepared = store.prepare(base or store.version(environment), Changes(tuple(operations), **frame))
-    return store.commit(environment, prepared, author="ann", message="edit")
+    prepared = store.versions.prepare(base or store.versions.get(environment), Changes(tuple(operations), **frame))
+    return store.versions.commit(environment, prepared, author="ann", message="edit")
 
 
 def rows(f: Features) -> dict[str, tuple[str, Any, bool]]:

@@ -14,6 +14,8 @@ from app.errors import Damaged, Invalid
 from app.model.features import features
 from app.store import encode, parts
 from app.store.changes import Replace
+from app.store.parts.features import encode_leaf, split_leaf
+from app.store.parts.rasters import morton
 from app.store.store import Store
 from app.store.tree import ChunkStage
 from tests.store.samples import TOPOLOGY, grid, mixed, network, picture, save, typed, voxels
@@ -93,10 +95,10 @@ json_values = st.recursive(
 def test_properties_come_back_exactly(properties):
     ids = [f"i{k}" for k in range(len(properties))]
     packed = encode.pack_properties(ids, properties)
-    leaf = parts.encode_leaf(ids, b"\0" * 8 * len(ids), [b""] * len(ids), packed)
+    leaf = encode_leaf(ids, b"\0" * 8 * len(ids), [b""] * len(ids), packed)
     back = encode.unpack(leaf)[-1]
     assert typed(back) == typed(properties)
-    assert parts.split_leaf(leaf) == (ids, b"\0" * 8 * len(ids), [b""] * len(ids), packed)
+    assert split_leaf(leaf) == (ids, b"\0" * 8 * len(ids), [b""] * len(ids), packed)
     assert encode.pack_properties(ids, back) == packed
 
 
@@ -108,7 +110,7 @@ def test_interleaving_is_reversible(pairs):
     back = encode.deinterleave(code)
     assert (back[0] == x).all()
     assert (back[1] == y).all()
-    assert parts.morton(int(encode.interleave(x % 1000, y % 1000)[0])) == (pairs[0][1] % 1000, pairs[0][0] % 1000)
+    assert morton(int(encode.interleave(x % 1000, y % 1000)[0])) == (pairs[0][1] % 1000, pairs[0][0] % 1000)
 
 
 def test_boxes_of_wkb_are_those_of_geos():
@@ -138,6 +140,6 @@ def test_adversarial_ids_are_told(sqlite_store: Store):
     shape = shapely.Point(1, 2)
     cell = encode.z_cells(encode.bounds(np.array([shape])), np.array([True])).astype(">u8").tobytes()
     chosen = [i for i in (f"i{k}" for k in range(60_000)) if tree.ends_node(cell + i.encode(), 0, 6)]
-    sqlite_store.create_environment("farm")
+    sqlite_store.environments.create("farm")
     with pytest.raises(Invalid, match="Use other ids"):
         save(sqlite_store, "farm", Replace(TOPOLOGY, features([(i, shape, {}) for i in chosen], "local")))

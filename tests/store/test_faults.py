@@ -47,19 +47,19 @@ from tests.store.samples import TOPOLOGY, GRID, network, grid
 store = Store(sys.argv[1], Path(sys.argv[2]))
 print("ready", flush=True)
 for n in range(1000):
-    head = store.version("farm")
+    head = store.versions.get("farm")
     data = b"upload %d" % head.number + bytes(100_000)
     files = store.blobs.put_many([data, b"small %d" % n, b"other %d" % n])
     operations = (Replace(TOPOLOGY, network(400, seed=head.number)), Replace(GRID, grid(seed=head.number)))
-    prepared = store.prepare(head, Changes(operations))
+    prepared = store.versions.prepare(head, Changes(operations))
     sources = [Source(f"f{k}", 1, sha) for k, sha in enumerate(files)]
-    made = store.commit("farm", prepared, author="child", message=str(head.number), sources=sources)
+    made = store.versions.commit("farm", prepared, author="child", message=str(head.number), sources=sources)
     print("committed", made.number, made.root, flush=True)
 """
 
 
 def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
-    store.create_environment("farm", datum=DATUM)
+    store.environments.create("farm", datum=DATUM)
     random.seed(1)
     acknowledged: dict[int, str] = {}
     root = Path(__file__).resolve().parents[2]
@@ -87,14 +87,14 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
         again.recover()
         assert temporary(again) == []
         again.check()
-        head = again.version("farm")
-        listed = again.versions("farm", limit=1000)
+        head = again.versions.get("farm")
+        listed = again.versions.page("farm", limit=1000)
         assert [v.number for v in listed] == list(range(head.number, -1, -1))
         for number, root_hash in acknowledged.items():
-            assert again.version("farm", number).root == root_hash
-        assert [e.sequence for e in again.events("farm", limit=10_000)] == list(range(1, head.number + 2))
+            assert again.versions.get("farm", number).root == root_hash
+        assert [e.sequence for e in again.events.page("farm", limit=10_000)] == list(range(1, head.number + 2))
         for version in listed[:2]:
-            loaded = again.load(version)
+            loaded = again.content.load(version)
             if version.parts:
                 expected = {TOPOLOGY: network(400, seed=version.number - 1), GRID: grid(seed=version.number - 1)}
                 assert_same_layers(loaded, Layers(expected, DATUM))
@@ -106,7 +106,7 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
         again.close()
     assert acknowledged
     save(store, "farm", Replace(TOPOLOGY, network(3)))
-    store.collect(timedelta(0))
+    store.garbage.collect(timedelta(0))
     assert temporary(store) == []
     assert store.blobs.verify() == []
 
@@ -124,16 +124,16 @@ def files_in(store: Store) -> list[tuple[Path, int]]:
 
 def read_all(store: Store, version: Version) -> None:
     """Read every chunk of a version; loading alone leaves out the tables of ids."""
-    store.load(version)
+    store.content.load(version)
     for entry in version.parts:
         if entry.key.layer in VECTOR_LAYERS:
             part = everything()[entry.key]
             assert isinstance(part, Features)
-            store.has_ids(version, entry.key, part.ids)
+            store.content.has_ids(version, entry.key, part.ids)
 
 
 def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
-    store.create_environment("farm", datum=DATUM)
+    store.environments.create("farm", datum=DATUM)
     version = save(store, "farm", *replaces(everything()))
     with store._database.read() as connection:
         chunks = connection.exec_driver_sql("SELECT hash, data FROM chunk").all()
@@ -148,7 +148,7 @@ def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
                     connection.exec_driver_sql(f"DELETE FROM chunk WHERE hash = {mark}", (name,))
                 else:
                     connection.exec_driver_sql(f"UPDATE chunk SET data = {mark} WHERE hash = {mark}", (wrong, name))
-            store._chunks.forget()
+            store.chunks.forget()
             with pytest.raises(Damaged):
                 read_all(store, version)
         with store._database.write() as connection:
@@ -157,19 +157,19 @@ def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
             else:
                 statement = "INSERT INTO chunk (hash, data, used) VALUES (%s, %s, 0)"
             connection.exec_driver_sql(statement, (name, data))
-        store._chunks.forget()
-        assert_same_layers(store.load(version), Layers(everything(), DATUM))
+        store.chunks.forget()
+        assert_same_layers(store.content.load(version), Layers(everything(), DATUM))
 
 
 def test_collecting_stops_at_damage(sqlite_store: Store):
-    sqlite_store.create_environment("farm")
+    sqlite_store.environments.create("farm")
     version = save(sqlite_store, "farm", Replace(GRID, grid()))
     root = bytes.fromhex(version.parts[0].hash)
     with sqlite_store._database.write() as connection:
         connection.exec_driver_sql("DELETE FROM chunk WHERE hash = ?", (root,))
         before = connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one()
     with pytest.raises(Damaged):
-        sqlite_store.collect(timedelta(0))
+        sqlite_store.garbage.collect(timedelta(0))
     with sqlite_store._database.read() as connection:
         assert connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one() == before
 
@@ -267,25 +267,25 @@ def test_a_disk_that_refuses_is_unavailable_and_leaves_nothing(store: Store, mon
 
 
 def test_a_failing_commit_stores_nothing(store: Store, monkeypatch: pytest.MonkeyPatch):
-    store.create_environment("farm", datum=DATUM)
-    head = store.version("farm")
-    prepared = store.prepare(head, Changes((Replace(GRID, grid()),)))
-    events = store.events("farm")
+    store.environments.create("farm", datum=DATUM)
+    head = store.versions.get("farm")
+    prepared = store.versions.prepare(head, Changes((Replace(GRID, grid()),)))
+    events = store.events.page("farm")
 
     def fail(*args: object, **more: object) -> None:
         raise RuntimeError("after everything but the event")
 
     monkeypatch.setattr("app.store.outbox.append_event", fail)
     with pytest.raises(RuntimeError):
-        store.commit("farm", prepared, author="a", message="m")
+        store.versions.commit("farm", prepared, author="a", message="m")
     monkeypatch.undo()
-    assert store.version("farm") == head
-    assert store.events("farm") == events
+    assert store.versions.get("farm") == head
+    assert store.events.page("farm") == events
     with store._database.read() as connection:
         assert connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one() == 0
     with pytest.raises(Unavailable):
-        store.commit("farm", prepared, author="a", message="m", sources=[Source("x", 1, "f" * 64)])
-    assert store.version("farm") == head
+        store.versions.commit("farm", prepared, author="a", message="m", sources=[Source("x", 1, "f" * 64)])
+    assert store.versions.get("farm") == head
 
 
 def test_a_locked_sqlite_is_unavailable_not_a_crash(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch):
@@ -294,8 +294,8 @@ def test_a_locked_sqlite_is_unavailable_not_a_crash(sqlite_store: Store, monkeyp
     monkeypatch.setattr(database, "BUSY_MILLISECONDS", 50)
     other = Store(sqlite_store.database_url, sqlite_store.blob_dir)
     with sqlite_store._database.write(), pytest.raises(Unavailable, match="locked"):
-        other.create_environment("farm")
-    other.create_environment("farm")
+        other.environments.create("farm")
+    other.environments.create("farm")
     other.close()
 
 
@@ -306,7 +306,7 @@ def test_other_urls_are_refused(tmp_path: Path):
 
 
 def test_chunks_are_named_by_their_canonical_bytes(store: Store):
-    store.create_environment("farm")
+    store.environments.create("farm")
     save(store, "farm", *replaces(everything()))
     from app.store.encode import decompress
 

@@ -14,12 +14,12 @@ def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> No
     store = Store(f"sqlite:///{tmp_path}/a.sqlite", tmp_path / "blobs")
     store.migrate()
     before = store.generation()
-    assert store.environments() == ([], None)
+    assert store.environments.page() == ([], None)
     assert store.generation() == before
-    store.create_environment("farm")
+    store.environments.create("farm")
     after = store.generation()
     assert after != before
-    store.create_token("somebody", "viewer")
+    store.tokens.create("somebody", "viewer")
     assert store.generation() != after
     store.close()
 

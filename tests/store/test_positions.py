@@ -56,11 +56,11 @@ def at(datum: Datum, x: float, y: float) -> tuple[float, float]:
 
 
 def names(store: Store, latitude: float, longitude: float, **more: Any) -> list[str]:
-    return [e.name for e, _ in store.locate(latitude, longitude, **more)[0]]
+    return [e.name for e, _ in store.areas.locate(latitude, longitude, **more)[0]]
 
 
 def match(store: Store, name: str, latitude: float, longitude: float) -> Match | None:
-    matches = {e.name: m for e, m in store.locate(latitude, longitude)[0]}
+    matches = {e.name: m for e, m in store.areas.locate(latitude, longitude)[0]}
     return matches.get(name)
 
 
@@ -73,10 +73,10 @@ def stale(store: Store) -> list[str]:
 def test_two_fields_of_one_farm_answer_for_their_own(store: Store):
     fields = {"north": shapely.box(-0.53, 53.27, -0.529, 53.271), "south": shapely.box(-0.53, 53.268, -0.529, 53.269)}
     for name, field in fields.items():
-        store.create_environment(name, datum=Datum(field.bounds[1], field.bounds[0]))
+        store.environments.create(name, datum=Datum(field.bounds[1], field.bounds[0]))
         farm = features([("farm", FARM, {"kind": "region"})], "wgs84")
         save(store, name, Replace(SITE, fence(field)), Replace(OBJECTS, farm))
-        assert store.environment(name).bounds == FARM.bounds
+        assert store.environments.get(name).bounds == FARM.bounds
     assert names(store, 53.2705, -0.5295) == ["north"]
     assert names(store, 53.2685, -0.5295) == ["south"]
     assert names(store, 53.2695, -0.5295) == []
@@ -86,12 +86,12 @@ def test_two_fields_of_one_farm_answer_for_their_own(store: Store):
     assert position_match.area == pytest.approx(surface(fields["north"]), abs=0.1)
     assert position_match.area == pytest.approx(66.7 * 111.3, rel=0.01)
     assert position_match.distance == pytest.approx(math.hypot(33.4, 55.7), rel=0.01)
-    assert {e.name for e in store.environments(bbox=(-0.53, 53.2694, -0.5295, 53.2696))[0]} == {"north", "south"}
+    assert {e.name for e in store.environments.page(bbox=(-0.53, 53.2694, -0.5295, 53.2696))[0]} == {"north", "south"}
     assert stale(store) == []
 
 
 def test_fences_have_holes_and_several_pieces(store: Store):
-    store.create_environment("yard", datum=HERE)
+    store.environments.create("yard", datum=HERE)
     ring = shapely.Polygon(
         shapely.box(-0.53, 53.26, -0.52, 53.27).exterior, [shapely.box(-0.526, 53.264, -0.524, 53.266).exterior]
     )
@@ -114,7 +114,7 @@ def test_both_databases_agree_with_geometry(store: Store):
     for k in range(6):
         outer = shapely.convex_hull(shapely.multipoints(random.random((8, 2)) * 0.1))
         drawn[f"f{k}"] = shapely.difference(outer, outer.centroid.buffer(0.01))
-        store.create_environment(f"f{k}")
+        store.environments.create(f"f{k}")
         save(store, f"f{k}", Replace(SITE, fence(shapely.MultiPolygon(shapely.get_parts(drawn[f"f{k}"]).tolist()))))
     vertices = shapely.get_coordinates(list(drawn.values()))[::7]
     for x, y in (*vertices.tolist(), *(random.random((40, 2)) * 0.1).tolist()):
@@ -125,7 +125,7 @@ def test_both_databases_agree_with_geometry(store: Store):
 @pytest.mark.parametrize("form", ["crossing", "cut", "local", "touching", "circle"])
 def test_fences_across_the_antimeridian(store: Store, form: str):
     datum = Datum(-17.0, 179.999)
-    store.create_environment("fiji", datum=datum)
+    store.environments.create("fiji", datum=datum)
     shape: Any = shapely.Polygon([(179.99, -17.01), (-179.99, -17.01), (-179.99, -16.99), (179.99, -16.99)])
     if form == "cut":
         shape = shapely.MultiPolygon(
@@ -160,17 +160,17 @@ def test_a_fence_without_area_is_none(store: Store):
         "empty": features([("none", None, {"kind": "fence"})], "wgs84"),
     }
     for name, part in drawn.items():
-        store.create_environment(name, datum=Datum(53.2605, -0.5255))
+        store.environments.create(name, datum=Datum(53.2605, -0.5255))
         save(store, name, Replace(SITE, part))
     assert names(store, 53.265, -0.529) == ["bow"]
     assert names(store, 53.265, -0.521) == ["bow"]
     assert names(store, 53.269, -0.525) == [], "between the two triangles"
-    environments = store.locate(53.2605, -0.5255)[0]
+    environments = store.areas.locate(53.2605, -0.5255)[0]
     assert {(e.name, m.by) for e, m in environments} == {(name, "datum") for name in ("line", "path", "empty")}
 
 
 def test_what_is_called_a_fence_wins_over_other_polygons(store: Store):
-    store.create_environment("farm", datum=HERE)
+    store.environments.create("farm", datum=HERE)
     boundary = shapely.box(-0.525, 53.268, -0.524, 53.269)
     save(store, "farm", Replace(SITE, features([("farm", FARM, {}), ("own", boundary, {"kind": "fence"})], "wgs84")))
     assert names(store, 53.2685, -0.5245) == ["farm"]
@@ -182,7 +182,7 @@ def test_what_is_called_a_fence_wins_over_other_polygons(store: Store):
 def test_floor_is_what_grids_networks_and_floors_show(store: Store):
     turned = Datum(53.2, -0.5, heading=30.0)
     for name in ("grid", "network", "hall", "mask", "unknown"):
-        store.create_environment(name, datum=turned)
+        store.environments.create(name, datum=turned)
     save(store, "grid", Replace(MAP, grid((100, 50, 300, 250), origin=(500.0, 0.0, math.pi / 2))))
     nodes = [(f"n{k}", shapely.Point(xy), {"kind": "node"}) for k, xy in enumerate([(-500, 0), (-300, 0), (-400, 90)])]
     far = ("n9", shapely.Point(9000, 0), {"kind": "node"})
@@ -197,7 +197,7 @@ def test_floor_is_what_grids_networks_and_floors_show(store: Store):
     save(store, "unknown", Replace(MAP, grid(None)))
 
     def hits(x: float, y: float) -> dict[str, str]:
-        return {e.name: m.by for e, m in store.locate(*at(turned, x, y))[0]}
+        return {e.name: m.by for e, m in store.areas.locate(*at(turned, x, y))[0]}
 
     # The grid is turned by 90°: x = 500 - v, y = u; the lowest row of its free room is a wall.
     assert hits(350, 200) == {"grid": "floor"}
@@ -219,8 +219,8 @@ def test_floor_is_what_grids_networks_and_floors_show(store: Store):
 @pytest.mark.parametrize("anchor", ["local", "wgs84"])
 def test_floor_counts_near_the_datum_alone(store: Store, anchor: Any):
     datum = Datum(53.2, -0.5)
-    store.create_environment("long", datum=datum)
-    store.create_environment("far", datum=datum)
+    store.environments.create("long", datum=datum)
+    store.environments.create("far", datum=datum)
     road = shapely.LineString([(0, 0), (50_000, 0)])
     other = shapely.LineString([(5000, 0), (9000, 0)])
     if anchor == "wgs84":
@@ -232,14 +232,14 @@ def test_floor_counts_near_the_datum_alone(store: Store, anchor: Any):
     assert names(store, *at(datum, 1900, 0)) == ["long"]
     assert names(store, *at(datum, 2100, 0)) == []
     assert names(store, *at(datum, 6000, 0)) == []
-    assert {(e.name, m.by) for e, m in store.locate(*at(datum, 0, 0))[0]} == {("long", "floor"), ("far", "datum")}
+    assert {(e.name, m.by) for e, m in store.areas.locate(*at(datum, 0, 0))[0]} == {("long", "floor"), ("far", "datum")}
 
 
 def test_a_datum_has_a_neighbourhood_but_null_island_has_none(store: Store):
-    store.create_environment("bare", datum=HERE)
-    store.create_environment("nowhere")
-    store.create_environment("unset", datum=Datum(0.0, 0.0))
-    store.create_environment("gulf", datum=Datum(0.0, 0.0))
+    store.environments.create("bare", datum=HERE)
+    store.environments.create("nowhere")
+    store.environments.create("unset", datum=Datum(0.0, 0.0))
+    store.environments.create("gulf", datum=Datum(0.0, 0.0))
     square = fence(shapely.box(-9, -9, 9, 9), anchor="local")
     save(store, "unset", Replace(TOPOLOGY, network(20)), Replace(SITE, square))
     save(store, "nowhere", Replace(TOPOLOGY, network(20)), Replace(SITE, fence(FARM)))
@@ -255,12 +255,12 @@ def test_a_datum_has_a_neighbourhood_but_null_island_has_none(store: Store):
 
 def test_fences_first_then_the_smallest_then_the_nearest_datum(store: Store):
     for name, half in (("large", 0.02), ("small", 0.01)):
-        store.create_environment(name, datum=HERE)
+        store.environments.create(name, datum=HERE)
         box = shapely.box(*(c + s * half for c, s in zip((-0.5245, 53.268) * 2, (-1, -1, 1, 1), strict=True)))
         save(store, name, Replace(SITE, fence(box)))
-    store.create_environment("a-far", datum=Datum(*at(HERE, 150, 0)))
-    store.create_environment("b-near", datum=Datum(*at(HERE, 50, 0)))
-    store.create_environment("room", datum=HERE)
+    store.environments.create("a-far", datum=Datum(*at(HERE, 150, 0)))
+    store.environments.create("b-near", datum=Datum(*at(HERE, 50, 0)))
+    store.environments.create("room", datum=HERE)
     save(store, "room", Replace(MAP, grid((0, 0, 10, 10), origin=(-5.0, -5.0, 0.0))))
     expected = ["small", "large", "room", "b-near", "a-far"]
     assert names(store, HERE.latitude, HERE.longitude) == expected
@@ -268,7 +268,7 @@ def test_fences_first_then_the_smallest_then_the_nearest_datum(store: Store):
     cursor: str | None = None
     pages = 0
     while pages == 0 or cursor is not None:
-        environments, cursor = store.locate(HERE.latitude, HERE.longitude, limit=2, cursor=cursor)
+        environments, cursor = store.areas.locate(HERE.latitude, HERE.longitude, limit=2, cursor=cursor)
         seen += [e.name for e, _ in environments]
         pages += 1
     assert (seen, pages) == (expected, 3)
@@ -277,12 +277,12 @@ def test_fences_first_then_the_smallest_then_the_nearest_datum(store: Store):
     assert names(store, HERE.latitude, HERE.longitude, bbox=(-0.51, 53.26, -0.50, 53.27)) == ["large"]
     for bad in ("", "farm", "1 2 3", "a 1 2 farm"):
         with pytest.raises(Invalid, match="Link"):
-            store.locate(HERE.latitude, HERE.longitude, cursor=bad)
+            store.areas.locate(HERE.latitude, HERE.longitude, cursor=bad)
     for wrong in ((91.0, 0.0), (0.0, 181.0), (math.nan, 0.0), (0.0, math.inf)):
         with pytest.raises(Invalid, match="degrees"):
-            store.locate(*wrong)
+            store.areas.locate(*wrong)
     with pytest.raises(Invalid):
-        store.locate(0.0, 0.0, limit=0)
+        store.areas.locate(0.0, 0.0, limit=0)
 
 
 def test_areas_follow_every_change_in_its_transaction(store: Store):
@@ -293,36 +293,36 @@ def test_areas_follow_every_change_in_its_transaction(store: Store):
         assert stale(store) == []
         return names(store, *west), names(store, *east)
 
-    store.create_environment("farm", datum=HERE)
+    store.environments.create("farm", datum=HERE)
     save(store, "farm", Replace(SITE, fence(one)))
     assert matching_names() == (["farm"], [])
     save(store, "farm", Put(SITE, fence(other)))
     assert matching_names() == ([], ["farm"])
     save(store, "farm", Replace(TOPOLOGY, network(50, side=300)))
     assert matching_names() == ([], ["farm"])
-    store.revert("farm", 2, author="me", message="back")
+    store.versions.revert("farm", 2, author="me", message="back")
     assert matching_names() == (["farm"], [])
-    store.create_environment("copy", clone=store.version("farm", 4))
+    store.environments.create("copy", clone=store.versions.get("farm", 4))
     assert matching_names() == (["farm"], ["copy"])
-    store.update_environment("copy", new_name="second")
+    store.environments.update("copy", new_name="second")
     assert matching_names() == (["farm"], ["second"])
-    store.delete_environment("second")
+    store.environments.delete("second")
     assert matching_names() == (["farm"], [])
     assert names(store, *east, deleted=True) == ["second"]
-    store.restore_environment("second")
+    store.environments.restore("second")
     assert matching_names() == (["farm"], ["second"])
     save(store, "second", Drop(SITE))
     assert matching_names() == (["farm"], [])
     position_match = match(store, "second", *at(HERE, 150, 150))
     assert (position_match.by if position_match else "none") == "floor"
     moved = Datum(53.3, -0.6)
-    base = store.version("second")
-    store.commit("second", store.prepare(base, Changes(datum=moved)), author="me", message="moved")
+    base = store.versions.get("second")
+    store.versions.commit("second", store.versions.prepare(base, Changes(datum=moved)), author="me", message="moved")
     assert stale(store) == []
     assert names(store, *at(HERE, 150, 150)) == []
     assert names(store, *at(moved, 150, 150)) == ["second"]
-    store.delete_environment("second")
-    store.purge_environment("second")
+    store.environments.delete("second")
+    store.environments.purge("second")
     with store._database.read() as connection:
         assert len(connection.execute(select(tables.area)).all()) == 1
 
@@ -330,7 +330,7 @@ def test_areas_follow_every_change_in_its_transaction(store: Store):
 def test_large_content_is_left_to_the_next_query(store: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(area, "MAX_FEATURES", 10)
     monkeypatch.setattr(area, "MAX_CELLS", 1000)
-    store.create_environment("farm", datum=HERE)
+    store.environments.create("farm", datum=HERE)
     save(store, "farm", Replace(TOPOLOGY, network(50, side=300)))
     assert stale(store) == ["farm"]
     expected = Match("floor", pytest.approx(9e4, rel=0.2), pytest.approx(212.1, abs=0.1))
@@ -350,7 +350,7 @@ def test_large_content_is_left_to_the_next_query(store: Store, monkeypatch: pyte
 
 def test_several_servers_catch_up_together(store: Store, database_url: str, monkeypatch: pytest.MonkeyPatch):
     for k in range(8):
-        store.create_environment(f"farm-{k}", datum=HERE)
+        store.environments.create(f"farm-{k}", datum=HERE)
         save(store, f"farm-{k}", Replace(SITE, fence(FARM)))
     table = tables.environment
     with store._database.write() as connection:
@@ -388,7 +388,7 @@ def test_damaged_content_of_one_environment_keeps_no_other_away(
     store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     for name in ("good", "rotten"):
-        store.create_environment(name, datum=HERE)
+        store.environments.create(name, datum=HERE)
     with store._database.write() as connection:
         connection.execute(tables.area.delete())
         connection.execute(update(tables.environment).values(area_stale=True))
@@ -411,7 +411,7 @@ def test_damaged_content_of_one_environment_keeps_no_other_away(
 
 
 def test_environments_of_an_older_release_are_found_after_the_migration(store: Store):
-    store.create_environment("old", datum=HERE)
+    store.environments.create("old", datum=HERE)
     save(store, "old", Replace(SITE, fence(FARM)))
     revision = ScriptDirectory.from_config(schema.config()).get_revision("0007")
     settings = schema.config()
@@ -448,7 +448,7 @@ def statements(store: Store) -> Iterator[list[tuple[str, Any]]]:
 
 def crowd(store: Store, corners: Sequence[tuple[float, float]], size: float) -> None:
     """Environments with a square fence each, written as they are stored."""
-    store.create_environment("model", datum=DATUM)
+    store.environments.create("model", datum=DATUM)
     with store._database.write() as connection:
         row = dict(connection.execute(select(tables.environment)).mappings().one())
         boxes = shapely.box(*np.array([(x, y, x + size, y + size) for x, y in corners]).T)
@@ -522,7 +522,7 @@ def flat(plan: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def test_nothing_is_read_of_environments_that_are_not_behind(sqlite_store: Store):
-    sqlite_store.create_environment("farm", datum=HERE)
+    sqlite_store.environments.create("farm", datum=HERE)
     with sqlite_store._database.engine.connect() as connection:
         query = select(tables.environment.c.id).where(tables.environment.c.area_stale)
         text = str(query.compile(sqlite_store._database.engine))

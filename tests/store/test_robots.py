@@ -13,8 +13,8 @@ from app.errors import Conflict, NotFound
 from app.fleet import channel_convergence, is_online, robot_lag
 from app.store import robots
 from app.store.changes import Replace
+from app.store.fleet_values import NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, RobotReport
 from app.store.store import Store
-from app.store.values import NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, RobotReport
 from tests.store.samples import DATUM, GRID, grid, save
 
 NOW = datetime(2031, 5, 1, 14, 0, tzinfo=UTC)
@@ -32,23 +32,23 @@ def heard(robot: str, minute: float, root: str = A, state: Any = "active", **mor
 
 @pytest.fixture
 def farm(store: Store) -> Store:
-    store.create_environment("farm")
+    store.environments.create("farm")
     return store
 
 
 def test_held_version_follows_the_statement_of_the_robot(farm: Store):
     def active_map() -> ActiveMap | None:
-        return farm.robots("farm", "r1")[0].held
+        return farm.robots.all("farm", "r1")[0].held
 
     def say(minute: float, root: str, state: Any, holds: tuple[int, str] | None, **more: Any) -> None:
-        assert farm.note_reports([heard("r1", minute, root, state, holds=holds, **more)]) == [None]
+        assert farm.robots.note_reports([heard("r1", minute, root, state, holds=holds, **more)]) == [None]
 
     say(0, A, "active", None, sequence=3)
     say(1, "c" * 64, "failed", (2, B), version=3, sequence=5)
     assert active_map() == ActiveMap(2, B, 5, NOW + timedelta(minutes=1)), "the status active of B was lost"
     say(2, "c" * 64, "failed", (2, B), version=3, sequence=5)
     assert active_map() == ActiveMap(2, B, 5, NOW + timedelta(minutes=1))
-    assert len(farm.robot_history("farm", "r1")) == 2
+    assert len(farm.robots.history("farm", "r1")) == 2
     say(3, "c" * 64, "failed", (1, A), version=3, sequence=5)
     assert active_map() == ActiveMap(1, A, 5, NOW + timedelta(minutes=3)), "the same failure, and it went back"
     say(4, "c" * 64, "downloading", None, version=3)
@@ -61,151 +61,156 @@ def test_held_version_follows_the_statement_of_the_robot(farm: Store):
 
 def test_authority_of_one_report_lasts(farm: Store):
     def vouched() -> list[bool]:
-        return [r.vouched for r in farm.robots("farm")]
+        return [r.vouched for r in farm.robots.all("farm")]
 
     open_bus = {"vouched": False}
     reported_at = NOW
     first, second = heard("r1", 0, A, reported_at=reported_at), heard("r1", 1, B, "ready", reported_at=reported_at)
-    farm.note_reports([replace(first, **open_bus), replace(second, **open_bus), replace(heard("r2", 0), **open_bus)])
+    farm.robots.note_reports(
+        [replace(first, **open_bus), replace(second, **open_bus), replace(heard("r2", 0), **open_bus)]
+    )
     assert vouched() == [False, False]
-    farm.note_reports([replace(first, time=NOW + timedelta(minutes=2))])
+    farm.robots.note_reports([replace(first, time=NOW + timedelta(minutes=2))])
     assert vouched() == [True, False], "the same report came late, over HTTP"
-    assert farm.robots("farm", "r1")[0].report.state == "ready"
-    farm.note_reports([replace(heard("r1", 3, A, "failed"), **open_bus), heard("r2", 3)])
+    assert farm.robots.all("farm", "r1")[0].report.state == "ready"
+    farm.robots.note_reports([replace(heard("r1", 3, A, "failed"), **open_bus), heard("r2", 3)])
     assert vouched() == [True, True]
-    farm.forget_robot("farm", "r2")
-    farm.note_reports([replace(heard("r2", 4), **open_bus)])
+    farm.robots.forget("farm", "r2")
+    farm.robots.note_reports([replace(heard("r2", 4), **open_bus)])
     assert vouched() == [True, False]
 
 
 def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
     reported_at = NOW - timedelta(hours=5)
-    assert farm.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, reported_at=reported_at)]) == [None]
-    (robot,) = farm.robots("farm")
+    assert farm.robots.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, reported_at=reported_at)]) == [None]
+    (robot,) = farm.robots.all("farm")
     assert robot.report == RobotReport("production", 1, A, "active", "ok\ufffd", 4, reported_at)
     assert (robot.environment, robot.robot, robot.time, robot.since) == ("farm", "r1", NOW, NOW)
     assert robot.held == ActiveMap(1, A, 4, NOW)
     assert (robot.on_bus, robot.presence_at) == (None, None)
-    farm.note_reports([heard("r1", 1, B, "downloading", version=2), heard("r1", 2, B, "failed", version=2)])
-    (robot,) = farm.robots("farm", "r1")
+    farm.robots.note_reports([heard("r1", 1, B, "downloading", version=2), heard("r1", 2, B, "failed", version=2)])
+    (robot,) = farm.robots.all("farm", "r1")
     assert (robot.report.state, robot.report.version) == ("failed", 2)
     assert robot.held == ActiveMap(1, A, 4, NOW)
-    farm.note_reports([heard("r1", 3, B, version=2, sequence=9), heard("r1", 4, B, version=2, sequence=9)])
-    (robot,) = farm.robots("farm", "r1")
+    farm.robots.note_reports([heard("r1", 3, B, version=2, sequence=9), heard("r1", 4, B, version=2, sequence=9)])
+    (robot,) = farm.robots.all("farm", "r1")
     assert robot.held == ActiveMap(2, B, 9, NOW + timedelta(minutes=3))
     assert (robot.since, robot.time) == (NOW + timedelta(minutes=3), NOW + timedelta(minutes=4))
-    history = farm.robot_history("farm", "r1")
+    history = farm.robots.history("farm", "r1")
     assert [(t, r.state) for t, r in history] == [
         (NOW + timedelta(minutes=m), state)
         for m, state in ((3, "active"), (2, "failed"), (1, "downloading"), (0, "active"))
     ]
-    assert len(farm.robot_history("farm", "r1", limit=2)) == 2
+    assert len(farm.robots.history("farm", "r1", limit=2)) == 2
 
 
 def test_a_report_that_comes_twice_counts_once(farm: Store):
     first = heard("r1", 0, B, "downloading", reported_at=NOW)
     second = heard("r1", 0, B, "ready", reported_at=NOW + timedelta(seconds=1), detail="x")
-    farm.note_reports([first, second, replace(first, time=NOW + timedelta(minutes=1)), second])
-    assert [r.state for _, r in farm.robot_history("farm", "r1")] == ["ready", "downloading"]
-    (robot,) = farm.robots("farm")
+    farm.robots.note_reports([first, second, replace(first, time=NOW + timedelta(minutes=1)), second])
+    assert [r.state for _, r in farm.robots.history("farm", "r1")] == ["ready", "downloading"]
+    (robot,) = farm.robots.all("farm")
     assert (robot.report.state, robot.time) == ("ready", NOW)
-    farm.note_reports([replace(first, time=NOW + timedelta(minutes=1))])
-    (robot,) = farm.robots("farm")
+    farm.robots.note_reports([replace(first, time=NOW + timedelta(minutes=1))])
+    (robot,) = farm.robots.all("farm")
     assert (robot.report.state, robot.time) == ("ready", NOW + timedelta(minutes=1))
-    farm.note_reports([heard("r1", 2, B, "downloading", reported_at=NOW + timedelta(seconds=2))])
-    assert farm.robots("farm")[0].report.state == "downloading"
+    farm.robots.note_reports([heard("r1", 2, B, "downloading", reported_at=NOW + timedelta(seconds=2))])
+    assert farm.robots.all("farm")[0].report.state == "downloading"
 
 
 def test_robots_of_several_environments(farm: Store):
-    farm.create_environment("yard")
-    refused = farm.note_reports(
+    farm.environments.create("yard")
+    refused = farm.robots.note_reports(
         [heard("r2", 0), heard("r1", 0), heard("r1", 0, environment="nowhere"), heard("r1", 1, environment="yard")]
     )
     assert [type(r) for r in refused] == [type(None), type(None), NotFound, type(None)]
-    assert [(r.environment, r.robot) for r in farm.robots()] == [("farm", "r1"), ("farm", "r2"), ("yard", "r1")]
-    assert [r.environment for r in farm.robots(robot="r1")] == ["farm", "yard"]
-    farm.delete_environment("yard")
-    assert [r.environment for r in farm.robots(robot="r1")] == ["farm"]
+    assert [(r.environment, r.robot) for r in farm.robots.all()] == [("farm", "r1"), ("farm", "r2"), ("yard", "r1")]
+    assert [r.environment for r in farm.robots.all(robot="r1")] == ["farm", "yard"]
+    farm.environments.delete("yard")
+    assert [r.environment for r in farm.robots.all(robot="r1")] == ["farm"]
     with pytest.raises(NotFound):
-        farm.robots("nowhere")
-    farm.purge_environment("yard")
-    farm.forget_robot("farm", "r1")
-    assert [r.robot for r in farm.robots()] == ["r2"]
-    assert farm.robot_history("farm", "r1") == []
+        farm.robots.all("nowhere")
+    farm.environments.purge("yard")
+    farm.robots.forget("farm", "r1")
+    assert [r.robot for r in farm.robots.all()] == ["r2"]
+    assert farm.robots.history("farm", "r1") == []
     with pytest.raises(NotFound, match="r1"):
-        farm.forget_robot("farm", "r1")
+        farm.robots.forget("farm", "r1")
 
 
 def test_history_and_fleet_are_bounded(farm: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(robots, "HISTORY", 5)
     monkeypatch.setattr(robots, "MAX_ROBOTS", 2)
-    farm.note_reports([heard("r1", k, version=k) for k in range(12)] + [heard("r2", 0)])
-    assert [r.version for _, r in farm.robot_history("farm", "r1")] == [11, 10, 9, 8, 7]
-    assert len(farm.robot_history("farm", "r2")) == 1
-    (refused,) = farm.note_reports([heard("r3", 0)])
+    farm.robots.note_reports([heard("r1", k, version=k) for k in range(12)] + [heard("r2", 0)])
+    assert [r.version for _, r in farm.robots.history("farm", "r1")] == [11, 10, 9, 8, 7]
+    assert len(farm.robots.history("farm", "r2")) == 1
+    (refused,) = farm.robots.note_reports([heard("r3", 0)])
     assert isinstance(refused, Conflict)
-    assert farm.note_reports([heard("r2", 1)]) == [None]
-    assert [r.robot for r in farm.robots()] == ["r1", "r2"]
+    assert farm.robots.note_reports([heard("r2", 1)]) == [None]
+    assert [r.robot for r in farm.robots.all()] == ["r1", "r2"]
 
 
 def test_many_writers_of_the_same_robots(farm: Store):
     def write(k: int) -> None:
         names = [f"r{n}" for n in range(6)]
         for name in names if k % 2 else reversed(names):
-            assert farm.note_reports([heard(name, k, version=k), heard("r0", k, version=k)]) == [None, None]
+            assert farm.robots.note_reports([heard(name, k, version=k), heard("r0", k, version=k)]) == [None, None]
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(write, range(8)))
-    assert [r.robot for r in farm.robots("farm")] == [f"r{n}" for n in range(6)]
+    assert [r.robot for r in farm.robots.all("farm")] == [f"r{n}" for n in range(6)]
 
 
 def test_presence(farm: Store, monkeypatch: pytest.MonkeyPatch):
-    farm.note_reports([heard("r1", 0), heard("r2", 0)])
-    farm.note_presence({"r1", "r2", "r9"}, set(), NOW)
+    farm.robots.note_reports([heard("r1", 0), heard("r2", 0)])
+    farm.robots.note_presence({"r1", "r2", "r9"}, set(), NOW)
     later = NOW + timedelta(minutes=9)
-    farm.note_presence({"r1"}, {"r2"}, later)
-    assert [(r.robot, r.on_bus, r.presence_at) for r in farm.robots()] == [("r1", True, later), ("r2", False, later)]
+    farm.robots.note_presence({"r1"}, {"r2"}, later)
+    assert [(r.robot, r.on_bus, r.presence_at) for r in farm.robots.all()] == [
+        ("r1", True, later),
+        ("r2", False, later),
+    ]
     monkeypatch.setattr(robots, "MAX_PRESENT", 3)
-    farm.note_reports([heard("r3", 0)])
-    farm.note_presence({"r2", "r3"}, {"r1"}, later)
-    assert [(r.robot, r.on_bus) for r in farm.robots()] == [("r1", False), ("r2", True), ("r3", None)]
+    farm.robots.note_reports([heard("r3", 0)])
+    farm.robots.note_presence({"r2", "r3"}, {"r1"}, later)
+    assert [(r.robot, r.on_bus) for r in farm.robots.all()] == [("r1", False), ("r2", True), ("r3", None)]
 
 
 def test_silent_robots_are_tidied_away(farm: Store):
     old = datetime.now(UTC) - timedelta(days=91)
-    farm.note_reports([ReceivedReport("farm", "old", RobotReport("latest", 0, A, "active"), old)])
-    farm.note_reports([ReceivedReport("farm", "new", RobotReport("latest", 0, A, "active"), datetime.now(UTC))])
-    farm.note_presence({"old"}, set(), old)
-    farm.collect(timedelta(hours=6))
-    assert [r.robot for r in farm.robots()] == ["new"]
-    assert farm.robot_history("farm", "old") == []
+    farm.robots.note_reports([ReceivedReport("farm", "old", RobotReport("latest", 0, A, "active"), old)])
+    farm.robots.note_reports([ReceivedReport("farm", "new", RobotReport("latest", 0, A, "active"), datetime.now(UTC))])
+    farm.robots.note_presence({"old"}, set(), old)
+    farm.garbage.collect(timedelta(hours=6))
+    assert [r.robot for r in farm.robots.all()] == ["new"]
+    assert farm.robots.history("farm", "old") == []
 
 
 def test_moves_of_channels(farm: Store):
     first = save(farm, "farm", Replace(GRID, grid()))
     second = save(farm, "farm", Replace(GRID, grid(seed=1)))
-    farm.set_channel("farm", "production", 2, author="ann")
-    farm.set_channel("farm", "staging", 1, author="ann")
-    farm.set_channel("farm", "production", 1, author="ann")
-    farm.set_channel("farm", "production", 2, author="ann", activate_at=NOW)
-    assert [(m.sequence, m.version, m.root) for m in farm.moves("farm", "latest")] == [
+    farm.channels.move("farm", "production", 2, author="ann")
+    farm.channels.move("farm", "staging", 1, author="ann")
+    farm.channels.move("farm", "production", 1, author="ann")
+    farm.channels.move("farm", "production", 2, author="ann", activate_at=NOW)
+    assert [(m.sequence, m.version, m.root) for m in farm.channels.moves("farm", "latest")] == [
         (2, 1, first.root), (3, 2, second.root),
     ]  # fmt: skip
-    assert [(m.sequence, m.version) for m in farm.moves("farm", "production")] == [(4, 2), (6, 1)]
-    assert farm.moves("farm", "none") == []
+    assert [(m.sequence, m.version) for m in farm.channels.moves("farm", "production")] == [(4, 2), (6, 1)]
+    assert farm.channels.moves("farm", "none") == []
 
 
 def test_convergence_is_proved(farm: Store):
     old, new = (save(farm, "farm", Replace(GRID, grid(seed=k))).root for k in range(2))
-    channel = farm.set_channel("farm", "production", 2, author="ann")
+    channel = farm.channels.move("farm", "production", 2, author="ann")
     base = channel.time
 
     def say(robot: str, seconds: float, root: str, state: Any = "active", **more: Any) -> None:
         report = RobotReport(more.pop("channel", "production"), 0, root, state, **more)
-        farm.note_reports([ReceivedReport("farm", robot, report, base + timedelta(seconds=seconds))])
+        farm.robots.note_reports([ReceivedReport("farm", robot, report, base + timedelta(seconds=seconds))])
 
     def stand(seconds: float = 60) -> Any:
-        return channel_convergence(farm.robots("farm"), channel, base + timedelta(seconds=seconds))
+        return channel_convergence(farm.robots.all("farm"), channel, base + timedelta(seconds=seconds))
 
     assert stand().as_dict() == {
         "total": 0, "online": 0, "holding": 0, "lagging": 0, "failed": 0, "ready": 0, "since": None,
@@ -223,32 +228,32 @@ def test_convergence_is_proved(farm: Store):
     now = stand()
     assert (now.total, now.holding, now.lagging, now.failed) == (3, 3, 0, 0)
     assert now.since == base + timedelta(seconds=7)
-    farm.forget_robot("farm", "b")
-    farm.forget_robot("farm", "c")
+    farm.robots.forget("farm", "b")
+    farm.robots.forget("farm", "c")
     assert stand().since == base, "before the channel came there, nobody held the channel's root"
     # What comes next is fetched, while the present is held.
-    planned = farm.set_channel("farm", "production", 1, author="ann", activate_at=base + timedelta(hours=1))
+    planned = farm.channels.move("farm", "production", 1, author="ann", activate_at=base + timedelta(hours=1))
     assert planned.planned is not None
     assert planned.planned.root == old
     say("a", 20, old, "ready")
-    ready = channel_convergence(farm.robots("farm"), planned, base, old)
+    ready = channel_convergence(farm.robots.all("farm"), planned, base, old)
     assert (ready.holding, ready.ready) == (1, 1)
     report = RobotReport("production", 1, old, "ready")
-    farm.note_reports([ReceivedReport("farm", "made-up", report, base + timedelta(seconds=21), vouched=False)])
-    ready = channel_convergence(farm.robots("farm"), planned, base, old)
+    farm.robots.note_reports([ReceivedReport("farm", "made-up", report, base + timedelta(seconds=21), vouched=False)])
+    ready = channel_convergence(farm.robots.all("farm"), planned, base, old)
     assert (ready.total, ready.ready) == (2, 1), "it is listed, and does not count in the roll-out"
 
 
 def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
     farm = sqlite_store
-    farm.create_environment("farm", datum=DATUM)
-    channel = next(c for c in farm.channels("farm"))
+    farm.environments.create("farm", datum=DATUM)
+    channel = next(c for c in farm.channels.all("farm"))
     moves = [ChannelMove(n, n, str(n) * 64, NOW + timedelta(minutes=n)) for n in (2, 5, 7)]
     channel = replace(channel, root=moves[-1].root)
 
     def lag(*reports: ReceivedReport) -> Any:
-        farm.note_reports(list(reports))
-        (robot,) = farm.robots("farm", reports[0].robot)
+        farm.robots.note_reports(list(reports))
+        (robot,) = farm.robots.all("farm", reports[0].robot)
         lag = robot_lag(robot, channel, moves)
         return lag.events, lag.differs, lag.since and (lag.since - NOW) / timedelta(minutes=1)
 
@@ -269,10 +274,10 @@ def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
     ],
 )  # fmt: skip
 def test_who_is_online(sqlite_store: Store, report: float, there: bool | None, seen: float | None, online: bool):
-    sqlite_store.create_environment("farm")
-    sqlite_store.note_reports([heard("r", report)])
+    sqlite_store.environments.create("farm")
+    sqlite_store.robots.note_reports([heard("r", report)])
     if seen is not None:
         at = NOW + timedelta(minutes=seen)
-        sqlite_store.note_presence({"r"} if there else set(), set() if there else {"r"}, at)
-    (robot,) = sqlite_store.robots()
+        sqlite_store.robots.note_presence({"r"} if there else set(), set() if there else {"r"}, at)
+    (robot,) = sqlite_store.robots.all()
     assert is_online(robot, NOW) is online

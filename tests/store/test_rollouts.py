@@ -9,8 +9,8 @@ import pytest
 
 from app.fleet import next_step
 from app.store.changes import Replace
+from app.store.fleet_values import Channel, ReceivedReport, Robot, RobotReport, Rollout
 from app.store.store import Store
-from app.store.values import Channel, ReceivedReport, Robot, RobotReport, Rollout
 from tests.store.samples import GRID, grid, save
 
 
@@ -19,9 +19,9 @@ class Fleet:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        store.create_environment("farm")
+        store.environments.create("farm")
         self.roots = {k + 1: save(store, "farm", Replace(GRID, grid(seed=k))).root for k in range(3)}
-        store.set_channel("farm", "production", 1, author="ann")
+        store.channels.move("farm", "production", 1, author="ann")
         self.start = datetime.now(UTC)
 
     def at(self, seconds: float) -> datetime:
@@ -30,27 +30,29 @@ class Fleet:
     def say(self, robots: str, version: int, state: Any, seconds: float = 1, *, vouched: bool = True) -> None:
         report = RobotReport("production", version, self.roots[version], state)
         assert not any(
-            self.store.note_reports([ReceivedReport("farm", r, report, self.at(seconds), vouched) for r in robots])
+            self.store.robots.note_reports(
+                [ReceivedReport("farm", r, report, self.at(seconds), vouched) for r in robots]
+            )
         )
 
     def roll(self, version: int = 2, activate_at: datetime | None = None, **more: Any) -> Channel:
         rollout = Rollout(0, "", self.start, **more)
-        return self.store.set_channel(
+        return self.store.channels.move(
             "farm", "production", version, author="bob", activate_at=activate_at, rollout=rollout
         )
 
     def tick(self, seconds: float) -> tuple[int | None, str]:
         """(version, state of the roll-out) after it."""
-        self.store.apply_due_moves(self.at(seconds))
-        self.store.advance_rollouts(self.at(seconds), next_step)
+        self.store.channels.apply_due_moves(self.at(seconds))
+        self.store.channels.advance_rollouts(self.at(seconds), next_step)
         now = self.channel()
         return now.version, now.rollout.state if now.rollout else ""
 
     def channel(self) -> Channel:
-        return next(c for c in self.store.channels("farm") if c.name == "production")
+        return next(c for c in self.store.channels.all("farm") if c.name == "production")
 
     def told(self) -> list[dict[str, Any]]:
-        return [dict(e.body) for e in self.store.events("farm", since=5)]
+        return [dict(e.body) for e in self.store.events.page("farm", since=5)]
 
 
 @pytest.fixture
@@ -191,7 +193,7 @@ def test_it_moves_back_when_too_many_fail(fleet: Fleet):
 
 
 def test_back_to_a_newer_version_is_a_rollback_too(fleet: Fleet):
-    fleet.store.set_channel("farm", "production", 3, author="ann")
+    fleet.store.channels.move("farm", "production", 3, author="ann")
     fleet.roll(2, failed=0.5)
     assert fleet.tick(0) == (2, "watching"), "without a share to wait for it moves at once"
     fleet.say("a", 2, "failed", 10)
@@ -230,25 +232,25 @@ def test_what_cannot_be_fetched_is_not_activated(fleet: Fleet):
 def test_another_move_ends_a_rollout(fleet: Fleet):
     fleet.say("a", 1, "active")
     fleet.roll(failed=0.1)
-    fleet.store.set_channel("farm", "production", 3, author="ann")
+    fleet.store.channels.move("farm", "production", 3, author="ann")
     fleet.say("a", 2, "failed", 2)
     assert fleet.tick(3) == (3, "")
     fleet.roll(ready=1.0)
-    fleet.store.cancel_planned("farm", "production", "ann")
+    fleet.store.channels.cancel_planned("farm", "production", "ann")
     fleet.say("a", 2, "ready", 4)
     assert fleet.tick(5) == (3, "cancelled")
     fleet.roll(ready=1.0)
-    fleet.store.set_channel("farm", "production", 1, author="ann", activate_at=fleet.at(10))
+    fleet.store.channels.move("farm", "production", 1, author="ann", activate_at=fleet.at(10))
     assert fleet.tick(9) == (3, "")
     assert fleet.tick(10) == (1, "")
 
 
 def test_a_first_move_has_nothing_to_go_back_to(fleet: Fleet):
     rollout = Rollout(0, "", fleet.start, failed=0.1)
-    moved = fleet.store.set_channel("farm", "staging", 2, author="ann", rollout=rollout)
+    moved = fleet.store.channels.move("farm", "staging", 2, author="ann", rollout=rollout)
     assert moved.rollout is not None
     assert (moved.version, moved.rollout.state) == (2, "done")
-    same = fleet.store.set_channel("farm", "staging", 2, author="ann", rollout=rollout)
+    same = fleet.store.channels.move("farm", "staging", 2, author="ann", rollout=rollout)
     assert same.sequence == moved.sequence
 
 
@@ -261,6 +263,6 @@ def test_a_decision_is_taken_again_where_it_is_carried_out(fleet: Fleet):
         calls.append(about)
         return next_step(*about) if len(calls) == 1 else None
 
-    assert fleet.store.advance_rollouts(fleet.at(2), changes_its_mind) == []
+    assert fleet.store.channels.advance_rollouts(fleet.at(2), changes_its_mind) == []
     assert len(calls) == 2
     assert fleet.channel().version == 1

@@ -16,10 +16,10 @@ from alembic.script import ScriptDirectory
 from app.errors import Unavailable
 from app.main import startup_lock
 from app.store.database import Database
+from app.store.fleet_values import ReceivedReport, RobotReport
 from app.store.schema import comparison, config, newest
 from app.store.store import Store
 from app.store.tables import metadata
-from app.store.values import ReceivedReport, RobotReport
 
 
 def test_models_and_migrations_do_not_differ(store: Store, database_url: str):
@@ -46,9 +46,9 @@ def test_migrating_again_changes_nothing_and_check_passes(store: Store):
 
 
 def test_robots_of_before_are_vouched_for(store: Store, database_url: str):
-    store.create_environment("farm")
+    store.environments.create("farm")
     report = RobotReport("latest", 0, "a" * 64, "active")
-    store.note_reports([ReceivedReport("farm", "old", report, datetime.now(UTC), vouched=False)])
+    store.robots.note_reports([ReceivedReport("farm", "old", report, datetime.now(UTC), vouched=False)])
     settings = config()
     before = ScriptDirectory.from_config(settings).get_revision("0008").down_revision
     database = Database(database_url, readonly=False)
@@ -59,7 +59,7 @@ def test_robots_of_before_are_vouched_for(store: Store, database_url: str):
             command.downgrade(settings, str(before))
     database.close()
     store.migrate()
-    assert [r.vouched for r in store.robots("farm")] == [True]
+    assert [r.vouched for r in store.robots.all("farm")] == [True]
 
 
 def test_check_fails_before_migration(empty_database_url: str, tmp_path: Path):
@@ -74,7 +74,7 @@ def test_no_database_is_unavailable(tmp_path: Path):
     with pytest.raises(Unavailable):
         store.check()
     with pytest.raises(Unavailable):
-        store.environment("farm")
+        store.environments.get("farm")
     store.close()
 
 
@@ -117,7 +117,7 @@ def test_of_servers_that_start_together_one_makes_the_administrator(empty_databa
             with startup_lock(tmp_path):
                 store.migrate()
             store.check()
-            return store.create_administrator()
+            return store.tokens.create_administrator()
         finally:
             store.close()
 
@@ -125,6 +125,6 @@ def test_of_servers_that_start_together_one_makes_the_administrator(empty_databa
         tokens = list(threads.map(start, range(6)))
     assert sum(secret is not None for secret in tokens) == 1
     store = Store(empty_database_url, tmp_path / "blobs")
-    assert [token.role for token in store.tokens()] == ["admin"]
-    assert store.find_token(next(filter(None, tokens))) is not None
+    assert [token.role for token in store.tokens.all()] == ["admin"]
+    assert store.tokens.find(next(filter(None, tokens))) is not None
     store.close()

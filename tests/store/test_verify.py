@@ -28,11 +28,11 @@ from tests.store.samples import GRID, everything, grid, replaces, save
 
 def filled(store: Store) -> None:
     """Two versions of everything, with sources: a large file and two packed ones."""
-    store.create_environment("farm")
+    store.environments.create("farm")
     names = store.blobs.put_many([b"b" * 100_000, b"small", b"other"])
     sources = [Source(f"f{k}", 1, name) for k, name in enumerate(names)]
-    prepared = store.prepare(store.version("farm"), Changes(replaces(everything())))
-    store.commit("farm", prepared, author="ann", message="all", sources=sources)
+    prepared = store.versions.prepare(store.versions.get("farm"), Changes(replaces(everything())))
+    store.versions.commit("farm", prepared, author="ann", message="all", sources=sources)
     save(store, "farm", *replaces({GRID: grid(seed=5)}))
 
 
@@ -44,7 +44,7 @@ def spoil_chunk(store: Store, name: str, *, lose: bool = False) -> None:
         else:
             statement = f"UPDATE chunk SET data = {mark} WHERE hash = {mark}"
             connection.exec_driver_sql(statement, (b"spoilt", bytes.fromhex(name)))
-    store._chunks.forget()
+    store.chunks.forget()
 
 
 def test_verification_names_what_is_damaged_and_the_versions_it_hits(store: Store) -> None:
@@ -53,7 +53,7 @@ def test_verification_names_what_is_damaged_and_the_versions_it_hits(store: Stor
     assert verification.findings == []
     assert verification.checked["version"] == 3
     assert verification.checked["blob"] >= 3
-    first, second = store.version("farm", 1), store.version("farm", 2)
+    first, second = store.versions.get("farm", 1), store.versions.get("farm", 2)
     only_first = first.part(GRID)
     both = next(e for e in first.parts if e.key != GRID and e in second.parts)
     assert only_first is not None
@@ -82,21 +82,21 @@ def test_verification_names_what_is_damaged_and_the_versions_it_hits(store: Stor
 
 def test_every_node_of_a_tree_counts(sqlite_store: Store) -> None:
     filled(sqlite_store)
-    version = sqlite_store.version("farm", 2)
+    version = sqlite_store.versions.get("farm", 2)
     names = [name for name, _, _ in sqlite_store.verifier().chunks()][::7]
     lost = 0
     for name in names:
-        raw = sqlite_store.chunk(name)
+        raw = sqlite_store.chunks.read(name)
         spoil_chunk(sqlite_store, name, lose=True)
         findings = sqlite_store.verifier().run().findings
         if findings:
             assert {f.name for f in findings} == {name}
             lost += ("farm", version.number) in findings[0].versions
-        sqlite_store.heal_chunks({name: raw})
+        sqlite_store.chunks.heal({name: raw})
     assert lost > len(names) // 2
     assert sqlite_store.verifier().run().findings == []
     with pytest.raises(Damaged):
-        sqlite_store.heal_chunks({names[0]: b"other bytes"})
+        sqlite_store.chunks.heal({names[0]: b"other bytes"})
 
 
 def test_a_changed_version_row_is_found(store: Store) -> None:
@@ -110,7 +110,7 @@ def test_a_changed_version_row_is_found(store: Store) -> None:
 
 def test_the_scrub_finds_damage_goes_on_after_a_stop_and_tells_its_age(store: Store) -> None:
     filled(store)
-    entry = store.version("farm", 1).part(GRID)
+    entry = store.versions.get("farm", 1).part(GRID)
     assert entry is not None
     spoil_chunk(store, entry.hash)
     assert figures(read_state(store.blob_dir))["age"] == float("inf")
@@ -238,23 +238,23 @@ def test_database_errors_say_what_to_do(tmp_path: Path) -> None:
         file.write_bytes(content)
         store = Store(f"sqlite:///{file}", tmp_path / "blobs")
         with pytest.raises(kind, match=text) as raised:
-            store.environments()
+            store.environments.page()
         assert "some.sqlite" in raised.value.detail
         store.close()
     file.unlink()
     with pytest.raises(DatabaseDamaged, match="missing"):
-        Store(f"sqlite:///{file}", tmp_path / "blobs", readonly=True).environments()
+        Store(f"sqlite:///{file}", tmp_path / "blobs", readonly=True).environments.page()
     assert not file.exists()
     folder = tmp_path / "folder.sqlite"
     folder.mkdir()
     store = Store(f"sqlite:///{folder}", tmp_path / "blobs")
     with pytest.raises(Unavailable, match="check the file"):
-        store.environments()
+        store.environments.page()
     store.close()
 
 
 def test_a_full_and_a_read_only_database_refuse_writes(sqlite_store: Store) -> None:
-    sqlite_store.create_environment("farm")
+    sqlite_store.environments.create("farm")
     with sqlite_store._database.read() as connection:
         pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
 
@@ -268,10 +268,10 @@ def test_a_full_and_a_read_only_database_refuse_writes(sqlite_store: Store) -> N
     with pytest.raises(NoRoom, match="room"):
         save(sqlite_store, "farm", *replaces(everything()))
     event.remove(sqlite_store._database.engine, "begin", limit)
-    assert sqlite_store.version("farm").number == 0
+    assert sqlite_store.versions.get("farm").number == 0
     reading = Store(sqlite_store.database_url, sqlite_store.blob_dir, readonly=True)
     with pytest.raises(Unavailable, match="cannot be written"):
-        reading.create_environment("other")
+        reading.environments.create("other")
     reading.close()
 
 
@@ -305,7 +305,7 @@ def test_a_file_that_a_worker_missed_is_no_lasting_damage(sqlite_store: Store) -
     file = Path(sqlite_store.database_url.removeprefix("sqlite:///"))
     away = file.rename(file.with_suffix(".away"))
     with pytest.raises(DatabaseDamaged, match="missing") as caught:
-        sqlite_store.environments()
+        sqlite_store.environments.page()
     sqlite_store.note_damage(pickle.loads(pickle.dumps(caught.value)))
     away.rename(file)
     sqlite_store.check()
@@ -355,6 +355,6 @@ def test_only_chunks_that_are_still_damaged_and_unused_are_removed(store: Store)
     with store._database.write() as connection:  # uploads of other processes, while the check goes on
         insert(connection, {healed: compress(raws[healed])}, now=time.time() - 50)
         insert(connection, {in_use: b"damaged"})
-    assert store.remove_unused_chunks(verification) == {unused}
-    assert store.chunk(healed) == raws[healed]
+    assert store.chunks.remove_damaged(verification.unused_chunks, verification.started) == {unused}
+    assert store.chunks.read(healed) == raws[healed]
     assert {f.name for f in store.verifier().run().findings} == {in_use}

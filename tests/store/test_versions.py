@@ -44,7 +44,7 @@ from tests.store.samples import (
 
 @pytest.fixture
 def farm(store: Store) -> Store:
-    store.create_environment("farm", datum=DATUM)
+    store.environments.create("farm", datum=DATUM)
     return store
 
 
@@ -54,37 +54,37 @@ def test_every_kind_of_part_comes_back_whole(farm: Store):
     assert version.number == 2
     assert version.parent == 1
     assert [e.key for e in version.parts] == sorted(parts)
-    assert_same_layers(farm.load(farm.version("farm")), Layers(parts, DATUM))
-    some = farm.load(version, [GRID, OBJECTS])
+    assert_same_layers(farm.content.load(farm.versions.get("farm")), Layers(parts, DATUM))
+    some = farm.content.load(version, [GRID, OBJECTS])
     assert set(some.parts) == {GRID, OBJECTS}
     with pytest.raises(NotFound, match="occupancy"):
-        farm.load(version, [PartKey("occupancy", "ground", "keepout")])
+        farm.content.load(version, [PartKey("occupancy", "ground", "keepout")])
 
 
 def test_another_process_reads_the_same(farm: Store, tmp_path: Path):
     parts = everything()
     version = save(farm, "farm", *replaces(parts))
     other = Store(farm.database_url, farm.blob_dir, readonly=True)
-    assert_same_layers(other.load(other.version("farm")), Layers(parts, DATUM))
-    assert other.prepare(version, Changes((Drop(GRID),))).changed
+    assert_same_layers(other.content.load(other.versions.get("farm")), Layers(parts, DATUM))
+    assert other.versions.prepare(version, Changes((Drop(GRID),))).changed
     with pytest.raises((Unavailable, Invalid)):
-        other.create_environment("second")
+        other.environments.create("second")
     other.close()
 
 
 def test_equal_content_has_equal_roots_on_both_databases(store: Store, sqlite_store: Store):
     for one in (store, sqlite_store):
-        one.create_environment("farm", datum=DATUM)
+        one.environments.create("farm", datum=DATUM)
         save(one, "farm", *replaces(everything()))
-    assert store.version("farm").root == sqlite_store.version("farm").root
+    assert store.versions.get("farm").root == sqlite_store.versions.get("farm").root
 
 
 def test_the_root_depends_on_content_alone(farm: Store):
-    farm.create_environment("other", title="t")
+    farm.environments.create("other", title="t")
     save(farm, "other", *replaces(everything()))
     other = save(farm, "other", datum=DATUM)
-    prepared = farm.prepare(
-        farm.version("farm"), Changes(tuple(Replace(k, p, Provenance("derived")) for k, p in everything().items()))
+    prepared = farm.versions.prepare(
+        farm.versions.get("farm"), Changes(tuple(Replace(k, p, Provenance("derived")) for k, p in everything().items()))
     )
     assert prepared.root == other.root
     for changed in (
@@ -93,26 +93,26 @@ def test_the_root_depends_on_content_alone(farm: Store):
         Changes(datum=None),
         Changes(levels=(Level(), Level("first", 3.0))),
     ):
-        assert farm.prepare(other, changed).root != other.root
+        assert farm.versions.prepare(other, changed).root != other.root
 
 
 def test_the_same_again_changes_nothing(farm: Store):
     first = save(farm, "farm", *replaces(everything()))
-    farm._chunks.forget()
-    reads = farm._chunks.reads
-    prepared = farm.prepare(first, Changes((Replace(TOPOLOGY, network(300)),)))
+    farm.chunks.forget()
+    reads = farm.chunks.reads
+    prepared = farm.versions.prepare(first, Changes((Replace(TOPOLOGY, network(300)),)))
     assert not prepared.changed
     assert not prepared.chunks
-    assert farm._chunks.reads - reads == 2  # the part's root: compared, and checked for damage
+    assert farm.chunks.reads - reads == 2  # the part's root: compared, and checked for damage
     shuffled = network(300).select(np.random.default_rng(0).permutation(300))
-    assert not farm.prepare(first, Changes((Replace(TOPOLOGY, shuffled),))).changed
-    assert not farm.prepare(first, Changes(replaces(everything()))).changed
+    assert not farm.versions.prepare(first, Changes((Replace(TOPOLOGY, shuffled),))).changed
+    assert not farm.versions.prepare(first, Changes(replaces(everything()))).changed
     digest = farm.blobs.put(b"again")
-    same = farm.commit("farm", prepared, author="bob", message="x", sources=[Source("again.txt", 5, digest)])
+    same = farm.versions.commit("farm", prepared, author="bob", message="x", sources=[Source("again.txt", 5, digest)])
     assert same.number == first.number
     assert [(s.name, s.used) for s in same.sources] == [("again.txt", False)]
-    assert farm.version("farm").number == first.number
-    assert farm.add_sources("farm", first.number, [Source("again.txt", 5, digest)]).sources == same.sources
+    assert farm.versions.get("farm").number == first.number
+    assert farm.versions.add_sources("farm", first.number, [Source("again.txt", 5, digest)]).sources == same.sources
 
 
 def edits(seed: int) -> Callable[[Store], None]:
@@ -122,8 +122,8 @@ def edits(seed: int) -> Callable[[Store], None]:
         random.seed(seed)
         rng = np.random.default_rng(seed)
         items: dict[str, tuple[Any, dict[str, Any], bool]] = {}
-        store.create_environment("a")
-        store.create_environment("b")
+        store.environments.create("a")
+        store.environments.create("b")
         for round_ in range(14):
             for local in (True, False):
                 chosen = [f"n{i}" for i in rng.integers(0, 600, rng.choice([0, 1, 5, 200]))]
@@ -165,7 +165,7 @@ def edits(seed: int) -> Callable[[Store], None]:
                 assert entry is not None
                 assert entry.count == len(items)
                 assert entry.bounds == fresh.part(TOPOLOGY).bounds  # type: ignore[union-attr]
-        loaded = store.load(store.version("a")).parts[TOPOLOGY]
+        loaded = store.content.load(store.versions.get("a")).parts[TOPOLOGY]
         assert isinstance(loaded, Features)
         assert set(loaded.ids) == set(items)
 
@@ -190,40 +190,40 @@ def test_put_and_delete_say_what_they_changed(farm: Store):
     )
     version = save(farm, "farm", Put(TOPOLOGY, new), Delete(TOPOLOGY, ("n2", "n3")))
     assert version.changes == {"topology": {"added": 1, "changed": 1, "deleted": 2, "document": True}}
-    part = farm.load(version).parts[TOPOLOGY]
+    part = farm.content.load(version).parts[TOPOLOGY]
     assert isinstance(part, Features)
     assert part.document == {"tmap2": {"name": "changed"}, "more": 1}
     assert len(part) == 199
     with pytest.raises(NotFound, match="'gone'"):
-        farm.prepare(version, Changes((Delete(TOPOLOGY, ("n1", "gone")),)))
+        farm.versions.prepare(version, Changes((Delete(TOPOLOGY, ("n1", "gone")),)))
     with pytest.raises(NotFound):
-        farm.prepare(version, Changes((Delete(OBJECTS, ("n1",)),)))
+        farm.versions.prepare(version, Changes((Delete(OBJECTS, ("n1",)),)))
     with pytest.raises(NotFound):
-        farm.prepare(version, Changes((Drop(OBJECTS),)))
+        farm.versions.prepare(version, Changes((Drop(OBJECTS),)))
     with pytest.raises(Invalid):
-        farm.prepare(version, Changes((Put(GRID, new),)))
+        farm.versions.prepare(version, Changes((Put(GRID, new),)))
     with pytest.raises(Invalid):
-        farm.prepare(version, Changes((Replace(GRID, new),)))
+        farm.versions.prepare(version, Changes((Replace(GRID, new),)))
 
 
 def test_an_integer_that_becomes_a_float_is_a_change(farm: Store):
     save(farm, "farm", Replace(TOPOLOGY, features([("a", shapely.Point(0, 0), {"v": 1, "w": 2})], "local")))
-    before = farm.version("farm")
+    before = farm.versions.get("farm")
     after = save(farm, "farm", Replace(TOPOLOGY, features([("a", shapely.Point(0, 0), {"v": 1.0, "w": 2})], "local")))
     assert after.changes == {"topology": {"added": 0, "changed": 1, "deleted": 0}}
-    assert farm.diff(before, after) == {
+    assert farm.content.diff(before, after) == {
         "topology": {"added": [], "changed": [{"id": "a", "fields": ["v"]}], "deleted": []}
     }
 
 
 def test_features_come_by_id_and_by_document_order(farm: Store):
     version = save(farm, "farm", Replace(TOPOLOGY, network(300)))
-    part = farm.load(version).parts[TOPOLOGY]
+    part = farm.content.load(version).parts[TOPOLOGY]
     assert isinstance(part, Features)
     assert list(part.ids) == sorted(part.ids)
-    assert farm.has_ids(version, TOPOLOGY, ["n5", "n299", "nope"]) == {"n5", "n299"}
-    assert farm.has_ids(version, OBJECTS, ["n5"]) == set()
-    some = farm.get(version, TOPOLOGY, ["n7", "n250", "nope"])
+    assert farm.content.has_ids(version, TOPOLOGY, ["n5", "n299", "nope"]) == {"n5", "n299"}
+    assert farm.content.has_ids(version, OBJECTS, ["n5"]) == set()
+    some = farm.content.features(version, TOPOLOGY, ids=["n7", "n250", "nope"])
     assert some.ids == ("n250", "n7")
     index = part.index()
     assert rows(some) == rows(part.select([index["n250"], index["n7"]]))
@@ -231,36 +231,36 @@ def test_features_come_by_id_and_by_document_order(farm: Store):
 
 def test_an_old_version_reads_like_the_head(farm: Store):
     first = save(farm, "farm", *replaces(everything()))
-    farm._chunks.forget()
-    before = farm._chunks.reads
-    farm.load(first)
-    cost = farm._chunks.reads - before
+    farm.chunks.forget()
+    before = farm.chunks.reads
+    farm.content.load(first)
+    cost = farm.chunks.reads - before
     for k in range(30):
         save(farm, "farm", Put(TOPOLOGY, features([(f"n{k}", shapely.Point(k, k), {"k": k})], "local")))
-    old = farm.version("farm", first.number)
+    old = farm.versions.get("farm", first.number)
     assert old.root == first.root
-    farm._chunks.forget()
-    before = farm._chunks.reads
-    assert_same_layers(farm.load(old), Layers(everything(), DATUM))
-    assert farm._chunks.reads - before == cost
+    farm.chunks.forget()
+    before = farm.chunks.reads
+    assert_same_layers(farm.content.load(old), Layers(everything(), DATUM))
+    assert farm.chunks.reads - before == cost
 
 
 def test_a_version_costs_what_it_changes(farm: Store):
     save(farm, "farm", Replace(TOPOLOGY, network(20_000, side=3000)), Replace(GRID, grid(3000, 3000)))
-    head = farm.version("farm")
-    near = farm.features(head, TOPOLOGY, bbox=(1000, 1000, 1300, 1300))
+    head = farm.versions.get("farm")
+    near = farm.content.features(head, TOPOLOGY, bbox=(1000, 1000, 1300, 1300))
     assert 100 < len(near) < 400
     changed = Features(
         near.ids, near.geometry.copy(), tuple({**p, "name": "x"} for p in near.properties), near.local.copy()
     )
-    one = farm.prepare(head, Changes((Put(TOPOLOGY, changed.select([0])),)))
-    many = farm.prepare(head, Changes((Put(TOPOLOGY, changed),)))
+    one = farm.versions.prepare(head, Changes((Put(TOPOLOGY, changed.select([0])),)))
+    many = farm.versions.prepare(head, Changes((Put(TOPOLOGY, changed),)))
     assert len(one.chunks) <= 6
     assert sum(map(len, one.chunks.values())) < 20_000
     assert len(many.chunks) < 25  # of about 320 leaves
     cells = grid(3000, 3000).cells.copy()
     cells[1000:1010, 1000:1010] = 100
-    blocked = farm.prepare(head, Changes((Replace(GRID, grid_of(cells)),)))
+    blocked = farm.versions.prepare(head, Changes((Replace(GRID, grid_of(cells)),)))
     assert len(blocked.chunks) <= 4
     assert sum(map(len, blocked.chunks.values())) < 20_000
 
@@ -281,16 +281,16 @@ def grid_of(cells: Any) -> Any:
 
 def test_a_diff_reads_what_differs(farm: Store):
     save(farm, "farm", Replace(TOPOLOGY, network(20_000, side=3000)))
-    a = farm.version("farm")
+    a = farm.versions.get("farm")
     moved = features([("n17", shapely.Point(5.0, 5.0), {"kind": "node"}), ("new", None, {})], "local")
     b = save(farm, "farm", Put(TOPOLOGY, moved), Delete(TOPOLOGY, ("n18",)))
-    farm._chunks.forget()
-    before = farm._chunks.reads
+    farm.chunks.forget()
+    before = farm.chunks.reads
     changed = {"id": "n17", "fields": ["count", "geometry", "name", "weight"]}
-    assert farm.diff(a, b) == {"topology": {"added": ["new"], "changed": [changed], "deleted": ["n18"]}}
-    assert farm._chunks.reads - before < 30
-    assert farm.diff(b, a)["topology"]["added"] == ["n18"]
-    assert farm.diff(a, a) == {}
+    assert farm.content.diff(a, b) == {"topology": {"added": ["new"], "changed": [changed], "deleted": ["n18"]}}
+    assert farm.chunks.reads - before < 30
+    assert farm.content.diff(b, a)["topology"]["added"] == ["n18"]
+    assert farm.content.diff(a, a) == {}
 
 
 def test_a_box_is_found_at_any_version_without_reading_all(farm: Store):
@@ -298,43 +298,45 @@ def test_a_box_is_found_at_any_version_without_reading_all(farm: Store):
     old = save(farm, "farm", Replace(TOPOLOGY, network_part))
     save(farm, "farm", Drop(TOPOLOGY))
     box = (500.0, 700.0, 800.0, 900.0)
-    farm._chunks.forget()
-    before = farm._chunks.reads
-    hits = farm.features(old, TOPOLOGY, bbox=box)
-    assert farm._chunks.reads - before < 60
+    farm.chunks.forget()
+    before = farm.chunks.reads
+    hits = farm.content.features(old, TOPOLOGY, bbox=box)
+    assert farm.chunks.reads - before < 60
     xy = shapely.get_coordinates(network_part.geometry)
     inside = (xy[:, 0] >= 500) & (xy[:, 0] <= 800) & (xy[:, 1] >= 700) & (xy[:, 1] <= 900)
     assert set(hits.ids) == {network_part.ids[k] for k in np.flatnonzero(inside)}
     assert hits.document == network_part.document
-    frame = farm.load(old).frame
+    frame = farm.content.load(old).frame
     assert frame is not None
     corners = frame.to_wgs84(np.array([[500.0, 700.0], [800.0, 900.0]]))
     (west, south), (east, north) = corners.tolist()
     degrees = frame.to_wgs84(xy)
     inside = (degrees[:, 0] >= west) & (degrees[:, 0] <= east) & (degrees[:, 1] >= south) & (degrees[:, 1] <= north)
-    hits = farm.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84")
+    hits = farm.content.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84")
     assert set(hits.ids) == {network_part.ids[k] for k in np.flatnonzero(inside)}
-    some = farm.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84", ids=hits.ids[:3])
+    some = farm.content.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84", ids=hits.ids[:3])
     assert some.ids == hits.ids[:3]
 
 
 def test_items_on_earth_and_local_ones_are_found_by_either_kind_of_box(farm: Store):
     version = save(farm, "farm", Replace(OBJECTS, mixed()))
-    assert set(farm.features(version, OBJECTS, bbox=(-100, -100, 100, 100)).ids) == set("pzlaem")
-    assert set(farm.features(version, OBJECTS, bbox=(-100, -100, 100, -1)).ids) == {"p", "m"}
-    assert set(farm.features(version, OBJECTS, bbox=(5, -100, 100, -0.5)).ids) == set()
-    assert set(farm.features(version, OBJECTS, bbox=(-0.512, 53.19, -0.49, 53.22), crs="wgs84").ids) == set("pzlaem")
+    assert set(farm.content.features(version, OBJECTS, bbox=(-100, -100, 100, 100)).ids) == set("pzlaem")
+    assert set(farm.content.features(version, OBJECTS, bbox=(-100, -100, 100, -1)).ids) == {"p", "m"}
+    assert set(farm.content.features(version, OBJECTS, bbox=(5, -100, 100, -0.5)).ids) == set()
+    assert set(farm.content.features(version, OBJECTS, bbox=(-0.512, 53.19, -0.49, 53.22), crs="wgs84").ids) == set(
+        "pzlaem"
+    )
     blind = save(farm, "farm", datum=None)
     from app.errors import MissingDatum
 
     with pytest.raises(MissingDatum, match="datum"):
-        farm.features(blind, OBJECTS, bbox=(-1, 53, 0, 54), crs="wgs84")
+        farm.content.features(blind, OBJECTS, bbox=(-1, 53, 0, 54), crs="wgs84")
 
 
 def test_cells_that_change_are_counted_and_boxed(farm: Store):
     cells = np.zeros((600, 700), np.uint8)
     save(farm, "farm", Replace(GRID, grid_of(cells)))
-    a = farm.version("farm")
+    a = farm.versions.get("farm")
     assert a.changes["occupancy"]["map"]["freed"] == 600 * 700
     new = cells.copy()
     new[10:12, 20:23] = 100
@@ -349,8 +351,8 @@ def test_cells_that_change_are_counted_and_boxed(farm: Store):
         "bbox": [-3 + 20 * 0.05, 2.5, -3 + 601 * 0.05, 17.1],
     }
     assert b.changes["occupancy"]["map"] == {**expected, "bbox": pytest.approx(expected["bbox"])}
-    assert farm.diff(b, a)["occupancy"]["map"]["freed"] == 8
-    delta = farm.delta_parts(a, b)
+    assert farm.content.diff(b, a)["occupancy"]["map"]["freed"] == 8
+    delta = farm.content.delta_parts(a, b)
     patched = cells.copy()
     for r in delta.grids[0].rectangles:
         h, w = r.cells.shape
@@ -369,17 +371,17 @@ def test_a_grid_that_grows_is_laid_over_the_old_one(farm: Store):
     g = grid_of(wider)
     moved = type(g)(wider, g.resolution, (g.origin[0] - 20 * 0.05, g.origin[1] - 10 * 0.05, 0.0), g.mode)
     b = save(farm, "farm", Replace(GRID, moved))
-    diff = farm.diff(a, b)["occupancy"]["map"]
+    diff = farm.content.diff(a, b)["occupancy"]["map"]
     assert (diff["freed"], diff["blocked"], diff["unknown"], diff["other"]) == (0, 1, 0, 0)
     assert {"height", "origin", "width"} <= set(diff["fields"])
-    assert farm.delta_parts(a, b).grids[0].whole
+    assert farm.content.delta_parts(a, b).grids[0].whole
     c = save(farm, "farm", Replace(GRID, grid_of(cells)))
     turned = type(g)(cells, 0.07, (0.0, 0.0, 0.5), "trinary")
-    diff = farm.diff(c, save(farm, "farm", Replace(GRID, turned)))["occupancy"]["map"]
+    diff = farm.content.diff(c, save(farm, "farm", Replace(GRID, turned)))["occupancy"]["map"]
     assert diff["fields"] == ["mode", "origin", "properties", "resolution"]
     deletion = save(farm, "farm", Drop(GRID))
     assert deletion.changes["occupancy"]["map"]["unknown"] == 3000
-    assert farm.delta_parts(c, deletion).grids[0].deleted
+    assert farm.content.delta_parts(c, deletion).grids[0].deleted
 
 
 def test_other_layers_tell_counts(farm: Store):
@@ -399,15 +401,15 @@ def test_other_layers_tell_counts(farm: Store):
         files: Resources({"a": b"1", "b": b"3", "c": b"4"}),
     }
     b = save(farm, "farm", *replaces(second))
-    assert farm.diff(a, b) == {
+    assert farm.content.diff(a, b) == {
         "imagery": {"i": {"added": 0, "changed": 1, "deleted": 0, "fields": ["properties"]}},
         "resources": {"r": {"added": 1, "changed": 1, "deleted": 0}},
     }
-    assert b.changes == farm.diff(a, b)
-    assert farm.delta_parts(a, b).other == (photo, files)
+    assert b.changes == farm.content.diff(a, b)
+    assert farm.content.delta_parts(a, b).other == (photo, files)
     for dtype in (np.uint16, np.float32, bool):
         again = save(farm, "farm", Replace(photo, picture(dtype=dtype)))
-        assert_same_part(farm.load(again, [photo]).parts[photo], picture(dtype=dtype))
+        assert_same_part(farm.content.load(again, [photo]).parts[photo], picture(dtype=dtype))
 
 
 def test_voxels_tell_which_came_changed_and_went(farm: Store):
@@ -429,7 +431,7 @@ def test_voxels_tell_which_came_changed_and_went(farm: Store):
     b = save(farm, "farm", Replace(key, other))
     deleted_count = int((~remaining).sum())
     assert b.changes["voxels"] == {"v": {"added": 1, "changed": 3, "deleted": deleted_count + 1}}
-    assert_same_part(farm.load(b, [key]).parts[key], other)
+    assert_same_part(farm.content.load(b, [key]).parts[key], other)
     plain = save(farm, "farm", Replace(key, dataclasses.replace(other, colour=None)))
     assert plain.changes["voxels"]["v"] == {"added": 0, "changed": len(other), "deleted": 0, "fields": ["colour"]}
     empty = VoxelMap(0.05, np.empty(0, np.uint8), np.empty(0, np.uint64), np.empty(0, np.float32))
@@ -441,7 +443,7 @@ def test_a_delta_turns_one_version_into_the_other(farm: Store):
     a = save(farm, "farm", Replace(TOPOLOGY, network(500)))
     put = features([("n3", shapely.Point(9, 9), {"v": 2}), ("x", None, {})], "local")
     b = save(farm, "farm", Put(TOPOLOGY, put), Delete(TOPOLOGY, ("n4",)), datum=Datum(1, 2))
-    delta = farm.delta_parts(a, b)
+    delta = farm.content.delta_parts(a, b)
     assert delta.datum
     assert not delta.levels
     (one,) = delta.features
@@ -450,13 +452,13 @@ def test_a_delta_turns_one_version_into_the_other(farm: Store):
 
 
 def test_only_one_of_two_changes_of_the_same_head_wins(farm: Store):
-    head = farm.version("farm")
-    first = farm.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
-    second = farm.prepare(head, Changes((Replace(TOPOLOGY, network(11)),)))
-    farm.commit("farm", first, author="a", message="1")
+    head = farm.versions.get("farm")
+    first = farm.versions.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
+    second = farm.versions.prepare(head, Changes((Replace(TOPOLOGY, network(11)),)))
+    farm.versions.commit("farm", first, author="a", message="1")
     with pytest.raises(StaleParent, match="version 2"):
-        farm.commit("farm", second, author="b", message="2")
-    assert farm.version("farm").part(TOPOLOGY).count == 10  # type: ignore[union-attr]
+        farm.versions.commit("farm", second, author="b", message="2")
+    assert farm.versions.get("farm").part(TOPOLOGY).count == 10  # type: ignore[union-attr]
 
 
 def test_many_writers_make_one_line_of_versions(farm: Store):
@@ -466,9 +468,9 @@ def test_many_writers_make_one_line_of_versions(farm: Store):
             for n in range(4):
                 for _ in range(200):
                     put = features([(f"w{k}-{n}", shapely.Point(k, n), {"k": k})], "local")
-                    prepared = store.prepare(store.version("farm"), Changes((Put(TOPOLOGY, put),)))
+                    prepared = store.versions.prepare(store.versions.get("farm"), Changes((Put(TOPOLOGY, put),)))
                     try:
-                        store.commit("farm", prepared, author=f"w{k}", message=str(n))
+                        store.versions.commit("farm", prepared, author=f"w{k}", message=str(n))
                         break
                     except StaleParent:
                         continue
@@ -480,11 +482,11 @@ def test_many_writers_make_one_line_of_versions(farm: Store):
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(write, range(4)))
-    listed = farm.versions("farm", limit=100)
+    listed = farm.versions.page("farm", limit=100)
     assert [v.number for v in listed] == list(range(17, -1, -1))
     assert [v.parent for v in listed] == [*range(16, -1, -1), None]
-    assert farm.version("farm").part(TOPOLOGY).count == 16  # type: ignore[union-attr]
-    assert [e.sequence for e in farm.events("farm")] == list(range(1, 19))
+    assert farm.versions.get("farm").part(TOPOLOGY).count == 16  # type: ignore[union-attr]
+    assert [e.sequence for e in farm.events.page("farm")] == list(range(1, 19))
 
 
 def test_threads_may_share_a_store(farm: Store):
@@ -492,50 +494,50 @@ def test_threads_may_share_a_store(farm: Store):
     expected = Layers(everything(), DATUM)
 
     def read(k: int) -> None:
-        farm._chunks.forget()
-        assert_same_layers(farm.load(version), expected)
-        assert farm.prepare(version, Changes((Replace(TOPOLOGY, network(50 + k)),))).changed
+        farm.chunks.forget()
+        assert_same_layers(farm.content.load(version), expected)
+        assert farm.versions.prepare(version, Changes((Replace(TOPOLOGY, network(50 + k)),))).changed
 
     with ThreadPoolExecutor(6) as pool:
         list(pool.map(read, range(12)))
 
 
 def test_a_key_makes_one_version_however_often_it_is_sent(farm: Store):
-    head = farm.version("farm")
-    prepared = farm.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
+    head = farm.versions.get("farm")
+    prepared = farm.versions.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
     key = Idempotency("abc", "print")
-    version = farm.commit("farm", prepared, author="a", message="m", idempotency=key)
-    assert farm.idempotent("farm", "abc") == ("print", version.number)
-    assert farm.idempotent("farm", "other") is None
-    assert farm.commit("farm", prepared, author="a", message="m", idempotency=key) == version
+    version = farm.versions.commit("farm", prepared, author="a", message="m", idempotency=key)
+    assert farm.versions.idempotent("farm", "abc") == ("print", version.number)
+    assert farm.versions.idempotent("farm", "other") is None
+    assert farm.versions.commit("farm", prepared, author="a", message="m", idempotency=key) == version
     with pytest.raises(Conflict, match="abc"):
-        farm.commit("farm", prepared, author="a", message="m", idempotency=Idempotency("abc", "else"))
-    assert farm.version("farm").number == version.number
+        farm.versions.commit("farm", prepared, author="a", message="m", idempotency=Idempotency("abc", "else"))
+    assert farm.versions.get("farm").number == version.number
 
 
 def test_revert_copies_a_manifest(farm: Store):
     a = save(farm, "farm", *replaces(everything()))
     b = save(farm, "farm", Drop(GRID), Put(TOPOLOGY, features([("n1", None, {})], "local")), datum=None)
-    c = farm.revert("farm", a.number, author="bob", message="back")
+    c = farm.versions.revert("farm", a.number, author="bob", message="back")
     assert (c.number, c.root, c.parent) == (b.number + 1, a.root, b.number)
     assert c.changes["topology"] == {"added": 0, "changed": 1, "deleted": 0}
     assert c.changes["occupancy"]["map"]["freed"] > 0
     assert c.changes["datum"]["to"] == DATUM.as_dict()
-    assert_same_layers(farm.load(c), farm.load(a))
-    assert farm.revert("farm", a.number, author="bob", message="again").number == c.number
+    assert_same_layers(farm.content.load(c), farm.content.load(a))
+    assert farm.versions.revert("farm", a.number, author="bob", message="again").number == c.number
     with pytest.raises(StaleParent):
-        farm.revert("farm", b.number, author="bob", message="x", expected=b.number)
+        farm.versions.revert("farm", b.number, author="bob", message="x", expected=b.number)
     key = Idempotency("k", "f")
-    d = farm.revert("farm", b.number, author="bob", message="x", expected=c.number, idempotency=key)
-    assert farm.revert("farm", b.number, author="bob", message="x", expected=c.number, idempotency=key) == d
+    d = farm.versions.revert("farm", b.number, author="bob", message="x", expected=c.number, idempotency=key)
+    assert farm.versions.revert("farm", b.number, author="bob", message="x", expected=c.number, idempotency=key) == d
     with pytest.raises(NotFound, match="no version 77"):
-        farm.revert("farm", 77, author="bob", message="x")
+        farm.versions.revert("farm", 77, author="bob", message="x")
 
 
 def test_a_version_says_where_it_comes_from(farm: Store):
     digest = farm.blobs.put(b"content")
-    prepared = farm.prepare(
-        farm.version("farm"),
+    prepared = farm.versions.prepare(
+        farm.versions.get("farm"),
         Changes(
             (
                 Replace(TOPOLOGY, network(5), Provenance("raw", "tmap2", ("a.yaml",), "f" * 64, (), ("ODbL",))),
@@ -545,8 +547,8 @@ def test_a_version_says_where_it_comes_from(farm: Store):
     )
     warnings = [Problem("odd\x00 name \ud800", "a.yaml", 3, "nodes[1]")]
     sources = [Source("a.yaml", 7, digest, "tmap2"), Source("b.txt", 7, digest, None, used=False)]
-    version = farm.commit("farm", prepared, author="ann", message="first", sources=sources, warnings=warnings)
-    again = farm.version("farm", version.number)
+    version = farm.versions.commit("farm", prepared, author="ann", message="first", sources=sources, warnings=warnings)
+    again = farm.versions.get("farm", version.number)
     assert again == version
     assert again.sources == tuple(sources)
     assert again.warnings == (Problem("odd\ufffd name ?", "a.yaml", 3, "nodes[1]"),)
@@ -566,22 +568,27 @@ def test_a_version_says_where_it_comes_from(farm: Store):
     edited = save(farm, "farm", Put(TOPOLOGY, features([("q", None, {})], "local"), Provenance("raw", "edit")))
     assert edited.part(TOPOLOGY).provenance.sources == ("a.yaml",)  # type: ignore[union-attr]
     with pytest.raises(Unavailable, match="send it again"):
-        farm.add_sources("farm", version.number, [Source("lost", 1, "0" * 64)])
+        farm.versions.add_sources("farm", version.number, [Source("lost", 1, "0" * 64)])
     with pytest.raises(Invalid, match="NUL"):
-        farm.commit("farm", prepared, author="ann", message="a\x00b")
+        farm.versions.commit("farm", prepared, author="ann", message="a\x00b")
 
 
 def test_versions_are_found_by_number_channel_and_latest(farm: Store):
     for n in range(3):
         save(farm, "farm", Replace(TOPOLOGY, network(5 + n)))
-    farm.set_channel("farm", "production", 2, author="a")
-    assert farm.version("farm").number == farm.version("farm", "latest").number == farm.version("farm", "4").number == 4
-    assert farm.version("farm", "production").number == 2
-    assert [v.number for v in farm.versions("farm", limit=2)] == [4, 3]
-    assert [v.number for v in farm.versions("farm", limit=2, before=3)] == [2, 1]
+    farm.channels.move("farm", "production", 2, author="a")
+    assert (
+        farm.versions.get("farm").number
+        == farm.versions.get("farm", "latest").number
+        == farm.versions.get("farm", "4").number
+        == 4
+    )
+    assert farm.versions.get("farm", "production").number == 2
+    assert [v.number for v in farm.versions.page("farm", limit=2)] == [4, 3]
+    assert [v.number for v in farm.versions.page("farm", limit=2, before=3)] == [2, 1]
     for ref in ("9", 9, "staging", "no such", ""):
         with pytest.raises(NotFound):
-            farm.version("farm", ref)
+            farm.versions.get("farm", ref)
 
 
 def test_a_datum_moves_no_item(farm: Store):
@@ -589,7 +596,7 @@ def test_a_datum_moves_no_item(farm: Store):
     b = save(farm, "farm", datum=Datum(10.0, 20.0))
     assert a.part(OBJECTS) == b.part(OBJECTS)
     assert b.changes == {"datum": {"from": DATUM.as_dict(), "to": Datum(10.0, 20.0).as_dict()}}
-    assert farm.environment("farm").datum == Datum(10.0, 20.0)
+    assert farm.environments.get("farm").datum == Datum(10.0, 20.0)
     with pytest.raises(Invalid, match="same name"):
         save(farm, "farm", levels=(Level("a"), Level("a", 2.0)))
 
@@ -597,24 +604,24 @@ def test_a_datum_moves_no_item(farm: Store):
 def test_nothing_is_collected_that_a_version_needs(farm: Store):
     a = save(farm, "farm", *replaces(everything()))
     digest = farm.blobs.put(b"original")
-    farm.add_sources("farm", a.number, [Source("o", 8, digest)])
+    farm.versions.add_sources("farm", a.number, [Source("o", 8, digest)])
     save(farm, "farm", *(Drop(key) for key in everything()))
-    farm.prepare(a, Changes((Replace(TOPOLOGY, network(7)),)))
-    removed = farm.collect(timedelta(0))
+    farm.versions.prepare(a, Changes((Replace(TOPOLOGY, network(7)),)))
+    removed = farm.garbage.collect(timedelta(0))
     assert removed["chunks"] == removed["blobs"] == 0
-    farm._chunks.forget()
-    assert_same_layers(farm.load(farm.version("farm", a.number)), Layers(everything(), DATUM))
+    farm.chunks.forget()
+    assert_same_layers(farm.content.load(farm.versions.get("farm", a.number)), Layers(everything(), DATUM))
     assert farm.blobs.get(digest) == b"original"
 
 
 def test_what_nothing_needs_is_gone_after_one_collection(farm: Store):
     save(farm, "farm", *replaces(everything()))
-    farm.create_environment("copy", clone=farm.version("farm"))
+    farm.environments.create("copy", clone=farm.versions.get("farm"))
     files = [bytes([k]) * 1000 for k in range(20)]
     digests = farm.blobs.put_many([*files, b"x" * 200_000])
-    assert farm.collect(timedelta(hours=1)) == {"chunks": 0, "blobs": 0, "bytes": 0, "temporary": 0}
-    farm.add_sources("farm", 2, [Source("keep", 1000, digests[3])])
-    removed = farm.collect(timedelta(0))
+    assert farm.garbage.collect(timedelta(hours=1)) == {"chunks": 0, "blobs": 0, "bytes": 0, "temporary": 0}
+    farm.versions.add_sources("farm", 2, [Source("keep", 1000, digests[3])])
+    removed = farm.garbage.collect(timedelta(0))
     assert removed["blobs"] == 20
     assert removed["bytes"] == 19_000 + 200_000
     assert farm.blobs.get(digests[3]) == files[3]
@@ -623,13 +630,13 @@ def test_what_nothing_needs_is_gone_after_one_collection(farm: Store):
     assert total == 1000 + sum(len(v) for v in everything()[PartKey("resources", "ground", "gazebo")].files.values())  # type: ignore[union-attr]
     with pytest.raises(NotFound):
         farm.blobs.get(digests[4])
-    farm.delete_environment("farm")
-    farm.purge_environment("farm")
-    assert farm.collect(timedelta(0))["chunks"] == 0
-    assert_same_layers(farm.load(farm.version("copy")), Layers(everything(), DATUM))
-    farm.delete_environment("copy")
-    farm.purge_environment("copy")
-    assert farm.collect(timedelta(0))["chunks"] > 10
+    farm.environments.delete("farm")
+    farm.environments.purge("farm")
+    assert farm.garbage.collect(timedelta(0))["chunks"] == 0
+    assert_same_layers(farm.content.load(farm.versions.get("copy")), Layers(everything(), DATUM))
+    farm.environments.delete("copy")
+    farm.environments.purge("copy")
+    assert farm.garbage.collect(timedelta(0))["chunks"] > 10
     with farm._database.read() as connection:
         assert connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one() == 0
     assert not [p for p in farm.blob_dir.rglob("*") if p.is_file() and not p.name.startswith(".")]
@@ -637,23 +644,23 @@ def test_what_nothing_needs_is_gone_after_one_collection(farm: Store):
 
 def test_a_chunk_that_is_used_again_is_kept(farm: Store):
     """A commit that finds its chunks there already marks them as used: a collection with a grace period passes."""
-    prepared = farm.prepare(farm.version("farm"), Changes((Replace(TOPOLOGY, network(100)),)))
-    farm.commit("farm", prepared, author="a", message="1")
+    prepared = farm.versions.prepare(farm.versions.get("farm"), Changes((Replace(TOPOLOGY, network(100)),)))
+    farm.versions.commit("farm", prepared, author="a", message="1")
     with farm._database.write() as connection:
         connection.exec_driver_sql("UPDATE chunk SET used = 5")
         connection.exec_driver_sql("UPDATE blob SET used = 5")
-    farm.create_environment("other", datum=DATUM)
-    farm.commit(
+    farm.environments.create("other", datum=DATUM)
+    farm.versions.commit(
         "other",
-        farm.prepare(farm.version("other"), Changes((Replace(TOPOLOGY, network(100)),))),
+        farm.versions.prepare(farm.versions.get("other"), Changes((Replace(TOPOLOGY, network(100)),))),
         author="b",
         message="2",
     )
-    farm.delete_environment("farm")
-    farm.purge_environment("farm")
-    farm.delete_environment("other")
-    farm.purge_environment("other")
-    assert farm.collect(timedelta(hours=1))["chunks"] == 0
+    farm.environments.delete("farm")
+    farm.environments.purge("farm")
+    farm.environments.delete("other")
+    farm.environments.purge("other")
+    assert farm.garbage.collect(timedelta(hours=1))["chunks"] == 0
 
 
 # --- templates ---
@@ -664,8 +671,8 @@ OUTDOOR = Templates(
 
 
 def say(store: Store, templates: Templates, env: str = "farm") -> Any:
-    prepared = store.prepare(store.version(env), Changes(templates=templates))
-    return store.commit(env, prepared, author="a", message="templates")
+    prepared = store.versions.prepare(store.versions.get(env), Changes(templates=templates))
+    return store.versions.commit(env, prepared, author="a", message="templates")
 
 
 def test_templates_are_part_of_a_version(farm: Store):
@@ -675,32 +682,32 @@ def test_templates_are_part_of_a_version(farm: Store):
     assert (version.number, version.parts) == (before.number + 1, before.parts)
     assert version.root != before.root
     assert version.changes.keys() == {"templates"}
-    assert farm.version("farm").templates == OUTDOOR
-    assert farm.version("farm", before.number).templates == NO_TEMPLATES
-    assert farm.diff(before, version) == version.changes
+    assert farm.versions.get("farm").templates == OUTDOOR
+    assert farm.versions.get("farm", before.number).templates == NO_TEMPLATES
+    assert farm.content.diff(before, version) == version.changes
     assert say(farm, OUTDOOR).number == version.number, "nothing new"
-    event = farm.events("farm", since=0)[-1]
+    event = farm.events.page("farm", since=0)[-1]
     assert (event.body["version"], event.body["layers"]) == (version.number, [])
     later = save(farm, "farm", Drop(GRID))
     assert later.templates == OUTDOOR, "other changes leave them"
-    moved = farm.commit("farm", farm.prepare(later, Changes(datum=None)), author="a", message="")
+    moved = farm.versions.commit("farm", farm.versions.prepare(later, Changes(datum=None)), author="a", message="")
     assert moved.templates == OUTDOOR
-    back = farm.revert("farm", before.number, author="a", message="")
+    back = farm.versions.revert("farm", before.number, author="a", message="")
     assert (back.root, back.templates) == (before.root, NO_TEMPLATES)
     assert back.changes["templates"]["set"] == {"from": "outdoor", "to": "default"}
-    farm.create_environment("copy", clone=version)
-    copied = farm.version("copy")
+    farm.environments.create("copy", clone=version)
+    copied = farm.versions.get("copy")
     assert (copied.root, copied.templates) == (version.root, OUTDOOR)
     assert copied.changes["templates"]["set"] == {"from": "default", "to": "outdoor"}
-    farm.collect(timedelta(0))
-    assert farm.version("farm", version.number).templates == OUTDOOR
+    farm.garbage.collect(timedelta(0))
+    assert farm.versions.get("farm", version.number).templates == OUTDOOR
 
 
 def test_templates_count_for_roots_alike_on_both_databases(store: Store, sqlite_store: Store):
     roots = []
     for one in (store, sqlite_store):
-        one.create_environment("farm", datum=DATUM)
-        bare = one.version("farm").root
+        one.environments.create("farm", datum=DATUM)
+        bare = one.versions.get("farm").root
         roots.append((bare, say(one, OUTDOOR).root, say(one, Templates()).root))
     assert roots[0] == roots[1]
     assert roots[0][0] == roots[0][2] != roots[0][1]
@@ -722,8 +729,8 @@ def test_what_is_derived_anew_from_other_inputs_is_a_version_though_it_is_the_sa
     assert (new.number, new.root) == (first.number + 1, first.root)
     assert new.changes["renewed"] == [{"layer": "topology", "level": "ground", "name": TOPOLOGY.name}]
     assert new.part(TOPOLOGY).provenance.inputs[0]["hash"] == "b"  # type: ignore[union-attr]
-    assert farm.version("farm", first.number).part(TOPOLOGY).provenance.inputs[0]["hash"] == "a"  # type: ignore[union-attr]
-    assert farm.diff(first, new) == {}
+    assert farm.versions.get("farm", first.number).part(TOPOLOGY).provenance.inputs[0]["hash"] == "a"  # type: ignore[union-attr]
+    assert farm.content.diff(first, new) == {}
     other = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("b", 2.0)))
     assert other.number == new.number + 1, "by another way"
     raw_version = save(farm, "farm", Replace(TOPOLOGY, network(3), Provenance(sources=("n.yaml",))))

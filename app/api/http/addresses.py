@@ -78,7 +78,7 @@ def resolve_version(services: Services, wanted: MapRequest) -> Version:
     """The version that an address means, with the closures that its maps show: on a short one production where there is
     one, else the head.
     """
-    target = partial(services.store.channel_target, wanted.environment)
+    target = partial(services.store.channels.target, wanted.environment)
     if wanted.version is not None:
         return target(parse_version_ref(wanted.version), wanted.closures)[0]
     try:

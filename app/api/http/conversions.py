@@ -83,7 +83,7 @@ class ConversionJobs:
                 return running.future.result()
             job_id = running.jobs.get(principal.id)
             if job_id is not None:
-                return JobStarted(await run_in_threadpool(self._store.job, job_id))
+                return JobStarted(await run_in_threadpool(self._store.jobs.get, job_id))
             try:
                 return JobStarted(await self._as_job(recipe, running, principal, address))
             except NoRoom:  # nowhere to note a job: the answer waits for the map
@@ -138,8 +138,8 @@ class ConversionJobs:
         label = f"{recipe.format.name} of {recipe.version.environment}, version {recipe.version.number}"
 
         def begin() -> Job:
-            job = self._store.create_job(principal.id, f"making {label}")
-            return self._store.update_job(job.id, state="running")
+            job = self._store.jobs.create(principal.id, f"making {label}")
+            return self._store.jobs.update(job.id, state="running")
 
         job = await run_in_threadpool(begin)
         running.jobs[principal.id] = job.id
@@ -156,21 +156,21 @@ class ConversionJobs:
 
     def _finish_job(self, job: str, error: BaseException | None, label: str, address: str) -> None:
         try:
-            if self._store.job(job).state == "cancelled":
+            if self._store.jobs.get(job).state == "cancelled":
                 return
             if error is None:
                 detail = f"made {label}"
-                self._store.update_job(job, state="done", progress=1.0, detail=detail, result={"location": address})
+                self._store.jobs.update(job, state="done", progress=1.0, detail=detail, result={"location": address})
             else:
-                self._store.update_job(job, state="failed", detail=f"could not make {label}", problem=_problem(error))
+                self._store.jobs.update(job, state="failed", detail=f"could not make {label}", problem=_problem(error))
         except FleetMapError as other:
             log.warning("a job's end could not be noted: %s", other.detail)
 
     def _touch(self, job: str) -> None:
         try:
-            state = self._store.job(job).state
+            state = self._store.jobs.get(job).state
             if state == "running":
-                self._store.update_job(job, state="running")
+                self._store.jobs.update(job, state="running")
             elif state == "cancelled":  # in another process of the server
                 self.cancel(job)
         except FleetMapError as error:

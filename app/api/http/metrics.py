@@ -79,7 +79,7 @@ class _HeadVersionCollector(Collector):
         heads = GaugeMetricFamily("fleetmap_head", "Number of an environment's newest version.", labels=["environment"])
         count, cursor = 0, None
         while count < MAX_HEADS:
-            page, cursor = self._store.environments(limit=1000, cursor=cursor)
+            page, cursor = self._store.environments.page(limit=1000, cursor=cursor)
             for environment in page:
                 heads.add_metric([environment.name], environment.head)
             count += len(page)
