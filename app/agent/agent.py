@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import random
-import re
 import threading
 import time
 import traceback
@@ -24,44 +22,24 @@ from app.agent.manifests import Manifests
 from app.agent.map_directory import MapDirectory
 from app.agent.options import AgentOptions, robot_name
 from app.agent.requests import parse_requests
+from app.agent.router import find_router
 from app.agent.signed_manifest import Manifest, ManifestFile
 from app.agent.state import AgentState, StateStore
-from app.agent.status import StatusReporter
+from app.agent.status import StatusReporter, Subject, describe_status, loaded_version
+from app.agent.waking import CLOSURE_EVENTS, LATEST, Alarm, is_relevant
 from app.agent.zenoh_client import ZenohClient
 from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events import messages
-from app.events.messages import RobotState, RobotStatus
+from app.events.messages import RobotState
 
 __all__ = ["Agent", "AgentOptions", "robot_name"]
 
-LATEST = "latest"
 PRODUCTION = "production"
 FIRST_PAUSE_SECONDS = 1.0
 """After the first failure; doubled each time up to the pause between polls."""
 
-DEBOUNCE_SECONDS = 0.02
-"""Events that come together are one look at the server. Doubled for each look that brought nothing, up to 5 seconds: on
-an open router anybody can put events.
-"""
-
-MAX_DOUBLINGS = 8
-
-ROUTER = re.compile(r"(tcp|tls|quic|udp|ws|wss)/[A-Za-z0-9_.:%\[\]-]+")
-"""A router as a server may tell it: no device, no local socket, nothing (``#…``) that would weaken the robot's TLS."""
-
 RECHECK_AFTER_SECONDS = 5.0
 """After a longer download the channel is looked at again before the switch."""
-
-REJOIN_SECONDS = 1.0
-"""A fleet that finds its router again does not ask in the same moment: up to so long."""
-
-NO_ROOT = "0" * 64
-
-Subject = Manifest | tuple[int, str]
-"""A map that a status is about: its manifest, or version and root if there is no manifest yet."""
-
-CLOSURE_EVENTS = ("overlay.accepted", "overlay.ended")
-"""Events that change the closures in force."""
 
 MAX_CLOSURE_CHANGES = 5
 """Maximum number of times that a manifest is fetched again in one sync because closures have changed."""
@@ -83,10 +61,10 @@ class Agent:
             self._login = dataclasses.replace(self._login, user=self._robot)
         self._login.values()  # Invalid comes now, not in the session's thread
         self._stopping = threading.Event()
-        self._wake = threading.Event()
+        self._wake = Alarm(self._stopping)
         self._folder = MapDirectory(options.into)
         self._web = ServerClient(options.server, options.token, self._stopping, options.ca)
-        self._ear: ZenohClient | None = None
+        self._zenoh: ZenohClient | None = None
         self._store = StateStore(self._folder.state, options.environment, self._folder.free_space)
         self._retries = Retries(options.poll_seconds, lambda: FIRST_PAUSE_SECONDS)
         self._activation = Activation(
@@ -119,8 +97,6 @@ class Agent:
         self._preloaded_closures = ""
         self._fetched: Manifest | None = None
         self._refreshed: tuple[str, str] | None = None
-        self._rejoined = False
-        self._idle_wakeups = 0
         self._announced_sequence = 0
         self._stale_replies = 0
 
@@ -128,19 +104,13 @@ class Agent:
     def _state(self) -> AgentState:
         return self._store.value
 
-    # --- outside ---
-
     def open(self) -> None:
         """Take the folder and look at what is in it. Raises Conflict or Invalid where it is not ours."""
         self._folder.open()
         self._store.load()
-        given = self.options.key
-        state = self._state
-        if given is not None and given != state.given:
-            if state.key is not None and given not in (signed_manifest.key_id(state.key), _text(state.key)):
-                self._log_event("trusting", key=given, detail="the key that was pinned before is forgotten")
-                state = dataclasses.replace(state, key=None, marks={})
-            state = dataclasses.replace(state, given=given)
+        state = signed_manifest.pin_key(self._state, self.options.key)
+        if state.key is None and self._state.key is not None:
+            self._log_event("trusting", key=state.given, detail="the key that was pinned before is forgotten")
         installed = self._folder.manifest(self._folder.current_version)
         name = self._folder.current_version
         if installed is not None and name is not None and (bad := self._folder.damaged_files(name, installed)):
@@ -154,8 +124,8 @@ class Agent:
 
     def close(self) -> None:
         """Let go of everything."""
-        if self._ear is not None:
-            self._ear.close()
+        if self._zenoh is not None:
+            self._zenoh.close()
         self._web.close()
         self._folder.close()
 
@@ -175,7 +145,7 @@ class Agent:
 
     def run(self) -> None:
         """Keep the folder up to date until ``stop``."""
-        self._ear = ZenohClient(
+        self._zenoh = ZenohClient(
             self.options.environment,
             self._robot,
             heard=self._on_event,
@@ -184,7 +154,7 @@ class Agent:
             config=self.options.zenoh_config,
             login=self._login,
         )
-        self._status.bus = self._ear
+        self._status.bus = self._zenoh
         if self._login.user not in (None, self._robot):
             reason = (
                 f"a fleet map server's router lets the user {self._login.user} be seen as the robot of that name alone"
@@ -199,7 +169,7 @@ class Agent:
             before = (self._state.marks, self._status.status)
             pause = self.options.poll_seconds
             try:
-                if not woken or not self._ear.connected:
+                if not woken or not self._zenoh.connected:
                     self._find_router()
                 good = self._attempt(self._sync) or self._activation.is_waiting()
                 failures = 0 if good else failures + 1
@@ -208,7 +178,7 @@ class Agent:
                     self._stale_replies + 1 if good and self._accepted_sequence < self._announced_sequence else 0
                 )
                 vain = woken and before == (self._state.marks, self._status.status)
-                self._idle_wakeups = self._idle_wakeups + 1 if vain else 0
+                self._wake.idle_wakeups = self._wake.idle_wakeups + 1 if vain else 0
                 if failures or self._stale_replies:
                     pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, max(failures, self._stale_replies) - 1))
                 pause *= random.uniform(0.5, 1.5)  # noqa: S311  jitter is no secret
@@ -223,40 +193,13 @@ class Agent:
         end = time.monotonic() + seconds
         while self._activation.is_waiting():
             remaining = end - time.monotonic()
-            woken = self._sleep_until_woken(max(0.0, min(BEFORE_SWITCH_SECONDS, remaining)))
+            woken = self._wake.sleep(max(0.0, min(BEFORE_SWITCH_SECONDS, remaining)), self._status)
             if woken or self._stopping.is_set() or time.monotonic() >= end:
                 return woken
             self._attempt(self._switch_pending)
             if not self._activation.is_waiting():
                 return True  # switched, or refused: sync at once
-        return self._sleep_until_woken(max(0.0, end - time.monotonic()))
-
-    # --- what wakes it ---
-
-    def _sleep_until_woken(self, seconds: float) -> bool:
-        """Until something happens, at most so long: whether it did. What is to be confirmed is confirmed meanwhile."""
-        end = time.monotonic() + seconds
-        while True:
-            now = time.monotonic()
-            confirm_at = self._status.confirm_at
-            until = end if confirm_at is None else min(end, confirm_at)
-            woken = self._wait(max(0.0, until - now))
-            if woken or self._stopping.is_set() or time.monotonic() >= end:
-                return woken
-            self._status.send()
-
-    def _wait(self, seconds: float) -> bool:
-        """Until something happens, at most so long: whether an event or the router was it."""
-        woken = self._wake.wait(seconds)
-        if woken and not self._stopping.is_set():
-            rejoined, self._rejoined = self._rejoined, False
-            max_seconds = REJOIN_SECONDS * random.random() if rejoined else self._gather  # noqa: S311
-            self._stopping.wait(max_seconds)
-        return woken
-
-    @property
-    def _gather(self) -> float:
-        return DEBOUNCE_SECONDS * 2.0 ** min(MAX_DOUBLINGS, self._idle_wakeups)
+        return self._wake.sleep(max(0.0, end - time.monotonic()), self._status)
 
     def _on_event(self, event: messages.Event) -> None:
         """In a thread of Zenoh's: wake the loop if it is of our concern."""
@@ -265,16 +208,7 @@ class Agent:
         channel = self._state.channel
         if not 0 < event.sequence - self._accepted_sequence <= signed_manifest.MAX_SEQUENCE_AHEAD + 1:
             return
-        ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
-        if event.type == "version.created":
-            concerns = channel in (LATEST, None)
-        elif event.type in CLOSURE_EVENTS:
-            concerns = True  # in force on every channel at once
-        elif event.type.startswith("overlay."):
-            concerns = False
-        else:
-            concerns = event.channel in ours or event.type.startswith("environment.")
-        if concerns:
+        if is_relevant(event, channel, {self.options.channel} if self.options.channel else {PRODUCTION, channel}):
             is_move = event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST)
             if is_move or (event.type in CLOSURE_EVENTS and self._manifests.has_closures):
                 self._announced_sequence = event.sequence  # so far the manifest of the followed channel has moved
@@ -289,7 +223,7 @@ class Agent:
 
     def _on_router_connected(self) -> None:
         self._log_event("connected", detail="listening for events over Zenoh")
-        self._rejoined = True
+        self._wake.rejoined = True
         self._status.forget_sent()
         self._wake.set()
 
@@ -299,30 +233,15 @@ class Agent:
         )
 
     def _find_router(self) -> None:
-        if self._ear is None:
+        if self._zenoh is None:
             return
-        connect, prefix = self.options.zenoh_connect, self.options.zenoh_prefix
-        if connect is None or prefix is None:
-            try:
-                events = self._web.readyz().get("events", {})
-                from_server = events.get("connect")
-                connect = connect or (plain(str(from_server)) if from_server else None)
-                prefix = prefix or plain(str(events.get("prefix") or messages.PREFIX))
-            except (FleetMapError, AttributeError):
-                if connect is None or self._ear.has_endpoint:
-                    return
-                prefix = prefix or messages.PREFIX
-        if connect is None:
-            self._log_once("polling", detail="the server tells no router: FLEETMAP_ZENOH_CONNECT can name one")
+        try:
+            router = find_router(self.options, self._web, has_endpoint=self._zenoh.has_endpoint)
+        except Invalid as error:
+            self._log_once("polling", detail=error.detail)
             return
-        from_server = self.options.zenoh_connect is None
-        if from_server and not all(ROUTER.fullmatch(part.strip()) for part in connect.split(",")):
-            detail = f"the server tells a router by what is no plain address ({connect[:300]}): FLEETMAP_ZENOH_CONNECT"
-            self._log_once("polling", detail=f"{detail} can name it")
-            return
-        self._ear.set_endpoint(connect, prefix)
-
-    # --- one sync ---
+        if router is not None:
+            self._zenoh.set_endpoint(*router)
 
     def _attempt(self, action: Callable[[], bool]) -> bool:
         """Run a step and report its errors: whether it succeeded."""
@@ -601,8 +520,6 @@ class Agent:
         elif self._set_status("failed", detail, subject):
             self._log_event("refused" if isinstance(error, Untrusted) else "failed", detail=detail)
 
-    # --- status ---
-
     def _report(self, outcome: Outcome, *, is_planned: bool = False) -> None:
         """Report what became of the channel's map.
 
@@ -644,33 +561,28 @@ class Agent:
     def _set_status(self, state: RobotState, detail: str | None = None, about: Subject | None = None) -> bool:
         """Note the status and send it: whether it is new. about: the map that it is about; default: the current one."""
         current = self._folder.manifest(self._folder.current_version)
-        version, root = _version(about or current)
-        channel = self._state.channel or self.options.channel or LATEST
-        overlays = current.overlays_digest if current else None
-        # That of a version fetched by its number is of no move of the channel: the server goes by the root then.
-        sequence = current.sequence if current and current.channel is not None else None
-        detail = plain(detail[: messages.MAX_DETAIL]) if detail else None
-        holds = self._loaded_version(current)
-        status = RobotStatus(channel, version, root, state, detail, self._time_text(), sequence, overlays, holds)
+        is_loaded = self._state.activated == self._folder.current_version
+        status = describe_status(
+            state,
+            plain(detail[: messages.MAX_DETAIL]) if detail else None,
+            about,
+            current,
+            channel=self._state.channel or self.options.channel or LATEST,
+            time=self._time_text(),
+            holds=loaded_version(current, is_loaded=is_loaded, has_closures=self._manifests.has_closures),
+        )
         if not self._status.set(status):
             return False
         if state != "failed":
             self._log_event(
-                state, version=version, root=root, channel=channel, **({"detail": detail} if detail else {})
+                state,
+                version=status.version,
+                root=status.root,
+                channel=status.channel,
+                **({"detail": status.detail} if status.detail else {}),
             )
         self._status.send()
         return True
-
-    def _loaded_version(self, current: Manifest | None) -> tuple[int, str] | None:
-        """Version and root of the current map if the hooks have loaded it; None while they have not.
-
-        A server that applies no closures does not know this member either.
-        """
-        if current is None:
-            return (0, NO_ROOT) if self._manifests.has_closures else None
-        if current.overlays_digest is None:
-            return None
-        return (current.version, current.root) if self._state.activated == self._folder.current_version else None
 
     def _time_text(self) -> str:
         moment = datetime.fromtimestamp(self._clock(), timezone.utc)
@@ -684,14 +596,3 @@ class Agent:
         if event not in self._reported_once:
             self._reported_once.add(event)
             self._log_event(event, **members)
-
-
-def _version(subject: Subject | None) -> tuple[int, str]:
-    """Return the version and root of a map, those of none if there is none."""
-    if isinstance(subject, Manifest):
-        return subject.version, subject.root
-    return subject or (0, NO_ROOT)
-
-
-def _text(key: bytes) -> str:
-    return base64.b64encode(key).decode()

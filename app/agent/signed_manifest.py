@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import dataclasses
 import hashlib
 import json
 import re
@@ -20,7 +21,7 @@ from typing import Any
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from app.agent.state import Mark
+from app.agent.state import AgentState, Mark
 from app.errors import Untrusted
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
@@ -438,3 +439,12 @@ def _bytes(text: str) -> bytes | None:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
         return None
+
+
+def pin_key(state: AgentState, key: str | None) -> AgentState:
+    """Return the state that trusts a key (id or public key, base64) of the options; another pinned key is forgotten."""
+    if key is None or key == state.given:
+        return state
+    if state.key is not None and key not in (key_id(state.key), base64.b64encode(state.key).decode()):
+        state = dataclasses.replace(state, key=None, marks={})
+    return dataclasses.replace(state, given=key)

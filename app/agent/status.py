@@ -10,8 +10,9 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from app.agent.http_client import ServerClient
+from app.agent.signed_manifest import Manifest
 from app.errors import FleetMapError, Unavailable
-from app.events.messages import RobotStatus
+from app.events.messages import RobotState, RobotStatus
 
 CONFIRM_SECONDS = 60.0
 """Maximum time until a status sent over Zenoh is confirmed over HTTP: the bus acknowledges nothing. A fleet that
@@ -20,6 +21,11 @@ changes at once spreads its confirmations over this time.
 
 FIRST_CONFIRM_SECONDS = 2.0
 """The same for the first status after the start: a robot counts in roll-outs once it has reported with its token."""
+
+NO_ROOT = "0" * 64
+
+Subject = Manifest | tuple[int, str]
+"""A map that a status is about: its manifest, or version and root if there is no manifest yet."""
 
 REPEAT_SECONDS = 30.0
 """Interval after which a robot without Zenoh repeats its status with the next sync."""
@@ -101,3 +107,40 @@ class StatusReporter:
 
 def _is_same_status(one: RobotStatus, other: RobotStatus | None) -> bool:
     return other is not None and dataclasses.replace(one, time=None) == dataclasses.replace(other, time=None)
+
+
+def describe_status(
+    state: RobotState,
+    detail: str | None,
+    about: Subject | None,
+    current: Manifest | None,
+    *,
+    channel: str,
+    time: str,
+    holds: tuple[int, str] | None,
+) -> RobotStatus:
+    """Return the status of a robot. about: the map that it is about; default: the current one."""
+    version, root = _version(about or current)
+    # That of a version fetched by its number is of no move of the channel: the server goes by the root then.
+    sequence = current.sequence if current and current.channel is not None else None
+    overlays = current.overlays_digest if current else None
+    return RobotStatus(channel, version, root, state, detail, time, sequence, overlays, holds)
+
+
+def loaded_version(current: Manifest | None, *, is_loaded: bool, has_closures: bool) -> tuple[int, str] | None:
+    """Return version and root of the current map if the hooks have loaded it; None while they have not.
+
+    A server that applies no closures does not have this member either.
+    """
+    if current is None:
+        return (0, NO_ROOT) if has_closures else None
+    if current.overlays_digest is None:
+        return None
+    return (current.version, current.root) if is_loaded else None
+
+
+def _version(subject: Subject | None) -> tuple[int, str]:
+    """Return the version and root of a map, those of none if there is none."""
+    if isinstance(subject, Manifest):
+        return subject.version, subject.root
+    return subject or (0, NO_ROOT)

@@ -11,11 +11,15 @@ from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app.cli import completion, options, output
+from app.errors import Invalid
+
+if TYPE_CHECKING:
+    from app.agent.agent import Agent
 
 
 def _copy_ros_package(workspace: Path | None) -> None:
@@ -29,123 +33,141 @@ def _copy_ros_package(workspace: Path | None) -> None:
         raise typer.Exit
 
 
+Environment = Annotated[
+    str,
+    typer.Option("--environment", "-e", help="Name of the environment.", autocompletion=completion.environments),
+]
+Formats = Annotated[
+    str,
+    typer.Option(
+        "--formats",
+        "-f",
+        help="Required formats, comma-separated, with their parameters: `occupancy_grid?level=L2&grid=map,tmap2`.",
+    ),
+]
+OptionalFormats = Annotated[
+    str, typer.Option("--optional", help="Optional formats, comma-separated: installed if the server has them.")
+]
+Channel = Annotated[
+    str | None,
+    typer.Option(
+        "--channel",
+        help="Channel to follow [default: production if it exists, else latest].",
+        autocompletion=completion.versions,
+    ),
+]
+Robot = Annotated[
+    str | None, typer.Option("--robot", envvar="FLEETMAP_ROBOT", help="Name of the robot [default: this host's].")
+]
+OnChange = Annotated[
+    list[str] | None,
+    typer.Option("--on-change", help="Command to run after a change, or `nav2`, `topological`; repeatable."),
+]
+BeforeSwitch = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--before-switch",
+        help="Command to run before each switch, also for a closure: exit status 0 switches, 75 runs it again "
+        "after 5 seconds, any other refuses the map; repeatable.",
+    ),
+]
+TrustedKey = Annotated[
+    str | None,
+    typer.Option(
+        "--key",
+        envvar="FLEETMAP_AGENT_KEY",
+        help="Key of the server to trust: its id or public key (`fleetmap keys show`) [default: the first seen].",
+    ),
+]
+Poll = Annotated[
+    float,
+    typer.Option("--poll", min=0.1, help="Seconds between polls, up to a half more or less; events arrive at once."),
+]
+ZenohConnect = Annotated[
+    str | None,
+    typer.Option(
+        "--zenoh",
+        envvar="FLEETMAP_ZENOH_CONNECT",
+        help="Address of the Zenoh router [default: the server names it].",
+    ),
+]
+ZenohPrefix = Annotated[
+    str | None,
+    typer.Option("--zenoh-prefix", envvar="FLEETMAP_ZENOH_PREFIX", help="Start of every key expression."),
+]
+ZenohConfig = Annotated[
+    Path | None,
+    typer.Option(
+        "--zenoh-config",
+        envvar="FLEETMAP_ZENOH_CONFIG",
+        help="JSON5 file with Zenoh's own settings, for everything else.",
+    ),
+]
+ZenohCa = Annotated[
+    Path | None,
+    typer.Option(
+        "--zenoh-ca",
+        envvar="FLEETMAP_ZENOH_CA",
+        help="Authority that signs the router's certificate, PEM [default: public ones].",
+    ),
+]
+ZenohCertificate = Annotated[
+    Path | None,
+    typer.Option(
+        "--zenoh-certificate",
+        envvar="FLEETMAP_ZENOH_CERTIFICATE",
+        help="Certificate of the robot, if the router needs one.",
+    ),
+]
+ZenohKey = Annotated[
+    Path | None, typer.Option("--zenoh-key", envvar="FLEETMAP_ZENOH_KEY", help="Private key of that certificate.")
+]
+ZenohUser = Annotated[
+    str | None,
+    typer.Option(
+        "--zenoh-user", envvar="FLEETMAP_ZENOH_USER", help="User name at the router [default: the robot's name]."
+    ),
+]
+Ca = Annotated[
+    Path | None,
+    typer.Option(
+        "--ca",
+        envvar="FLEETMAP_CA",
+        help="Authority that signs the server's certificate, PEM [default: public ones].",
+    ),
+]
+RosPackage = Annotated[
+    Path | None,
+    typer.Option(
+        "--ros-package",
+        metavar="DIR",
+        callback=_copy_ros_package,
+        is_eager=True,
+        help="Copy the ROS 2 package fleetmap_ros into this folder (a workspace's src) and exit.",
+    ),
+]
+
+
 def agent(
-    environment: Annotated[
-        str,
-        typer.Option("--environment", "-e", help="Name of the environment.", autocompletion=completion.environments),
-    ],
-    formats: Annotated[
-        str,
-        typer.Option(
-            "--formats",
-            "-f",
-            help="Required formats, comma-separated, with their parameters: `occupancy_grid?level=L2&grid=map,tmap2`.",
-        ),
-    ],
+    environment: Environment,
+    formats: Formats,
     into: Annotated[Path, typer.Option("--into", "-o", help="Folder; the maps are in its `current/<format>/`.")],
-    optional: Annotated[
-        str, typer.Option("--optional", help="Optional formats, comma-separated: installed if the server has them.")
-    ] = "",
-    channel: Annotated[
-        str | None,
-        typer.Option(
-            "--channel",
-            help="Channel to follow [default: production if it exists, else latest].",
-            autocompletion=completion.versions,
-        ),
-    ] = None,
-    robot: Annotated[
-        str | None, typer.Option("--robot", envvar="FLEETMAP_ROBOT", help="Name of the robot [default: this host's].")
-    ] = None,
-    on_change: Annotated[
-        list[str] | None,
-        typer.Option("--on-change", help="Command to run after a change, or `nav2`, `topological`; repeatable."),
-    ] = None,
-    before_switch: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--before-switch",
-            help="Command to run before each switch, also for a closure: exit status 0 switches, 75 runs it again "
-            "after 5 seconds, any other refuses the map; repeatable.",
-        ),
-    ] = None,
-    key: Annotated[
-        str | None,
-        typer.Option(
-            "--key",
-            envvar="FLEETMAP_AGENT_KEY",
-            help="Key of the server to trust: its id or public key (`fleetmap keys show`) [default: the first seen].",
-        ),
-    ] = None,
-    poll: Annotated[
-        float,
-        typer.Option(
-            "--poll", min=0.1, help="Seconds between polls, up to a half more or less; events arrive at once."
-        ),
-    ] = 60.0,
-    zenoh_connect: Annotated[
-        str | None,
-        typer.Option(
-            "--zenoh",
-            envvar="FLEETMAP_ZENOH_CONNECT",
-            help="Address of the Zenoh router [default: the server names it].",
-        ),
-    ] = None,
-    zenoh_prefix: Annotated[
-        str | None,
-        typer.Option("--zenoh-prefix", envvar="FLEETMAP_ZENOH_PREFIX", help="Start of every key expression."),
-    ] = None,
-    zenoh_config: Annotated[
-        Path | None,
-        typer.Option(
-            "--zenoh-config",
-            envvar="FLEETMAP_ZENOH_CONFIG",
-            help="JSON5 file with Zenoh's own settings, for everything else.",
-        ),
-    ] = None,
-    zenoh_ca: Annotated[
-        Path | None,
-        typer.Option(
-            "--zenoh-ca",
-            envvar="FLEETMAP_ZENOH_CA",
-            help="Authority that signs the router's certificate, PEM [default: public ones].",
-        ),
-    ] = None,
-    zenoh_certificate: Annotated[
-        Path | None,
-        typer.Option(
-            "--zenoh-certificate",
-            envvar="FLEETMAP_ZENOH_CERTIFICATE",
-            help="Certificate of the robot, if the router needs one.",
-        ),
-    ] = None,
-    zenoh_key: Annotated[
-        Path | None, typer.Option("--zenoh-key", envvar="FLEETMAP_ZENOH_KEY", help="Private key of that certificate.")
-    ] = None,
-    zenoh_user: Annotated[
-        str | None,
-        typer.Option(
-            "--zenoh-user", envvar="FLEETMAP_ZENOH_USER", help="User name at the router [default: the robot's name]."
-        ),
-    ] = None,
-    ca: Annotated[
-        Path | None,
-        typer.Option(
-            "--ca",
-            envvar="FLEETMAP_CA",
-            help="Authority that signs the server's certificate, PEM [default: public ones].",
-        ),
-    ] = None,
-    ros_package: Annotated[  # noqa: ARG001  its callback
-        Path | None,
-        typer.Option(
-            "--ros-package",
-            metavar="DIR",
-            callback=_copy_ros_package,
-            is_eager=True,
-            help="Copy the ROS 2 package fleetmap_ros into this folder (a workspace's src) and exit.",
-        ),
-    ] = None,
+    optional: OptionalFormats = "",
+    channel: Channel = None,
+    robot: Robot = None,
+    on_change: OnChange = None,
+    before_switch: BeforeSwitch = None,
+    key: TrustedKey = None,
+    poll: Poll = 60.0,
+    zenoh_connect: ZenohConnect = None,
+    zenoh_prefix: ZenohPrefix = None,
+    zenoh_config: ZenohConfig = None,
+    zenoh_ca: ZenohCa = None,
+    zenoh_certificate: ZenohCertificate = None,
+    zenoh_key: ZenohKey = None,
+    zenoh_user: ZenohUser = None,
+    ca: Ca = None,
+    ros_package: RosPackage = None,  # noqa: ARG001  its callback
     once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and exit.")] = False,
     server: options.Server = None,
     token: options.Token = None,
@@ -162,42 +184,42 @@ def agent(
     from app.agent.agent import Agent, AgentOptions, robot_name
     from app.agent.requests import parse_formats
     from app.cli.client import DEFAULT_SERVER
-    from app.errors import Invalid
     from app.events.credentials import ZenohCredentials
 
-    names = parse_formats(formats)
+    password = os.environ.get("FLEETMAP_ZENOH_PASSWORD") or None
+    agent_options = AgentOptions(
+        server=server or DEFAULT_SERVER,
+        environment=environment,
+        formats=_required_formats(formats),
+        optional=parse_formats(optional),
+        into=into,
+        channel=channel,
+        robot=robot_name(robot),
+        on_change=tuple(on_change or ()),
+        before_switch=tuple(before_switch or ()),
+        token=token or None,
+        key=key or None,
+        poll_seconds=poll,
+        zenoh_connect=zenoh_connect or None,
+        zenoh_prefix=zenoh_prefix or None,
+        zenoh_config=zenoh_config,
+        zenoh_login=ZenohCredentials(zenoh_ca, zenoh_certificate, zenoh_key, zenoh_user or None, password),
+        ca=ca,
+    )
+    _run(Agent(agent_options, _logger(as_json=as_json)), once=once)
+
+
+def _required_formats(text: str) -> tuple[str, ...]:
+    from app.agent.requests import parse_formats
+
+    names = parse_formats(text)
     if not names:
         raise Invalid("--formats needs one format or several, separated by commas: occupancy_grid,tmap2")
+    return names
 
-    tell = _logger(as_json=as_json)
-    agent = Agent(
-        AgentOptions(
-            server=server or DEFAULT_SERVER,
-            environment=environment,
-            formats=names,
-            optional=parse_formats(optional),
-            into=into,
-            channel=channel,
-            robot=robot_name(robot),
-            on_change=tuple(on_change or ()),
-            before_switch=tuple(before_switch or ()),
-            token=token or None,
-            key=key or None,
-            poll_seconds=poll,
-            zenoh_connect=zenoh_connect or None,
-            zenoh_prefix=zenoh_prefix or None,
-            zenoh_config=zenoh_config,
-            zenoh_login=ZenohCredentials(
-                zenoh_ca,
-                zenoh_certificate,
-                zenoh_key,
-                zenoh_user or None,
-                os.environ.get("FLEETMAP_ZENOH_PASSWORD") or None,
-            ),
-            ca=ca,
-        ),
-        tell,
-    )
+
+def _run(agent: Agent, *, once: bool) -> None:
+    """Run the agent until it is stopped by a signal, or once."""
 
     def stop(_number: int, _frame: FrameType | None) -> None:
         agent.stop()

@@ -12,40 +12,44 @@ from app.cli import completion, options, output
 from app.cli.client import Client, quote_path
 from app.errors import Invalid
 
+Onto = Annotated[
+    str | None,
+    typer.Argument(help="Map to lay it onto: objects, voxels, or the name of another grid; or give --pair."),
+]
+OntoLevel = Annotated[
+    str | None, typer.Option("--onto-level", help="Level of the map to lay it onto [default: the grid's].")
+]
+Pair = Annotated[
+    list[str] | None,
+    typer.Option("--pair", metavar="X,Y=X,Y", help="Where a point is, and where it should be, in metres; repeatable."),
+]
+Option = Annotated[
+    list[str] | None, options.named_values_option("A parameter of the slice of objects or voxels (height, …)")
+]
+Reach = Annotated[
+    float | None, typer.Option("--reach", min=0, help="Maximum distance to move the middle of the grid, in metres.")
+]
+Near = Annotated[
+    float | None,
+    typer.Option(
+        "--near", help="Distance at which two cells [default: 0.1] or points [default: 0.5] agree, in metres."
+    ),
+]
+Least = Annotated[float, typer.Option("--least", min=0, max=1, help="Minimum share of cells or points that agree.")]
+
 
 def align(
     environment: options.Environment,
-    onto: Annotated[
-        str | None,
-        typer.Argument(help="Map to lay it onto: objects, voxels, or the name of another grid; or give --pair."),
-    ] = None,
+    onto: Onto = None,
     grid: Annotated[str, typer.Option("--grid", help="Grid to move.", autocompletion=completion.grids)] = "map",
     level: options.Level = "ground",
-    onto_level: Annotated[
-        str | None, typer.Option("--onto-level", help="Level of the map to lay it onto [default: the grid's].")
-    ] = None,
-    pair: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--pair", metavar="X,Y=X,Y", help="Where a point is, and where it should be, in metres; repeatable."
-        ),
-    ] = None,
-    option: Annotated[
-        list[str] | None, options.named_values_option("A parameter of the slice of objects or voxels (height, …)")
-    ] = None,
+    onto_level: OntoLevel = None,
+    pair: Pair = None,
+    option: Option = None,
     angle: Annotated[float, typer.Option("--angle", min=0, max=180, help="Maximum turn to try, in degrees.")] = 180.0,
-    reach: Annotated[
-        float | None, typer.Option("--reach", min=0, help="Maximum distance to move the middle of the grid, in metres.")
-    ] = None,
-    near: Annotated[
-        float | None,
-        typer.Option(
-            "--near", help="Distance at which two cells [default: 0.1] or points [default: 0.5] agree, in metres."
-        ),
-    ] = None,
-    least: Annotated[
-        float, typer.Option("--least", min=0, max=1, help="Minimum share of cells or points that agree.")
-    ] = 0.5,
+    reach: Reach = None,
+    near: Near = None,
+    least: Least = 0.5,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the result; store nothing.")] = False,
     message: options.Message = "",
     server: options.Server = None,

@@ -20,40 +20,47 @@ if TYPE_CHECKING:
     from app.model.frame import Datum
 
 
+Site = Annotated[
+    str | None,
+    typer.Argument(
+        help="Generator, such as orchard or warehouse [default: list generators].",
+        autocompletion=completion.generators,
+    ),
+]
+Seed = Annotated[
+    int, typer.Option("--seed", min=0, help="Number to start from: the same seed gives the same site again.")
+]
+EnvironmentOption = Annotated[
+    str | None,
+    typer.Option(
+        "--environment",
+        "-e",
+        help="Environment to store it in, created if it does not exist [default: SITE-SEED].",
+        autocompletion=completion.environments,
+    ),
+]
+Describe = Annotated[
+    bool,
+    typer.Option("--parameters", help="Only show what the generator makes, and its parameters: needs no server."),
+]
+To = Annotated[
+    str | None,
+    typer.Option(
+        "--to",
+        help="Write a map in this format instead: needs no server, stores nothing.",
+        autocompletion=completion.formats,
+    ),
+]
+
+
 def generate(
-    site: Annotated[
-        str | None,
-        typer.Argument(
-            help="Generator, such as orchard or warehouse [default: list generators].",
-            autocompletion=completion.generators,
-        ),
-    ] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Number to start from: the same seed gives the same site again.")
-    ] = 0,
-    environment: Annotated[
-        str | None,
-        typer.Option(
-            "--environment",
-            "-e",
-            help="Environment to store it in, created if it does not exist [default: SITE-SEED].",
-            autocompletion=completion.environments,
-        ),
-    ] = None,
+    site: Site = None,
+    seed: Seed = 0,
+    environment: EnvironmentOption = None,
     option: Annotated[list[str] | None, options.named_values_option("A parameter of the generator")] = None,
     datum: options.DatumText = None,
-    describe: Annotated[
-        bool,
-        typer.Option("--parameters", help="Only show what the generator makes, and its parameters: needs no server."),
-    ] = False,
-    to: Annotated[
-        str | None,
-        typer.Option(
-            "--to",
-            help="Write a map in this format instead: needs no server, stores nothing.",
-            autocompletion=completion.formats,
-        ),
-    ] = None,
+    describe: Describe = False,
+    to: To = None,
     out: options.Output = None,
     create: options.Create = None,
     message: options.Message = "",

@@ -21,24 +21,28 @@ if TYPE_CHECKING:
     from app.formats import Format, LayerRequirements
 
 
+Environment = Annotated[
+    str | None,
+    typer.Option(
+        "--environment",
+        "-e",
+        help="Name of the environment, created if it does not exist [default: made from the folder's name].",
+        autocompletion=completion.environments,
+    ),
+]
+Mode = Annotated[
+    str, typer.Option("--mode", help="replace: a map replaces what it describes; merge: nothing is deleted.")
+]
+
+
 def import_maps(
     paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="An environment's folder, or map files.")],
-    environment: Annotated[
-        str | None,
-        typer.Option(
-            "--environment",
-            "-e",
-            help="Name of the environment, created if it does not exist [default: made from the folder's name].",
-            autocompletion=completion.environments,
-        ),
-    ] = None,
+    environment: Environment = None,
     format: options.Format = None,
     layer: options.Layer = None,
     level: options.Level = GROUND,
     grid: options.Grid = None,
-    mode: Annotated[
-        str, typer.Option("--mode", help="replace: a map replaces what it describes; merge: nothing is deleted.")
-    ] = "replace",
+    mode: Mode = "replace",
     message: options.Message = "",
     datum: options.DatumText = None,
     option: options.Options = None,

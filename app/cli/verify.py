@@ -29,26 +29,30 @@ MAX_VERSIONS = 5
 """Versions that one line of the table names."""
 
 
+Sources = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--from",
+        metavar="PLACE",
+        help="Where the same bytes may be: a file or folder of original files, another server's data folder, or "
+        "its address (with --token or FLEETMAP_TOKEN of an administrator); repeatable.",
+    ),
+]
+DatabaseUrl = Annotated[
+    str | None, typer.Option("--database-url", help="The database [default: FLEETMAP_DATABASE_URL].")
+]
+DataDir = Annotated[Path | None, typer.Option("--data-dir", help="The server's folder [default: FLEETMAP_DATA_DIR].")]
+BlobUrl = Annotated[
+    str | None, typer.Option("--blob-url", help="The folder of stored files [default: FLEETMAP_BLOB_URL].")
+]
+
+
 def verify(
     repair: Annotated[bool, typer.Option("--repair", help="Replace what is damaged; history stays as it is.")] = False,
-    sources: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--from",
-            metavar="PLACE",
-            help="Where the same bytes may be: a file or folder of original files, another server's data folder, or "
-            "its address (with --token or FLEETMAP_TOKEN of an administrator); repeatable.",
-        ),
-    ] = None,
-    database_url: Annotated[
-        str | None, typer.Option("--database-url", help="The database [default: FLEETMAP_DATABASE_URL].")
-    ] = None,
-    data_dir: Annotated[
-        Path | None, typer.Option("--data-dir", help="The server's folder [default: FLEETMAP_DATA_DIR].")
-    ] = None,
-    blob_url: Annotated[
-        str | None, typer.Option("--blob-url", help="The folder of stored files [default: FLEETMAP_BLOB_URL].")
-    ] = None,
+    sources: Sources = None,
+    database_url: DatabaseUrl = None,
+    data_dir: DataDir = None,
+    blob_url: BlobUrl = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:

@@ -99,43 +99,50 @@ def _summary(layer: str, change: Mapping[str, Any]) -> str:
     return f"{layer} {counts(change)}" if any(change.values()) else ""
 
 
+VersionOption = Annotated[
+    str,
+    typer.Argument(
+        help="Version number or channel that the channel is to point to.", autocompletion=completion.versions
+    ),
+]
+ChannelOption = Annotated[
+    str, typer.Option("--channel", "-c", help="Channel to move.", autocompletion=completion.channels)
+]
+At = Annotated[
+    str | None,
+    typer.Option("--at", metavar="TIME", help="Move at this time (RFC 3339: 2030-01-31T06:00:00Z), not now."),
+]
+Ready = Annotated[
+    float | None,
+    typer.Option("--ready", metavar="SHARE", help="Move when this share of its online robots has the version (0.9)."),
+]
+Failed = Annotated[
+    float | None,
+    typer.Option(
+        "--failed", metavar="SHARE", help="Do not move, or move back, if this share of its robots fails (0.2)."
+    ),
+]
+Deadline = Annotated[
+    str | None,
+    typer.Option(
+        "--deadline", metavar="TIME", help="Give up at this time if too few robots are ready (needs --ready)."
+    ),
+]
+Window = Annotated[
+    float | None,
+    typer.Option("--window", metavar="SECONDS", help="Watch robots for this long after the move [default: 600]."),
+]
+
+
 def promote(
     environment: options.Environment,
-    version: Annotated[
-        str,
-        typer.Argument(
-            help="Version number or channel that the channel is to point to.", autocompletion=completion.versions
-        ),
-    ] = "latest",
-    channel: Annotated[
-        str, typer.Option("--channel", "-c", help="Channel to move.", autocompletion=completion.channels)
-    ] = "production",
-    at: Annotated[
-        str | None,
-        typer.Option("--at", metavar="TIME", help="Move at this time (RFC 3339: 2030-01-31T06:00:00Z), not now."),
-    ] = None,
-    ready: Annotated[
-        float | None,
-        typer.Option(
-            "--ready", metavar="SHARE", help="Move when this share of its online robots has the version (0.9)."
-        ),
-    ] = None,
-    failed: Annotated[
-        float | None,
-        typer.Option(
-            "--failed", metavar="SHARE", help="Do not move, or move back, if this share of its robots fails (0.2)."
-        ),
-    ] = None,
-    deadline: Annotated[
-        str | None,
-        typer.Option(
-            "--deadline", metavar="TIME", help="Give up at this time if too few robots are ready (needs --ready)."
-        ),
-    ] = None,
-    window: Annotated[
-        float | None,
-        typer.Option("--window", metavar="SECONDS", help="Watch robots for this long after the move [default: 600]."),
-    ] = None,
+    version: VersionOption = "latest",
+    channel: ChannelOption = "production",
+    at: At = None,
+    ready: Ready = None,
+    failed: Failed = None,
+    deadline: Deadline = None,
+    window: Window = None,
     cancel: Annotated[bool, typer.Option("--cancel", help="Cancel the planned move of the channel.")] = False,
     server: options.Server = None,
     token: options.Token = None,

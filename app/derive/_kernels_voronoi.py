@@ -5,7 +5,7 @@ holes (distance-ordered homotopic thinning: Pudney, Distance-ordered homotopic t
 cells between obstacles that lie on about opposite sides of them. What is left are the ridges of the distance, and
 between them the ways along which the distance is largest.
 
-Masks are [height, width] with a border of zeros, as in ``_kernels_skeleton``.
+Masks are [height, width] with a border of zeros, as in ``_kernels_thinning``.
 """
 
 # numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.derive._kernels_skeleton import pieces, slim, steps
 from app.derive._kernels_space import F64, I32, I64, U8, U16, gaps
+from app.derive._kernels_thinning import pieces, slim, steps
 from app.native import native
 
 _SIMPLE = np.array([pieces(code) == 1 for code in range(256)], np.uint8)
-"""By code of a neighbourhood (``_kernels_skeleton``): whether a cell can go without changing pieces or holes."""
+"""By code of a neighbourhood (``_kernels_thinning``): whether a cell can go without changing pieces or holes."""
 
 OPPOSITE = 1.6
 """Obstacles that are this many times as far from each other as from a cell lie on opposite sides: 106 degrees as seen

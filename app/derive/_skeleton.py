@@ -87,9 +87,10 @@ def skeleton(
     Voronoi diagram, farthest from obstacles everywhere, instead of Zhang and Suen's skeleton.
     """
     from app.derive import _kernels_skeleton as kernels
+    from app.derive._kernels_thinning import thin
 
     thinned = free_space.mask.copy()
-    cells = np.empty((ridges(thinned, free_space.gap) if voronoi else kernels.thin(thinned), 2), np.int32)
+    cells = np.empty((ridges(thinned, free_space.gap) if voronoi else thin(thinned), 2), np.int32)
     rows = np.empty(len(thinned) + 1, np.int64)
     kernels.list_cells(thinned, cells, rows)
     raw = kernels.trace(thinned, cells, rows)

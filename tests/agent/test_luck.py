@@ -707,8 +707,8 @@ def test_a_server_tells_routers_by_plain_addresses(fake: Fake, robot: Robot, tol
     one = robot()
     with run(one):
         eventually(lambda: one.saw("polling"))
-        assert one.agent._ear is not None
-        assert not one.agent._ear.has_endpoint
+        assert one.agent._zenoh is not None
+        assert not one.agent._zenoh.has_endpoint
     assert "no plain address" in one.saw("polling")["detail"]  # type: ignore[index]
 
 

@@ -21,6 +21,7 @@ from app.derive import DerivationNotes, _skeleton
 from app.derive import _kernels_skeleton as kernels
 from app.derive import _kernels_space as space_kernels
 from app.derive import _kernels_voronoi as voronoi_kernels
+from app.derive._kernels_thinning import thin
 from app.derive.occupancy_to_topology import Parameters, network
 from app.errors import CannotConvert
 from app.model.grid import FREE, OccupancyGrid
@@ -31,7 +32,7 @@ Mask = NDArray[np.bool_]
 
 def thinned(mask: Mask) -> Mask:
     padded = np.pad(mask.astype(np.uint8), 1)
-    count = kernels.thin(padded)
+    count = thin(padded)
     assert count == padded.sum()
     assert set(np.unique(padded)) <= {0, 1}
     return np.asarray(padded[1:-1, 1:-1] == 1)
