@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,8 +24,8 @@ SERVER = re.compile(
 
 
 @pytest.fixture(scope="module")
-def python310(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment with the robot's install, built from the lock file."""
+def python310(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The interpreter of an environment with the robot's install, from the lock file; its bytecode goes with it."""
     python = find_python310()
     assert python is not None  # else this file is not collected
     uv = shutil.which("uv") or str(Path(sys.executable).with_name("uv"))
@@ -40,7 +41,9 @@ def python310(tmp_path_factory: pytest.TempPathFactory) -> Path:
         check=False,
     )
     assert ended.returncode == 0, ended.stderr
-    return place / "bin" / "python"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPYCACHEPREFIX", str(place.with_name("bytecode")))
+        yield place / "bin" / "python"
 
 
 def fleetmap(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
