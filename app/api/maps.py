@@ -700,4 +700,5 @@ async def report(
     outcome = await convert_plan(services, plan, request_address(request), principal)
     if isinstance(outcome, JobStarted):
         return job_started_response(outcome.job)
-    return json_response(await run_in_threadpool(services.maps.report, outcome[0]))
+    map_report = await run_in_threadpool(services.maps.report, outcome[0])
+    return json_response(map_report.as_dict())
