@@ -117,7 +117,9 @@ def test_no_text_breaks_out_of_a_file(name: str) -> None:
     main = next(iter(converted.files))
     back = formats.read(FileGroup(fmt, main, converted.files), ReadContext(frame=Layers({}, datum).frame))
     content = str([(p.ids, p.properties, p.document) for p in back.parts.values() if isinstance(p, Features)])
-    filled = {line["option"] for line in converted.report["template"] if line.get("option") in options}
+    filled = {line["option"] for line in converted.report.as_dict()["template"] if line.get("option") in options}
     assert filled
-    assert {line["from"] for line in converted.report["template"] if line.get("option") in filled} == {"request"}
+    assert {line["from"] for line in converted.report.as_dict()["template"] if line.get("option") in filled} == {
+        "request"
+    }
     assert content.count(repr(EVIL)[1:-1]) >= 1, "it came through as a text, whole"

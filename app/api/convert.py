@@ -117,13 +117,13 @@ def _convert(services: Services, form: UploadForm) -> Response:
 
 def _answer(done: Converted, to: str, only_report: bool) -> Response:
     fmt = formats.get_format(to)
-    headers = {"fleetmap-warnings": str(len(done.report["warnings"]))}
+    headers = {"fleetmap-warnings": str(len(done.report.warnings))}
     if only_report:
         files = [
             {"name": name, "size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
             for name, data in done.files.items()
         ]
-        return json_response({**done.report, "files": files}, headers=headers)
+        return json_response({**done.report.as_dict(), "files": files}, headers=headers)
     if len(done.files) == 1:
         name, data = next(iter(done.files.items()))
         kind = media_type(fmt, name)

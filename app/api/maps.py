@@ -350,4 +350,5 @@ async def report(
     outcome = await services.jobs.convert(plan, principal, request_address(request))
     if isinstance(outcome, JobStarted):
         return job_started_response(outcome.job)
-    return json_response(await run_in_threadpool(services.maps.report, outcome[0]))
+    map_report = await run_in_threadpool(services.maps.report, outcome[0])
+    return json_response(map_report.as_dict())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -190,10 +191,12 @@ def _write(
         how = generate.step(site, seed, generator_values, {}, layers.datum if datum is None else None)
         came = Provenance("generated", steps=(how,))
         result = write_layers(layers, to, {n: v for n, v in values.items() if n not in ours}, came)
-    report: dict[str, Any] = {**result.report}
-    report["warnings"] = [w.as_dict() for w in notes.warnings] + report["warnings"]
-    report["dropped"] = notes.dropped + report["dropped"]
-    report["template"] = notes.template + report["template"]
+    report = replace(
+        result.report,
+        warnings=(*notes.warnings, *result.report.warnings),
+        dropped=(*notes.dropped, *result.report.dropped),
+        template=(*notes.template, *result.report.template),
+    ).as_dict()
     as_folder = output_files.wants_folder(out) or (
         len(result.files) > 1 and out != "-" and not out.lower().endswith(".zip")
     )

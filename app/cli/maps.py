@@ -215,13 +215,13 @@ def convert(
     )
     names = output_files.bundle(converted.files, Path(out), folder=as_folder)
     if as_json:
-        output.show_json({"files": names, "report": converted.report})
+        output.show_json({"files": names, "report": converted.report.as_dict()})
         return
     for note in notes:
         output.print_status(f"left out: {note}", style="yellow")
     for name in names if as_folder else [out] if out != "-" else []:
         output.print_status(f"wrote {Path(out) / name if as_folder else name}")
-    show_report(converted.report)
+    show_report(converted.report.as_dict())
 
 
 def check(

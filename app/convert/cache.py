@@ -32,6 +32,7 @@ from uuid import uuid4
 
 import orjson
 
+from app.convert.report import Report
 from app.errors import BROKEN_STORAGE_ERRNOS, DISK_FULL_ERRNOS, Unavailable, system_reason
 
 log = logging.getLogger(__name__)
@@ -97,7 +98,7 @@ class CachedMap:
 
     files: tuple[CachedFile, ...]
     archive: CachedFile | None
-    report: dict[str, Any]
+    report: Report
     fresh: bool = field(default=False, compare=False)
 
     @property
@@ -127,7 +128,7 @@ class ConvertedMap:
 
     files: dict[str, tuple[bytes | CachedFile, str]]
     archive: tuple[str, bytes] | None
-    report: dict[str, Any]
+    report: Report
     places: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 
@@ -210,7 +211,7 @@ class Cache:
         damaged = partial(self.discard, key)
         files = tuple(_file_from_entry(folder, f, damaged) for f in described["files"])
         archive = _file_from_entry(folder, described["archive"], damaged) if described["archive"] else None
-        cached_map = CachedMap(files, archive, described["report"])
+        cached_map = CachedMap(files, archive, Report.from_dict(described["report"]))
         times = [status.st_mtime_ns, *(_write_file(file) for file in cached_map.all_files())]
         return cached_map, (status.st_ino, min(times), max(times))
 
@@ -342,7 +343,7 @@ class Cache:
             files = [_write(making, str(k), name, *content) for k, (name, content) in enumerate(product.files.items())]
             files = [{**f, "place": product.places[f["name"]]} if f["name"] in product.places else f for f in files]
             archive = _write(making, "whole", *product.archive, "application/zip") if product.archive else None
-            text = orjson.dumps({"key": key, "files": files, "archive": archive, "report": product.report})
+            text = orjson.dumps({"key": key, "files": files, "archive": archive, "report": product.report.as_dict()})
             (making / "map.json").write_bytes(hashlib.sha256(text).hexdigest().encode() + b"\n" + text)
             target = self._path(key)
             target.parent.mkdir(exist_ok=True)

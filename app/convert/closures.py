@@ -204,6 +204,32 @@ def _frame(datum: Datum | None) -> LocalFrame | None:
 # --- maps ---
 
 
+@dataclass(frozen=True, slots=True)
+class ClosureLine:
+    """What one closure did to a map. edge: the closed edge, None for an area. edges: ids, ``MAX_LISTED`` at most.
+    why: the reason for no effect."""
+
+    id: str
+    level: str
+    expires: str
+    effect: str
+    edges: tuple[str, ...] = ()
+    edge: str | None = None
+    why: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The line as JSON, without its empty members."""
+        out: dict[str, Any] = {"id": self.id, "level": self.level, "expires": self.expires}
+        out |= {} if self.edge is None else {"edge": self.edge}
+        out |= {"effect": self.effect, "edges": list(self.edges)}
+        return out if self.why is None else {**out, "why": self.why}
+
+    @classmethod
+    def from_dict(cls, line: Mapping[str, Any]) -> ClosureLine:
+        """The line from its JSON."""
+        return cls(**{**line, "edges": tuple(line["edges"])})
+
+
 @dataclass(slots=True)
 class ClosureReport:
     """What closures did to one map.
@@ -212,7 +238,7 @@ class ClosureReport:
     edges that stay in a format that cannot express it. emptied: whether no edge would have been left.
     """
 
-    lines: list[dict[str, Any]] = field(default_factory=list)
+    lines: list[ClosureLine] = field(default_factory=list)
     omitted: int = 0
     kept: int = 0
     emptied: bool = False
@@ -268,38 +294,33 @@ class _Effect:
         return ", ".join([*did, *(["zone"] if self.zone else []), *([self.cells] if self.cells else [])]) or NO_EFFECT
 
 
-def line(
-    closure: Closure, effect: _Effect | None = None, *, mark: bool = False, why: str | None = None
-) -> dict[str, Any]:
+def line(closure: Closure, effect: _Effect | None = None, *, mark: bool = False, why: str | None = None) -> ClosureLine:
     """A report's line about one closure. why: the reason for no effect."""
     effect = effect or _Effect()
-    out: dict[str, Any] = {"id": closure.id, "level": closure.level, "expires": closure.expires}
-    if closure.edge is not None:
-        out["edge"] = closure.edge
-    out |= {"effect": effect.text(mark=mark), "edges": effect.edges[:MAX_LISTED]}
-    return out if why is None else {**out, "why": why}
+    edges = tuple(effect.edges[:MAX_LISTED])
+    return ClosureLine(closure.id, closure.level, closure.expires, effect.text(mark=mark), edges, closure.edge, why)
 
 
-def report_lines(version: Version, stored: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def report_lines(version: Version, stored: Iterable[ClosureLine]) -> tuple[ClosureLine, ...]:
     """A line for each closure in force: the effect in a map's stored report, or why there is none."""
-    effects = {one["id"]: dict(one) for one in stored}
+    effects = {one.id: one for one in stored}
     out = []
     for closure in () if version.closures is None else version.closures.items:
         why: str | None = "this map has no such edge"
         if closure.edge is None:
             why = place_problem(closure, version) or "this map has nothing that the area could close"
         out.append(effects.get(closure.id) or line(closure, why=why))
-    return out
+    return tuple(out)
 
 
-def merge_report_lines(reports: Iterable[Iterable[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+def merge_report_lines(reports: Iterable[Iterable[ClosureLine]]) -> tuple[ClosureLine, ...]:
     """Join the lines of several maps' reports: one line for each closure, with all its effects and edges."""
-    out: dict[str, dict[str, Any]] = {}
+    out: dict[str, ClosureLine] = {}
     for one in (one for report in reports for one in report):
-        joined = out.setdefault(one["id"], {**one})
-        joined["effect"] = ", ".join(dict.fromkeys([joined["effect"], one["effect"]]))
-        joined["edges"] = list(dict.fromkeys([*joined["edges"], *one["edges"]]))[:MAX_LISTED]
-    return list(out.values())
+        first = out.setdefault(one.id, one)
+        effect = ", ".join(dict.fromkeys([first.effect, one.effect]))
+        out[one.id] = replace(first, effect=effect, edges=tuple(dict.fromkeys(first.edges + one.edges))[:MAX_LISTED])
+    return tuple(out.values())
 
 
 # --- networks ---

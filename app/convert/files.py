@@ -11,6 +11,7 @@ from app import formats, upload_reader
 from app.convert import recipe as recipes
 from app.convert import site
 from app.convert import worker as making
+from app.convert.report import Report, unsupported_layers
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.formats import Files, Format
 from app.limits import Limits
@@ -26,7 +27,7 @@ class Converted:
     """The map's files, main file first, the report on it, and what was doubtful in the input."""
 
     files: dict[str, bytes]
-    report: dict[str, Any]
+    report: Report
     warnings: list[Problem] = field(default_factory=list)
 
 
@@ -82,9 +83,8 @@ def _offline(
             upload_reader.unpack(load(), limits), hints, replace(knowing, wanted=None, cells=True), limits
         )
         written = _convert_layers(fmt, upload_bundle, datum, option_values, derived=derived)
-    filled = making.with_value_origin(written.report["template"], dict.fromkeys(option_values, REQUEST))
-    report = {**written.report, "template": filled}
-    report |= {"warnings": [p.as_dict() for p in upload_bundle.warnings] + written.report["warnings"]}
+    report = written.report.with_value_origin(dict.fromkeys(option_values, REQUEST))
+    report = replace(report, warnings=(*upload_bundle.warnings, *report.warnings))
     return Converted(written.files, report, upload_bundle.warnings)
 
 
@@ -110,11 +110,8 @@ def write_layers(layers: Layers, to: str, options: Mapping[str, str], came: Prov
     recipes.writer_options(fmt, options)
     entries = {key: PartEntry(key, "", 1, {}, came) for key in layers.parts}
     written_map = making.from_layers(fmt, layers, options, derived=True, entries=entries)
-    left = making.unsupported_layers(fmt, None, layers)
-    filled = making.with_value_origin(written_map.report["template"], dict.fromkeys(options, REQUEST))
-    return Converted(
-        written_map.files, {**written_map.report, "template": filled, "dropped": written_map.report["dropped"] + left}
-    )
+    report = written_map.report.with_value_origin(dict.fromkeys(options, REQUEST))
+    return Converted(written_map.files, replace(report, dropped=report.dropped + unsupported_layers(fmt, None, layers)))
 
 
 def offline_paths(

@@ -23,6 +23,7 @@ from app.convert import site
 from app.convert import worker as making
 from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap
 from app.convert.recipe import Recipe
+from app.convert.report import LayerLine, Report, all_credits, merge_reports, unsupported_layers
 from app.convert.trials import Trials
 from app.derive import ChainFailure, first_working
 from app.errors import (
@@ -42,9 +43,10 @@ from app.limits import Limits
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.model.names import did_you_mean
+from app.model.notes import Dropped
 from app.pool import CancelHandle, WorkerDied
 from app.store.store import Store
-from app.store.values import Version
+from app.store.values import Provenance, Version
 from app.syntax import shell
 from app.upload_reader import UploadHints
 
@@ -234,52 +236,38 @@ class Maps:
         """The map; blocks until it is made. Raises what ``recipe`` and ``get_or_convert`` do."""
         return self.get_or_convert(self.recipe(version, name, values, derive=derive))[1]
 
-    def report(self, recipe: Recipe) -> dict[str, Any]:
+    def report(self, recipe: Recipe) -> Report:
         """The report for this version: what was raw, derived, filled in and dropped."""
-        if recipe.members:
-            clashes = {
-                **making.empty_report(recipe.format),
-                "dropped": self.get_or_convert(recipe)[1].report["dropped"],
-            }
-            members = [(member.folder, self.report(member.recipe)) for member in recipe.members]
-            return site.merge_reports([*members, ("", clashes)])
         recipe, cached_map = self.get_or_convert(recipe)
-        map_report = cached_map.report
-        entries = {(e.key.layer, e.key.level, e.key.name): e.provenance for e in recipe.version.parts}
+        written = cached_map.report
+        if recipe.members:
+            members = [(member.folder, self.report(member.recipe)) for member in recipe.members]
+            return merge_reports([*members, ("", Report(written.format, dropped=written.dropped))])
+        version = recipe.version
+        stored = {e.key: e for e in version.parts}
         anew = {step.gives for step in recipe.steps}
-        lines = []
-        for line in map_report["layers"]:
-            # Equal content may have come from other files in another version: sources are this version's own. What a
-            # step on the way has made anew beside a stored part of that name came from the step's own sources.
-            entry = entries.get((line["layer"], line.get("level"), line["name"]))
-            if entry is not None and line["layer"] not in anew:
-                line = {  # noqa: PLW2901
-                    **line,
-                    "information": entry.information,
-                    "sources": list(entry.sources),
-                    "attribution": list(entry.attribution),
-                }
-            lines.append(line)
-        stored = {e.key: e for e in recipe.version.parts}
-        dropped = map_report["dropped"] + making.unsupported_layers(recipe.format, stored, Layers())
-        version, credit = recipe.version.number, making.report_credits(lines)
-        stored_version = applied_closures.drop_areas(recipe.version)
-        used = {k: why for k, why in stored_version.stale.items() if k in recipe.chain.keys}
-        stale = [
-            {
-                "problem": f"it was derived from what has changed since ({', '.join(why)}): derive it anew",
-                "where": f"{k.layer} {k.level}/{k.name}",
-            }
-            for k, why in used.items()
-        ]
-        ignored = [{"problem": reason} for reason in self._unused_templates(recipe)]
-        warnings = [*recipes.detours(recipe.failed), *map_report["warnings"], *stale, *ignored]
-        texts = {line["problem"] for line in warnings}
-        warnings += [p.as_dict() for p in self._crossings(recipe) if p.problem not in texts]
-        filled = making.with_value_origin(map_report["template"], recipe.origin, recipe.version.templates)
-        more = {"layers": lines, "attribution": credit, "template": filled, "dropped": dropped, "warnings": warnings}
-        closures = applied_closures.report_lines(recipe.version, map_report["closures"])
-        return {**map_report, "version": version, "closures": closures, **more}
+        # Equal content may have come from other files in another version: sources are this version's own. What a step
+        # on the way has made anew beside a stored part of that name came from the step's own sources.
+        lines = tuple(
+            _with_provenance(line, stored[line.key].provenance)
+            if line.key in stored and line.layer not in anew
+            else line
+            for line in written.layers
+        )
+        warnings = [*recipes.detours(recipe.failed), *written.warnings, *_stale_warnings(recipe)]
+        warnings += [Problem(reason) for reason in self._unused_templates(recipe)]
+        texts = {one.problem for one in warnings}
+        warnings += [one for one in self._crossings(recipe) if one.problem not in texts]
+        report = replace(
+            written,
+            layers=lines,
+            attribution=all_credits(lines),
+            dropped=written.dropped + unsupported_layers(recipe.format, stored, Layers()),
+            warnings=tuple(warnings),
+            closures=applied_closures.report_lines(version, written.closures),
+            version=version.number,
+        )
+        return report.with_value_origin(recipe.origin, version.templates)
 
     def _crossings(self, recipe: Recipe) -> list[Problem]:
         """Warnings of edges that lead through obstacles which the map itself does not hold."""
@@ -479,14 +467,14 @@ def join_members(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedM
     """The files of all members, each at its place; of two of one name the first stays, and the report says so."""
     files: dict[str, tuple[bytes | CachedFile, str]] = {}
     places: dict[str, tuple[str, str]] = {}
-    clashes: list[dict[str, Any]] = []
+    clashes: list[Dropped] = []
     for member, cached_map in zip(recipe.members, cached_maps, strict=True):
         for file in site.select(cached_map.files, member):
             name = member.folder + file.name
             place = file.place or member.place
             if name in files:
                 why = f"a file of {places[name][1]!r} has the same name: rename one of the two"
-                clashes.append({"what": f"file {name} of {place[1] if place else name!r}", "count": 1, "why": why})
+                clashes.append(Dropped(f"file {name} of {place[1] if place else name!r}", 1, why))
                 continue
             files[name] = (file, file.media_type)
             if place is not None:
@@ -496,10 +484,10 @@ def join_members(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedM
     archive = None
     if recipe.archive and len(files) > 1:
         archive = (f"{recipe.format.name}.zip", making.zip_files(_LazyFiles({n: p for n, (p, _) in files.items()})))
-    report = site.merge_reports(
+    report = merge_reports(
         [(m.folder, cached_map.report) for m, cached_map in zip(recipe.members, cached_maps, strict=True)]
     )
-    return ConvertedMap(files, archive, {**report, "dropped": [*report["dropped"], *clashes]}, places)
+    return ConvertedMap(files, archive, replace(report, dropped=(*report.dropped, *clashes)), places)
 
 
 class _LazyFiles(Mapping[str, bytes]):
@@ -517,6 +505,25 @@ class _LazyFiles(Mapping[str, bytes]):
 
     def __len__(self) -> int:
         return len(self._files)
+
+
+def _with_provenance(line: LayerLine, provenance: Provenance) -> LayerLine:
+    return replace(
+        line, information=provenance.information, sources=provenance.sources, attribution=provenance.attribution
+    )
+
+
+def _stale_warnings(recipe: Recipe) -> list[Problem]:
+    """Warnings of the parts that were derived from content that has changed since."""
+    stale = applied_closures.drop_areas(recipe.version).stale
+    return [
+        Problem(
+            f"it was derived from what has changed since ({', '.join(why)}): derive it anew",
+            where=f"{key.layer} {key.level}/{key.name}",
+        )
+        for key, why in stale.items()
+        if key in recipe.chain.keys
+    ]
 
 
 def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:

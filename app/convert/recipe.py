@@ -352,9 +352,9 @@ def missing_layers(fmt: Format, available: AvailableLayers) -> list[str]:
     return [text for text in dict.fromkeys(out) if text]
 
 
-def detours(failed: Sequence[ChainFailure]) -> list[dict[str, Any]]:
+def detours(failed: Sequence[ChainFailure]) -> list[Problem]:
     """The warnings of a map that was made another way than the usual one: which step failed, and why."""
-    return [{"problem": f"made another way, since {one.step} failed: {one.reason}"} for one in failed if one.step]
+    return [Problem(f"made another way, since {one.step} failed: {one.reason}") for one in failed if one.step]
 
 
 def recipe(

@@ -18,7 +18,6 @@ from typing import Any
 import orjson
 
 from app import derive
-from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert.recipe import AvailableLayers, DerivationChain, Member, Recipe, Spread
 from app.derive import Derivation
@@ -399,24 +398,6 @@ def _fits(place: tuple[str, str] | None, member: Member) -> bool:
         return False
     level, name = place
     return (member.levels is None or level in member.levels) and (member.names is None or name in member.names)
-
-
-def merge_reports(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
-    """Join the reports of several maps, each with the folder of its files; what several say is said once."""
-    out: dict[str, Any] = {**reports[0][1]}
-    for member in ("layers", "attribution", "template", "dropped", "warnings"):
-        lines: list[Any] = []
-        for folder, report in reports:
-            for line in report[member]:
-                named = folder and isinstance(line, Mapping) and "file" in line
-                lines.append({**line, "file": folder + line["file"]} if named else line)
-        out[member] = _unique(lines)
-    out["closures"] = applied_closures.merge_report_lines([report["closures"] for _, report in reports])
-    return out
-
-
-def _unique(lines: Iterable[Any]) -> list[Any]:
-    return list({orjson.dumps(line, option=orjson.OPT_SORT_KEYS): line for line in lines}.values())
 
 
 def no_parts_error(recipe: Recipe) -> NotFound:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import mimetypes
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -14,7 +14,9 @@ from app import derive, formats, parameters
 from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert import site
+from app.convert.closures import ClosureLine
 from app.convert.recipe import DerivationChain, Recipe, Spread
+from app.convert.report import LayerLine, Report, all_credits, merge_reports, unsupported_layers
 from app.derive import ChainFailure, Step
 from app.errors import CannotConvert, CannotDerive, FleetMapError, MissingLayer, Problem
 from app.formats import UNTITLED, Format, NestedMap, WriteContext
@@ -22,11 +24,11 @@ from app.model.closures import Closures
 from app.model.crossings import crossings
 from app.model.features import Features
 from app.model.frame import GROUND
-from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
+from app.model.layers import Layer, Layers, PartKey
 from app.model.templates import NO_TEMPLATES, Templates
 from app.store.values import PartEntry, Provenance, Version, datum_information
 from app.syntax import archives
-from app.templates import DEFAULT, resolve
+from app.templates import resolve
 
 if TYPE_CHECKING:
     from app.store.store import Store
@@ -38,7 +40,7 @@ class WrittenMap:
     level and the name of the part that each is of."""
 
     files: dict[str, bytes]
-    report: dict[str, Any]
+    report: Report
     places: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
@@ -143,7 +145,7 @@ def write(
         if not spread.optional:
             raise
         if isinstance(error.__cause__, MissingLayer):
-            return WrittenMap({}, empty_report(fmt))
+            return WrittenMap({}, Report(fmt.name))
         raise CannotConvert(error.detail, error.problems) from error
     return _write_each(fmt, derived_layers, options, source, notes, spread)
 
@@ -178,7 +180,7 @@ def _write_each(
     keys = [k for k in keys if not spread.names or k.name in spread.names]
     files: dict[str, bytes] = {}
     places: dict[str, tuple[str, str]] = {}
-    reports: list[tuple[str, Mapping[str, Any]]] = []
+    reports: list[tuple[str, Report]] = []
     for key in sorted(keys, key=lambda k: (k.level != spread.default, k)):
         names = [k.name for k in keys if k.level == key.level]
         usual = not spread.names and key.name == site.default_name(parts, names)
@@ -189,14 +191,7 @@ def _write_each(
         for name, data in one.files.items():
             files.setdefault(folder + name, data)
             places.setdefault(folder + name, (key.level, key.name))
-    return WrittenMap(files, site.merge_reports(reports) if reports else empty_report(fmt), places)
-
-
-def empty_report(fmt: Format) -> dict[str, Any]:
-    """Build the report of a map without files."""
-    members = ("layers", "attribution", "template", "dropped", "warnings", "closures")
-    empty: dict[str, Any] = {member: [] for member in members}
-    return {"format": fmt.name, **empty}
+    return WrittenMap(files, merge_reports(reports) if reports else Report(fmt.name), places)
 
 
 def _write_one(
@@ -207,8 +202,8 @@ def _write_one(
     credit, closures = source.credit, source.closures
     noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
     context = WriteContext(source.title, options, stored=None if closures is not None and closures.items else noted)
-    inner: list[dict[str, Any]] = []
-    inner_closures: list[list[dict[str, Any]]] = []
+    inner: list[LayerLine] = []
+    inner_closures: list[tuple[ClosureLine, ...]] = []
     if fmt.traits.is_container:
         context.make = partial(_inner, source, inner, inner_closures)
     chosen = fmt.selection.choose(sorted(k for k in derived_layers.parts if k.layer in fmt.layers), context.options)
@@ -221,25 +216,26 @@ def _write_one(
             applied, closed = applied_closures.close(fmt, used, closures, drawn, mark=True)
         used = applied
     lines = _report_layers(used, layers, chain, entries or {}, origin or {}, noted)
-    context.attribution = tuple(sorted(report_credits(lines)))  # whichever part came first: equal content, equal bytes
+    context.attribution = tuple(sorted(all_credits(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(fmt, used, context)
     _report_blocked_edges(fmt, closed, context)
     if not fmt.traits.is_container:  # as above
         context.warnings += crossing_edges(
             fmt, used, replace(derived_layers, parts={**source.around.parts, **derived_layers.parts})
         )
-    known_lines = {(line["layer"], line["level"], line["name"]) for line in lines}
-    lines += [line for line in inner if (line["layer"], line["level"], line["name"]) not in known_lines]
-    report = {
-        "format": fmt.name,
-        "layers": lines,
-        "attribution": report_credits(lines),
-        "template": notes.template + context.template,
-        # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
-        "dropped": notes.dropped + context.dropped + (unsupported_layers(fmt, None, layers) if entries is None else []),
-        "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
-        "closures": applied_closures.merge_report_lines([closed.lines, *inner_closures]),
-    }
+    keys = {line.key for line in lines}
+    lines += [line for line in inner if line.key not in keys]
+    # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
+    unsupported = unsupported_layers(fmt, None, layers) if entries is None else ()
+    report = Report(
+        fmt.name,
+        tuple(lines),
+        all_credits(lines),
+        (*notes.template, *context.template),
+        (*notes.dropped, *context.dropped, *unsupported),
+        (*notes.warnings, *context.warnings),
+        applied_closures.merge_report_lines([closed.lines, *inner_closures]),
+    )
     return WrittenMap(files, report)
 
 
@@ -302,8 +298,8 @@ def from_layers(
             around=around or layers,
             title=title,
         )
-        warnings = [*recipes.detours(failed), *written.report["warnings"]]
-        return replace(written, report={**written.report, "warnings": warnings})
+        warnings = (*recipes.detours(failed), *written.report.warnings)
+        return replace(written, report=replace(written.report, warnings=warnings))
 
     return derive.first_working(plan, attempt)
 
@@ -327,7 +323,7 @@ def _write_every_part(
     def attempt(recipe: Recipe, _: Sequence[ChainFailure]) -> WrittenMap:
         files: dict[str, bytes] = {}
         places: dict[str, tuple[str, str]] = {}
-        reports: list[tuple[str, Mapping[str, Any]]] = []
+        reports: list[tuple[str, Report]] = []
         for member in recipe.members:
             chain, spread = member.recipe.chain, member.recipe.spread
             chain_layers = Layers({k: layers.parts[k] for k in chain.keys}, layers.datum, layers.levels)
@@ -339,7 +335,7 @@ def _write_every_part(
                 places.setdefault(member.folder + file.name, file.place or member.place or ("", ""))
         if not files:
             raise site.no_parts_error(recipe)
-        return WrittenMap(files, site.merge_reports(reports), places)
+        return WrittenMap(files, merge_reports(reports), places)
 
     return derive.first_working(plan, attempt)
 
@@ -365,8 +361,8 @@ def _as_version(layers: Layers) -> Version:
 
 def _inner(
     source: _Source,
-    derivations: list[dict[str, Any]],
-    closed: list[list[dict[str, Any]]],
+    derivations: list[LayerLine],
+    closed: list[tuple[ClosureLine, ...]],
     name: str,
     layers: Layers,
     values: Mapping[str, Any],
@@ -388,15 +384,10 @@ def _inner(
         title=source.title,
     )
     report = written_map.report
-    derivations += [line for line in report["layers"] if line["information"] == "derived"]
-    closed.append(report["closures"])
-    return NestedMap(
-        written_map.files,
-        tuple(report["layers"]),
-        tuple(report["dropped"]),
-        tuple({**line, "format": fmt.name} for line in report["template"]),
-        tuple(report_warnings(report)),
-    )
+    derivations += [line for line in report.layers if line.information == "derived"]
+    closed.append(report.closures)
+    template = tuple(replace(line, format=fmt.name) for line in report.template)
+    return NestedMap(written_map.files, report.dropped, template, report.warnings)
 
 
 def media_type(fmt: Format, name: str) -> str:
@@ -420,7 +411,7 @@ def _report_layers(
     entries: Mapping[PartKey, PartEntry],
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]],
     noted: Mapping[PartKey, Sequence[str]],
-) -> list[dict[str, Any]]:
+) -> list[LayerLine]:
     """For each part in the map: raw, derived or template, by which steps, from which sources."""
     out = []
     steps = {step.gives: step for step in chain.steps}
@@ -428,27 +419,23 @@ def _report_layers(
         part = used.parts[key]
         if isinstance(part, Features) and not len(part):
             continue
-        line: dict[str, Any] = {"layer": key.layer, "level": key.level, "name": key.name}
+        line = LayerLine(key.layer, key.level, key.name, "raw", attribution=tuple(noted.get(key, ())))
         if key not in before.parts and key.layer in steps:
             part_steps, roots = _ancestry(key.layer, steps)
             sources = sorted({s for k, e in entries.items() if k.layer in roots for s in e.provenance.sources})
             sources = sources or sorted({s for k, (n, _) in origin.items() if k.layer in roots for s in n})
             needed = [k for k in before.parts if k.layer in roots]
-            credit = list(dict.fromkeys(text for k in needed for text in noted.get(k, ())))
-            done = [step.as_dict() for step in chain.steps if step in part_steps]
-            line |= {"information": "derived", "steps": done, "sources": sources, "attribution": credit}
+            credit = tuple(dict.fromkeys(text for k in needed for text in noted.get(k, ())))
+            done = tuple(step.as_dict() for step in chain.steps if step in part_steps)
+            line = replace(line, information="derived", steps=done, sources=tuple(sources), attribution=credit)
         elif key in entries:
             p = entries[key].provenance
-            line |= {"information": p.information, "steps": [dict(s) for s in p.steps], "sources": list(p.sources)}
-            line["attribution"] = list(noted.get(key, ()))
+            line = replace(line, information=p.information, steps=p.steps, sources=p.sources)
         else:
-            line |= {"information": "raw", "steps": [], "sources": list(origin.get(key, ((), ""))[0])}
-            line["attribution"] = list(noted.get(key, ()))
+            line = replace(line, sources=origin.get(key, ((), ""))[0])
         out.append(line)
-    if used.datum is not None and not any(line["layer"] == "location" for line in out):
-        line = {"layer": "location", "level": GROUND, "name": "datum"}
-        line["information"] = datum_information(used.datum, entries.values())
-        out.insert(0, {**line, "steps": [], "sources": [], "attribution": []})
+    if used.datum is not None and not any(line.layer == "location" for line in out):
+        out.insert(0, LayerLine("location", GROUND, "datum", datum_information(used.datum, entries.values())))
     return out
 
 
@@ -465,46 +452,3 @@ def _ancestry(layer: Layer, steps: Mapping[Layer, Step]) -> tuple[set[Step], set
         todo += [need for need in step.reads if need in steps]
         roots |= {need for need in step.reads if need not in steps}
     return done, roots
-
-
-def report_credits(lines: Iterable[Mapping[str, Any]]) -> list[str]:
-    """The licences and credits of all layers of a report, each once."""
-    return list(dict.fromkeys(text for line in lines for text in line.get("attribution", ())))
-
-
-def with_value_origin(
-    lines: Iterable[Mapping[str, Any]], origin: Mapping[str, str], templates: Templates = NO_TEMPLATES
-) -> list[dict[str, Any]]:
-    """A report's template lines, each with where its value came ``from``. origin: of the map's own parameters; those of
-    maps inside it follow from the environment's templates."""
-    out = []
-    for line in lines:
-        inside = line.get("format")
-        origins = origin if inside is None else resolve(templates, formats.get_format(str(inside))).origin
-        out.append({**line, "from": origins.get(str(line.get("option")), DEFAULT)})
-    return out
-
-
-def unsupported_layers(
-    fmt: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers
-) -> list[dict[str, Any]]:
-    """Stored layers that this format has no words for."""
-    counts: dict[str, int] = {}
-    if entries is not None:
-        for key, entry in entries.items():
-            if key.layer not in fmt.layers and entry.count:
-                items = entry.count if key.layer in VECTOR_LAYERS else 1  # grids and pictures, not their cells
-                counts[key.layer] = counts.get(key.layer, 0) + items
-    else:
-        for key, part in layers.parts.items():
-            if key.layer not in fmt.layers:
-                counts[key.layer] = counts.get(key.layer, 0) + (len(part) if isinstance(part, Features) else 1)
-    why = f"{fmt.name} has no place for it"
-    return [{"what": layer, "count": counts[layer], "why": why} for layer in LAYERS if counts.get(layer)]
-
-
-def report_warnings(report: Mapping[str, Any]) -> list[Problem]:
-    """A report's warnings as values."""
-    return [
-        Problem(w["problem"], w.get("file"), w.get("line"), w.get("where"), w.get("level")) for w in report["warnings"]
-    ]

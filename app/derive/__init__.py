@@ -13,7 +13,7 @@ import heapq
 import importlib
 import pkgutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, TypeVar
 
@@ -22,30 +22,13 @@ from app.errors import Ambiguous, CannotConvert, CannotDerive, MissingLayer, Pro
 from app.model.features import Features
 from app.model.grid import FREE, UNKNOWN, OccupancyGrid
 from app.model.layers import Layer, Layers, Part
+from app.model.notes import Notes
 from app.model.voxels import VoxelMap
 
 
 @dataclass(slots=True)
-class DerivationNotes:
+class DerivationNotes(Notes):
     """Where a step says what was doubtful, what it left out, and what it made up (it goes into the map's report)."""
-
-    warnings: list[Problem] = field(default_factory=list)
-    dropped: list[dict[str, Any]] = field(default_factory=list)
-    template: list[dict[str, Any]] = field(default_factory=list)
-
-    def warn(self, problem: str, *, where: str | None = None) -> None:
-        """The layer was made, but whoever uses it should know this."""
-        self.warnings.append(Problem(problem, where=where))
-
-    def drop(self, subject: str, count: int, why: str) -> None:
-        """This much of the source had no part in the result."""
-        if count:
-            self.dropped.append({"what": subject, "count": count, "why": why})
-
-    def fill(self, subject: str, value: Any, why: str, option: str | None = None) -> None:
-        """No source says this: a default was taken. option: the parameter that says it."""
-        option_entry = {} if option is None else {"option": option}
-        self.template.append({"what": subject, "value": value, "why": why, **option_entry})
 
 
 P = TypeVar("P")

@@ -162,7 +162,7 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
         if unreadable:
             raise unreadable_error(unreadable, f"nothing that can be read stands in a robot's way {band}{extra}")
         extra += "".join(
-            f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped if d["why"] != NOT_AN_OBSTACLE
+            f"; {one.count} {one.subject}: {one.why}" for one in notes.dropped if one.why != NOT_AN_OBSTACLE
         )
         raise MissingLayer(
             f"no stored object stands in a robot's way {band}{extra}: ask for another height or band, or upload walls, "

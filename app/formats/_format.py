@@ -11,17 +11,14 @@ from app.limits import Limits
 from app.model.frame import GROUND, Anchor
 from app.model.geodesy import LocalFrame
 from app.model.layers import MAP, Layer, Layers, PartKey
+from app.model.notes import Dropped, Filled, Notes, Warnings
 
 Files = Mapping[str, bytes]
 """A map as named files: relative path with forward slashes -> content."""
 
 
-MAX_RAW_WARNINGS = 100_000
-"""Warnings that are kept until they are grouped."""
-
-
 @dataclass(slots=True)
-class ReadContext:
+class ReadContext(Warnings):
     """What a reader is told, and where it leaves its warnings.
 
     frame: the environment's, where it has a datum. level: where the map belongs. grid: the name for a grid, else None.
@@ -44,14 +41,7 @@ class ReadContext:
     requested_layers: frozenset[Layer] | None = None
     decode_cells: bool = True
     keep_source_properties: bool = True
-    main: str = ""
     folder: Callable[[Files], Layers] | None = None
-    warnings: list[Problem] = field(default_factory=list)
-
-    def warn(self, problem: str, *, file: str | None = None, line: int | None = None, where: str | None = None) -> None:
-        """Something doubtful that is stored all the same."""
-        if len(self.warnings) < MAX_RAW_WARNINGS:
-            self.warnings.append(Problem(problem, file or self.main or None, line, where))
 
     def wants(self, layer: Layer) -> bool:
         """Whether anybody will use this layer."""
@@ -60,15 +50,11 @@ class ReadContext:
 
 @dataclass(frozen=True, slots=True)
 class NestedMap:
-    """A map inside another one: its files, main file first, and what its writer declared (see ``WriteContext``).
-
-    layers: what the report says of each layer in it.
-    """
+    """A map inside another one: its files, main file first, and what its writer declared (see ``WriteContext``)."""
 
     files: dict[str, bytes]
-    layers: tuple[Mapping[str, Any], ...] = ()
-    dropped: tuple[Mapping[str, Any], ...] = ()
-    template: tuple[Mapping[str, Any], ...] = ()
+    dropped: tuple[Dropped, ...] = ()
+    template: tuple[Filled, ...] = ()
     warnings: tuple[Problem, ...] = ()
 
 
@@ -77,7 +63,7 @@ UNTITLED = "map"
 
 
 @dataclass(slots=True)
-class WriteContext:
+class WriteContext(Notes):
     """What a writer is told, and where it declares what it lost or made up (loss is data).
 
     title: the environment's name, for formats with a place for one. options: the format's own write options.
@@ -92,23 +78,6 @@ class WriteContext:
     attribution: tuple[str, ...] = ()
     make: Callable[[str, Layers, Mapping[str, Any], bool], NestedMap] | None = None
     stored: Mapping[PartKey, Sequence[str]] | None = None
-    dropped: list[dict[str, Any]] = field(default_factory=list)
-    template: list[dict[str, Any]] = field(default_factory=list)
-    warnings: list[Problem] = field(default_factory=list)
-
-    def drop(self, item: str, count: int, why: str) -> None:
-        """This much of the stored information has no place in the format."""
-        if count:
-            self.dropped.append({"what": item, "count": int(count), "why": why})  # also of NumPy's integers
-
-    def fill(self, item: str, value: Any, why: str, option: str | None = None) -> None:
-        """The format asks for this and no layer has it: a default was filled in. option: the parameter that says it."""
-        option_entry = {} if option is None else {"option": option}
-        self.template.append({"what": item, "value": value, "why": why, **option_entry})
-
-    def warn(self, problem: str, *, file: str | None = None, where: str | None = None) -> None:
-        """The map was written, but its consumer may not like it."""
-        self.warnings.append(Problem(problem, file, None, where))
 
 
 @dataclass(frozen=True, slots=True)

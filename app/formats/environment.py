@@ -163,8 +163,12 @@ class _Writer:
         self.out |= {names[name]: data for name, data in inner.files.items()}
         main = f"{CONFIG}/{names[first]}"
         if not copy:
-            self.context.dropped += [{**line, "what": f"{main}: {line['what']}"} for line in inner.dropped]
-            self.context.template += [{**line, "what": f"{main}: {line['what']}"} for line in inner.template]
+            self.context.dropped += [
+                dataclasses.replace(line, subject=f"{main}: {line.subject}") for line in inner.dropped
+            ]
+            self.context.template += [
+                dataclasses.replace(line, subject=f"{main}: {line.subject}") for line in inner.template
+            ]
         reported = {problem.problem for problem in self.context.warnings} if copy else ()
         for problem in inner.warnings:
             if problem.problem in reported:
@@ -310,7 +314,7 @@ class _Writer:
                 continue
             # What one world lacks of another one stands in that one's file here.
             others_ = {f"ask with world={other}" for other in worlds}
-            inner = dataclasses.replace(inner, dropped=tuple(d for d in inner.dropped if d["why"] not in others_))
+            inner = dataclasses.replace(inner, dropped=tuple(d for d in inner.dropped if d.why not in others_))
             self.reported.update(own_parts)
             self.reported.update(k for k in self.layers.parts if k.layer == "resources" and k.name == "gazebo")
             main, *companions = inner.files

@@ -156,7 +156,7 @@ def perturbation(given: Layers, options: Perturbation, source: RandomSource, not
         parts |= _Level(given, options, source, notes, level).changed_parts()
     if not parts:
         text = "; ".join(f"{w.where}: {w.problem}" for w in notes.warnings)
-        text += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped)
+        text += "".join(f"; {one.count} {one.subject}: {one.why}" for one in notes.dropped)
         raise CannotGenerate(
             f"nothing is disturbed by these parameters{': ' + text.removeprefix('; ') if text else ''}: ask for more, "
             "or upload or derive objects that stand in the way, or a grid"

@@ -100,9 +100,7 @@ def prepare_derivation(
         (*(input_line(e) for k, e in sorted(used.items())), frame_input(base.datum, base.levels)),
     )
     operations = tuple(Replace(key, part, provenance) for key, part in sorted(fresh.items()))
-    warnings = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
-    warnings += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
-    return store.versions.prepare(base, Changes(operations)), (*notes.warnings, *warnings)
+    return store.versions.prepare(base, Changes(operations)), notes.as_warnings()
 
 
 def _is_display_only(entry: PartEntry) -> bool:

@@ -61,9 +61,7 @@ def prepare_generation(
         ]
     datum = generated_layers.datum if generated_layers.datum != base.datum else KEEP
     levels = generated_layers.levels if generated_layers.levels != base.levels else KEEP
-    warnings = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
-    warnings += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
-    return store.versions.prepare(base, Changes(tuple(operations), datum, levels)), (*notes.warnings, *warnings)
+    return store.versions.prepare(base, Changes(tuple(operations), datum, levels)), notes.as_warnings()
 
 
 def _is_generated(entry: PartEntry) -> bool:

@@ -51,12 +51,12 @@ WITH_A_PLACE = ("osm", "kml", "kmz", "geojson", "tmap2", "nav2_route")
 @pytest.mark.parametrize("name", WITH_A_PLACE)
 def test_a_format_with_a_place_carries_the_credits_and_gives_them_back(name: str) -> None:
     converted = offline({"a.osm": OSM}, name, datum=HERE)
-    assert sorted(converted.report["attribution"]) == sorted(CREDIT)
+    assert sorted(converted.report.as_dict()["attribution"]) == sorted(CREDIT)
     assert all(text in attribution_of(name, converted.files) for text in CREDIT)
     # Read back they are known again: to the report, and to the next format.
     again = offline(converted.files, name, hints=UploadHints(name), datum=HERE)
     assert again.files == converted.files
-    assert all(text in "; ".join(again.report["attribution"]) for text in CREDIT)
+    assert all(text in "; ".join(again.report.as_dict()["attribution"]) for text in CREDIT)
     assert all(
         text in attribution_of("kml", offline(converted.files, "kml", hints=UploadHints(name), datum=HERE).files)
         for text in CREDIT
@@ -69,14 +69,14 @@ def test_nothing_is_made_up_where_nobody_claims_anything(name: str) -> None:
         f'license="{ODBL}"'.encode(), b""
     )
     converted = offline({"a.osm": bare}, name, datum=HERE)
-    assert converted.report["attribution"] == []
+    assert converted.report.as_dict()["attribution"] == []
     assert attribution_of(name, converted.files).strip("; ") == ""
 
 
 def test_a_licence_file_is_named_with_what_lies_beside_and_below_it() -> None:
     files = {"a/LICENSE": LICENSE, "a/maps/gate.kml": KML, "b/field.osm": OSM}
     converted = offline(files, "geojson", datum=HERE)
-    lines = {(line["layer"], line["name"]): line["attribution"] for line in converted.report["layers"]}
+    lines = {(line["layer"], line["name"]): line["attribution"] for line in converted.report.as_dict()["layers"]}
     assert lines["objects", "kml"] == ["MIT License, Copyright (c) 2024 A Farm (a/LICENSE)"]
     assert lines["topology", "network"] == CREDIT
 
@@ -97,7 +97,7 @@ def test_a_licence_file_is_named_with_what_lies_beside_and_below_it() -> None:
 )
 def test_what_a_licence_file_says_in_a_line(name: str, text: bytes, expected: str | None) -> None:
     converted = offline({name: text, "gate.kml": KML}, "kml", datum=HERE)
-    assert converted.report["attribution"] == ([expected] if expected else [])
+    assert converted.report.as_dict()["attribution"] == ([expected] if expected else [])
 
 
 def test_a_drawing_with_a_licence_shows_it_and_comes_back_as_it_was() -> None:

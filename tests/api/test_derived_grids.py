@@ -148,7 +148,7 @@ def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
     api.post("environments", {"name": "lane"})
     api.upload("lane", files)
     fetch_grid(api, "lane")
-    for report in (fetch_report(api, "lane"), direct.offline(files, "occupancy_grid").report):
+    for report in (fetch_report(api, "lane"), direct.offline(files, "occupancy_grid").report.as_dict()):
         line = next(line for line in report["layers"] if line["layer"] == "occupancy")
         assert [s["step"] for s in line["steps"]] == ["topology_to_occupancy"]
         (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].startswith("made another way")]

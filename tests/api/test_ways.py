@@ -60,12 +60,12 @@ def blank(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_next_way_is_taken_and_notes_are_told(blank: None) -> None:
     converted = offline({"a.geojson": SQUARE}, "occupancy_grid", options={"side": "7"})
     assert b"7 7" in converted.files["map.pgm"][:20]
-    line = next(line for line in converted.report["layers"] if line["layer"] == "occupancy")
+    line = next(line for line in converted.report.as_dict()["layers"] if line["layer"] == "occupancy")
     assert line["information"] == "derived"
     assert line["sources"] == ["a.geojson"]
     assert line["steps"] == [{"step": "blank_grid", "from": ["objects"], "to": "occupancy", "parameters": {"side": 7}}]
-    assert {"problem": "it is blank"} in converted.report["warnings"]
-    assert {"what": "objects", "count": 1, "why": "a blank grid shows none"} in converted.report["dropped"]
+    assert {"problem": "it is blank"} in converted.report.as_dict()["warnings"]
+    assert {"what": "objects", "count": 1, "why": "a blank grid shows none"} in converted.report.as_dict()["dropped"]
 
 
 def test_when_nothing_is_left_every_reason_is_told(blank: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,12 +79,14 @@ def test_a_parameter_makes_a_stored_layer_anew(blank: None) -> None:
     yaml = b"image: map.pgm\nresolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     files = {"map.yaml": yaml, "map.pgm": b"P5 2 1 255\n\0\xfe", "a.geojson": SQUARE}
     stored = offline(files, "occupancy_grid")
-    assert [entry["information"] for entry in stored.report["layers"] if entry["layer"] == "occupancy"] == ["raw"]
+    assert [entry["information"] for entry in stored.report.as_dict()["layers"] if entry["layer"] == "occupancy"] == [
+        "raw"
+    ]
     converted = offline(files, "occupancy_grid", options={"side": "3"})
     assert b"3 3" in converted.files["map.pgm"][:20]
-    assert [entry["information"] for entry in converted.report["layers"] if entry["layer"] == "occupancy"] == [
-        "derived"
-    ]
+    assert [
+        entry["information"] for entry in converted.report.as_dict()["layers"] if entry["layer"] == "occupancy"
+    ] == ["derived"]
     with pytest.raises(Invalid, match="side"):
         offline(files, "occupancy_grid", options={"side": "3"}, derived=False)
 

@@ -18,7 +18,7 @@ def test_a_made_up_map_converts(name: str) -> None:
     assert files == case.make(SMALL)
     converted = offline(files, case.to, datum=case.datum, options=case.options)
     assert converted.files
-    assert not [w for w in converted.report["warnings"] if "left out" in w["problem"]]
+    assert not [w for w in converted.report.as_dict()["warnings"] if "left out" in w["problem"]]
 
 
 @pytest.mark.parametrize("name", sorted(derived.CASES))

@@ -17,6 +17,7 @@ import pytest
 
 from app.convert import cache as caching
 from app.convert.cache import Cache, ConvertedMap, LostMap
+from app.convert.report import Report
 
 
 def key(text: str) -> str:
@@ -24,7 +25,7 @@ def key(text: str) -> str:
 
 
 def product(data: bytes = b"hello", archive: bytes | None = None) -> ConvertedMap:
-    return ConvertedMap({"map.kml": (data, "text/xml")}, ("kml.zip", archive) if archive else None, {"format": "kml"})
+    return ConvertedMap({"map.kml": (data, "text/xml")}, ("kml.zip", archive) if archive else None, Report("kml"))
 
 
 def test_a_made_map_comes_back_with_its_bytes_hash_and_report(tmp_path: Path) -> None:
@@ -35,7 +36,7 @@ def test_a_made_map_comes_back_with_its_bytes_hash_and_report(tmp_path: Path) ->
     assert (file.name, file.size, file.media_type) == ("map.kml", 5, "text/xml")
     assert file.path.read_bytes() == b"hello"
     assert file.sha256 == hashlib.sha256(b"hello").hexdigest()
-    assert cached_map.report == {"format": "kml"}
+    assert cached_map.report == Report("kml")
     again = Cache(tmp_path, 10**6).get(key("a"))
     assert again == cached_map
 

@@ -79,7 +79,7 @@ def test_map_of_real_network_loses_the_closed_edge_alone(shared: Path, name: str
     before, after = edges_in(name, complete.files), edges_in(name, closed.files)
     assert before - after == Counter([edges(layers)[level, edge]])
     assert not after - before
-    assert closed.report["closures"] == [
+    assert closed.report.as_dict()["closures"] == [
         {"id": "c", "level": level, "expires": "2030-01-01T00:00:00Z", "edge": edge, "effect": "left out 1 edge",
          "edges": [edge]}
     ]  # fmt: skip

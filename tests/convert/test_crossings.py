@@ -60,11 +60,14 @@ def test_straight_edges_through_a_wall_are_reported_and_bent_ones_go_around(yaw:
     for name in ("tmap2", "geojson"):
         fmt = formats.get_format(name)
         through = worker.from_layers(fmt, site(False, yaw, occupancy=hall(yaw)), {}, derived=False)
-        assert crossing(through.report) == [
+        assert crossing(through.report.as_dict()) == [
             "2 edges cross occupied cells of the occupancy grid 'map': a_b, b_a; a robot that follows the network "
             "meets an obstacle there"
         ]
-        assert crossing(worker.from_layers(fmt, site(True, yaw, occupancy=hall(yaw)), {}, derived=False).report) == []
+        assert (
+            crossing(worker.from_layers(fmt, site(True, yaw, occupancy=hall(yaw)), {}, derived=False).report.as_dict())
+            == []
+        )
 
 
 def test_buildings_count_where_there_is_no_grid() -> None:
@@ -76,9 +79,9 @@ def test_buildings_count_where_there_is_no_grid() -> None:
     ]
     objects = features(rows, "local")
     fmt = formats.get_format("tmap2")
-    (warning,) = crossing(worker.from_layers(fmt, site(False, objects=objects), {}, derived=False).report)
+    (warning,) = crossing(worker.from_layers(fmt, site(False, objects=objects), {}, derived=False).report.as_dict())
     assert warning.startswith("2 edges cross buildings or walls: a_b, b_a;") or warning.startswith("2 edges cross")
-    assert crossing(worker.from_layers(fmt, site(True, objects=objects), {}, derived=False).report) == []
+    assert crossing(worker.from_layers(fmt, site(True, objects=objects), {}, derived=False).report.as_dict()) == []
 
 
 def test_nav2_drives_straight_along_its_own_bent_edges() -> None:
@@ -89,9 +92,9 @@ def test_nav2_drives_straight_along_its_own_bent_edges() -> None:
         {**layers.parts, TOPOLOGY: features(zip(part.ids, part.geometry, owned, strict=True), "local")}
     )
     fmt = formats.get_format("nav2_route")
-    (warning,) = crossing(worker.from_layers(fmt, nav2_layers, {}, derived=False).report)
+    (warning,) = crossing(worker.from_layers(fmt, nav2_layers, {}, derived=False).report.as_dict())
     assert warning.startswith("2 edges cross occupied cells")
-    assert crossing(worker.from_layers(fmt, layers, {}, derived=False).report) == []
+    assert crossing(worker.from_layers(fmt, layers, {}, derived=False).report.as_dict()) == []
 
 
 def test_closures_by_id_and_area_close_all_pieces_of_a_bent_edge() -> None:
@@ -105,7 +108,7 @@ def test_closures_by_id_and_area_close_all_pieces_of_a_bent_edge() -> None:
         nodes = yaml.safe_load(written_map.files["network.tmap2.yaml"])["nodes"]
         left = {e["edge_id"].partition("~")[0] for n in nodes for e in n["node"]["edges"]}
         assert left == {"a_b", "b_a", "a_c"} - closed_ids
-        (line,) = written_map.report["closures"]
+        (line,) = written_map.report.as_dict()["closures"]
         assert set(line["edges"]) == closed_ids, "the report names the edges of the version"
 
 
@@ -147,10 +150,10 @@ def test_bends_inside_a_building_do_not_hide_that_an_edge_leads_through_it(name:
         "in, out and in": detour((5, 1), (5, 6), (4.5, 6), (4.5, 2), (2, 2), inside=True),
     }
     for called, layers in crossed.items():
-        (warning,) = crossing(worker.from_layers(fmt, layers, {}, derived=False).report)
+        (warning,) = crossing(worker.from_layers(fmt, layers, {}, derived=False).report.as_dict())
         assert warning.startswith("1 edge crosses buildings or walls: e;"), called
     clear = [detour(inside=True), detour((4.5, 1), inside=True), detour((3, 6), (8, 6))]
-    assert all(crossing(worker.from_layers(fmt, layers, {}, derived=False).report) == [] for layers in clear)
+    assert all(crossing(worker.from_layers(fmt, layers, {}, derived=False).report.as_dict()) == [] for layers in clear)
 
 
 def test_buildings_count_where_a_grid_knows_nothing() -> None:
@@ -160,13 +163,13 @@ def test_buildings_count_where_a_grid_knows_nothing() -> None:
     beyond = OccupancyGrid(np.full((20, 20), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     grey = replace(free, free_thresh=0.25, properties={UNKNOWN_GREY: pack_cells(np.ones((20, 40), bool))})
     for grid, count in ((free, 0), (unknown, 1), (beyond, 1), (grey, 1)):
-        warnings = crossing(worker.from_layers(fmt, detour((5, 1), occupancy=grid), {}, derived=False).report)
+        warnings = crossing(worker.from_layers(fmt, detour((5, 1), occupancy=grid), {}, derived=False).report.as_dict())
         assert len(warnings) == count
 
 
 def test_an_environment_package_warns_of_edges_through_obstacles() -> None:
     fmt = formats.get_format("environment")
-    warnings = crossing(worker.from_layers(fmt, detour((5, 1)), {}, derived=False).report)
+    warnings = crossing(worker.from_layers(fmt, detour((5, 1)), {}, derived=False).report.as_dict())
     assert len(warnings) == 1
     assert "1 edge crosses buildings or walls: e;" in warnings[0]
 
@@ -177,6 +180,6 @@ def test_files_of_a_network_and_a_grid_are_checked_without_a_server(name: str) -
     files: dict[str, bytes] = {}
     for source in ("nav2_route", "occupancy_grid"):
         files |= worker.from_layers(formats.get_format(source), layers, {}, derived=False).files
-    warnings = crossing(offline(files, name, datum=Datum(48.0, 9.0)).report)
+    warnings = crossing(offline(files, name, datum=Datum(48.0, 9.0)).report.as_dict())
     assert len(warnings) == 1
     assert "occupied cells of the occupancy grid" in warnings[0]

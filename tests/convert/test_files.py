@@ -29,7 +29,7 @@ def test_offline_conversion_keeps_mesh_walls_beside_a_primitive_solid() -> None:
     alone = cells(direct.offline(house(WALLS), "occupancy_grid").files)
     both = direct.offline(files, "occupancy_grid")
     assert (cells(both.files) == 0).sum() > (alone == 0).sum() > 500
-    assert not [w for w in both.report["warnings"] if "cannot be read" in w["problem"]]
+    assert not [w for w in both.report.as_dict()["warnings"] if "cannot be read" in w["problem"]]
 
 
 @pytest.mark.parametrize("wanted", ["occupancy_grid", "octomap", "satellite"])

@@ -54,23 +54,23 @@ def edges_in(name: str, files: Mapping[str, bytes]) -> set[tuple[str, str]]:
 def test_blocked_edge_is_left_out_and_reported(name: str) -> None:
     written = write_map(name, network(blocked=True))
     assert edges_in(name, written.files) == {("b", "a")}
-    assert [d["count"] for d in written.report["dropped"] if d["what"] == "blocked edges"] == [1]
+    assert [d["count"] for d in written.report.as_dict()["dropped"] if d["what"] == "blocked edges"] == [1]
     for free in (network(), network(blocked=False)):
         written = write_map(name, free)
         assert edges_in(name, written.files) == {("a", "b"), ("b", "a")}
-        assert not [d for d in written.report["dropped"] if d["what"] == "blocked edges"]
+        assert not [d for d in written.report.as_dict()["dropped"] if d["what"] == "blocked edges"]
 
 
 @pytest.mark.parametrize("name", PLANNED)
 def test_blocked_edge_stays_with_a_warning_when_marked(name: str) -> None:
     written = write_map(name, network(blocked=True), "mark")
     assert edges_in(name, written.files) == {("a", "b"), ("b", "a")}
-    (warning,) = [w["problem"] for w in written.report["warnings"] if "blocked" in w["problem"]]
+    (warning,) = [w["problem"] for w in written.report.as_dict()["warnings"] if "blocked" in w["problem"]]
     assert warning.startswith("1 blocked edge stays")
     assert name in warning
 
 
 def test_formats_that_nobody_plans_on_mark_blocked_edges() -> None:
     written = write_map("geojson", network(blocked=True))
-    assert not written.report["warnings"]
+    assert not written.report.as_dict()["warnings"]
     assert b'"blocked":true' in b"".join(written.files.values())

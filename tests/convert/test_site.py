@@ -15,13 +15,15 @@ from app.convert import site, worker
 from app.convert.cache import Cache, ConvertedMap, LostMap
 from app.convert.maps import join_members, select_file
 from app.convert.recipe import DerivationChain, Member, Recipe, Spread
-from app.errors import MissingLayer, NotFound
+from app.convert.report import Report, merge_reports
+from app.errors import MissingLayer, NotFound, Problem
 from app.model.features import features
 from app.model.frame import Level
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
+from app.model.notes import Dropped
 
-EMPTY = worker.empty_report(formats.get_format("satellite"))
+EMPTY = Report("satellite")
 
 
 def recipe(key: str, **more: Any) -> Recipe:
@@ -31,7 +33,7 @@ def recipe(key: str, **more: Any) -> Recipe:
 
 
 def product(name: str, **more: Any) -> ConvertedMap:
-    return ConvertedMap({name: (name.encode(), "image/tiff")}, None, {**EMPTY, **more})
+    return ConvertedMap({name: (name.encode(), "image/tiff")}, None, replace(EMPTY, **more))
 
 
 def test_files_of_one_name_are_reported(tmp_path: Path) -> None:
@@ -41,18 +43,17 @@ def test_files_of_one_name_are_reported(tmp_path: Path) -> None:
     out = join_members(recipe("all", members=members), cached_maps)
     assert list(out.files) == ["L2/a_b.tif"]
     assert out.places == {"L2/a_b.tif": ("L2", "a_b")}
-    (line,) = out.report["dropped"]
-    assert "'a/b'" in line["what"]
-    assert "'a_b'" in line["why"]
+    (line,) = out.report.dropped
+    assert "'a/b'" in line.subject
+    assert "'a_b'" in line.why
 
 
 def test_reports_are_joined_with_the_folders_of_their_files() -> None:
-    lost = {"what": "zones", "count": 1, "why": "no place"}
-    warned = {"problem": "turned", "file": "map.yaml"}
-    reports = [(folder, {**EMPTY, "dropped": [lost], "warnings": [warned]}) for folder in ("", "L2/")]
-    report = site.merge_reports(reports)
-    assert report["dropped"] == [lost]
-    assert [w["file"] for w in report["warnings"]] == ["map.yaml", "L2/map.yaml"]
+    lost, warning = Dropped("zones", 1, "no place"), Problem("turned", "map.yaml")
+    reports = [(folder, replace(EMPTY, dropped=(lost,), warnings=(warning,))) for folder in ("", "L2/")]
+    report = merge_reports(reports)
+    assert report.dropped == (lost,)
+    assert [one.file for one in report.warnings] == ["map.yaml", "L2/map.yaml"]
 
 
 def test_held_files_outlive_the_cache(tmp_path: Path) -> None:
@@ -134,7 +135,7 @@ def test_layers_in_memory_give_the_whole_site(asked: dict[str, str], derived: bo
         formats.get_format("occupancy_grid"), tower("keepout", "priority"), asked, derived=derived
     )
     assert {name.removesuffix(".pgm") for name in written_map.files if name.endswith(".pgm")} == expected
-    drawn = [line for line in written_map.report["layers"] if line["information"] == "derived"]
+    drawn = [line for line in written_map.report.as_dict()["layers"] if line["information"] == "derived"]
     assert [(line["level"], line["name"]) for line in drawn] == [("L2", "keepout")] * ("L2/keepout" in expected)
 
 

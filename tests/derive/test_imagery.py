@@ -158,7 +158,7 @@ def test_small_things_are_left_out() -> None:
     part = objects(layers(local(farm())), notes, minimum_area=15.0)
     assert not of(part, "tree")
     assert len(of(part, "building")) == 1
-    assert any(d["what"] == "spots" and d["count"] >= len(TREES) for d in notes.dropped)
+    assert any(d.subject == "spots" and d.count >= len(TREES) for d in notes.dropped)
 
 
 def on_earth() -> GeoImage:
@@ -186,7 +186,7 @@ def test_vegetation_by_index() -> None:
     part = objects(layers(local(farm())), notes, segmentation="index")
     assert set(Counter(f.properties["kind"] for f in part)) == {"tree", "field"}
     assert len(of(part, "tree")) == len(TREES)
-    assert notes.template[0]["what"] == "threshold"
+    assert notes.template[0].subject == "threshold"
     g = grid(layers(local(farm())), segmentation="index")
     assert (at(g, *TREES[0]), at(g, 41, 29), at(g, 50, 5)) == (OCCUPIED, FREE, FREE), "a roof does not grow"
 
@@ -203,7 +203,7 @@ def test_a_near_infrared_band_gives_the_ndvi() -> None:
     for content, options in ((layers(labelled), {}), (layers(unsaid), {"near_infrared": 4})):
         notes = DerivationNotes()
         part = objects(content, notes, segmentation="index", **options)
-        assert "NDVI" in notes.template[0]["why"]
+        assert "NDVI" in notes.template[0].why
         reach = shapely.total_bounds(part.geometry)
         assert reach[2] == pytest.approx(30.0, abs=0.5)
     notes = DerivationNotes()
@@ -226,7 +226,7 @@ def test_a_plan_has_walls_rooms_and_an_outside() -> None:
     assert (at(g, 1, 6), at(g, 13, 11), at(g, 1, 11.2)) == (UNKNOWN, UNKNOWN, UNKNOWN), "outside, and the title"
     rooms = 9.6 * 7.6 - 0.1 * 6.6
     assert (g.cells == FREE).sum() * 0.0025 == pytest.approx(rooms, rel=0.03)
-    assert any(d["what"] == "cells of ink" for d in notes.dropped)
+    assert any(d.subject == "cells of ink" for d in notes.dropped)
     part = objects(layers(local(plan(), 0.02)))
     walls, floors = shapely.union_all(of(part, "wall")), shapely.union_all(of(part, "floor"))
     assert walls.area == pytest.approx(10 * 8 - 9.6 * 7.6 - 0.2 + 0.66, rel=0.1)

@@ -262,7 +262,7 @@ def test_each_pixel_is_told_across_tiles(folder: Path) -> None:
     assert alike(things["building"][0][0], box((10, 20, 140, 40), 80)) > 0.98
     assert things["field"][0][0].area == pytest.approx((80 * 150 - 20 * 130 - 200) / 4, rel=0.02)
     assert things["building"][0][1]["confidence"] > 0.9
-    assert [d["what"] for d in notes.dropped] == ["m² of ground"]
+    assert [d.subject for d in notes.dropped] == ["m² of ground"]
     with pytest.raises(CannotConvert, match="finds nothing"):
         detect(content(np.full((80, 80, 3), 128, np.uint8)), model="pixels")  # a third each
 

@@ -48,7 +48,7 @@ def test_a_fence_on_earth() -> None:
 def test_large_fences_get_coarser_cells_and_absurd_ones_are_refused() -> None:
     notes = DerivationNotes()
     assert blank(shapely.box(0, 0, 2000, 2000), notes=notes).resolution == 0.5
-    assert notes.template[0]["value"] == 0.5
+    assert notes.template[0].value == 0.5
     with pytest.raises(CannotConvert, match="resolution of at least"):
         blank(shapely.box(0, 0, 2000, 2000), resolution=0.01)
     with pytest.raises(CannotConvert, match="smaller fence"):

@@ -151,7 +151,7 @@ def test_walls_doors_floors_and_holes_of_a_building() -> None:
     assert (at(g, 5, 0.02), at(g, 5, -0.02), at(g, 4.2, 3), at(g, 4.3, 3), at(g, 8.5, 4.5)) == (100, 100, 100, 0, 100)
     assert (at(g, 5, 3), at(g, 6, 3), at(g, 1.5, 5.98)) == (0, 0, 0)
     assert at(grid(layers(objects(*rows)), doors="closed"), 1.5, 5.98) == 100
-    assert {d["what"]: d["count"] for d in notes.dropped} == {
+    assert {d.subject: d.count for d in notes.dropped} == {
         "objects door": 1,
         "objects measurement": 1,
         "objects fiducial": 1,
@@ -300,7 +300,7 @@ def test_a_town_gets_coarser_cells_and_absurd_wishes_are_refused() -> None:
     notes = DerivationNotes()
     g = grid(town, notes)
     assert g.resolution == 1.0
-    assert notes.template[0]["what"] == "resolution"
+    assert notes.template[0].subject == "resolution"
     with pytest.raises(CannotConvert, match=r"the limit is 536870912 cells .* resolution of at least 0\.13"):
         grid(town, resolution=0.01)
     world = layers(objects(house, (shapely.box(9e6, 9e6, 9e6 + 1, 9e6 + 1), {"kind": "wall"})))
@@ -335,7 +335,7 @@ def test_ground_that_nothing_encloses_is_unknown() -> None:
     notes = DerivationNotes()
     g = grid(layers(objects(room)), notes, outside_free=False)
     assert (at(g, 0, 0), at(g, -3.5, 0), at(g, 2.75, 0)) == (0, 255, 100)
-    assert [(t["value"], t["option"]) for t in notes.template] == [("unknown", "outside_free")]
+    assert [(t.value, t.option) for t in notes.template] == [("unknown", "outside_free")]
     assert not notes.warnings
     alone = grid(layers(objects((None, {"kind": "model", "shapes": [BOX]}))), notes, outside_free=False)
     assert not alone.counts()["free"]
@@ -377,7 +377,7 @@ def test_ground_around_a_solid_that_cannot_be_read_is_unknown(lost: dict[str, An
     (warning,) = notes.warnings
     assert "2 objects have a solid that cannot be read (shed, barn): " in warning.problem
     assert str(lost.get("file") or lost.get("uri")) in warning.problem
-    assert ("surroundings", 5.0) in [(t["what"], t["value"]) for t in notes.template]
+    assert ("surroundings", 5.0) in [(t.subject, t.value) for t in notes.template]
     assert at(grid(layers(objects(*rows), fence=fence, files=files), surroundings=1.0), 13, 2) == 0
 
 
@@ -431,7 +431,7 @@ def test_bodies_without_files_are_told_apart_from_marks() -> None:
     ]
     notes = DerivationNotes()
     grid(layers(objects(*rows)), notes)
-    assert {d["what"]: d["why"] for d in notes.dropped} == {
+    assert {d.subject: d.why for d in notes.dropped} == {
         "objects light": "nothing in a robot's way",
         "objects model": "nothing in a robot's way",
         "objects include": "they say neither shapes nor a size: upload the files of their models with them",
@@ -479,7 +479,7 @@ def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None
     assert files.problem.startswith("2 objects have an unknown extent (chair, table): they say neither shapes nor")
     assert poses.problem.startswith("3 objects have an unknown extent (o2, o3, o5): pose")
     assert points.problem.startswith("1 object has an unknown extent (o6): they are points")
-    assert ("unknown_radius", 0.7) in [(t["what"], t["value"]) for t in notes.template]
+    assert ("unknown_radius", 0.7) in [(t.subject, t.value) for t in notes.template]
 
 
 def test_objects_of_unknown_extent_leave_the_other_ground_free() -> None:

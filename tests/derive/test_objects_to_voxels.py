@@ -15,6 +15,7 @@ from app.derive.objects_to_voxels import Parameters, objects_to_voxels
 from app.errors import CannotConvert, MissingLayer
 from app.model.frame import Level
 from app.model.layers import MAP, Layers, PartKey
+from app.model.notes import Filled
 from app.model.voxels import VoxelMap
 from tests.derive.test_objects_to_occupancy import BOX, layers, objects
 
@@ -68,8 +69,8 @@ def test_footprints_are_extruded_from_their_base_to_their_top() -> None:
     assert v.voxel_counts()["occupied"] == 10 * 10 * 10 + 22 * 30  # the wall is half its thickness longer on each end
     assert v.bounds() == (0.0, 0.0, 0.0, 7.1, 1.0, 3.0)
     (line,) = notes.template
-    assert (line["what"], line["value"], line["option"]) == ("height", 3.0, "extrude")
-    assert line["why"] == "1 footprints do not say how high they are"
+    assert (line.subject, line.value, line.option) == ("height", 3.0, "extrude")
+    assert line.why == "1 footprints do not say how high they are"
 
 
 def test_all_levels_stand_in_one_map() -> None:
@@ -105,7 +106,7 @@ def test_limits_come_before_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     assert time.process_time() - start < 20
     notes = DerivationNotes()
     assert voxels(model(big), notes).resolution == 10.0
-    assert notes.template == [{"what": "resolution", "value": 10.0, "why": "0.1 m would be too many voxels"}]
+    assert notes.template == [Filled("resolution", 10.0, "0.1 m would be too many voxels")]
     from app.derive import objects_to_voxels as module
 
     monkeypatch.setattr(module, "MAX_VOXELS", 5999)

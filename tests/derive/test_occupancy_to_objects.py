@@ -204,19 +204,19 @@ def test_specks_are_left_out_and_said() -> None:
     notes = DerivationNotes()
     f = find_objects(grid(cells), notes)
     assert f.ids == find_objects(scene()).ids
-    assert [(d["what"], d["count"]) for d in notes.dropped] == [("specks", 3)]
+    assert [(d.subject, d.count) for d in notes.dropped] == [("specks", 3)]
     assert len(find_objects(grid(cells), minimum_size=0.0)) == len(f) + 3
     notes = DerivationNotes()
     few = find_objects(grid(cells), notes, minimum_size=1.0)
     # Of the discs none is a metre across, of the others all are.
     assert kinds(few) == {"furniture": len(BOXES), "wall": len(WALLS)}
-    assert notes.dropped[0]["count"] == 3 + len(DISCS)
+    assert notes.dropped[0].count == 3 + len(DISCS)
 
 
 def test_what_is_made_up_is_said() -> None:
     notes = DerivationNotes()
     find_objects(scene(), notes, context="orchard")
-    assert {(t["what"], t["value"]) for t in notes.template} == {
+    assert {(t.subject, t.value) for t in notes.template} == {
         ("height of tree", 3.0),
         ("height of crate", 1.0),
         ("height of wall", 2.0),
@@ -225,7 +225,7 @@ def test_what_is_made_up_is_said() -> None:
     assert "orchard" in notes.warnings[0].problem
     notes = DerivationNotes()
     f = find_objects(scene(), notes, height=1.75)
-    assert [(t["what"], t["value"]) for t in notes.template] == [("height", 1.75)]
+    assert [(t.subject, t.value) for t in notes.template] == [("height", 1.75)]
     assert {p["height"] for p in f.properties} == {1.75}
 
 

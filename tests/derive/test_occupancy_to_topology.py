@@ -214,14 +214,14 @@ def test_what_is_left_out_is_said() -> None:
     notes = DerivationNotes()
     layers = Layers({PartKey("occupancy"): grid(rooms(2))})
     occupancy_to_topology(layers, Parameters(island=6.0), notes)
-    assert [(d["what"], d["count"]) for d in notes.dropped] == [("places", 1)]
+    assert [(d.subject, d.count) for d in notes.dropped] == [("places", 1)]
     assert not notes.warnings
     notes = DerivationNotes()
     occupancy_to_topology(layers, Parameters(island=0.0), notes)
     assert [w.problem[:26] for w in notes.warnings] == ["the network is in 2 pieces"]
     assert not notes.dropped
     occupancy_to_topology(layers, Parameters(island=6.0, method="roadmap"), notes)
-    assert {d["what"] for d in notes.dropped} == {"places", "samples"}
+    assert {d.subject for d in notes.dropped} == {"places", "samples"}
 
 
 def test_the_open_is_covered_without_detours() -> None:

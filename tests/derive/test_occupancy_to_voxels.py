@@ -117,7 +117,7 @@ def test_real_maps_there_and_back(shared: Path, name: str) -> None:
     assert np.array_equal(back.cells, crop)
     bt = offline(files, "octomap", options={"height": "1"})
     assert bt.files["map.bt"].startswith(b"# Octomap OcTree binary file")
-    assert any(t["what"] == "height" for t in offline(files, "octomap").report["template"])
+    assert any(t["what"] == "height" for t in offline(files, "octomap").report.as_dict()["template"])
 
 
 def test_grey_cells_follow_the_thresholds() -> None:

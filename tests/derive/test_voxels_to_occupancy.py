@@ -235,4 +235,4 @@ def test_a_cloud_as_a_grid(shared: Path) -> None:
     data = (shared / "data/pointcloud/pcl_data/room_scan1.pcd").read_bytes()
     converted = offline({"room.pcd": data}, "occupancy_grid", options={"band": "-0.5,0.5"})
     assert set(converted.files) == {"room.yaml", "room.pgm"} or set(converted.files) == {"map.yaml", "map.pgm"}
-    assert any("no free space" in w["problem"] for w in converted.report["warnings"])
+    assert any("no free space" in w["problem"] for w in converted.report.as_dict()["warnings"])

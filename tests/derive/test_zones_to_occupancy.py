@@ -113,7 +113,7 @@ def test_speed_in_metres_per_second_lowest_wins_and_is_never_raised() -> None:
     assert speed_at(mask, 1.0, 1.0) == pytest.approx(0.32), "rounded down"
     assert speed_at(mask, 3.5, 0.5) == pytest.approx(0.02)
     assert speed_at(mask, -0.5, -0.5) is None
-    assert {d["what"]: d["count"] for d in notes.dropped} == {"speed zones without a limit": 1, "exact speed limits": 2}
+    assert {d.subject: d.count for d in notes.dropped} == {"speed zones without a limit": 1, "exact speed limits": 2}
     assert "limit 0" in notes.warnings[0].problem
 
 
@@ -149,7 +149,7 @@ def test_preferred_lanes_are_free_and_what_lies_beside_them_costs() -> None:
     mask = grid(out, KEEPOUT)
     assert mask.cells[2].tolist() == [70, 70, 0, 0, 100, 100, 0, 0, 0, 0, 70, 70]
     assert mask.cells[0].tolist() == [70] * 12
-    assert [t["value"] for t in notes.template] == [70]
+    assert [t.value for t in notes.template] == [70]
 
 
 def test_what_is_left_out_is_told() -> None:
@@ -162,7 +162,7 @@ def test_what_is_left_out_is_told() -> None:
         parts={MAP: the_map()},
     )
     _, notes = derive_masks(layers)
-    assert {d["what"]: d["count"] for d in notes.dropped} == {
+    assert {d.subject: d.count for d in notes.dropped} == {
         "zones of other kinds": 1,
         "zones without an area": 1,
         "zones outside of the map": 1,

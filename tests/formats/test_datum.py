@@ -114,8 +114,8 @@ def test_the_sample_in_full() -> None:
     assert template | before["navsat_transform_node"] == template
     assert {**after, "navsat_transform_node": 0} == {**before, "navsat_transform_node": 0}
     lacking = {key for key in template if key not in before["navsat_transform_node"]}
-    assert {t["option"] for t in write_context.template} == lacking
-    assert {t["what"].partition(": ")[0] for t in write_context.template} == {"navsat_transform_node"}
+    assert {t.option for t in write_context.template} == lacking
+    assert {t.subject.partition(": ")[0] for t in write_context.template} == {"navsat_transform_node"}
     assert "frequency" in template
 
 
@@ -155,7 +155,7 @@ def test_what_no_source_says_is_filled_in_from_the_extent() -> None:
     assert top["mapviz_initialize_origin"]["local_xy_origins"][0]["latitude"] == 10.0
     assert top["navsat_transform_node"]["wait_for_datum"] is True
     assert top["navsat_transform_node"]["datum"] == [10.0, 20.0, 0.0]
-    whats = {t["what"].partition(": ")[0] for t in context.template}
+    whats = {t.subject.partition(": ")[0] for t in context.template}
     assert whats == {"gmapping", "mapviz_initialize_origin", "navsat_transform_node"}
 
 
@@ -167,7 +167,7 @@ def test_what_no_source_says_can_be_said() -> None:
     assert top["gmapping"] == {"xmin": -50, "xmax": 50, "ymin": -50, "ymax": 50}
     assert top["navsat_transform_node"]["wait_for_datum"] is False
     assert top["navsat_transform_node"]["yaw_offset"] == 1.57
-    assert {t.get("option") for t in context.template} >= {"wait_for_datum", "yaw_offset", "half_size"}
+    assert {t.option for t in context.template} >= {"wait_for_datum", "yaw_offset", "half_size"}
     data = (SAMPLES / "datum.yaml").read_bytes()
     other = {"use_odometry_yaw": True, "wait_for_datum": False}
     other_context = WriteContext(options=formats.write_options(FORMAT, other))
@@ -200,7 +200,7 @@ def test_the_fence_is_chosen_and_the_rest_declared() -> None:
     ]
     served, context = write(Layers({SITE: features(rows, "wgs84")}, Datum(1.0, 1.0)))
     assert yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"] == [[0, 0], [3, 0], [3, 3], [0, 3]]
-    assert {d["what"]: d["count"] for d in context.dropped} == {
+    assert {d.subject: d.count for d in context.dropped} == {
         "location items that are no polygons": 1,
         "further location polygons": 1,
         "holes of the fence": 1,

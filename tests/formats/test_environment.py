@@ -71,7 +71,7 @@ def read_upload(files: dict[str, bytes], name: str | None = None) -> Bundle:
 
 def written(layers: Layers, **options: Any) -> tuple[dict[str, bytes], dict[str, Any]]:
     written_map = making.from_layers(FORMAT, layers, options, derived=True)
-    return unzipped(written_map.files[MAIN]), written_map.report
+    return unzipped(written_map.files[MAIN]), written_map.report.as_dict()
 
 
 def grid(level: int = 0) -> OccupancyGrid:
@@ -215,7 +215,7 @@ def test_variables_come_back_as_they_are_and_never_run(tmp_path: Path) -> None:
     assert values["FIELD_NAME"] == ""
     assert values["ENVIRONMENT_COMMON_LATEST_RELEASE"] == "v1.0.1"
     assert values["DATUM_FILE"] == f"{tmp_path}/config/location/datum.yaml", "not the path on somebody's machine"
-    assert "variables that name files" in {d["what"] for d in converted.report["dropped"]}
+    assert "variables that name files" in {d["what"] for d in converted.report.as_dict()["dropped"]}
     assert check_paths(values, tmp_path) == {
         "PROPERTIES_FILE",
         "DATUM_FILE",
@@ -235,7 +235,7 @@ def test_variables_come_back_as_they_are_and_never_run(tmp_path: Path) -> None:
 
 
 def test_the_report_tells_of_every_map_in_it() -> None:
-    report = offline({"yard.zip": SAMPLE}, "environment").report
+    report = offline({"yard.zip": SAMPLE}, "environment").report.as_dict()
     lines = {(line["layer"], line["name"]): line for line in report["layers"]}
     assert lines["topology", "network"]["sources"] == ["config/topological/network.tmap2.yaml"]
     assert {line["information"] for line in report["layers"]} == {"raw"}

@@ -104,7 +104,7 @@ def test_a_network_from_elsewhere() -> None:
     assert [e.get("oneway") for e in back["network_lines"]] == [None, True]
     assert back["network_lines"][0]["speed_limit"] == 2.0
     assert any("one way" in w.problem for w in context.warnings)
-    assert {d["what"] for d in context.dropped} == {
+    assert {d.subject for d in context.dropped} == {
         "attributes of the way back",
         "names of nodes that are not their ids",
     }

@@ -231,12 +231,12 @@ def test_an_orchard_from_a_list() -> None:
     assert len(world.findall("model[@name='tree']//collision")) == 1
     assert len(world.findall("model[@name='tree']//visual")) == 2
     assert world.findtext("model[@name='grass']//script/name") == "Gazebo/DarkGrey"
-    assert {t["what"]: t["option"] for t in answer.report["template"]} == {
+    assert {t["what"]: t["option"] for t in answer.report.as_dict()["template"]} == {
         "ground plane": "ground",
         "colour of ground": "ground_colour",
         "sun": "sun",
     }
-    assert [(d["what"], d["count"]) for d in answer.report["dropped"]] == [
+    assert [(d["what"], d["count"]) for d in answer.report.as_dict()["dropped"]] == [
         ("objects of kind model", 1),
         ("solids of objects of kind model", 1),
     ]
@@ -414,8 +414,8 @@ def test_several_worlds_lie_side_by_side() -> None:
     assert tree(answer.files).get("name") == "one"
     assert tree(answer.files).findtext("gravity") == "0 0 -1"
     assert [m.find("link").get("name") for m in tree(answer.files).iterchildren("model")] == ["l"]
-    assert any("longer" in w["problem"] for w in answer.report["warnings"])
-    assert answer.report["dropped"] == [
+    assert any("longer" in w["problem"] for w in answer.report.as_dict()["warnings"])
+    assert answer.report.as_dict()["dropped"] == [
         {"what": "objects of the world w/longer", "count": 1, "why": "ask with world=w/longer"}
     ]
     for name in ("longer", "w/longer"):
@@ -620,13 +620,13 @@ def test_objects_of_other_formats_become_static_models() -> None:
     assert by["door"].properties["shapes"][0]["visual"] is True
     assert by["field"].properties["shapes"][0]["visual"] is True
     assert extent("bin") == (6.75, 6.7, 3, 7.25, 7.3, 4)
-    colours = {t["what"]: (t["value"], t["option"]) for t in context.template if t["what"].startswith("colour")}
+    colours = {t.subject: (t.value, t.option) for t in context.template if t.subject.startswith("colour")}
     assert colours["colour of building"] == ([0.75, 0.68, 0.6], "building_colour")
     assert set(colours) == {f"colour of {kind}" for kind in ("building", "wall", "floor", "door", "region", "ground")}
-    filled = {(t["what"], t["value"]) for t in context.template if not isinstance(t["value"], list)}
+    filled = {(t.subject, t.value) for t in context.template if not isinstance(t.value, list)}
     assert {("height of building", 5.0), ("height of wall", 2.0), ("height of tree", 3.0)} <= filled
     assert ("sun", "directional light") in filled
-    assert {d["what"] for d in context.dropped} == {"objects of kind poi", "objects of kind building"}
+    assert {d.subject for d in context.dropped} == {"objects of kind poi", "objects of kind building"}
     assert write(parts, None, (Level(), Level("L2", 3.0)), wall_height=2.0, building_height=5.0) == files
 
 
@@ -665,7 +665,7 @@ def test_what_no_source_tells_can_be_said() -> None:
     ground = next(m for m in tree(files).iter("model") if m.get("name") == "ground_plane")
     assert ground.findtext(".//diffuse") == "0.1 0.2 0.1 1"
     assert tree(files).find(".//light") is None
-    options = {t["option"]: t["value"] for t in context.template if "option" in t}
+    options = {t.option: t.value for t in context.template if t.option}
     assert {name: options[name] for name in measures} == measures
     assert "sun" not in options
     bare = tree(write(parts, ground=False, sun=False))
@@ -708,7 +708,7 @@ def test_a_stored_world_stands_alone_unless_all_is_asked_for() -> None:
     parts[PartKey("occupancy")] = OccupancyGrid(np.full((2, 2), 100, np.uint8), 0.5)
     files, context = report(parts)
     assert [m.get("name") for m in tree(files).iter("model")] == ["m"]
-    assert {d["what"]: d["count"] for d in context.dropped} == {
+    assert {d.subject: d.count for d in context.dropped} == {
         "objects of other formats": 1,
         "walls of the grid map": 1,
     }
@@ -735,7 +735,7 @@ def test_walls_of_a_grid() -> None:
     assert walls.geometry.area == pytest.approx(11 * 0.25, abs=1e-6)
     # The grid's x axis looks north: its 6 × 4 cells of half a metre lie west of (10, 20).
     assert walls.geometry.bounds == pytest.approx((8.0, 20.0, 10.0, 23.0), abs=1e-6)
-    assert [t["value"] for t in context.template if t["what"] == "height of walls"] == [3.0]
+    assert [t.value for t in context.template if t.subject == "height of walls"] == [3.0]
     less = write({PartKey("occupancy", name="map"): grid}, threshold=80)
     assert len(less["models/walls_map/meshes/walls_map.stl"]) < len(files["models/walls_map/meshes/walls_map.stl"])
     free = OccupancyGrid(np.zeros((3, 3), np.uint8), 0.5)

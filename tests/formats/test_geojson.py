@@ -316,7 +316,7 @@ def test_what_geojson_cannot_hold_is_declared() -> None:
     context = WriteContext(attribution=("© somebody",))
     layers = Layers({**everything("wgs84").parts, PartKey("occupancy"): grid})
     served = orjson.loads(write(layers, context))
-    assert [(d["what"], d["count"]) for d in context.dropped] == [("occupancy", 1)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("occupancy", 1)]
     assert served["attribution"] == "© somebody"
 
 

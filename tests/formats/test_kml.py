@@ -553,7 +553,7 @@ def test_a_grid_tells_where_it_lies():
     layers = Layers({PartKey("occupancy", GROUND, MAP): grid}, DATUM)
     context = WriteContext()
     root = etree.fromstring(write(get_format("kml"), layers, context)["map.kml"])
-    assert context.dropped[0]["what"] == "occupancy"
+    assert context.dropped[0].subject == "occupancy"
     overlay = root.find(".//{*}GroundOverlay")
     assert overlay.findtext(".//{*}href") == "map.png"
     turned = float(overlay.findtext("{*}LatLonBox/{*}rotation"))

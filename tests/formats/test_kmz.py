@@ -25,6 +25,7 @@ from app.model.frame import GROUND, Datum, Level
 from app.model.grid import OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import MAP, Layers, PartKey, Resources
+from app.model.notes import Dropped
 from app.syntax import archives
 
 SAMPLES = Path(__file__).parents[1] / "samples" / "kmz"
@@ -107,9 +108,7 @@ def test_the_drawing_of_an_archive_can_be_had_as_kml(same):
     out = write(get_format("kml"), layers, context)
     original = archives.unpack((SAMPLES / "yard.kmz").read_bytes(), Limits())["site/yard.kml"]
     assert same("kml", {"a.kml": original}, out) == []
-    assert context.dropped == [
-        {"what": "resources", "count": 2, "why": "images and further files of a drawing travel in KMZ only"}
-    ]
+    assert context.dropped == [Dropped("resources", 2, "images and further files of a drawing travel in KMZ only")]
 
 
 def grids() -> Layers:
@@ -253,7 +252,7 @@ def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
     layers = Layers({key: a_picture(**EARTH)}, DATUM)
     bare = WriteContext()
     assert list(write(fmt, layers, bare)) == ["map.kml"]
-    assert [(d["what"], d["count"]) for d in bare.dropped] == [("imagery", 1)]
+    assert [(d.subject, d.count) for d in bare.dropped] == [("imagery", 1)]
     files = write(fmt, layers, WriteContext(options=write_options(fmt, {"pictures": "true"})))
     assert list(files) == ["map.kml", "aerial.png"]
     (item,), rest = group({f"a/{name}": data for name, data in files.items()})
@@ -280,16 +279,16 @@ def test_pictures_without_a_place_are_dropped_and_told(picture: GeoImage, datum:
     data = write(get_format("kmz"), Layers({PartKey("imagery", name="p"): picture}, datum), context)["map.kmz"]
     assert list(archives.unpack(data, Limits())) == ["doc.kml"]
     (line,) = context.dropped
-    assert (line["what"], line["count"]) == ("imagery ground/p", 1)
-    assert line["why"].startswith("it cannot be placed: ")
-    assert reason in line["why"]
+    assert (line.subject, line.count) == ("imagery ground/p", 1)
+    assert line.why.startswith("it cannot be placed: ")
+    assert reason in line.why
 
 
 def test_values_that_an_overlay_cannot_show_are_told() -> None:
     context = WriteContext()
     heights = GeoImage(np.arange(24, dtype=np.float32).reshape(4, 6, 1), **EARTH, properties={"nodata": 3})
     data = write(get_format("kmz"), Layers({PartKey("imagery", name="dem"): heights}), context)["map.kmz"]
-    assert [d["what"] for d in context.dropped] == ["imagery ground/dem: pixel values"]
+    assert [d.subject for d in context.dropped] == ["imagery ground/dem: pixel values"]
     image = load(data).parts[PartKey("imagery", name="dem")]
     assert isinstance(image, GeoImage)
     assert (image.pixels.shape, image.transform) == ((4, 6, 2), EARTH["transform"])

@@ -30,6 +30,7 @@ from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
+from app.model.notes import Dropped, Filled
 from app.upload_reader import EnvironmentContext, UploadHints
 from app.upload_reader import read as read_bundle
 
@@ -292,7 +293,7 @@ def test_metres_of_another_frame_are_not_ours() -> None:
     assert tags == {}, "metres that are no longer true are left out"
     assert elements(files[MAIN])["node", 1]["tags"] == {"local_x": "7", "local_y": "5"}
     assert context.dropped == [
-        {"what": "local_x and local_y of moved points", "count": 1, "why": "a Lanelet2 map has no place for them"}
+        Dropped("local_x and local_y of moved points", 1, "a Lanelet2 map has no place for them")
     ]
 
 
@@ -406,7 +407,7 @@ def test_a_lanelet_without_edges_goes_and_its_bounds_stay() -> None:
     assert ("relation", 102) not in osm_elements
     assert {("way", 23), ("way", 24)} <= osm_elements.keys()
     why = "a Lanelet2 map has no place for them"
-    assert context.dropped == [{"what": "lanelets whose edges are no longer in the network", "count": 1, "why": why}]
+    assert context.dropped == [Dropped("lanelets whose edges are no longer in the network", 1, why)]
 
 
 def test_a_redrawn_bound_stays_with_its_lanelet() -> None:
@@ -516,7 +517,7 @@ def test_a_straight_road_is_worked_out_by_hand() -> None:
             lat, lon = e["place"]
             np.testing.assert_allclose(frame.to_local(np.array([[lon, lat]]))[0], at[i], atol=1e-6)
     assert not context.warnings
-    assert {f["what"] for f in context.template} == {"type of bounds", "location of lanelets", "subtype of lanelets"}
+    assert {f.subject for f in context.template} == {"type of bounds", "location of lanelets", "subtype of lanelets"}
 
 
 @pytest.mark.parametrize("arms", [3, 4, 5, 6])
@@ -603,7 +604,7 @@ def test_options_are_heeded() -> None:
     assert (tags["subtype"], tags["location"], "width" in tags) == ("walkway", "nonurban", False)
     assert {at[r][1] for r in sides["left"]} == {1.5}
     assert files[PROJECTOR].startswith(b"projector_type: Local")
-    assert {"what": "width of lanes", "value": 3.0, "why": "1 edges say none", "option": "width"} in context.template
+    assert Filled("width of lanes", 3.0, "1 edges say none", "width") in context.template
     assert [e["tags"]["type"] for (kind, _), e in elements(files[MAIN]).items() if kind == "way"].count(
         "curbstone"
     ) == 2
@@ -632,7 +633,7 @@ def test_sharp_bends_and_narrow_places_stay_sound() -> None:
     valid(files[MAIN])
     assert lanelets(files[MAIN]).keys() == {"e"}
     assert any("narrower" in w.problem for w in context.warnings)
-    assert {"edges without length", "edges from a node to itself"} <= {d["what"] for d in context.dropped}
+    assert {"edges without length", "edges from a node to itself"} <= {d.subject for d in context.dropped}
 
 
 def test_without_a_datum_it_says_what_to_supply() -> None:

@@ -160,7 +160,7 @@ def test_another_cloud_as_las() -> None:
     shelf = (SAMPLES / "pcd" / "shelf.pcd").read_bytes()
     converted = offline({"shelf.pcd": shelf}, "las")
     las = points(converted.files["map.las"])
-    assert ("points", 1) in [(d["what"], d["count"]) for d in converted.report["dropped"]], "the NaN"
+    assert ("points", 1) in [(d["what"], d["count"]) for d in converted.report.as_dict()["dropped"]], "the NaN"
     assert str(las.header.version) == "1.4"
     assert las.point_format.id == 7
     assert list(las.header.scales) == [0.001] * 3

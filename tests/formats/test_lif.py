@@ -216,7 +216,7 @@ def test_what_an_edit_changes_is_served() -> None:
     assert [e["maxSpeed"] for e in hall["edges"][0]["vehicleTypeEdgeProperties"]] == [0.75, 0.75]
     assert hall["nodes"][-1]["nodeId"] == "new"
     assert hall["nodes"][-1]["vehicleTypeNodeProperties"] == [{"vehicleTypeId": "any"}]
-    assert [(t["what"], t["option"]) for t in context.template] == [("nodes: type of vehicle", "vehicle_type")]
+    assert [(t.subject, t.option) for t in context.template] == [("nodes: type of vehicle", "vehicle_type")]
 
 
 def test_what_no_source_says_can_be_said() -> None:
@@ -239,7 +239,7 @@ def test_what_no_source_says_can_be_said() -> None:
     assert layout["edges"][0]["vehicleTypeEdgeProperties"] == [
         {"vehicleTypeId": "fork", "vehicleOrientation": 1.5, "orientationType": "GLOBAL", "rotationAllowed": True}
     ]
-    assert {t["option"]: t["value"] for t in context.template if "option" in t} == options
+    assert {t.option: t.value for t in context.template if t.option} == options
 
 
 def test_drafts_speak_their_own_words(shared: Path) -> None:
@@ -295,7 +295,7 @@ def test_a_network_of_another_format() -> None:
     assert entry["vehicleTypeId"] == "robot"
     assert entry["maxSpeed"] == 2.5
     assert entry["trajectory"]["controlPoints"][1] == {"x": 0.5, "y": 1.0}
-    assert [(d["what"], d["count"]) for d in context.dropped] == [("attributes of edges", 1)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("attributes of edges", 1)]
     assert "got a number" in warnings(context)
     back, _ = read(served)
     assert item(back, "e0")["speed_limit"] == 2.5

@@ -298,7 +298,7 @@ def test_a_network_of_another_format() -> None:
     assert all(
         m == {"action": "row_traversal", "abs_speed_limit": 2.0} for (k, _), m in server.metadata.items() if k == "edge"
     )
-    assert {t["what"] for t in write_context.template} == {"id", "name", "crs", "frame"}
+    assert {t.subject for t in write_context.template} == {"id", "name", "crs", "frame"}
     options = formats.write_options(FORMAT, {"graph_name": "rows", "frame_id": "farm_map"})
     context = WriteContext(options=options)
     document = json.loads(formats.write(FORMAT, Layers({NETWORK: part}), context)["graph.geojson"])
@@ -306,8 +306,8 @@ def test_a_network_of_another_format() -> None:
     assert {f["properties"].get("frame") for f in document["features"] if f["geometry"]["type"] == "Point"} == {
         "farm_map"
     }
-    assert {t["option"] for t in context.template if "option" in t} == {"graph_name", "frame_id"}
-    assert [(d["what"], d["count"]) for d in write_context.dropped] == [
+    assert {t.option for t in context.template if t.option} == {"graph_name", "frame_id"}
+    assert [(d.subject, d.count) for d in write_context.dropped] == [
         ("items with attributes that Nav2 has no word for", 4)
     ]
     back, _ = read(served)
@@ -353,7 +353,7 @@ def test_places_on_earth_need_a_datum_and_levels_are_joined() -> None:
     up = PartKey("topology", "up", "network")
     served, context = write(Layers({NETWORK: part, up: part}, Datum(53.0, -0.5), (Level(), Level("up", 3.0))))
     assert len(RouteServer(served).nodes) == 4
-    assert "levels of nodes" in {d["what"] for d in context.dropped}
+    assert "levels of nodes" in {d.subject for d in context.dropped}
 
 
 def test_far_coordinates_are_warned_about() -> None:
@@ -480,7 +480,7 @@ def test_edges_to_nowhere_are_kept_but_not_served() -> None:
     assert part.document["nav2_route"]["dangling"] == [{"id": 12, "from": 98, "to": 99, "properties": {}}]
     served, context = write(part)
     assert set(RouteServer(served).edges) == {3}
-    assert [(d["what"], d["count"]) for d in context.dropped] == [("edges to nowhere", 2)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("edges to nowhere", 2)]
 
 
 def test_words_of_other_types_stay_where_they_are() -> None:

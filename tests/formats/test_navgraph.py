@@ -233,7 +233,7 @@ def test_what_an_edit_changes_is_served() -> None:
     assert "      - name: Bay\n" in served
     assert "  - !dir [A, Dock]\n" in served
     assert "  - !dir ['010', 'C 1']\n" in served or "  - !dir ['010', C 1]\n" in served
-    assert [d["what"] for d in context.dropped] == ["intersection tags"]
+    assert [d.subject for d in context.dropped] == ["intersection tags"]
 
 
 # --- from other formats ----------------------------------------------------------------------------------------------
@@ -270,14 +270,14 @@ def test_a_network_of_another_format_is_one_that_fawkes_takes() -> None:
     }
     assert graph.properties["W"] == {"name": "West gate", "floor": "2"}
     assert served.count("!allow-intersection") == 2
-    assert {d["what"]: d["count"] for d in context.dropped} == {
+    assert {d.subject: d.count for d in context.dropped} == {
         "altitudes of nodes": 1,
         "ids of edges": 9,
         "edges with attributes (action, speed limit …)": 7,
         "attributes of nodes that are no scalars": 1,
     }
-    assert {t["what"] for t in context.template} == {"graph-name", "nodes: !unconnected", "nodes at bends"}
-    assert next(t["option"] for t in context.template if t["what"] == "graph-name") == "graph_name"
+    assert {t.subject for t in context.template} == {"graph-name", "nodes: !unconnected", "nodes at bends"}
+    assert next(t.option for t in context.template if t.subject == "graph-name") == "graph_name"
     assert context.warnings == []
     assert write(read(served)[0])[0] == served
 
@@ -329,7 +329,7 @@ def test_levels_are_joined_with_distinct_names() -> None:
     layers = Layers({NETWORK: one_way("AB", "BA"), up: one_way("AB", "BA")}, None, (Level(), Level("up", 3.0)))
     served, context = write(layers)
     assert "name: A#2" in served or "name: 'A#2'" in served
-    assert {d["what"] for d in context.dropped} >= {"levels of nodes"}
+    assert {d.subject for d in context.dropped} >= {"levels of nodes"}
     assert "got a number" in warnings(context)
 
 
@@ -451,7 +451,7 @@ def test_connections_to_nowhere_are_kept_but_not_served() -> None:
     assert part.document["navgraph"]["dangling"] == [{"ends": ["X", "Y"]}]
     served, context = write(part)
     assert len(Fawkes(served).edges) == 1
-    assert [(d["what"], d["count"]) for d in context.dropped] == [("connections to nowhere", 3)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("connections to nowhere", 3)]
 
 
 def test_a_repeated_name_is_served_as_it_was() -> None:

@@ -184,7 +184,7 @@ def test_samples_have_their_facts(name: str, facts: Any, same: Same) -> None:
     assert same("occupancy_grid", files, served) == []
     again, _ = read(served)
     assert (again.origin, again.negate) == (grid.origin, grid.negate)
-    filled = [t["what"] for t in context.template]
+    filled = [t.subject for t in context.template]
     assert filled == (["filter info: type, base, multiplier"] if name == "speed/speed.yaml" else [])
     if not filled:
         assert again.properties == grid.properties
@@ -461,7 +461,7 @@ def test_a_value_that_trinary_cannot_say_goes_out_raw(facts: Any) -> None:
     assert "raw" in context.warnings[0].problem
     forced, context = write(grid, mode="trinary")
     assert seen(read(forced)[0]) == [[0, 100], [255, 255]]
-    assert context.dropped[0]["count"] == 1
+    assert context.dropped[0].count == 1
     scaled, _ = write(grid, mode="scale")
     assert list(scaled) == ["map.yaml", "map.png"]
     assert (independent(scaled, facts) == grid.cells).all()
@@ -796,7 +796,7 @@ def test_a_mask_that_does_not_say_what_it_means_gets_nav2s_usual_values() -> Non
     }  # fmt: skip
     server = yaml.safe_load(served["keepout_filter_info.yaml"])["filter_mask_server"]["ros__parameters"]
     assert server == {"frame_id": "map", "topic_name": "/keepout_filter_mask", "yaml_filename": "keepout.yaml"}
-    assert [t["value"] for t in context.template] == [{"type": 0, "base": 0.0, "multiplier": 1.0}]
+    assert [t.value for t in context.template] == [{"type": 0, "base": 0.0, "multiplier": 1.0}]
     served, context = write(Layers({PartKey("occupancy", name="speed_zone"): grid_of([[0, 50], [255, 0]])}))
     parameters = info_of(served, "speed_zone_filter_info.yaml")
     assert (parameters["type"], parameters["base"], parameters["multiplier"]) == (1, 100.0, -1.0)

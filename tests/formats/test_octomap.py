@@ -343,7 +343,7 @@ def test_pruning_averages_colours_and_says_so() -> None:
     assert merged.colour.tolist() == [[15, 20, 30]]
     context = WriteContext(options=WriteOptions(prune=True))
     octomap.write(Layers({PartKey("voxels"): voxels}), context)
-    assert [(d["what"], d["count"]) for d in context.dropped] == [("colours", 8)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("colours", 8)]
     first = VoxelMap(0.1, eight.depth, eight.code, eight.log_odds, shades[::-1].copy(), False)
     assert prune(first).colour.tolist() == [[255] * 3]  # type: ignore[union-attr]
 
@@ -367,7 +367,7 @@ def test_level_of_detail_is_declared_and_pruned() -> None:
     context = WriteContext(options=WriteOptions(kind="bt", depth=15))
     data = octomap.write(Layers({PartKey("voxels"): voxels}), context)["map.bt"]
     assert rows(read(data)[0]) == [(14, 0, pytest.approx(OCCUPIED))]
-    assert ("voxels", 56) in [(d["what"], d["count"]) for d in context.dropped]
+    assert ("voxels", 56) in [(d.subject, d.count) for d in context.dropped]
 
 
 def test_a_cut_keeps_exactly_the_voxels_that_meet_the_box() -> None:
@@ -418,7 +418,7 @@ def test_a_kind_that_cannot_say_everything_declares_it() -> None:
     context = WriteContext(options=WriteOptions(kind="bt"))
     (name,) = octomap.write(Layers({PartKey("voxels"): voxels}), context)
     assert name == "map.bt"
-    assert [(d["what"], d["count"]) for d in context.dropped] == [("log-odds", len(voxels)), ("colours", 36)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("log-odds", len(voxels)), ("colours", 36)]
     quiet = WriteContext(options=WriteOptions())
     (name,) = octomap.write(Layers({PartKey("voxels"): voxels}), quiet)
     assert name == "map.ot"

@@ -264,7 +264,7 @@ def test_a_changed_measurement_makes_it_metres_and_says_so() -> None:
     assert building["levels"]["Upstairs"]["vertices"][0][:2] == pytest.approx([9.8, -4.41])
     assert "drawing" not in building["levels"]["Ground floor"]
     assert "no longer place level" in problems(context)
-    assert any("pixels" in line["what"] for line in context.dropped)
+    assert any("pixels" in line.subject for line in context.dropped)
 
 
 def test_a_network_of_another_format_is_written_in_metres() -> None:
@@ -292,8 +292,8 @@ def test_a_network_of_another_format_is_written_in_metres() -> None:
         "orientation": [1, ""],
         "speed_limit": [3, 0],
     }
-    assert {line["what"] for line in context.dropped} >= {"edges' widths", "nodes' attributes of other formats"}
-    filled = {line["what"]: line["value"] for line in context.template}
+    assert {line.subject for line in context.dropped} >= {"edges' widths", "nodes' attributes of other formats"}
+    filled = {line.subject: line.value for line in context.template}
     assert filled == {"name": "map", "lanes: graph_idx": 0, "lanes: speed_limit": 0.0, "lanes: orientation": ""}
     options = {"chargers": "n1", "robot_name": "tractor", "graph": 2, "speed_limit": 0.8, "building": "Barn"}
     building, _, context = write(Layers({key: features(rows, "wgs84")}, datum), **options)
@@ -308,7 +308,7 @@ def test_a_network_of_another_format_is_written_in_metres() -> None:
     }
     assert [lane[2]["speed_limit"] for lane in level["lanes"]] == [[3, 1.5], [3, 0.8]]
     assert {lane[2]["graph_idx"][1] for lane in level["lanes"]} == {2}
-    assert {line["option"] for line in context.template if "option" in line} == {*options, "robot_type"}
+    assert {line.option for line in context.template if line.option} == {*options, "robot_type"}
 
 
 def test_a_network_on_a_level_of_its_own_stands_beside_a_building_in_pixels() -> None:

@@ -459,7 +459,7 @@ def test_another_network_replaces_the_streets_and_keeps_the_rest(tmp_path: Path)
     at = local_frame(datum).to_wgs84(np.array([[30.0, 0.0]]))[0]
     assert np.allclose([float(node[0]["lon"]), float(node[0]["lat"])], at, atol=1e-11)
     assert node[2]["ele"] == "2.5"
-    assert any("no longer in the network" in d["what"] for d in context.dropped)
+    assert any("no longer in the network" in d.subject for d in context.dropped)
     graph = network(read(served))
     assert sorted(d for _, d in graph.degree() if d) == [1, 1, 2], "the bend is a node, one way only"
     with pytest.raises(MissingDatum):
@@ -521,7 +521,7 @@ def test_items_of_other_formats_get_tags() -> None:
     assert {"name": "z", "kind": "keepout", "zone": "keepout", "area": "yes"} in tags
     assert {"name": "up", "kind": "path", "level": "L2"} in tags
     assert not any(t.get("name") == "drawn" for t in tags), "the network made from it stands there already"
-    lost = {d["what"] for d in context.dropped}
+    lost = {d.subject for d in context.dropped}
     assert {"GNSS fence", "datum", "items without a geometry"} <= lost
     assert any("nested" in item for item in lost)
 

@@ -85,10 +85,10 @@ def test_faces_are_kept_with_the_file_and_declared_where_they_are_lost() -> None
     assert voxels.leaf_counts() == {"occupied": 5, "free": 0}
     assert any("5 × face" in w.problem for w in context.warnings)
     assert again(PYRAMID) == PYRAMID
-    dropped_items = offline({"a.ply": PYRAMID}, "ply", options={"data": "ascii"}).report["dropped"]
+    dropped_items = offline({"a.ply": PYRAMID}, "ply", options={"data": "ascii"}).report.as_dict()["dropped"]
     assert [(d["what"], d["count"]) for d in dropped_items] == [("face", 5)]
     for to in ("pcd", "las"):
-        dropped = offline({"a.ply": PYRAMID}, to).report["dropped"]
+        dropped = offline({"a.ply": PYRAMID}, to).report.as_dict()["dropped"]
         assert ("face", 5) in [(d["what"], d["count"]) for d in dropped]
 
 
@@ -177,4 +177,6 @@ def test_centres_of_voxels_as_a_cloud() -> None:
         spans = [range(int(a[row]), int(b[row])) for a, b in map(voxels.axis, range(3))]
         want |= {(x, y, z) for x in spans[0] for y in spans[1] for z in spans[2]}
     assert set(map(tuple, np.floor(mesh.vertices / voxels.resolution).astype(int).tolist())) == want
-    assert any(d["what"] == "free voxels" for d in converted.report["dropped"]) == bool(voxels.leaf_counts()["free"])
+    assert any(d["what"] == "free voxels" for d in converted.report.as_dict()["dropped"]) == bool(
+        voxels.leaf_counts()["free"]
+    )

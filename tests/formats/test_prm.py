@@ -157,18 +157,18 @@ def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
     ]
     assert roadmap["edges"] == [{"from": 1, "to": 0, "weight": round(math.hypot(20, 20), 9), "oneway": True}]
     assert any("one way" in w.problem for w in context.warnings)
-    assert {d["what"]: d["count"] for d in context.dropped} == {
+    assert {d.subject: d.count for d in context.dropped} == {
         "places of nodes within their pixels": 2,
         "attributes of nodes": 1,
     }
-    assert [t["what"] for t in context.template] == ["edges: weight"]
+    assert [t.subject for t in context.template] == ["edges: weight"]
     alone, context = write(Layers({NETWORK: network}))
     assert alone["picture"] == {"resolution": 0.05, "origin": [0.0, 1.0, 0.0], "height": 80}
-    assert "picture: resolution, origin, height" in [t["what"] for t in context.template]
+    assert "picture: resolution, origin, height" in [t.subject for t in context.template]
     coarse = WriteContext(options=formats.write_options(FORMAT, {"pixel_size": 0.5}))
     coarse_roadmap = yaml.safe_load(formats.write(FORMAT, Layers({NETWORK: network}), coarse)["prm.yaml"])
     assert coarse_roadmap["picture"] == {"resolution": 0.5, "origin": [0.0, 1.0, 0.0], "height": 8}
-    assert [t["option"] for t in coarse.template if "option" in t] == ["pixel_size"]
+    assert [t.option for t in coarse.template if t.option] == ["pixel_size"]
     again, _ = read({"prm.yaml": yaml.safe_dump(alone).encode()})
     assert np.allclose(nodes(again)["0"], [3.0, 4.0], atol=0.05)
 

@@ -204,9 +204,9 @@ def test_a_network_of_another_format_is_graph_0_with_its_ids_as_names() -> None:
         [1, 0, {"speed_limit": 0.5}],
         [1, 2, {"speed_limit": 0.5, "is_bidirectional": False}],
     ]
-    dropped = {line["what"]: line["count"] for line in context.dropped}
+    dropped = {line.subject: line.count for line in context.dropped}
     assert dropped == {"edges' actions": 3, "nodes without lanes": 1, "nodes' attributes of other formats": 1}
-    assert [(line["what"], line["option"]) for line in context.template] == [
+    assert [(line.subject, line.option) for line in context.template] == [
         ("building_name", "building"),
         ("lanes: graph", "graph"),
     ]
@@ -228,7 +228,7 @@ def test_robots_and_lanes_that_no_source_tells_of() -> None:
     assert vertices["b10"] == {"name": "b10", **charger, "spawn_robot_name": "mower_2"}
     assert vertices["a"] == {"name": "a"}
     assert {lane[2]["speed_limit"] for lane in level["lanes"]} == {0.7}
-    filled = {line["option"]: line["value"] for line in context.template}
+    filled = {line.option: line.value for line in context.template}
     assert filled["robot_name"] == ["mower_1", "mower_2"]
     assert (filled["robot_type"], filled["graph"], filled["speed_limit"]) == ("Mower", 3, 0.7)
     assert [w.problem for w in context.warnings if "nowhere" in w.problem]
@@ -240,7 +240,7 @@ def test_robots_and_lanes_that_no_source_tells_of() -> None:
     assert "spawn_robot_type" not in at[0][2], "a robot that a source names is its own matter"
     plain, context = write(stored)
     assert plain["0.yaml"]["levels"]["L"]["vertices"][1][2] == {"name": "b", "is_charger": True}
-    assert not [line for line in context.template if "robot" in line["what"]]
+    assert not [line for line in context.template if "robot" in line.subject]
 
 
 CHARGERS = """building_name: x

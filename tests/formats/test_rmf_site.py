@@ -309,7 +309,7 @@ def test_a_site_of_another_place_keeps_the_datum_of_the_environment() -> None:
     assert "is not the environment's datum" in problems(context)
     site, _, told_back = write(Layers(layers.parts, Datum(1.0, 2.0, 5.0, 10.0), layers.levels))
     assert site["properties"]["geographic_offset"] == {"anchor": [1.0, 2.0], "zoom": 17, "visible": True}
-    assert {d["what"] for d in told_back.dropped} == {"the datum's heading", "the datum's altitude"}
+    assert {d.subject for d in told_back.dropped} == {"the datum's heading", "the datum's altitude"}
 
 
 def summary(building: dict[str, Any]) -> dict[str, Any]:
@@ -404,8 +404,8 @@ def test_any_network_is_written_with_chargers_and_robots_as_asked() -> None:
     assert tags == {"a": ["Charger", "ParkingSpot", "HoldingPoint"], "b": [], "c": []}
     (robot,) = site["model_instances"].values()
     assert (robot["name"], str(robot["description"]) in site["robots"]) == ("tug_1", True)
-    assert {t["what"] for t in context.template} >= {"lanes: graphs", "lanes: speed_limit"}
-    assert ("heights of nodes above their level", 1) in {(d["what"], d["count"]) for d in context.dropped}
+    assert {t.subject for t in context.template} >= {"lanes: graphs", "lanes: speed_limit"}
+    assert ("heights of nodes above their level", 1) in {(d.subject, d.count) for d in context.dropped}
     again, _ = read({"map.site.json": json.dumps(site).encode()})
     assert np.allclose(
         shapely.get_coordinates(network(again, "ground").select_kinds("node").geometry), [[0, 0], [3, 0], [3, 4]]

@@ -49,7 +49,7 @@ def test_what_is_served_would_be_loaded_where_the_sample_would(name: str, files:
         inside, _ = formats.group(unpack(files, Limits()))
         groups += inside
     bad = any(p.level == ERROR for g in groups for p in formats.check(g.format, g.files))
-    refused = [w for w in served.report["warnings"] if w.get("level") == ERROR]
+    refused = [w for w in served.report.as_dict()["warnings"] if w.get("level") == ERROR]
     assert bad or not refused
 
 
@@ -210,7 +210,7 @@ def test_a_wide_grid_is_told_in_its_report() -> None:
     cells = np.zeros((1, 32768), np.uint8)
     layers = Layers({PartKey("occupancy", "ground", "map"): OccupancyGrid(cells, 0.05, (0.0, 0.0, 0.5))})
     chain = DerivationChain((), tuple(layers.parts))
-    report = worker.write(formats.get_format("occupancy_grid"), layers, {}, chain).report
+    report = worker.write(formats.get_format("occupancy_grid"), layers, {}, chain).report.as_dict()
     warnings = {(w["level"], w["file"], w.get("where")) for w in report["warnings"]}
     assert warnings == {(ERROR, "map.pgm", None), (WARNING, "map.yaml", "origin")}
     assert any("normalize=true" in w["problem"] for w in report["warnings"]), "the writer's own words stay"

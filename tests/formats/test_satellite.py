@@ -580,10 +580,10 @@ def test_png_of_floats_declares_what_is_lost() -> None:
     shown = np.asarray(Image.open(io.BytesIO(files["satellite.png"])))
     assert shown.tolist() == [[[0, 255], [255, 255]], [[128, 255], [0, 0]]]
     (drop,) = context.dropped
-    assert (drop["what"], drop["count"]) == ("pixel values", 4)
-    assert "file_type=tif" in drop["why"]
+    assert (drop.subject, drop.count) == ("pixel values", 4)
+    assert "file_type=tif" in drop.why
     _, context = written(utm((3, 4, 6)), file_type="png")
-    assert [(d["what"], d["count"]) for d in context.dropped] == [("bands", 5)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("bands", 5)]
 
 
 def test_another_crs_on_request(tmp_path: Path) -> None:

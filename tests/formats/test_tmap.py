@@ -164,7 +164,7 @@ def test_a_tmap2_as_a_list_keeps_what_items_say_and_declares_what_the_top_said()
     layers = formats.read(FileGroup(get_format("tmap2"), "n.tmap2.yaml", {"n.tmap2.yaml": data}), ReadContext())
     served, context = write(layers)
     assert len(load_v1(served)) == len(yaml.safe_load(data)["nodes"])
-    assert any("transformation" in d["why"] for d in context.dropped)
+    assert any("transformation" in d.why for d in context.dropped)
     assert all(e["node"].keys() >= NODE_KEYS for e in yaml.safe_load(served))
     twice = offline({"map.tmap": served}, "tmap2").files["network.tmap2.yaml"]
     once, now = ({e["node"]["name"]: e["node"] for e in yaml.safe_load(d)["nodes"]} for d in (data, twice))
@@ -188,7 +188,7 @@ def test_a_network_from_elsewhere_is_completed_and_said_so() -> None:
     assert (forward["top_vel"], back["top_vel"]) == (1.25, 0.4)
     assert (forward["action"], forward["map_2d"]) == ("go", "map")
     assert load_v1(served)[0][:3] == ("a", "yard", [1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    filled = {t["what"] for t in context.template}
+    filled = {t.subject for t in context.template}
     assert {"edges: action", "edges: top_vel", "nodes: verts", "nodes: pose.orientation"} <= filled
     assert "transformation" not in filled
     again, _ = read(served)

@@ -238,7 +238,7 @@ def test_the_older_list_is_served_completed() -> None:
     edge = node["edges"][0]
     assert edge["top_vel"] == 0.55
     assert edge["goal"] == {"target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}}
-    assert any("edges" in t["what"] for t in context.template)
+    assert any("edges" in t.subject for t in context.template)
 
 
 # --- names -----------------------------------------------------------------------------------------------------------
@@ -345,7 +345,7 @@ def test_what_nodes_get_can_be_chosen(name: str) -> None:
         properties = node if name == "tmap" else node["properties"]
         turned = node["name"] == "n2"
         assert (properties["xy_goal_tolerance"], properties["yaw_goal_tolerance"]) == (0.2, 0.5 if turned else 6.29)
-    filled = {line["what"]: line["value"] for line in context.template}
+    filled = {line.subject: line.value for line in context.template}
     assert filled["nodes: verts"] == "an octagon of 1.5 m"
     assert (filled["nodes: xy_goal_tolerance"], filled["nodes: yaw_goal_tolerance"]) == (0.2, 0.5)
     assert filled["nodes without an orientation: yaw_goal_tolerance"] == 6.29
@@ -381,9 +381,9 @@ def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> No
     assert edge["properties"] == {"speed_limit": 1.5, "width": 3, "name": "Lane"}
     assert edge["restrictions_planning"] == "True"
     assert n10["edges"][0]["action"] == "row_traversal"
-    assert {d["what"]: d["count"] for d in context.dropped} == {"osm tags and attributes": 2}
+    assert {d.subject: d.count for d in context.dropped} == {"osm tags and attributes": 2}
     assert {"nodes at bends", "metric_map", "name", "pointset", "transformation"} <= {
-        t["what"] for t in context.template
+        t.subject for t in context.template
     }
 
     back = network(read(served)[0])
@@ -435,7 +435,7 @@ def test_levels_are_joined_at_their_elevation_and_said_so() -> None:
         (by_place[(0.0, 0.0, 0.0)], by_place[(0.0, 5.0, 0.0)]),
         (by_place[(10.0, 0.0, 4.0)], by_place[(10.0, 5.0, 3.5)]),
     }
-    assert [(d["what"], d["count"]) for d in context.dropped] == [("levels of nodes and edges", 3)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("levels of nodes and edges", 3)]
     assert "several networks" in warnings(context)
     only, context = write(Layers({upper: level(10.0)}, None, levels))
     assert yaml.safe_load(only)["nodes"][0]["node"]["pose"]["position"]["z"] == 3.5

@@ -66,7 +66,7 @@ def test_edges_and_altitudes_are_reported_as_dropped() -> None:
     ]
     text, context = write(Layers({NETWORK: features(rows, "local")}))
     assert text == "name,x,y,yaw\na,0.0,0.0,\nb,9.0,0.0,\n"
-    assert {(d["what"], d["count"]) for d in context.dropped} == {("edges", 1), ("altitudes of nodes", 1)}
+    assert {(d.subject, d.count) for d in context.dropped} == {("edges", 1), ("altitudes of nodes", 1)}
 
 
 @pytest.mark.parametrize(

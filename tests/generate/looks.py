@@ -124,9 +124,9 @@ def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
             continue
         written_map = write_layers(layers, name, {}, CAME)
         assert written_map.files, name
-        errors = [w for w in written_map.report["warnings"] if w.get("level") == "error"]
+        errors = [w for w in written_map.report.as_dict()["warnings"] if w.get("level") == "error"]
         assert not errors, (name, errors)
-        out[name] = written_map.report["dropped"]
+        out[name] = written_map.report.as_dict()["dropped"]
         if "topology" in fmt.layers and not fmt.traits.is_container:
             clear_of_obstacles(layers, fmt, written_map.files)
     return out

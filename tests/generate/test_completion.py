@@ -158,9 +158,9 @@ def test_a_wall_goes_on_and_nothing_beyond_the_walls_becomes_free() -> None:
     assert (result[hole] == FREE).mean() > 0.5
     beyond = room() == UNKNOWN
     assert (result[beyond] == UNKNOWN).all()
-    (left,) = [d for d in notes.dropped if d["what"] == "unknown cells"]
-    assert left["count"] > 0
-    assert "confidence of 0.98" in left["why"]
+    (left,) = [d for d in notes.dropped if d.subject == "unknown cells"]
+    assert left.count > 0
+    assert "confidence of 0.98" in left.why
 
 
 def test_more_confidence_fills_less() -> None:

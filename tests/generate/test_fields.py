@@ -69,7 +69,7 @@ def network(layers: Layers) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
 def test_a_site_agrees_with_itself_and_every_format_serves_from_it(name: str, tmp_path: Path) -> None:
     layers, notes = looks.make(name, **SMALL[name])
     assert not notes.dropped
-    assert [t["what"] for t in notes.template] == ["datum"]
+    assert [t.subject for t in notes.template] == ["datum"]
     looks.agrees_with_itself(layers, 0.3)
     looks.sound_sdf(layers, tmp_path)
     looks.serves(layers)
@@ -268,7 +268,7 @@ def test_large_fields_take_cells_that_still_show_the_ways() -> None:
     )
     (grid,) = layers.grids().values()
     assert grid.resolution == 0.1
-    assert [t["what"] for t in notes.template] == ["resolution"]
+    assert [t.subject for t in notes.template] == ["resolution"]
 
 
 def test_over_http_and_edits(api: Api) -> None:

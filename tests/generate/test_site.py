@@ -95,8 +95,8 @@ def test_free_space_is_one_piece_and_the_rest_is_told() -> None:
     assert at(grid, 3, 3) == UNKNOWN
     assert at(grid, 1, 3) == FREE
     (entry,) = notes.dropped
-    assert entry["what"] == "free cells"
-    assert entry["count"] == pytest.approx(1.8 * 1.8 / 0.05**2, rel=0.05)
+    assert entry.subject == "free cells"
+    assert entry.count == pytest.approx(1.8 * 1.8 / 0.05**2, rel=0.05)
     cells, closed = _reach.keep_largest_space(np.zeros((3, 3), np.uint8))
     assert (closed, cells.tolist()) == (0, [[0] * 3] * 3)
 
@@ -173,13 +173,13 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
     assert layers.datum == HERE
     assert layers.parts[key] is fence, "passed on as it was given"
     assert at(grid_of(layers), 29, 11) == FREE
-    assert [d["what"] for d in notes.dropped] == ["polygons of the fence"]
+    assert [d.subject for d in notes.dropped] == ["polygons of the fence"]
     assert notes.template == []
     with pytest.raises(Invalid, match="has a datum already"):
         yard(given=given, datum=(52.0, 5.0))
     notes = DerivationNotes()
     assert yard(notes).finish().datum == _site.DATUM
-    assert [t["what"] for t in notes.template] == ["datum"]
+    assert [t.subject for t in notes.template] == ["datum"]
     assert yard(datum=(52.0, 5.0)).finish().datum == Datum(52.0, 5.0)
     default_fence = yard().finish().parts[key]
     assert isinstance(default_fence, Features)
@@ -198,7 +198,7 @@ def test_sizes_are_told_before_work_starts() -> None:
     site.set_fence(shapely.box(0, 0, 300, 200))
     site.box("shed", "building", (10, 10), (4, 4, 3))
     assert grid_of(site.finish()).resolution == 0.2
-    assert [t["what"] for t in notes.template] == ["resolution"]
+    assert [t.subject for t in notes.template] == ["resolution"]
     site = Site(Layers(), SiteOptions(height=2.9), DerivationNotes())
     site.set_fence(shapely.box(0, 0, 20, 10))
     site.box("kerb", "wall", (10, 7), (4, 2, 1))

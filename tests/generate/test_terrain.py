@@ -265,7 +265,7 @@ def test_bare_ground_has_posts_at_its_corners() -> None:
     looks.agrees_with_itself(without_costs(site), 0.3)
     (objects,) = site.vector("objects").values()
     assert [p["kind"] for p in objects.properties].count("post") == 4
-    assert any(t["what"] == "posts" for t in notes.template)
+    assert any(t.subject == "posts" for t in notes.template)
 
 
 def test_inside_a_fence() -> None:

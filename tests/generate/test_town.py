@@ -151,7 +151,7 @@ def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
     walks = [p for p in edges if p.get("surface") == "paving_stones"]
     assert all((p["target"], p["source"]) in pairs for p in walks), "sidewalks are not"
     assert sum(p["action"] == "cross" for p in edges) >= 8
-    assert not any(d["what"] == "sidewalks" for d in notes.dropped)
+    assert not any(d.subject == "sidewalks" for d in notes.dropped)
     objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
     roads = objects.select_kinds("road")
     buildings = objects.select_kinds("building")
