@@ -279,7 +279,7 @@ def test_what_workers_are_forked_from_is_started_beside() -> None:
     script = (
         "import sys\n"
         "from app import pool\n"
-        "pool.start_beside(('app.sandbox', 'app.links'))\n"
+        "pool.preload_in_background(('app.sandbox', 'app.links'))\n"
         "one = pool.Pool(1, warm=())\n"
         "try:\n"
         "    print(one.run(eval, \"'app.links' in __import__('sys').modules\"))\n"
