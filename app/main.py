@@ -351,7 +351,7 @@ def start_relay(settings: Settings, services: Services) -> Relay | None:
     options = _bus_options(settings)
     zenoh_bus = Bus(
         options,
-        ask=partial(events.answer_zenoh_query, services, options.max_reply_bytes),
+        query_handler=partial(events.answer_zenoh_query, services, options.max_reply_bytes),
         explain=problems.problem_body,
         on_status=services.fleet.enqueue_status,
         on_alive=services.fleet.set_presence,

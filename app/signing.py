@@ -56,7 +56,7 @@ class Keys:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._lock = threading.Lock()
-        self._known: tuple[float, list[PublicKey], Ed25519PrivateKey] | None = None
+        self._loaded: tuple[float, list[PublicKey], Ed25519PrivateKey] | None = None
 
     def public(self) -> list[PublicKey]:
         """The newest first."""
@@ -73,20 +73,20 @@ class Keys:
         with self._exclusive():
             keys, private = self._read()
             key = self._create(keys, private)
-        self._known = None
+        self._loaded = None
         return key
 
     def _load(self) -> tuple[list[PublicKey], Ed25519PrivateKey]:
         with self._lock:
             changed = self._modified_at()
-            if self._known is None or self._known[0] != changed:
+            if self._loaded is None or self._loaded[0] != changed:
                 if changed == 0.0:
                     with self._exclusive():
                         if self._modified_at() == 0.0:
                             self._create([], None)
                 keys, private = self._read()
-                self._known = (self._modified_at(), keys, private)
-            return self._known[1], self._known[2]
+                self._loaded = (self._modified_at(), keys, private)
+            return self._loaded[1], self._loaded[2]
 
     def _modified_at(self) -> float:
         try:

@@ -190,7 +190,7 @@ def test_every_zenoh_key_is_documented(pages: Mapping[str, str]) -> None:
             return lambda *arguments, **__: self.keys.append(str(arguments[0])) if arguments else self
 
     session: Any = Recorder()
-    own = bus.Bus(bus.BusOptions(), ask=Any, explain=Any, on_status=Any, on_alive=Any)  # type: ignore[arg-type]
+    own = bus.Bus(bus.BusOptions(), query_handler=Any, explain=Any, on_status=Any, on_alive=Any)  # type: ignore[arg-type]
     own._declare(session)
     own.close()
     keys = [*session.keys, messages.events_key("fleetmap", "*"), messages.status_key("fleetmap", "*", "*")]

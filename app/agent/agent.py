@@ -51,10 +51,10 @@ CLOSURES_SECONDS = 0.1
 class Agent:
     """One environment's map in one folder. clock: seconds since 1970; it may be a minute off."""
 
-    def __init__(self, options: AgentOptions, tell: LogEvent, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, options: AgentOptions, log: LogEvent, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
             options = dataclasses.replace(options, key=signed_manifest.check_key(options.key))
-        self.options, self._log_event, self._clock = options, tell, clock
+        self.options, self._log_event, self._clock = options, log, clock
         self._robot = robot_name(options.robot)
         self._login = options.zenoh_login
         if self._login.password is not None and self._login.user is None:
@@ -68,7 +68,7 @@ class Agent:
         self._store = StateStore(self._folder.state, options.environment, self._folder.free_space)
         self._retries = Retries(options.poll_seconds, lambda: FIRST_PAUSE_SECONDS)
         self._activation = Activation(
-            self._folder, self._store, options, self._robot, log=tell, stopping=self._stopping, retries=self._retries
+            self._folder, self._store, options, self._robot, log=log, stopping=self._stopping, retries=self._retries
         )
         self._signed_clock = SignedClock(clock)
         self._freshness = Freshness(options.poll_seconds, self._time_text)
@@ -82,7 +82,7 @@ class Agent:
             self._store,
             clock=self._signed_clock,
             freshness=self._freshness,
-            log=tell,
+            log=log,
         )
         self._status = StatusReporter(
             options.environment,

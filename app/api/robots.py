@@ -252,7 +252,7 @@ def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[st
                 channels[robot.environment] = {c.name: c for c in services.store.channels.all(robot.environment)}
             channel = channels[robot.environment].get(name)
             behind = channel is not None and (
-                robot.held is None or not robot.held.shows(channel.root, channel.closures.digest)
+                robot.active_map is None or not robot.active_map.shows(channel.root, channel.closures.digest)
             )
             if behind and (robot.environment, name) not in moves:
                 moves[robot.environment, name] = services.store.channels.moves(robot.environment, name)
@@ -261,7 +261,7 @@ def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[st
         lag = None
         if channel is not None and channel.root is not None:
             lag = fleet.robot_lag(robot, channel, moves.get((robot.environment, name), [])).as_dict()
-        active_map = robot.held
+        active_map = robot.active_map
         body = {"robot": robot.robot, "environment": robot.environment, **_report(robot.report, robot.time)}
         body |= {
             "received": rfc3339(robot.time),

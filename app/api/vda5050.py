@@ -288,8 +288,8 @@ def _collect_reports(
     if (
         len(reports) > 1
         and stored_robot is not None
-        and stored_robot.held is not None
-        and stored_robot.held.root == reports[0].root
+        and stored_robot.active_map is not None
+        and stored_robot.active_map.root == reports[0].root
     ):
         reports = reports[1:]
     for report in reports:

@@ -287,7 +287,7 @@ def _best_chain(
 
 def _has_complete_map(fmt: Format, available: AvailableLayers) -> bool:
     """Whether a map of this very format is stored, so that nothing else is needed."""
-    return fmt.needs.own and any(k.layer == "objects" and k.name == fmt.family for k in available.keys)
+    return fmt.needs.accepts_family and any(k.layer == "objects" and k.name == fmt.family for k in available.keys)
 
 
 def _parameters_of(plan: derive.Plan) -> frozenset[str]:

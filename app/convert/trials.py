@@ -28,7 +28,7 @@ class Trials:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._guard = threading.Lock()
-        self._found: dict[str, ChainFailure | None] = {}
+        self._results: dict[str, ChainFailure | None] = {}
         self._lines = 0
         for key, failure in self._read():
             self._set(key, failure)
@@ -36,7 +36,7 @@ class Trials:
     def __getitem__(self, key: str) -> ChainFailure | None:
         """KeyError where it was not tried."""
         with self._guard:
-            return self._found[key]
+            return self._results[key]
 
     def add(self, key: str, failure: ChainFailure | None, *, lasting: bool) -> None:
         """Remember an outcome. lasting: also for the next start."""
@@ -53,10 +53,10 @@ class Trials:
                         file.write(_line(key, failure))
 
     def _set(self, key: str, failure: ChainFailure | None) -> None:
-        self._found.pop(key, None)  # the latest last: the oldest goes first
-        self._found[key] = failure
-        while len(self._found) > MAX_TRIALS:
-            self._found.pop(next(iter(self._found)))
+        self._results.pop(key, None)  # the latest last: the oldest goes first
+        self._results[key] = failure
+        while len(self._results) > MAX_TRIALS:
+            self._results.pop(next(iter(self._results)))
 
     def _read(self) -> Iterator[tuple[str, ChainFailure | None]]:
         try:
@@ -75,11 +75,11 @@ class Trials:
     def _rewrite(self) -> None:
         temporary = self._path.with_suffix(f".{uuid4().hex}")
         try:
-            temporary.write_bytes(b"".join(_line(key, failure) for key, failure in self._found.items()))
+            temporary.write_bytes(b"".join(_line(key, failure) for key, failure in self._results.items()))
             temporary.replace(self._path)
         finally:
             temporary.unlink(missing_ok=True)
-        self._lines = len(self._found)
+        self._lines = len(self._results)
 
 
 def _line(key: str, failure: ChainFailure | None) -> bytes:

@@ -168,10 +168,10 @@ class _Reader:
         surroundings: float,
         unknown_radius: float,
     ) -> None:
-        self.layers, self.notes, self.known, self.doors_closed = layers, notes, solid_reader, doors_closed
+        self.layers, self.notes, self.solids, self.doors_closed = layers, notes, solid_reader, doors_closed
         self.surroundings, self.unknown_radius = surroundings, unknown_radius
         self.seen = replace(solid_reader, planes=True, visuals=True)
-        self.found: dict[int, list[Array]] = {}
+        self.shapes: dict[int, list[Array]] = {}
         self.left: Counter[str] = Counter()
         self.shapeless: Counter[str] = Counter()
         self.broken = 0
@@ -266,7 +266,7 @@ class _Reader:
     def _solids(self, part: Features, k: int, site: LevelObstacles, level: str) -> None:
         p = part.properties[k]
         try:
-            triangles, unreadable = self.known.read(p)
+            triangles, unreadable = self.solids.read(p)
         except (Invalid, TooLarge) as error:
             self._mark_unknown_ground(_name(part, k), p, self._ground_around(part, k), [error.detail], site)
             return
@@ -280,7 +280,7 @@ class _Reader:
         if unreadable and not len(triangles):
             return
         if len(triangles):
-            self.found.setdefault(id(site), []).append(triangles - np.array([0.0, 0.0, self.layers.elevation(level)]))
+            self.shapes.setdefault(id(site), []).append(triangles - np.array([0.0, 0.0, self.layers.elevation(level)]))
         else:
             self.left["with planes or pictures only"] += 1
 
@@ -312,7 +312,7 @@ class _Reader:
 
     def finish(self, site: LevelObstacles, level: str) -> LevelObstacles:  # noqa: ARG002
         """The site with its solids' triangles."""
-        pieces = self.found.get(id(site), [])
+        pieces = self.shapes.get(id(site), [])
         if pieces:
             site.triangles = np.concatenate(pieces)
             site.owner = np.repeat(np.arange(len(pieces)), [len(one) for one in pieces])

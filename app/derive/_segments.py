@@ -279,7 +279,7 @@ class _RegionBuilder:
         self.regions: list[Region] = []
         self.lightness = cv2.cvtColor(ground.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[..., 0]
         self.few = 0
-        self.known = ground.valid
+        self.valid = ground.valid
         self.open_ = np.zeros(ground.valid.shape, bool)
 
     def pixels(self, metres: float) -> int:
@@ -383,7 +383,7 @@ class _RegionBuilder:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
         clean = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel)
         clean = cv2.morphologyEx(clean, cv2.MORPH_CLOSE, kernel, iterations=2)
-        clean[(self.label > 0) | ~self.known] = 0
+        clean[(self.label > 0) | ~self.valid] = 0
         for piece, at, area in self.pieces(clean):
             self._add_by_shape(piece, at, area)
 

@@ -172,13 +172,18 @@ class Bus:
         self,
         options: BusOptions,
         *,
-        ask: QueryHandler,
+        query_handler: QueryHandler,
         explain: ErrorEncoder,
         on_status: OnStatus,
         on_alive: OnLiveliness,
     ) -> None:
         self.options = options
-        self._query_handler, self._explain, self._on_status, self._on_alive = ask, explain, on_status, on_alive
+        self._query_handler, self._explain, self._on_status, self._on_alive = (
+            query_handler,
+            explain,
+            on_status,
+            on_alive,
+        )
         self._session: zenoh.Session | None = None
         self._router: Router | None = None
         self._declared: list[Any] = []

@@ -57,7 +57,7 @@ def robot_lag(robot: Robot, channel: Channel, moves: Sequence[ChannelMove]) -> L
 
     A robot that says no sequence has acted on the newest move that led to the root which it holds.
     """
-    active_map = robot.held
+    active_map = robot.active_map
     if active_map is not None and active_map.shows(channel.root, channel.closures.digest):
         return Lag(0, False, None)
     acted = 0
@@ -101,7 +101,7 @@ class ChannelConvergence:
 def is_ready(robot: Robot, root: str) -> bool:
     """Whether a robot has a root, so that it could drive on it at once."""
     loaded = robot.report.state in ("ready", "active") and robot.report.root == root
-    return loaded or (robot.held is not None and robot.held.root == root)
+    return loaded or (robot.active_map is not None and robot.active_map.root == root)
 
 
 def channel_convergence(
@@ -112,8 +112,8 @@ def channel_convergence(
     overlays = channel.closures.digest
     hold, behind = [], []
     for robot in channel_robots:
-        if robot.held is not None and robot.held.shows(channel.root, overlays):
-            hold.append(robot.held.since)
+        if robot.active_map is not None and robot.active_map.shows(channel.root, overlays):
+            hold.append(robot.active_map.since)
         else:
             behind.append(robot)
     failed = sum(robot.report.state == "failed" for robot in behind)

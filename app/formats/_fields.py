@@ -124,7 +124,7 @@ class Record:
     each: Any = ANY
     open: bool = False
     loose: bool = False
-    known: frozenset[str] = field(init=False)
+    names: frozenset[str] = field(init=False)
     rules: tuple[tuple[str, Any], ...] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -86,8 +86,9 @@ class LayerRequirements:
 
     one_of: alternatives, the first that is complete is enough; every carried layer that is there is written.
     anchor: the coordinates the format speaks, so that items anchored otherwise need a datum. datum: needed always.
-    also: layers of which the writer uses a part where they are there, and does without where they are not. own: objects
-    of the format's own family are a whole map: with them nothing else is needed, no datum either.
+    also: layers of which the writer uses a part where they are there, and does without where they are not.
+    accepts_family: objects of the format's own family are a whole map: with them nothing else is needed, no datum
+    either.
     missing_content: what such layers must hold besides being there (an edge), and do not: what to supply, or None.
     """
 
@@ -95,7 +96,7 @@ class LayerRequirements:
     anchor: Anchor | None = None
     datum: bool = False
     also: frozenset[Layer] = frozenset()
-    own: bool = False
+    accepts_family: bool = False
     missing_content: Callable[[Layers], str | None] | None = None
 
 

@@ -38,7 +38,7 @@ class Line:
 
     a: int
     b: int
-    said: dict[str, Any]
+    members: dict[str, Any]
 
 
 def canonical(keys: Iterable[str], members: dict[str, Any]) -> dict[str, Any]:
@@ -61,8 +61,8 @@ def edges(
     rows: list[tuple[int, int]] = []
     properties: list[Properties] = []
     for k, line in enumerate(lines):
-        canonical_members = canonical(WORDS, line.said)
-        extra_members = {key: value for key, value in line.said.items() if key not in canonical_members}
+        canonical_members = canonical(WORDS, line.members)
+        extra_members = {key: value for key, value in line.members.items() if key not in canonical_members}
         oneway = extra_members.get(ONEWAY) is True
         if oneway:
             del extra_members[ONEWAY]

@@ -275,13 +275,13 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     old = (document.get("datum_latitude"), document.get("datum_longitude"))
     out.append("\nmapviz_initialize_origin:" + _mapviz(document, datum, old, context))
     out.append("\nnavsat_transform_node:\n" + _navsat(document, datum, context))
-    extra_members = {key: value for key, value in document.items() if key not in _KNOWN}
+    extra_members = {key: value for key, value in document.items() if key not in _KEYS}
     if extra_members:
         out.append("\n" + yaml.mapping(extra_members, 0))
     return {"datum.yaml": "".join(out).encode()}
 
 
-_KNOWN = frozenset(
+_KEYS = frozenset(
     {"datum_latitude", "datum_longitude", "gmapping", "mapviz_initialize_origin", "navsat_transform_node"}
 )
 

@@ -204,8 +204,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     ranks = {k: rank for rank, k in enumerate(order)}
     line_texts = []
     for line in sorted(lines(net, context, NAME), key=lambda one: (ranks[one.a], ranks[one.b])):
-        ends = (_parse_end("start", line.said, at[line.a]), _parse_end("end", line.said, at[line.b]))
-        extra_members = {key: value for key, value in line.said.items() if key not in ("start", "end")}
+        ends = (_parse_end("start", line.members, at[line.a]), _parse_end("end", line.members, at[line.b]))
+        extra_members = {key: value for key, value in line.members.items() if key not in ("start", "end")}
         line_texts.append(f"- {ends[0]}  {ends[1]}{yaml.mapping(extra_members, 2) if extra_members else ''}")
     dangling = document.get("dangling")
     dangling = [one for one in dangling if isinstance(one, dict) and one] if isinstance(dangling, list) else []

@@ -374,7 +374,7 @@ def _line_texts(
     weighed = 0
     out = []
     for line in lines(net, context, NAME):
-        members = {key: v for key, v in line.said.items() if key not in ("from", "to")}
+        members = {key: v for key, v in line.members.items() if key not in ("from", "to")}
         if not isinstance(members.get("weight"), (int, float)):
             a, b = pixels[line.a], pixels[line.b]
             members["weight"] = round(float(np.hypot(*(a - b))), 9)

@@ -76,7 +76,7 @@ class Rule:
     action: str
     values: tuple[Expression, ...]
     makes: tuple[str, ...]
-    where: str
+    location: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +166,11 @@ def parse(text: str, constants: Mapping[str, float]) -> Grammar:
             )
         )
     grammar = Grammar(next(iter(rules)), {name: tuple(match) for name, match in rules.items()}, dict(constants))
-    for found_ in grammar.rules.values():
-        for rule_ in found_:
+    for alternatives in grammar.rules.values():
+        for rule_ in alternatives:
             for name in rule_.makes:
                 if name not in grammar.rules and name not in OPEN:
-                    raise_invalid(f"no rule says what becomes of {name!r}", rule_.where)
+                    raise_invalid(f"no rule says what becomes of {name!r}", rule_.location)
     return grammar
 
 
@@ -230,7 +230,7 @@ def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
             _finish_lot(town, shape, "garden")
             continue
         if shape.deep >= MAX_DEPTH:
-            _stop(f"the rules go more than {MAX_DEPTH} deep: give {shape.name!r} an end", rule.where)
+            _stop(f"the rules go more than {MAX_DEPTH} deep: give {shape.name!r} an end", rule.location)
         # The last one waits first, so that shapes are made from the first to the last.
         waiting += reversed(_apply_rule(town, shape, rule, [value(names, chance) for value in rule.values]))
     return town
@@ -281,7 +281,7 @@ def _choose_rule(rules: Sequence[Rule], names: Mapping[str, float], chance: np.r
         return holding[0] if holding else None
     weights = [1.0 if r.weight is None else r.weight(names, chance) for r in holding]
     if min(weights) < 0 or not sum(weights) > 0:
-        _stop("weights must not be negative, and one must be above 0", holding[0].where)
+        _stop("weights must not be negative, and one must be above 0", holding[0].location)
     left = float(chance.random()) * sum(weights)
     for rule, weight in zip(holding, weights, strict=True):
         left -= weight
@@ -298,26 +298,26 @@ def _apply_rule(town: Town, shape: _Shape, rule: Rule, values: list[float]) -> l
     if rule.action in ROOFS:
         storeys = math.floor(values[0] + 0.5)
         if not 1 <= storeys <= 100:
-            _stop(f"a building has 1 to 100 storeys, got {values[0]:g}", rule.where)
+            _stop(f"a building has 1 to 100 storeys, got {values[0]:g}", rule.location)
         _finish_lot(town, shape, rule.action, storeys)
         return []
     if rule.action == "inset":
         return _inset(town, shape, rule, values[0], deep)
     width = values[-1]
     if width != 0 and not 1.0 <= width <= 200.0:
-        _stop(f"a street is 1 to 200 m wide, or 0 for none, got {width:g}", rule.where)
+        _stop(f"a street is 1 to 200 m wide, or 0 for none, got {width:g}", rule.location)
     if width and shape.front is not None:
-        _stop("a street cannot lead through what has been cut into lots", rule.where)
+        _stop("a street cannot lead through what has been cut into lots", rule.location)
     if rule.action == "ring":
         return _ring(town, shape, rule, width, deep)
     if not 0.02 <= values[0] <= 0.98:
-        _stop(f"a share is from 0.02 to 0.98, got {values[0]:g}", rule.where)
+        _stop(f"a share is from 0.02 to 0.98, got {values[0]:g}", rule.location)
     return _cut(town, shape, rule, values[0], width, deep)
 
 
 def _inset(town: Town, shape: _Shape, rule: Rule, metres: float, deep: int) -> list[_Shape]:
     if metres < 0:
-        _stop(f"an inset is not negative, got {metres:g}", rule.where)
+        _stop(f"an inset is not negative, got {metres:g}", rule.location)
     front = shape.front
     if front is None:
         town.blocks.append(shape.land)
@@ -330,7 +330,7 @@ def _inset(town: Town, shape: _Shape, rule: Rule, metres: float, deep: int) -> l
 
 def _ring(town: Town, shape: _Shape, rule: Rule, width: float, deep: int) -> list[_Shape]:
     if width == 0:
-        _stop("a ring needs a street's width", rule.where)
+        _stop("a ring needs a street's width", rule.location)
     middle = _pieces(shapely.buffer(shape.land, -width / 2, join_style="mitre"))
     out = []
     for block in middle:
@@ -340,7 +340,7 @@ def _ring(town: Town, shape: _Shape, rule: Rule, width: float, deep: int) -> lis
         town.street(shapely.LineString(shapely.get_coordinates(block.exterior)), width)
         out += [_Shape(rule.makes[0], block, piece, None, deep) for piece in land]
     if not out:
-        _stop(f"there is no room for a ring of {width:g} m and anything in it", rule.where)
+        _stop(f"there is no room for a ring of {width:g} m and anything in it", rule.location)
     return out
 
 

@@ -50,7 +50,7 @@ class Grid:
     """What is known of a grid. occupied, known: bool [height, width]. cell: metres."""
 
     occupied: Bool
-    known: Bool
+    observed: Bool
     cell: float
 
 
@@ -81,7 +81,7 @@ def walls(grid: Grid, target: Bool) -> Bool:
     for end in (first, second):
         turn = np.abs(direction[end, 0] * line[:, 1] - direction[end, 1] * line[:, 0])
         aligned &= turn <= slack
-    seen_free = grid.known & ~grid.occupied
+    seen_free = grid.observed & ~grid.occupied
     for a, b in zip(at[first[aligned]].tolist(), at[second[aligned]].tolist(), strict=True):
         steps = max(abs(a[0] - b[0]), abs(a[1] - b[1]))
         row, column = (np.round(np.linspace(p, q, steps + 1)).astype(int)[1:-1] for p, q in zip(a, b, strict=True))
@@ -124,8 +124,8 @@ def surroundings(grid: Grid, at: Places) -> NDArray[np.int64]:
     the nearest known cell is.
     """
     limit = max(1, round(SPAN_METRES / grid.cell))
-    height, width = grid.known.shape
-    code = np.where(grid.known, np.where(grid.occupied, SEES_OCCUPIED, SEES_FREE), NOTHING).astype(np.uint8)
+    height, width = grid.observed.shape
+    code = np.where(grid.observed, np.where(grid.occupied, SEES_OCCUPIED, SEES_FREE), NOTHING).astype(np.uint8)
     seen = np.zeros((8, len(at)), np.uint8)
     nearest = np.full(len(at), limit + 1.0)
     for ray, (up, right) in enumerate(RAYS):
@@ -158,9 +158,9 @@ def confidence(grid: Grid, side: float, draw: np.random.Generator) -> Array:
     """
     free, count = np.zeros(KINDS), np.zeros(KINDS)
     for part, hole in _holes(grid, side, draw):
-        wall = walls(Grid(part.occupied & ~hole, part.known & ~hole, part.cell), hole)
-        cut = Grid((part.occupied & ~hole) | wall, (part.known & ~hole) | wall, part.cell)
-        at = np.argwhere(hole & part.known & ~wall)[::EVERY]
+        wall = walls(Grid(part.occupied & ~hole, part.observed & ~hole, part.cell), hole)
+        cut = Grid((part.occupied & ~hole) | wall, (part.observed & ~hole) | wall, part.cell)
+        at = np.argwhere(hole & part.observed & ~wall)[::EVERY]
         kind = surroundings(cut, at)
         count += np.bincount(kind, minlength=KINDS)
         free += np.bincount(kind, weights=~part.occupied[at[:, 0], at[:, 1]], minlength=KINDS)
@@ -173,13 +173,13 @@ def confidence(grid: Grid, side: float, draw: np.random.Generator) -> Array:
 
 def _holes(grid: Grid, side: float, draw: np.random.Generator) -> Iterator[tuple[Grid, Bool]]:
     """Places of the grid, each with a square hole around a known cell."""
-    indices = np.flatnonzero(grid.known)
+    indices = np.flatnonzero(grid.observed)
     half, margin = max(1, round(side / 2 / grid.cell)), round(SPAN_METRES / grid.cell)
-    width = grid.known.shape[1]
+    width = grid.observed.shape[1]
     for middle in draw.choice(indices, size=HOLES).tolist():
         row, column = divmod(middle, width)
         top, left = max(0, row - half - margin), max(0, column - half - margin)
         part = np.s_[top : row + half + margin, left : column + half + margin]
-        hole = np.zeros(grid.known[part].shape, bool)
+        hole = np.zeros(grid.observed[part].shape, bool)
         hole[max(0, row - half) - top : row + half - top, max(0, column - half) - left : column + half - left] = True
-        yield Grid(grid.occupied[part], grid.known[part], grid.cell), hole
+        yield Grid(grid.occupied[part], grid.observed[part], grid.cell), hole

@@ -53,7 +53,7 @@ class Expression:
     """A parsed expression. text: as it was written; where: the place it is named by in problems."""
 
     text: str
-    where: str
+    location: str
     value: Value
 
     def __call__(self, names: Mapping[str, float], chance: np.random.Generator) -> float:
@@ -68,7 +68,7 @@ class Expression:
 
     def _stop(self, reason: str) -> NoReturn:
         problem = f"{self.text.strip()!r} cannot be computed: {reason}"
-        raise CannotGenerate(f"{self.where}: {problem}", [Problem(problem, where=self.where)])
+        raise CannotGenerate(f"{self.location}: {problem}", [Problem(problem, where=self.location)])
 
 
 def raise_invalid(problem: str, location: str) -> NoReturn:

@@ -70,25 +70,25 @@ def _entropy(domain: U64, weights: I64, heavy: I64, logs: I64) -> int:
 
 
 @native
-def _push(keys: I64, where: I64, size: int, key: int, place: int) -> int:
+def _push(keys: I64, positions: I64, size: int, key: int, place: int) -> int:
     """Onto a binary heap; its new size."""
     i = size
     while i > 0:
         up = (i - 1) >> 1
         if keys[up] <= key:
             break
-        keys[i], where[i] = keys[up], where[up]
+        keys[i], positions[i] = keys[up], positions[up]
         i = up
-    keys[i], where[i] = key, place
+    keys[i], positions[i] = key, place
     return size + 1
 
 
 @native
-def _pop(keys: I64, where: I64, size: int) -> int:
+def _pop(keys: I64, positions: I64, size: int) -> int:
     """The first of a heap goes to its end; the new size."""
-    first_key, first = keys[0], where[0]
+    first_key, first = keys[0], positions[0]
     size -= 1
-    key, place = keys[size], where[size]
+    key, place = keys[size], positions[size]
     i = 0
     while True:
         child = 2 * i + 1
@@ -98,10 +98,10 @@ def _pop(keys: I64, where: I64, size: int) -> int:
             child += 1
         if keys[child] >= key:
             break
-        keys[i], where[i] = keys[child], where[child]
+        keys[i], positions[i] = keys[child], positions[child]
         i = child
-    keys[i], where[i] = key, place
-    keys[size], where[size] = first_key, first
+    keys[i], positions[i] = key, place
+    keys[size], positions[size] = first_key, first
     return size
 
 

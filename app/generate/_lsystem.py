@@ -86,14 +86,14 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One way to rewrite a symbol. names: of its values. where: its statement."""
+    """One way to rewrite a symbol. names: of its values. location: its statement."""
 
     symbol: str
     names: tuple[str, ...]
     condition: Expression | None
     weight: Expression | None
     after: tuple[Word, ...]
-    where: str
+    location: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ def _inside(text: str, at: int, location: str) -> tuple[list[str], int]:
 
 def _check_symbols(system: System) -> None:
     """Every letter has a meaning: a rule for as many values, or the turtle's."""
-    sides = [("axiom", system.axiom), *((r.where, r.after) for rules in system.rules.values() for r in rules)]
+    sides = [("axiom", system.axiom), *((r.location, r.after) for rules in system.rules.values() for r in rules)]
     for location, words in sides:
         for letter, values in words:
             minimum, maximum = TURTLE.get(letter, (1, 0))
@@ -299,7 +299,7 @@ def _rewrite(system: System, rules: Sequence[Rule], symbol: Symbol, chance: np.r
             weights.append(1.0 if rule.weight is None else rule.weight(variables, chance))
         if min(weights) < 0 or not sum(weights) > 0:
             problem = "weights must not be negative, and one must be above 0"
-            raise CannotGenerate(f"{chosen.where}: {problem}", [Problem(problem, where=chosen.where)])
+            raise CannotGenerate(f"{chosen.location}: {problem}", [Problem(problem, where=chosen.location)])
         left = float(chance.random()) * sum(weights)
         for rule, weight in zip(holding, weights, strict=True):
             chosen = rule

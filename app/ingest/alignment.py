@@ -51,7 +51,7 @@ class AlignmentRequest:
 class AlignmentResult:
     """What was found. prepared: None where it is only told."""
 
-    told: dict[str, Any]
+    summary: dict[str, Any]
     warnings: tuple[Problem, ...]
     prepared: Prepared | None
 

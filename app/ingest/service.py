@@ -286,9 +286,11 @@ class Ingest:
                 prepare_alignment, base, request, failure="the grid could not be aligned"
             )
             if result.prepared is None:
-                return CommitResult("dry_run", None, _alignment_as_json(result.told, None, result.warnings))
+                return CommitResult("dry_run", None, _alignment_as_json(result.summary, None, result.warnings))
             outcome = self._commit(environment, base, result.prepared, author, text, (), result.warnings, key)
-            return dataclasses.replace(outcome, body=_alignment_as_json(result.told, outcome.version, result.warnings))
+            return dataclasses.replace(
+                outcome, body=_alignment_as_json(result.summary, outcome.version, result.warnings)
+            )
 
         return self._commit_on_head(environment, None, if_match, once, "a grid can be aligned")
 

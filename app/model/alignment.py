@@ -194,7 +194,7 @@ class _Search:
         # A cell beside the outline counts half, and one that is two away next to nothing.
         field = np.exp(-0.7 * away.astype(np.float64) ** 2)
         self.field = np.fft.rfft2(field)
-        self.own = points
+        self.points = points
 
     def places(self, angle: float, reach: float, middle: Array) -> list[tuple[float, Array]]:
         """(yaw, where the middle goes) of the best places, apart from each other."""
@@ -226,7 +226,7 @@ class _Search:
 
     def _scores(self, yaw: float) -> Array:
         """For each cell, how much meets where the middle lies there."""
-        turned = np.floor(self.own @ _turn(yaw).T / self.cell + 0.5).astype(int)
+        turned = np.floor(self.points @ _turn(yaw).T / self.cell + 0.5).astype(int)
         image = np.zeros((self.height, self.width))
         image[turned[:, 1] % self.height, turned[:, 0] % self.width] = 1.0
         return np.asarray(np.fft.irfft2(self.field * np.fft.rfft2(image).conj(), s=image.shape))

@@ -249,18 +249,18 @@ class SharedKeyDicts:
     """Tables that are kept."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[str, ...], dict[str, Any]] = {}
+        self._patterns: dict[tuple[str, ...], dict[str, Any]] = {}
 
-    def __call__(self, said: dict[str, Any]) -> dict[str, Any]:
+    def __call__(self, mapping: dict[str, Any]) -> dict[str, Any]:
         """The mapping, with its keys in their order."""
-        keys = tuple(said)
-        pattern = self._known.get(keys)
+        keys = tuple(mapping)
+        pattern = self._patterns.get(keys)
         if pattern is None:
-            if len(self._known) >= self.MAX_LAYOUTS:
-                return said
-            pattern = self._known[keys] = shared_key_dict(*keys)
+            if len(self._patterns) >= self.MAX_LAYOUTS:
+                return mapping
+            pattern = self._patterns[keys] = shared_key_dict(*keys)
         out = pattern.copy()
-        for key, value in said.items():
+        for key, value in mapping.items():
             out[key] = value
         return out
 

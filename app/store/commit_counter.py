@@ -22,19 +22,19 @@ class CommitCounter:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._map: mmap.mmap | None = None
-        self._own = 0
+        self._changes = 0
         self._lock = threading.Lock()
 
     def __call__(self) -> int:
         """The number now."""
         shared = self._map or self._open()
-        return self._own if shared is None else int(_NUMBER.unpack_from(shared)[0])
+        return self._changes if shared is None else int(_NUMBER.unpack_from(shared)[0])
 
     def change(self) -> None:
         """Called after a commit: another number, so that no two processes need to agree on the next one."""
         shared = self._map or self._open()
         if shared is None:
-            self._own += 1
+            self._changes += 1
         else:
             _NUMBER.pack_into(shared, 0, int.from_bytes(os.urandom(8), "little"))
 

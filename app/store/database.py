@@ -162,8 +162,8 @@ class Database:
             yield connection
 
     @contextmanager
-    def write(self, *, tell: bool = True, upkeep: bool = False) -> Iterator[Connection]:
-        """A transaction that writes: all or nothing, and on disk when it ends. tell: whether caches are to know.
+    def write(self, *, notify: bool = True, upkeep: bool = False) -> Iterator[Connection]:
+        """A transaction that writes: all or nothing, and on disk when it ends. notify: whether caches are to know.
         upkeep: it is no change that anybody asked for, so that the audit log has nothing of it.
         """
         with self._write_turn(), self.connection() as connection:
@@ -173,7 +173,7 @@ class Database:
                 caller = None if upkeep else self._record(connection)
         if caller is not None:
             caller.recorded = True
-        if tell:
+        if notify:
             self._written()
 
     @contextmanager

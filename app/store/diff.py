@@ -312,10 +312,10 @@ def _rows(draft: ChunkStage, names: Sequence[bytes], kind: str) -> dict[Any, Any
 
 
 class _Voxels(NamedTuple):
-    """Leaves in ascending order. key: uint64 [n], place and depth. said: [n], what they say, comparable as a whole."""
+    """Leaves in ascending order. key: uint64 [n], place and depth. content: [n], comparable as a whole."""
 
     key: NDArray[np.uint64]
-    said: NDArray[np.void]
+    content: NDArray[np.void]
 
 
 def _voxels(draft: ChunkStage, names: Sequence[bytes], root: PartRoot | None) -> _Voxels:
@@ -343,5 +343,5 @@ def _voxel_changes(before: _Voxels, after: _Voxels) -> dict[str, Any]:
     common = at < len(before.key)
     common[common] = before.key[at[common]] == after.key[common]
     shared = int(np.count_nonzero(common))
-    changed = int(np.count_nonzero(before.said[at[common]] != after.said[common]))
+    changed = int(np.count_nonzero(before.content[at[common]] != after.content[common]))
     return {"added": len(after.key) - shared, "changed": changed, "deleted": len(before.key) - shared}

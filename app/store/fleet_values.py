@@ -166,7 +166,7 @@ class Robot:
     report: RobotReport
     time: datetime
     since: datetime
-    held: ActiveMap | None
+    active_map: ActiveMap | None
     on_bus: bool | None = None
     presence_at: datetime | None = None
     vouched: bool = True

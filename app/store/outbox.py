@@ -134,7 +134,7 @@ class Outbox:
     def set_relayed(self, position: int) -> None:
         """Note that events up to this position were handed over. It never goes back."""
         table = tables.relay
-        with self._database.write(tell=False, upkeep=True) as connection:
+        with self._database.write(notify=False, upkeep=True) as connection:
             stored_position = connection.execute(select(table.c.position).where(table.c.id == 1)).scalar()
             if stored_position is None:
                 connection.execute(insert(table).values(id=1, position=position))

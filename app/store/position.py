@@ -159,7 +159,7 @@ class Areas:
             except Damaged as error:
                 log.critical("area of %s: not computed, its last one stays: %s", head.environment, error.detail)
         moved: list[str] = []
-        with self._database.write(tell=False, upkeep=True) as connection:
+        with self._database.write(notify=False, upkeep=True) as connection:
             for environment_id in sorted(computed):
                 number, area = computed[environment_id]
                 query = select(table.c.head, table.c.area_stale).where(table.c.id == environment_id).with_for_update()

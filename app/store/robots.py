@@ -37,7 +37,7 @@ class Robots:
         such environment, Conflict where it has too many robots already.
         """
         out: list[FleetMapError | None] = [None] * len(heard)
-        with self._database.write(tell=False, upkeep=True) as connection:
+        with self._database.write(notify=False, upkeep=True) as connection:
             owners: dict[str, str | FleetMapError] = {}
             # One order for all writers, so that none waits for another that waits for it; each robot's own order stays.
             for k in sorted(range(len(heard)), key=lambda k: (heard[k].environment, heard[k].robot)):
@@ -114,7 +114,7 @@ class Robots:
 
     def forget(self, environment: str, robot: str) -> None:
         """Remove a robot and its history from an environment; NotFound. It comes back with its next report."""
-        with self._database.write(tell=False) as connection:
+        with self._database.write(notify=False) as connection:
             row = environment_row(connection, environment)
             for table in (tables.robot_history, tables.robot):
                 deleted_count = connection.execute(
@@ -126,7 +126,7 @@ class Robots:
     def note_presence(self, present_robots: Collection[str], absent_robots: Collection[str], now: datetime) -> None:
         """Robots that are on the bus at this moment, and robots that have left it."""
         table = tables.presence
-        with self._database.write(tell=False, upkeep=True) as connection:
+        with self._database.write(notify=False, upkeep=True) as connection:
             room = MAX_PRESENT - int(connection.execute(select(func.count()).select_from(table)).scalar_one())
             rows = sorted([(name, True) for name in present_robots] + [(name, False) for name in absent_robots])
             for name, is_present in rows:

@@ -17,7 +17,8 @@ import shapely
 
 from app import formats
 from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFile
-from app.formats import FileGroup, Files, Format, ReadContext, _content
+from app.formats import FileGroup, Files, Format, ReadContext
+from app.formats.environment import content as exact_content
 from app.limits import Limits
 from app.model.features import Features, from_columns
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum, Level
@@ -108,10 +109,10 @@ def read(
     if not files:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
     bundle = Bundle(files={name: FileUse() for name in files}, inner=inner)
-    if (content := _content.find(files)) is not None:
+    if (content := exact_content.find(files)) is not None:
         if _read_exact_content(files, content, hints, limits, bundle):
             return bundle
-        files = {name: data for name, data in files.items() if name not in _content.content_files(files, content)}
+        files = {name: data for name, data in files.items() if name not in exact_content.content_files(files, content)}
     if hints.format is not None and formats.get_format(hints.format).traits.is_container:
         # A folder of other formats' maps is what any upload may be: each file is found out by its content.
         template_files = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
@@ -172,11 +173,11 @@ def _unread_files(files: Files) -> set[str]:
 def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Limits, bundle: Bundle) -> bool:
     """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
     if dataclasses.replace(hints, format=None) != UploadHints() or hints.format not in (None, PACKAGE):
-        content: _content.Content | str = "the upload says how its maps are to be read"
+        content: exact_content.Content | str = "the upload says how its maps are to be read"
     else:
         try:
             with _errors_in_file(main):
-                content = _content.read(files, main, limits, lambda: _unread_files(files))
+                content = exact_content.read(files, main, limits, lambda: _unread_files(files))
         except BadUpload:
             raise
         except (*formats.BAD_INPUT, FleetMapError, shapely.errors.ShapelyError) as error:
@@ -186,7 +187,7 @@ def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Lim
             )
             raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)]) from error
     if isinstance(content, str):
-        for name in _content.content_files(files, main):
+        for name in exact_content.content_files(files, main):
             bundle.files[name] = FileUse(PACKAGE, used=False)
         bundle.warnings.append(Problem(f"not used, the maps of the package count: {content}", main))
         return False

@@ -93,13 +93,13 @@ def drops(write: Callable[..., Any]) -> list[tuple[str, str]]:
     for unit, scope, call in _calls(units, {"drop"}):
         if len(call.args) != 3:
             continue
-        for what in _texts(call.args[0], scope, unit) or _counted(unit):
+        for item in _texts(call.args[0], scope, unit) or _counted(unit):
             for why in _texts(call.args[2], scope, unit) or [""]:
-                out[what, why] = None
+                out[item, why] = None
     for unit, scope, index in _pairs(units):
-        for what in _texts(index.elts[0], scope, unit):
-            out |= dict.fromkeys((what, why) for why in _texts(index.elts[1], scope, unit) or ["…"])
-    return sorted((what, why) for what, why in out if what.strip("… "))
+        for item in _texts(index.elts[0], scope, unit):
+            out |= dict.fromkeys((item, why) for why in _texts(index.elts[1], scope, unit) or ["…"])
+    return sorted((item, why) for item, why in out if item.strip("… "))
 
 
 def fills(write: Callable[..., Any]) -> list[tuple[str, str, str]]:
@@ -109,18 +109,18 @@ def fills(write: Callable[..., Any]) -> list[tuple[str, str, str]]:
         if not 3 <= len(call.args) <= 4:
             continue
         option = (_texts(call.args[3], scope, unit) or [""])[0] if len(call.args) > 3 else ""
-        for what in _texts(call.args[0], scope, unit):
+        for item in _texts(call.args[0], scope, unit):
             for why in _texts(call.args[2], scope, unit) or [""]:
-                out[what, why, option] = None
-    return sorted((what, why, option) for what, why, option in out if what.strip("… "))
+                out[item, why, option] = None
+    return sorted((item, why, option) for item, why, option in out if item.strip("… "))
 
 
 def findings(check: Callable[..., Any]) -> list[tuple[str, str, str]]:
     """(level, place in the file or empty, problem) of each rule of a map's consumers."""
     out: dict[tuple[str, str, str], None] = {}
     for unit, scope, call in _calls(reachable(check), LEVELS):
-        where = next((k.value for k in call.keywords if k.arg == "where"), None)
-        place = (_texts(where, scope, unit) or [""])[0].strip("… .") if where is not None else ""
+        location = next((k.value for k in call.keywords if k.arg == "where"), None)
+        place = (_texts(location, scope, unit) or [""])[0].strip("… .") if location is not None else ""
         out |= dict.fromkeys((LEVELS[_called(call)], place, text) for text in _texts(call.args[0], scope, unit))
     return sorted(out)
 

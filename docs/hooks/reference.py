@@ -66,18 +66,18 @@ def on_config(config: MkDocsConfig) -> None:
 
 def on_files(files: Files, *, config: MkDocsConfig) -> None:
     """Add the formats' pages, and the picture of the packages."""
-    for known in all_formats().values():
-        files.append(File.generated(config, f"{FORMATS}/{known.name}.md", content=format_page(known)))
+    for fmt in all_formats().values():
+        files.append(File.generated(config, f"{FORMATS}/{fmt.name}.md", content=format_page(fmt)))
     files.append(File.generated(config, "images/architecture.svg", content=architecture.svg()))
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
     """Fill in what the code declares."""
 
-    def fill(found: re.Match[str]) -> str:
-        if found[1] not in BLOCKS:
-            raise PluginError(f"{page.file.src_uri}: there is no generated block {found[1]!r}: {', '.join(BLOCKS)}")
-        return BLOCKS[found[1]]()
+    def fill(match: re.Match[str]) -> str:
+        if match[1] not in BLOCKS:
+            raise PluginError(f"{page.file.src_uri}: there is no generated block {match[1]!r}: {', '.join(BLOCKS)}")
+        return BLOCKS[match[1]]()
 
     return MARKER.sub(fill, markdown)
 
@@ -129,8 +129,8 @@ def prose(docstring: str) -> str:
     return re.sub(r"(?m)^\\\* ", "* ", "\n\n".join(out)) + "\n"
 
 
-def _definition(found: re.Match[str]) -> str:
-    return f"* {found[1]}: {' '.join(found[2].split())}\n"
+def _definition(match: re.Match[str]) -> str:
+    return f"* {match[1]}: {' '.join(match[2].split())}\n"
 
 
 def sentence(text: str) -> str:
@@ -147,15 +147,15 @@ def parameters(cls: type[Any], *, head: str = "parameter") -> str:
     hints = get_type_hints(cls)
     rows = []
     for field in dataclasses.fields(cls):
-        said = field.metadata
+        metadata = field.metadata
         rows.append(
             (
                 code(field.name),
                 kind_of(hints[field.name]),
                 "" if field.default is None else code(_text(field.default)),
-                bounds(said.get("minimum"), said.get("maximum")),
-                said.get("unit", ""),
-                sentence(plain(said.get("doc", ""))),
+                bounds(metadata.get("minimum"), metadata.get("maximum")),
+                metadata.get("unit", ""),
+                sentence(plain(metadata.get("doc", ""))),
             )
         )
     return table((head, "type", "default", "bounds", "unit", "meaning"), rows)
@@ -216,35 +216,35 @@ def formats_table() -> str:
     )
 
 
-def format_page(known: Format) -> str:
+def format_page(fmt: Format) -> str:
     """The page of one format."""
-    module = _module(known)
-    said = re.sub(rf"\A{known.name}(\.yaml)?: (?=(.))", "", inspect.getdoc(module) or known.title)
-    text, further = _helpers(said[0].upper() + said[1:])
-    out = [f"# {known.name}: {plain(known.title)}\n", prose(text), _facts(known)]
-    if known.read and dataclasses.fields(known.read_options):
-        out += ["## Parameters of an upload\n", parameters(known.read_options)]
-    if known.write and dataclasses.fields(known.write_options):
+    module = _module(fmt)
+    doc = re.sub(rf"\A{fmt.name}(\.yaml)?: (?=(.))", "", inspect.getdoc(module) or fmt.title)
+    text, further = _helpers(doc[0].upper() + doc[1:])
+    out = [f"# {fmt.name}: {plain(fmt.title)}\n", prose(text), _facts(fmt)]
+    if fmt.read and dataclasses.fields(fmt.read_options):
+        out += ["## Parameters of an upload\n", parameters(fmt.read_options)]
+    if fmt.write and dataclasses.fields(fmt.write_options):
         out += [
             "## Parameters of a map\n",
-            f"In the address of a map, `/maps/{{environment}}/{known.name}?NAME=VALUE`, or as `-O NAME=VALUE` of "
+            f"In the address of a map, `/maps/{{environment}}/{fmt.name}?NAME=VALUE`, or as `-O NAME=VALUE` of "
             "`fleetmap export`. Parameters of a [derivation](../derivations.md) go the same way.\n",
-            parameters(known.write_options),
+            parameters(fmt.write_options),
         ]
     for name, doc in further:
         out += [f"## {name}\n", prose(doc)]
-    if known.write:
-        out += _losses(known)
-    if known.check:
-        out += _rules(known)
+    if fmt.write:
+        out += _losses(fmt)
+    if fmt.check:
+        out += _rules(fmt)
     return "\n".join(out)
 
 
-def _module(known: Format) -> types.ModuleType:
+def _module(fmt: Format) -> types.ModuleType:
     """The module that is the format's: by its name, in the package of its family or in ``app.formats``."""
-    module = known.detect.__module__
+    module = fmt.detect.__module__
     family = ".".join(module.split(".")[:3])
-    names = (f"{family}.{known.name}", f"app.formats.{known.name}", module)
+    names = (f"{family}.{fmt.name}", f"app.formats.{fmt.name}", module)
     return next(sys.modules[name] for name in names if name in sys.modules)
 
 
@@ -252,12 +252,12 @@ def _helpers(doc: str) -> tuple[str, list[tuple[str, str]]]:
     """The docstring with links in place of the names of shared modules, and the docstrings of these."""
     further: dict[str, str] = {}
 
-    def link(found: re.Match[str]) -> str:
+    def link(match: re.Match[str]) -> str:
         try:
-            module = importlib.import_module(f"app.formats.{found[1]}")
+            module = importlib.import_module(f"app.formats.{match[1]}")
         except ModuleNotFoundError:
-            return found[0]
-        name = found[1].rpartition(".")[2].lstrip("_")
+            return match[0]
+        name = match[1].rpartition(".")[2].lstrip("_")
         further[name] = inspect.getdoc(module) or ""
         return f"[{name}](#{name})"
 
@@ -266,37 +266,37 @@ def _helpers(doc: str) -> tuple[str, list[tuple[str, str]]]:
     return text, list(further.items())
 
 
-def _facts(known: Format) -> str:
-    needs, parts = known.needs, known.selection.parts
+def _facts(fmt: Format) -> str:
+    needs, parts = fmt.needs, fmt.selection.parts
     wants = " or ".join(" and ".join(sorted(layers)) for layers in needs.one_of if layers)
     rows = [
-        ("Files", codes(known.files)),
-        ("Media types", codes(dict.fromkeys(known.files.values()))),
-        ("Uploads end in", codes(known.extensions)),
-        ("Layers", ", ".join(sorted(known.layers)) + (" (of a grid only its place)" if known.traits.outlines else "")),
+        ("Files", codes(fmt.files)),
+        ("Media types", codes(dict.fromkeys(fmt.files.values()))),
+        ("Uploads end in", codes(fmt.extensions)),
+        ("Layers", ", ".join(sorted(fmt.layers)) + (" (of a grid only its place)" if fmt.traits.outlines else "")),
         ("A map needs", wants + (", and a datum" if needs.datum else "")),
         ("A map also uses", ", ".join(sorted(needs.also))),
         ("Coordinates", ANCHORS.get(needs.anchor or "", "")),
-        ("Bends of edges", BENDS.get(known.traits.keeps_bends, "")),
-        ("Blocked edges", "stay in a map, with a mark" if known.traits.marks_blocked else ""),
+        ("Bends of edges", BENDS.get(fmt.traits.keeps_bends, "")),
+        ("Blocked edges", "stay in a map, with a mark" if fmt.traits.marks_blocked else ""),
         (
             "Parts",
             f"one at a time, by `{parts.level}` and `{parts.name}`; `*` gives all" if parts else "",
         ),
-        ("Direction", "read only" if known.write is None else "written only" if known.read is None else ""),
+        ("Direction", "read only" if fmt.write is None else "written only" if fmt.read is None else ""),
     ]
     return "## Facts\n\n" + table(("fact", "value"), [row for row in rows if row[1]])
 
 
-def _losses(known: Format) -> list[str]:
-    assert known.write is not None
-    drops, fills = declared.drops(known.write), declared.fills(known.write)
+def _losses(fmt: Format) -> list[str]:
+    assert fmt.write is not None
+    drops, fills = declared.drops(fmt.write), declared.fills(fmt.write)
     out = []
     if drops:
         out += [
             "## What a map drops\n",
             "The report of each map lists what was dropped of this map, with counts, under `dropped`.\n",
-            table(("what", "why"), ((plain(what), plain(why)) for what, why in drops)),
+            table(("what", "why"), ((plain(item), plain(why)) for item, why in drops)),
         ]
     if fills:
         out += [
@@ -307,11 +307,11 @@ def _losses(known: Format) -> list[str]:
     return out
 
 
-def _rules(known: Format) -> list[str]:
-    assert known.check is not None
-    module = sys.modules[known.check.__module__]
+def _rules(fmt: Format) -> list[str]:
+    assert fmt.check is not None
+    module = sys.modules[fmt.check.__module__]
     levels = {"error": "refused", "warning": "doubtful"}
-    rows = [(levels[n], code(at) if at else "", plain(text)) for n, at, text in declared.findings(known.check)]
+    rows = [(levels[n], code(at) if at else "", plain(text)) for n, at, text in declared.findings(fmt.check)]
     return [
         "## Rules of its consumers\n",
         prose(inspect.getdoc(module) or ""),
@@ -388,14 +388,14 @@ def settings() -> str:
 
 def metrics() -> str:
     """All metrics of ``/metrics``."""
-    own = Metrics()
+    metrics = Metrics()
     rows = [
         (code(name), one._type, codes(one._labelnames), one._documentation)
-        for one in vars(own).values()
+        for one in vars(metrics).values()
         if isinstance(one, MetricWrapperBase) and not one._labelvalues
         for name in [one._name + ("_total" if one._type == "counter" else "")]
     ]
-    hits = own.registry._names_to_collectors["fleetmap_cache_hits"]
+    hits = metrics.registry._names_to_collectors["fleetmap_cache_hits"]
     rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
     with tempfile.TemporaryDirectory() as folder:
         environments = SimpleNamespace(page=lambda **_: ([], None))
@@ -491,14 +491,14 @@ def _roles() -> dict[tuple[str, str], str]:
     return out
 
 
-def _operation(method: str, path: str, said: Mapping[str, Any], role: str) -> str:
-    described = plain(said.get("description", ""))
-    out = [f"### {method.upper()} {plain(path)}\n", f"**{sentence(plain(said['summary']))}** {described}\n"]
-    if {"link": []} in said.get("security", ()):
+def _operation(method: str, path: str, operation: Mapping[str, Any], role: str) -> str:
+    described = plain(operation.get("description", ""))
+    out = [f"### {method.upper()} {plain(path)}\n", f"**{sentence(plain(operation['summary']))}** {described}\n"]
+    if {"link": []} in operation.get("security", ()):
         role = "`viewer`, or a [signed link](#post-apiv1environmentsenvversionsvlinks)"
     out.append(f"Role: {role}.\n" if role else "No token is needed.\n")
-    shown = said.get("parameters", [])
-    if "maps" in said["tags"] and "{format}" in path:
+    shown = operation.get("parameters", [])
+    if "maps" in operation["tags"] and "{format}" in path:
         shown = [p for p in shown if p["in"] != "query" or p["name"] in ("derive", "closures")]
         out.append("It also takes the parameters of the [format](formats.md) and of [derivations](derivations.md).\n")
     out.append(
@@ -516,18 +516,18 @@ def _operation(method: str, path: str, said: Mapping[str, Any], role: str) -> st
             ),
         )
     )
-    for media, body in said.get("requestBody", {}).get("content", {}).items():
+    for media, body in operation.get("requestBody", {}).get("content", {}).items():
         shape = body.get("schema", {})
         out.append(f"Body, `{media}`: {_schema(shape)}\n" if shape else f"Body: `{media}`\n")
     rows = []
-    for status, answer in sorted(said["responses"].items()):
+    for status, answer in sorted(operation["responses"].items()):
         if status in EVERYWHERE:
             continue
         content = answer.get("content", {})
         shapes = dict.fromkeys(_schema(c["schema"]) for c in content.values() if c.get("schema"))
         rows.append((status, sentence(plain(answer.get("description", ""))), codes(content), ", ".join(shapes)))
     out.append(table(("status", "answer", "media type", "schema"), rows))
-    shared = sorted(EVERYWHERE & set(said["responses"]))
+    shared = sorted(EVERYWHERE & set(operation["responses"]))
     if shared:
         out.append(f"Also {', '.join(shared)}: see [errors](errors.md).\n")
     return "\n".join(out)

@@ -127,7 +127,7 @@ def test_a_taken_port_is_not_tried_all_the_time(monkeypatch: pytest.MonkeyPatch)
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         options = BusOptions(listen=f"tcp/127.0.0.1:{taken.getsockname()[1]}")
-        bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
+        bus = Bus(options, query_handler=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
         for _ in range(5):
             assert not bus.ensure_connected()
         assert len(started) == 1
@@ -291,7 +291,7 @@ def test_router_that_dies_while_it_starts_is_started_again(monkeypatch: pytest.M
 
     monkeypatch.setattr("app.events.bus.Router", failing_once)
     options = BusOptions(mode="router", listen=f"tcp/127.0.0.1:{free_port()}")
-    bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
+    bus = Bus(options, query_handler=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
     try:
         eventually(bus.ensure_connected, 30)
         started[0]._process.kill()

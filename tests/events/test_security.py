@@ -320,7 +320,7 @@ def test_why_a_certificate_is_not_trusted_is_told(
     endpoint = f"tls/127.0.0.1:{port}"
     certificate, key = (Authority(tmp_path, "others") if foreign else authority).sign("own", days)
     options = BusOptions(listen=endpoint, security=RouterSecurity(ZenohCredentials(authority.pem, certificate, key)))
-    bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
+    bus = Bus(options, query_handler=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
     try:
         assert not bus.ensure_connected()
         assert bus.state["detail"] == f"no router at {endpoint}: its certificate is not to be trusted: {told}"

@@ -38,7 +38,7 @@ def farm(store: Store) -> Store:
 
 def test_held_version_follows_the_statement_of_the_robot(farm: Store):
     def active_map() -> ActiveMap | None:
-        return farm.robots.all("farm", "r1")[0].held
+        return farm.robots.all("farm", "r1")[0].active_map
 
     def say(minute: float, root: str, state: Any, holds: tuple[int, str] | None, **more: Any) -> None:
         assert farm.robots.note_reports([heard("r1", minute, root, state, holds=holds, **more)]) == [None]
@@ -86,15 +86,15 @@ def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
     (robot,) = farm.robots.all("farm")
     assert robot.report == RobotReport("production", 1, A, "active", "ok\ufffd", 4, reported_at)
     assert (robot.environment, robot.robot, robot.time, robot.since) == ("farm", "r1", NOW, NOW)
-    assert robot.held == ActiveMap(1, A, 4, NOW)
+    assert robot.active_map == ActiveMap(1, A, 4, NOW)
     assert (robot.on_bus, robot.presence_at) == (None, None)
     farm.robots.note_reports([heard("r1", 1, B, "downloading", version=2), heard("r1", 2, B, "failed", version=2)])
     (robot,) = farm.robots.all("farm", "r1")
     assert (robot.report.state, robot.report.version) == ("failed", 2)
-    assert robot.held == ActiveMap(1, A, 4, NOW)
+    assert robot.active_map == ActiveMap(1, A, 4, NOW)
     farm.robots.note_reports([heard("r1", 3, B, version=2, sequence=9), heard("r1", 4, B, version=2, sequence=9)])
     (robot,) = farm.robots.all("farm", "r1")
-    assert robot.held == ActiveMap(2, B, 9, NOW + timedelta(minutes=3))
+    assert robot.active_map == ActiveMap(2, B, 9, NOW + timedelta(minutes=3))
     assert (robot.since, robot.time) == (NOW + timedelta(minutes=3), NOW + timedelta(minutes=4))
     history = farm.robots.history("farm", "r1")
     assert [(t, r.state) for t, r in history] == [

@@ -253,22 +253,22 @@ class _RequestBody:
     __slots__ = (
         "_complete",
         "_declared",
-        "_here",
         "_limit",
         "_loaded",
         "_receive",
         "_received",
+        "_services",
         "_started",
-        "what",
+        "content",
     )
 
     def __init__(self, receive: Receive, services: Services) -> None:
-        self._receive, self._here = receive, services
+        self._receive, self._services = receive, services
         self._limit = services.options.max_json_bytes
         self._received, self._started, self._complete = 0, time.monotonic(), False
         self._declared: int | None = 0
         self._loaded: Message | None = None
-        self.what = "request body"
+        self.content = "request body"
 
     def check_headers(self, scope: Scope, headers: dict[bytes, bytes]) -> bool:
         """Look at what is announced (coding, media type, length): whether the body is one to be read as a whole."""
@@ -287,8 +287,8 @@ class _RequestBody:
         media = headers.get(b"content-type", b"").partition(b";")[0].strip().lower().decode("latin-1")
         upload = accepts_files(scope["path"])
         if media == "multipart/form-data" and upload:
-            limits = self._here.options.limits
-            self.what = "upload"
+            limits = self._services.options.limits
+            self.content = "upload"
             # Heads of parts are counted where they are read; this bound only has to be safe.
             parts = min(limits.files, 100_000)
             self._limit = limits.upload_bytes + MULTIPART_OVERHEAD + parts * PART_OVERHEAD
@@ -297,7 +297,7 @@ class _RequestBody:
             raise UnsupportedMedia(f"this call takes {takes}, not {media[:80] or 'a body without Content-Type'}")
         if self._declared is not None and self._declared > self._limit:
             raise self._too_large()
-        return self.what != "upload"
+        return self.content != "upload"
 
     async def preload(self) -> None:
         """Read the whole body now: its errors are told from here, before any route parses half of it."""
@@ -312,14 +312,14 @@ class _RequestBody:
             return message
         if self._declared == 0 or self._complete:
             return await self._receive()
-        pause, pace = self._here.options.body_seconds, self._here.options.body_pace
+        pause, pace = self._services.options.body_seconds, self._services.options.body_pace
         late = self._started + pause + self._received / pace - time.monotonic()
         try:
             async with asyncio.timeout(min(pause, max(0.001, late))):
                 message = await self._receive()
         except TimeoutError:
             raise SlowBody(
-                f"the {self.what} stopped coming, or comes at less than {pace} bytes a second: send it again"
+                f"the {self.content} stopped coming, or comes at less than {pace} bytes a second: send it again"
             ) from None
         if message["type"] == "http.disconnect":
             raise _Disconnected
@@ -330,7 +330,7 @@ class _RequestBody:
         return message
 
     def _too_large(self) -> TooLarge:
-        return TooLarge(f"the {self.what} is larger than {self._limit} bytes, the most that this server takes")
+        return TooLarge(f"the {self.content} is larger than {self._limit} bytes, the most that this server takes")
 
 
 def accepts_files(path: str) -> bool:

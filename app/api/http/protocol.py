@@ -61,7 +61,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._connections = connections
         self._tls = tls
         self._handshake: asyncio.Task[None] | None = None
-        self._held: bytearray | None = None
+        self._pending: bytearray | None = None
         self._limits = connections.limits
         self._head_timer: asyncio.TimerHandle | None = None
         self._stall_timer: asyncio.TimerHandle | None = None
@@ -110,7 +110,7 @@ class BoundedProtocol(HttpToolsProtocol):
         if not accepted:
             transport.abort()  # nothing can be said before the handshake
             return
-        self._held = bytearray()
+        self._pending = bytearray()
         self._handshake = self.loop.create_task(self._start_tls(transport, self._tls))
 
     async def _start_tls(self, transport: asyncio.Transport, tls: tuple[Path, Path]) -> None:
@@ -127,7 +127,7 @@ class BoundedProtocol(HttpToolsProtocol):
             )
         )
         await asyncio.sleep(0)  # from here on TLS reads; what came before is handed to it
-        hello, self._held = self._held, bytearray()
+        hello, self._pending = self._pending, bytearray()
         if hello:
             self.loop.call_soon(_feed, transport.get_protocol(), hello)
         with contextlib.suppress(OSError):
@@ -137,7 +137,7 @@ class BoundedProtocol(HttpToolsProtocol):
             transport.abort()
             return
         self._start(secured)
-        early, self._held = self._held, None
+        early, self._pending = self._pending, None
         if early:
             self.data_received(bytes(early))
 
@@ -212,10 +212,10 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Bytes came in."""
-        if self._held is not None:  # TLS has not begun to read, or its handshake is just over
+        if self._pending is not None:  # TLS has not begun to read, or its handshake is just over
             if self.transport.get_protocol() is self:
                 self.transport.pause_reading()
-            self._held += data
+            self._pending += data
             return
         if self.lingers or self._broken:
             self._left -= len(data)

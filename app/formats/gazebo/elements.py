@@ -52,5 +52,5 @@ _NAMES = """
     visualize voltage voxel_resolution wall_time waypoint width wind world world_frame_orientation wrench x xp xq xr
     xx xy xyz xz y yp yq yr yy yz z zp zq zr zz
 """
-KNOWN = frozenset(_NAMES.split())
+ELEMENTS = frozenset(_NAMES.split())
 """Their names, of all versions and places: what stands where is not told apart."""

@@ -284,19 +284,19 @@ class _Frames:
 
     def __init__(self, unfolder: ModelFlattener, file: str) -> None:
         self.unfolder, self.file = unfolder, file
-        self._said: dict[str, tuple[Pose, str, Matrix | None, etree._Element]] = {}
+        self._entries: dict[str, tuple[Pose, str, Matrix | None, etree._Element]] = {}
         self._inner: dict[str, Body] = {}
         self._placed: dict[str, Matrix] = {}
 
     def add(self, name: str, pose: Pose | None, attached: str, element: etree._Element) -> None:
         """A link, frame or joint. attached: the frame its pose stands in where it names none itself."""
-        self._said.setdefault(name, (pose or ZERO, attached, None, element))
+        self._entries.setdefault(name, (pose or ZERO, attached, None, element))
 
     def add_model(self, name: str, pose: Pose, body: Body, back: Matrix | None, element: etree._Element) -> None:
         """A nested model, with the frames in it. back: what ``placement`` gave."""
-        if name not in self._said:
+        if name not in self._entries:
             self._inner[name] = body
-        self._said.setdefault(name, (pose, "", back, element))
+        self._entries.setdefault(name, (pose, "", back, element))
 
     def place(self, name: str) -> Matrix:
         """A frame in the model's frame. A name that is not known, or whose frames go round in a circle, is warned of
@@ -304,13 +304,13 @@ class _Frames:
         if name in self._placed:
             return self._placed[name]
         chain: list[str] = []
-        while name in self._said and name not in self._placed and name not in chain:
+        while name in self._entries and name not in self._placed and name not in chain:
             chain.append(name)
-            pose, attached, _, _ = self._said[name]
+            pose, attached, _, _ = self._entries[name]
             name = pose.relative or attached
         at = self._base(name, chain)
         for link in reversed(chain):
-            pose, _, back, _ = self._said[link]
+            pose, _, back, _ = self._entries[link]
             at = at @ pose.matrix
             at = at if back is None else at @ back
             self._placed[link] = at
@@ -326,7 +326,7 @@ class _Frames:
             frame = self._inner[outer].frame(inner_name)
             if frame is not None:
                 return np.asarray(self.place(outer) @ frame, np.float64)
-        element = self._said[chain[-1]][3] if chain else None
+        element = self._entries[chain[-1]][3] if chain else None
         circle = "goes round in a circle" if name in chain else "is not known"
         line = None if element is None else element.sourceline
         location = None if element is None else element_path(element)
@@ -341,18 +341,18 @@ class _Frames:
             return parent
         if not pose.relative:
             return np.asarray(parent @ pose.matrix, np.float64)
-        if pose.relative in self._said or "::" in pose.relative or pose.relative == "__model__":
+        if pose.relative in self._entries or "::" in pose.relative or pose.relative == "__model__":
             return np.asarray(self._relative(pose.relative) @ pose.matrix, np.float64)
         reason = f"the frame {pose.relative[:80]!r} is not known: its parent's is taken"
         self.unfolder.context.warn(reason, line=element.sourceline, where=element_path(element))
         return np.asarray(parent @ pose.matrix, np.float64)
 
     def _relative(self, name: str) -> Matrix:
-        return self.place(name) if name in self._said else self._base(name, ())
+        return self.place(name) if name in self._entries else self._base(name, ())
 
     def find(self, name: str) -> Matrix | None:
         """A frame of this model or, as ``model::frame``, of one in it; None where there is none."""
-        if name in self._said:
+        if name in self._entries:
             return self.place(name)
         outer, _, inner_name = name.partition("::")
         inside = self._inner[outer].frame(inner_name) if inner_name and outer in self._inner else None

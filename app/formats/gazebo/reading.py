@@ -15,7 +15,7 @@ from lxml import etree
 from app.errors import Invalid, TooLarge
 from app.formats import Files, ReadContext
 from app.formats.gazebo import sdf, yaml_lists
-from app.formats.gazebo.elements import KNOWN
+from app.formats.gazebo.elements import ELEMENTS
 from app.formats.gazebo.library import Library, parse_version, required_files
 from app.formats.gazebo.models import Body, ModelFlattener, WorldFrames, absent_model, is_absent, placement
 from app.model import solids
@@ -38,7 +38,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         return _read_list(library, main, context)
     root = sdf.parse(files[main], context.limits)
     xml.report_active_content(files[main], context.warn, has_scripts=True)
-    xml.report_unknown_elements(files[main], root, KNOWN, context.warn, free={"plugin"})
+    xml.report_unknown_elements(files[main], root, ELEMENTS, context.warn, free={"plugin"})
     sdf.report_suspicious_values(root, context)
     version = parse_version(root.get("version"))
     if version is None or not (1, 4) <= version <= sdf.NEWEST:

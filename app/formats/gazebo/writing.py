@@ -108,7 +108,7 @@ class _Writer:
     def __init__(self, layers: Layers, context: WriteContext, options: WriteOptions) -> None:
         self.layers, self.context, self.options = layers, context, options
         self.resources = layers.resources()
-        self.made: list[tuple[str, etree._Element]] = []
+        self.elements: list[tuple[str, etree._Element]] = []
         self.taken: set[str] = set()
         self.stored: list[_StoredWorld] = []
         self.others: list[tuple[PartKey, Features]] = []
@@ -185,14 +185,14 @@ class _Writer:
                 name = free_name(f"walls_{slug(key.name)}", self.taken)
                 model = bodies.walls(grid, name, self.options.threshold, self.layers.elevation(key.level))
                 if model is not None:
-                    self.made.append((name, model))
+                    self.elements.append((name, model))
             else:
                 self.context.drop(f"walls of the grid {key.name}", 1, why)
         if source_world is None or not source_world.is_world:
             self._furnish(bodies)
         bodies.report()
         self._place(world, source_world)
-        world.extend([element for _, element in sorted(self.made, key=lambda row: _natural(row[0]))])
+        world.extend([element for _, element in sorted(self.elements, key=lambda row: _natural(row[0]))])
         return self._bundle(world, source_world, bodies)
 
     def _frame(self, source_world: _StoredWorld | None) -> etree._Element:
@@ -248,26 +248,26 @@ class _Writer:
             element.attrib.pop("placement_frame", None)
             if element.tag == "include" or any(pose):
                 element.insert(0, sdf.pose_element(pose))
-        self.made.append((name, element))
+        self.elements.append((name, element))
 
     def _make_models(self, bodies: Bodies, rows: Iterable[tuple[str, Feature]]) -> None:
         """Static models of objects that no world has told of."""
         for level, one in sorted(rows, key=lambda row: _natural(row[1].id)):
             model = bodies.model(one, self.layers.elevation(level), self.taken)
             if model is not None:
-                self.made.append((model.get("name", ""), model))
+                self.elements.append((model.get("name", ""), model))
 
     def _furnish(self, bodies: Bodies) -> None:
         """A ground to stand on and a light, where a world is made."""
         if "ground_plane" not in self.taken and self.options.ground and not bodies.hilly:
-            self.made.append(("ground_plane", bodies.ground()))
+            self.elements.append(("ground_plane", bodies.ground()))
             self.context.fill("ground plane", bodies.ground_size, "no world tells of the ground", "ground")
         lit = any(
-            e.tag == "light" or sdf.element_text(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.made
+            e.tag == "light" or sdf.element_text(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.elements
         )
         if not lit and self.options.sun:
             name = free_name("sun", self.taken)
-            self.made.append((name, sun(name)))
+            self.elements.append((name, sun(name)))
             self.context.fill("sun", "directional light", "no world tells of a light", "sun")
 
     def _place(self, world: etree._Element, source_world: _StoredWorld | None) -> None:

@@ -122,13 +122,13 @@ def read(library: Library, main: str, context: ReadContext) -> ParsedList:
     else:
         raise _unreadable_error("it must be a list of objects", "")
     if isinstance(data, Mapping):
-        reader.found.rest = (
+        reader.result.rest = (
             {"rest": extra_members}
             if (extra_members := {str(k): v for k, v in data.items() if k not in section_names})
             else {}
         )
     reader.unfolder.report()
-    return reader.found
+    return reader.result
 
 
 def _unreadable_error(reason: str, location: str) -> UnreadableFile:
@@ -177,14 +177,14 @@ class _Reader:
 
     def __init__(self, library: Library, main: str, context: ReadContext) -> None:
         self.library, self.main, self.context = library, main, context
-        self.found = ParsedList()
-        self.unfolder = ModelFlattener(library, self.found.served, context)
+        self.result = ParsedList()
+        self.unfolder = ModelFlattener(library, self.result.served, context)
         self._lists: dict[str, list[Mapping[str, Any]]] = {}
         self._count = 0
 
     def _add(self, name: str, properties: dict[str, Any]) -> None:
-        self.found.objects.append((name, properties))
-        if len(self.found.objects) > self.context.limits.features:
+        self.result.objects.append((name, properties))
+        if len(self.result.objects) > self.context.limits.features:
             raise TooLarge(f"the list has more than {self.context.limits.features} objects")
 
     # components
@@ -277,9 +277,9 @@ class _Reader:
             out = {"type": reference, "normal": [0.0, 0.0, 1.0], "size": size}
         elif reference == "mesh":
             uri = _text(item.get("dae"), f"{location}.dae")
-            self.found.served.update(required_files(self.library, near, [uri]))
+            self.result.served.update(required_files(self.library, near, [uri]))
             file = self.library.find(uri, near)
-            path = self.found.served.get(file) if file is not None else None
+            path = self.result.served.get(file) if file is not None else None
             if path is None:
                 self.unfolder.missing(uri)
                 out = {"type": reference, "uri": uri}
@@ -310,7 +310,7 @@ class _Reader:
                 },
             )
         elif ground is not None:
-            self.found.rest["ground"] = ground
+            self.result.rest["ground"] = ground
         items: list[tuple[Any, Any]]
         if isinstance(models, Mapping):
             items = [(name, item) for name, item in models.items()]
@@ -335,7 +335,7 @@ class _Reader:
 
     def _model(self, folder: str, reference: str) -> list[dict[str, Any]]:
         """The shapes of a model folder."""
-        self.found.served.update(required_files(self.library, self.main, [f"model://{reference}"]))
+        self.result.served.update(required_files(self.library, self.main, [f"model://{reference}"]))
         file = self.library.model_file(folder)
         body = None if file is None else self.unfolder.file(file)
         if body is None:

@@ -118,7 +118,7 @@ class _Reader:
         self.used: set[str] = set()
         self.datum: Datum | None = None
         self.levels: dict[str, float] = {}
-        self.own: dict[PartKey, _OwnItems] = {}
+        self.own_items: dict[PartKey, _OwnItems] = {}
         self.rasters: dict[PartKey, OccupancyGrid | GeoImage] = {}
         self.columns: dict[str, list[tuple[list[str], list[Any], list[dict[str, Any]]]]] = {}
         self.documents: dict[str, dict[str, Any]] = {}
@@ -214,7 +214,7 @@ class _Reader:
             shape = drawn
             if values.get("geometry") == "GeometryCollection" and drawn.geom_type != "GeometryCollection":
                 shape = shapely.geometrycollections(list(shapely.get_parts(drawn)))
-            part_items = self.own.setdefault(self._key(values, layer), _OwnItems())
+            part_items = self.own_items.setdefault(self._key(values, layer), _OwnItems())
             part_items.ids.append(usable_text(values.get("id") or title or local_name(element)))
             part_items.geometry.append(shape)
             part_items.properties.append(properties)
@@ -294,7 +294,7 @@ class _Reader:
                 if isinstance(elevation, int | float):
                     self.levels[level] = float(elevation)
                 document = unspell(values.get("document", "{}"))
-                part_items = self.own.setdefault(self._key(values, values["layer"]), _OwnItems())
+                part_items = self.own_items.setdefault(self._key(values, values["layer"]), _OwnItems())
                 part_items.document |= document if isinstance(document, dict) else {}
             described = child(element, "description")
             if values[OWN_ELEMENT] == "map" and described is not None:
@@ -404,7 +404,7 @@ class _Reader:
             document = {FAMILY: {"documents": self.documents[level]}} if self.documents[level] else {}
             key = PartKey("objects", level, FAMILY)
             parts[key] = Features(tuple(ids), geometry, tuple(properties), np.zeros(len(ids), bool), document)
-        for key, part_items in self.own.items():
+        for key, part_items in self.own_items.items():
             part = self._read_own_part(key, part_items)
             existing = parts.get(key)
             parts[key] = _concatenate(existing, part) if isinstance(existing, Features) else part

@@ -74,7 +74,7 @@ register(
         read=read,
         write=write,
         needs=LayerRequirements(
-            one_of=(frozenset({"topology"}),), anchor="wgs84", also=frozenset({"objects"}), own=True
+            one_of=(frozenset({"topology"}),), anchor="wgs84", also=frozenset({"objects"}), accepts_family=True
         ),
         write_options=WriteOptions,
         version=2,

@@ -135,7 +135,7 @@ class _Reader:
             if times:
                 context.warn(f"{times} {text}")
         self.xyz = xyz
-        self.known: dict[int, dict[str, Any]] = {}
+        self.points_by_row: dict[int, dict[str, Any]] = {}
         self.compact = SharedKeyDicts()
         self.located = {i: k for i, k in row.items() if not absent[k]}
 
@@ -231,9 +231,9 @@ class _Reader:
 
     def bend(self, k: int) -> dict[str, Any]:
         """What is known of a point beside its place; one value for all ways that bend there."""
-        cached = self.known.get(k)
+        cached = self.points_by_row.get(k)
         if cached is None:
-            cached = self.known[k] = self.read_point(k)
+            cached = self.points_by_row[k] = self.read_point(k)
         return cached
 
     def read_point(self, k: int) -> dict[str, Any]:

@@ -53,8 +53,8 @@ def read(files: Files, context: ReadContext) -> Layers:
 class _Item:
     """A node, edge or station of the file."""
 
-    said: dict[str, Any]
-    where: str
+    members: dict[str, Any]
+    location: str
     name: str
     layout: str
     at: int
@@ -77,7 +77,7 @@ class _Reader:
         self.is_first = "origins" not in top
         self.doubts: Counter[str] = Counter()
         self.heads: list[dict[str, Any]] = []
-        self.found: dict[str, list[_Item]] = {kind: [] for kind in ("node", "edge", "station")}
+        self.items: dict[str, list[_Item]] = {kind: [] for kind in ("node", "edge", "station")}
         self.document: dict[str, Any] = {
             "top": {w: v for w, v in top.items() if w not in ("layouts", "origins")},
             "layouts": self.heads,
@@ -85,7 +85,7 @@ class _Reader:
         self.version()
         for row, location in self.layouts():
             self.layout(row, location)
-        total = sum(map(len, self.found.values()))
+        total = sum(map(len, self.items.values()))
         if total > context.limits.features:
             raise TooLarge(f"the file has {total} items; the limit is {context.limits.features}")
 
@@ -145,7 +145,7 @@ class _Reader:
         elif not isinstance(level, str):
             raise_unreadable("must be a text", f"{location}.layoutLevelId")
         level = check_name(level, f"{location}.layoutLevelId")
-        for kind, items in self.found.items():
+        for kind, items in self.items.items():
             for at, item in enumerate(self._list(row, f"{kind}s", location)):
                 spot = f"{location}.{kind}s[{at}]"
                 if not isinstance(item, dict):
@@ -159,7 +159,7 @@ class _Reader:
                 items.append(_Item(item, spot, check_name(name, f"{spot}.{kind}Id"), layout_id, at, level))
 
     def layers(self) -> Layers:
-        nodes, edges, stations = self.found["node"], self.found["edge"], self.found["station"]
+        nodes, edges, stations = self.items["node"], self.items["edge"], self.items["station"]
         taken: set[str] = set()
         for kind, items in (("nodes", nodes), ("edges", edges)):
             for item, i in zip(items, unique_ids((identifier(item.name) for item in items), taken), strict=True):
@@ -172,7 +172,9 @@ class _Reader:
         for item, i in zip(stations, unique_ids(identifier(s.name) for s in stations), strict=True):
             item.id = i
         index_by_name = {item.name: k for k, item in reversed(list(enumerate(nodes)))}
-        xyz: Array = np.array([self.position(n.said.get("nodePosition"), n.where, "node") for n in nodes], np.float64)
+        xyz: Array = np.array(
+            [self.position(n.members.get("nodePosition"), n.location, "node") for n in nodes], np.float64
+        )
         xyz = xyz.reshape(-1, 3)
         levels: dict[str, _Level] = {}
         for k, node in enumerate(nodes):
@@ -205,8 +207,8 @@ class _Reader:
 
     def source_members(self, item: _Item, kind: str, *keys: str) -> dict[str, Any]:
         """What only this format knows of an item; ``keys`` members are canonical."""
-        position = item.said.get(f"{kind}Position")
-        extra_members = {w: v for w, v in item.said.items() if w not in (f"{kind}Id", *keys)}
+        position = item.members.get(f"{kind}Position")
+        extra_members = {w: v for w, v in item.members.items() if w not in (f"{kind}Id", *keys)}
         if isinstance(position, dict):
             extra_members.pop(f"{kind}Position", None)
             if more := {w: v for w, v in position.items() if w not in ("x", "y")}:
@@ -219,7 +221,7 @@ class _Reader:
         return out
 
     def name_members(self, item: _Item, kind: str) -> dict[str, Any]:
-        name = item.said.get(f"{kind}Name")
+        name = item.members.get(f"{kind}Name")
         return {"name": name} if isinstance(name, str) and is_name(name) else {}
 
     def node(self, item: _Item) -> dict[str, Any]:
@@ -245,29 +247,31 @@ class _Reader:
         levels: dict[str, _Level],
     ) -> None:
         """Put an edge on its level; one to nowhere stays with the node it knows, else with its layout."""
-        ends = [edge.said.get("startNodeId"), edge.said.get("endNodeId")]
+        ends = [edge.members.get("startNodeId"), edge.members.get("endNodeId")]
         a, b = (index_by_name.get(str(e)) if isinstance(e, (str, int)) else None for e in ends)
         if a is not None and b is not None:
             if a == b:
-                self.context.warn(f"the edge {edge.name} leads from a node to itself", where=edge.where)
+                self.context.warn(f"the edge {edge.name} leads from a node to itself", where=edge.location)
             levels.setdefault(edge.level, _Level()).edges.append((edge, a, b))
             return
         missing = str(ends[0] if a is None else ends[1])[:60]
-        self.context.warn(f"the edge {edge.name} leads to {missing!r}, which is no node; it is kept", where=edge.where)
-        dangling_edge = {"layout": edge.layout, "at": edge.at, "item": edge.said}
+        self.context.warn(
+            f"the edge {edge.name} leads to {missing!r}, which is no node; it is kept", where=edge.location
+        )
+        dangling_edge = {"layout": edge.layout, "at": edge.at, "item": edge.members}
         home = next((k for k in (a, b) if k is not None), None)
         of = self.document if home is None else properties[home][NAME]
         of.setdefault("dangling", []).append(dangling_edge)
 
     def check_station(self, station: _Item, index_by_name: Mapping[str, int]) -> None:
-        node_ids = station.said.get("interactionNodeIds")
+        node_ids = station.members.get("interactionNodeIds")
         if not isinstance(node_ids, list) or not all(isinstance(i, str) for i in node_ids):
-            self.context.warn("needs an array of the nodes where it is reached", where=station.where)
+            self.context.warn("needs an array of the nodes where it is reached", where=station.location)
             return
         unknown = [i for i in node_ids if i not in index_by_name]
         if unknown:
             self.context.warn(
-                f"the station is reached at {shorten_list(unknown)}, which is no node", where=station.where
+                f"the station is reached at {shorten_list(unknown)}, which is no node", where=station.location
             )
 
     def network(
@@ -301,9 +305,11 @@ class _Reader:
         geometry: NDArray[np.object_] = np.empty(len(items), object)
         rows: list[Properties] = []
         for k, item in enumerate(items):
-            position = item.said.get("stationPosition")
+            position = item.members.get("stationPosition")
             geometry[k] = (
-                NO_GEOMETRY if position is None else shapely.Point(self.position(position, item.where, "station")[:2])
+                NO_GEOMETRY
+                if position is None
+                else shapely.Point(self.position(position, item.location, "station")[:2])
             )
             source_properties = self.source_members(item, "station")
             if position is None and "stationPosition" in source_properties["item"]:

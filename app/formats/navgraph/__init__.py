@@ -25,7 +25,7 @@ from app.formats.navgraph.reading import read
 from app.formats.navgraph.vocabulary import NAME
 from app.formats.navgraph.writing import WriteOptions, write
 
-_OWN = re.compile(rb"(?m)^graph-name[ \t]*:")
+_GRAPH_NAME = re.compile(rb"(?m)^graph-name[ \t]*:")
 _TAG = re.compile(rb"(?m)^%TAG\s+\S+\s+tag:fawkesrobotics\.org,navgraph/")
 
 
@@ -33,7 +33,7 @@ def detect(name: str, data: bytes) -> bool:
     """YAML with Fawkes' tags announced on top, or with the name of a graph."""
     if not name.lower().endswith((".yaml", ".yml")) or b"nodes" not in data:
         return False
-    return bool(_TAG.search(data[:4096]) or _OWN.search(data))
+    return bool(_TAG.search(data[:4096]) or _GRAPH_NAME.search(data))
 
 
 register(

@@ -90,16 +90,18 @@ class _ParsedNode:
         if "name" not in entry:
             raise_unreadable("a node must have a name", location)
         self.name = check_name(_name(entry["name"], f"{location}.name"), f"{location}.name")
-        self.where = self.name
+        self.location = self.name
         if self.tag not in (None, UNCONNECTED):
-            context.warn(f"Fawkes does not know the tag !{self.tag} of a node", where=self.where)
+            context.warn(f"Fawkes does not know the tag !{self.tag} of a node", where=self.location)
         at = entry.get("pos")
         if not isinstance(at, list) or len(at) != 2:
-            raise_unreadable("pos must be [x, y]", f"{self.where}.pos")
-        self.at = tuple(number(_plain(v, f"{self.where}.pos"), f"{self.where}.pos") for v in at)
+            raise_unreadable("pos must be [x, y]", f"{self.location}.pos")
+        self.at = tuple(number(_plain(v, f"{self.location}.pos"), f"{self.location}.pos") for v in at)
         properties = entry.get("properties")
-        self.properties, self.words = _properties(properties, f"{self.where}.properties", context)
-        self.more = {key: _plain(value, f"{self.where}.{key}") for key, value in entry.items() if key not in NODE_KEYS}
+        self.properties, self.words = _properties(properties, f"{self.location}.properties", context)
+        self.more = {
+            key: _plain(value, f"{self.location}.{key}") for key, value in entry.items() if key not in NODE_KEYS
+        }
 
     def canonical(self, i: str) -> dict[str, Any]:
         """Its properties in the canonical layer."""

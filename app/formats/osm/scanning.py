@@ -61,7 +61,9 @@ SCAN_BYTES = 2**20
 MAX_CACHED_TEXTS, PATTERNS = 2**14, 64
 """Attribute values, and lists of attribute names, that are kept for the next element."""
 
-_KNOWN = {_pair(p) for p in (b"?x", b"os", b"/o", b"bo", b"no", b"/n", b"wa", b"/w", b"re", b"/r", b"nd", b"ta", b"me")}
+_TAG_STARTS = {
+    _pair(p) for p in (b"?x", b"os", b"/o", b"bo", b"no", b"/n", b"wa", b"/w", b"re", b"/r", b"nd", b"ta", b"me")
+}
 
 
 def scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
@@ -116,7 +118,11 @@ def _count_elements(data: bytes, limits: Limits) -> dict[bytes, int] | None:
             f"the file has {len(opened)} elements; with {limits.features} features as the limit that is too much"
         )
     codes = np.bincount(buffer[opened + 1].astype(np.int32) * 256 + buffer[opened + 2], minlength=65536)
-    if not {int(c) for c in np.flatnonzero(codes)} <= _KNOWN or codes[_pair(b"os")] != 1 or codes[_pair(b"?x")] > 1:
+    if (
+        not {int(c) for c in np.flatnonzero(codes)} <= _TAG_STARTS
+        or codes[_pair(b"os")] != 1
+        or codes[_pair(b"?x")] > 1
+    ):
         return None
     return {p: int(codes[_pair(p)]) for p in (b"no", b"/n", b"wa", b"re", b"nd", b"ta", b"me", b"bo")}
 

@@ -95,7 +95,7 @@ class _FlowParser:
     def __init__(self, limits: Limits) -> None:
         self.nodes = self.depth = 0
         self._limits = limits
-        self._known: dict[str, tuple[Any, int, int]] = {}
+        self._cache: dict[str, tuple[Any, int, int]] = {}
 
     def row(self, x: str, y: str, tail: str) -> list[Any]:
         """The value of ``[x, y, tail``, x and y being plain decimals."""
@@ -185,12 +185,12 @@ class _FlowParser:
         if end == "]" or depth != 2 or flow[-2:] != "}]" or flow.find("}", at) != len(flow) - 2:
             return self._content(flow, at, end, depth)
         remainder = flow[at:]
-        cached = self._known.get(remainder)
+        cached = self._cache.get(remainder)
         if cached is None:
             value, after, nodes, deepest = self._content(flow, at, end, depth)
             if after != len(flow) - 1:
                 return value, after, nodes, deepest
-            cached = self._known[remainder] = (value, nodes, deepest)
+            cached = self._cache[remainder] = (value, nodes, deepest)
         return cached[0], len(flow) - 1, cached[1], cached[2]
 
 

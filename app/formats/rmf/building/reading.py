@@ -49,7 +49,7 @@ class _Level:
 
     name: str
     order: int
-    said: dict[str, Any]
+    members: dict[str, Any]
     raw: Array
     rows: list[Any]
     elevation: float
@@ -112,7 +112,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     named = [
         (f"levels.{level.name}.{key}.filename", raw_value)
         for level in levels.values()
-        for key, raw_value in named_images(level.said)
+        for key, raw_value in named_images(level.members)
     ]
     pictures = images(files, main, named, context)
     if pictures and context.wants("resources"):
@@ -152,12 +152,12 @@ def _reference(top: Mapping[str, Any], levels: Mapping[str, _Level]) -> str:
 
 def _scaling(level: _Level) -> Scaling:
     measurements = []
-    for k, row in enumerate(listing(level.said.get("measurements"), f"levels.{level.name}.measurements")):
+    for k, row in enumerate(listing(level.members.get("measurements"), f"levels.{level.name}.measurements")):
         i, j, parameters, _ = _edge(row, level.location_of("measurements", k))
         if 0 <= i < len(level.raw) and 0 <= j < len(level.raw):
             metres = number(parameter_value(parameters, "distance"), f"{level.location_of('measurements', k)}.distance")
             measurements.append((math.dist(level.raw[i], level.raw[j]), metres))
-    rows = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
+    rows = listing(level.members.get("fiducials"), f"levels.{level.name}.fiducials")
     at = common.places(rows, f"levels.{level.name}.fiducials")
     names = [plain_text(row[2]) if len(row) > 2 else "" for row in rows]
     return Scaling(measurements, [(name, x, -y) for name, (x, y) in zip(names, at.tolist(), strict=True)])
@@ -195,7 +195,7 @@ class _Reader:
 
     def document(self, level: _Level, building: dict[str, Any]) -> dict[str, Any]:
         """What stands in the documents of a level's parts."""
-        extra_members = {key: value for key, value in level.said.items() if key not in LISTS}
+        extra_members = {key: value for key, value in level.members.items() if key not in LISTS}
         out: dict[str, Any] = {"building": building, "level": extra_members, "order": level.order}
         if self.system == IMAGE:
             out["transform"] = level.transform.as_list()
@@ -305,7 +305,7 @@ class _Reader:
     def _between(self, level: _Level, section: str) -> Iterable[tuple[int, int, int, dict[str, Any], list[Any]]]:
         """(place in the list, start, end, parameters, more) of the rows whose vertices exist. Each row is let go."""
         n = len(level.raw)
-        rows = list(listing(level.said.pop(section, None), f"levels.{level.name}.{section}"))
+        rows = list(listing(level.members.pop(section, None), f"levels.{level.name}.{section}"))
         for k in range(len(rows)):
             row, rows[k] = rows[k], None
             i, j, parameters, more = _edge(row, level.location_of(section, k))
@@ -337,7 +337,7 @@ class _Reader:
                     properties["name"] = name
                 rows.append((f"{prefix}/{kind}/{k}", shapely.LineString(level.at[[i, j]]), properties))
         for section, kind in RINGS.items():
-            for k, one in enumerate(listing(level.said.pop(section, None), f"levels.{level.name}.{section}")):
+            for k, one in enumerate(listing(level.members.pop(section, None), f"levels.{level.name}.{section}")):
                 location = level.location_of(section, k)
                 properties = dict(mapping(one, location))
                 corners = listing(properties.pop("vertices", None), f"{location}.vertices")
@@ -350,7 +350,7 @@ class _Reader:
                 source_properties = {"index": k, "vertices": ring, **properties}
                 rows.append((f"{prefix}/{kind}/{k}", _ring(level.at[ring]), {"kind": kind, NAME: source_properties}))
         rows += self._models(level, prefix)
-        marks = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
+        marks = listing(level.members.get("fiducials"), f"levels.{level.name}.fiducials")
         at = self._level_position(common.places(marks, f"levels.{level.name}.fiducials"), level)
         for k, row in enumerate(marks):
             properties = {"kind": "fiducial", NAME: {"index": k, **({"more": row[3:]} if len(row) > 3 else {})}}
@@ -363,7 +363,7 @@ class _Reader:
         return to_canonical(self.system, raw, level.transform)
 
     def _models(self, level: _Level, prefix: str) -> list[tuple[str, Any, Properties]]:
-        listed = listing(level.said.get("models"), f"levels.{level.name}.models")
+        listed = listing(level.members.get("models"), f"levels.{level.name}.models")
         raw = np.empty((len(listed), 2))
         for k, one in enumerate(listed):
             location = level.location_of("models", k)

@@ -10,7 +10,7 @@ Robots source the two scripts, so they are made anew and never copied: literal v
 that are there; as in the template those of maps that are missing are empty. The archive holds what is stored;
 ``complete`` adds what derivations can make of it.
 
-``config/fleet_map`` holds the stored layers exactly (``_content``): a package whose maps nobody has touched gives back
+``config/fleet_map`` holds the stored layers exactly (``content``): a package whose maps nobody has touched gives back
 the very environment, and in one that was edited the maps count. Added files that no format reads (a README,
 ``.DS_Store``) are no edit.
 
@@ -36,10 +36,10 @@ from app.formats import (
     ReadContext,
     Traits,
     WriteContext,
-    _content,
     register,
 )
 from app.formats._network import shorten_list
+from app.formats.environment import content as exact_content
 from app.limits import Limits
 from app.model.features import Features
 from app.model.frame import GROUND, Level
@@ -132,8 +132,8 @@ class _Writer:
         self.report_unwritten()
         self.scripts(variables)
         if self.context.stored is not None and not self.complete:  # else the maps say something else
-            content = _content.pack(self.layers, self.out, self.context.stored)
-            if len(content[_content.MAIN]) <= Limits().text_bytes:
+            content = exact_content.pack(self.layers, self.out, self.context.stored)
+            if len(content[exact_content.MAIN]) <= Limits().text_bytes:
                 self.out |= content
             else:
                 self.context.warn("the stored layers are too large to be in it exactly: it holds the maps only")
