@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from app.formats import Files, Format, LayerRequirements, ReadContext, Selection, WriteContext, register
-from app.formats.clouds import las_codec as _las
-from app.formats.clouds import points as _points
+from app.formats.clouds import las_codec, points
 from app.formats.clouds.parsers import PARSERS
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
@@ -26,17 +25,17 @@ ENDINGS = ("las", "laz")
 class WriteOptions:
     """Which cloud, and how it is written."""
 
-    name: str | None = parameter(None, _points.NAME_DOC)
-    level: str | None = parameter(None, _points.LEVEL_DOC)
+    name: str | None = parameter(None, points.NAME_DOC)
+    level: str | None = parameter(None, points.LEVEL_DOC)
     kind: Literal["las", "laz"] | None = parameter(None, "laz is compressed; default: as uploaded, else las")
-    frame: Literal["source", "local"] | None = parameter(None, _points.FRAME_DOC)
+    frame: Literal["source", "local"] | None = parameter(None, points.FRAME_DOC)
 
 
 def read(files: Files, context: ReadContext) -> Layers:
     """One voxel map and its cloud. Raises UnreadableFile or TooLarge."""
     main = context.main or next(iter(files))
     compressed = len(files[main]) > 104 and bool(files[main][104] & 0xC0)
-    return _points.read(files, context, "laz" if compressed else "las", _las.parse)
+    return points.read(files, context, "laz" if compressed else "las", las_codec.parse)
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
@@ -45,26 +44,26 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     Raises MissingLayer, NotFound, Ambiguous or Invalid.
     """
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    source = _points.source(layers, context, options.name, options.level, options.frame, ENDINGS, PARSERS)
+    source = points.source(layers, context, options.name, options.level, options.frame, ENDINGS, PARSERS)
     kind = options.kind or (source.form if source.form in ENDINGS else "las")
-    name = _points.file_name(options.name, kind)
+    name = points.file_name(options.name, kind)
     if source.data is not None:
-        return {name: source.data if kind == source.form else _las.recompress(source.data, kind == "laz")}
+        return {name: source.data if kind == source.form else las_codec.recompress(source.data, kind == "laz")}
     cloud = source.cloud()
     if source.form not in ENDINGS:
         if cloud.height > 1:
             context.drop("rows and columns of the cloud", 1, "LAS points are one list: ask for pcd")
         context.drop(
-            "viewpoint", int(cloud.viewpoint != _points.IDENTITY_VIEWPOINT), "LAS has no place for it: ask for pcd"
+            "viewpoint", int(cloud.viewpoint != points.IDENTITY_VIEWPOINT), "LAS has no place for it: ask for pcd"
         )
         for noun, count in cloud.further.items():
             context.drop(noun, count, "LAS has points only")
-    return {name: _las.pack(_points.plain(cloud), context, kind == "laz")}
+    return {name: las_codec.pack(points.plain(cloud), context, kind == "laz")}
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named voxel map; else ``map``, else the only one; and the cloud that belongs to it."""
-    return _points.choose(keys, options.name, options.level)
+    return points.choose(keys, options.name, options.level)
 
 
 def options_from_filename(name: str) -> dict[str, str]:
@@ -81,13 +80,13 @@ register(
         title="LAS and LAZ point cloud",
         files={"map.las": "application/vnd.las", "map.laz": "application/vnd.laszip"},
         layers=frozenset({"voxels", "resources"}),
-        detect=_las.detect,
+        detect=las_codec.detect,
         read=read,
         write=write,
         needs=LayerRequirements((frozenset({"voxels"}),), also=frozenset({"resources"})),
-        read_options=_points.ReadOptions,
+        read_options=points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".las", ".laz"),
-        selection=Selection(choose, options_from_filename, _points.PARTS),
+        selection=Selection(choose, options_from_filename, points.PARTS),
     )
 )

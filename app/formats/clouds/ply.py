@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from app.formats import Files, Format, LayerRequirements, ReadContext, Selection, WriteContext, register
-from app.formats.clouds import ply_codec as _ply
-from app.formats.clouds import points as _points
+from app.formats.clouds import ply_codec, points
 from app.formats.clouds.parsers import PARSERS
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
@@ -24,24 +23,24 @@ NAME = "ply"
 class WriteOptions:
     """Which cloud, and how it is written."""
 
-    name: str | None = parameter(None, _points.NAME_DOC)
-    level: str | None = parameter(None, _points.LEVEL_DOC)
+    name: str | None = parameter(None, points.NAME_DOC)
+    level: str | None = parameter(None, points.LEVEL_DOC)
     data: Literal["ascii", "binary_little_endian", "binary_big_endian"] | None = parameter(
         None, "how points are encoded; default: as uploaded, else binary_little_endian"
     )
-    frame: Literal["source", "local"] | None = parameter(None, _points.FRAME_DOC)
+    frame: Literal["source", "local"] | None = parameter(None, points.FRAME_DOC)
 
 
 def read(files: Files, context: ReadContext) -> Layers:
     """One voxel map and its cloud. Raises UnreadableFile (with line and word, or the reason) or TooLarge."""
-    return _points.read(files, context, NAME, _ply.parse)
+    return points.read(files, context, NAME, ply_codec.parse)
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``map.ply`` (``<name>.ply`` where a name is asked for). Raises MissingLayer, NotFound, Ambiguous or Invalid."""
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    source = _points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
-    name = _points.file_name(options.name, NAME)
+    source = points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
+    name = points.file_name(options.name, NAME)
     if source.data is not None and options.data is None:
         return {name: source.data}
     cloud = source.cloud()
@@ -49,17 +48,17 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         if cloud.height > 1:
             context.drop("rows and columns of the cloud", 1, "a PLY's vertices are one list: ask for pcd")
         context.drop(
-            "viewpoint", int(cloud.viewpoint != _points.IDENTITY_VIEWPOINT), "PLY has no place for it: ask for pcd"
+            "viewpoint", int(cloud.viewpoint != points.IDENTITY_VIEWPOINT), "PLY has no place for it: ask for pcd"
         )
-        cloud = replace(cloud, columns=_points.plain(cloud), comments=())
+        cloud = replace(cloud, columns=points.plain(cloud), comments=())
     for noun, count in cloud.further.items():
         context.drop(noun, count, "written again, a PLY has vertices only: leave out data= and frame= to keep it")
-    return {name: _ply.pack(cloud, options.data or "binary_little_endian")}
+    return {name: ply_codec.pack(cloud, options.data or "binary_little_endian")}
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named voxel map; else ``map``, else the only one; and the cloud that belongs to it."""
-    return _points.choose(keys, options.name, options.level)
+    return points.choose(keys, options.name, options.level)
 
 
 register(
@@ -68,13 +67,13 @@ register(
         title="PLY point cloud",
         files={"map.ply": "application/octet-stream"},
         layers=frozenset({"voxels", "resources"}),
-        detect=_ply.detect,
+        detect=ply_codec.detect,
         read=read,
         write=write,
         needs=LayerRequirements((frozenset({"voxels"}),), also=frozenset({"resources"})),
-        read_options=_points.ReadOptions,
+        read_options=points.ReadOptions,
         write_options=WriteOptions,
         extensions=(".ply",),
-        selection=Selection(choose, _points.options_from_filename((NAME,)), _points.PARTS),
+        selection=Selection(choose, points.options_from_filename((NAME,)), points.PARTS),
     )
 )

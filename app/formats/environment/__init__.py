@@ -10,7 +10,7 @@ Robots source the two scripts, so they are made anew and never copied: literal v
 that are there; as in the template those of maps that are missing are empty. The archive holds what is stored;
 ``complete`` adds what derivations can make of it.
 
-``config/fleet_map`` holds the stored layers exactly (``content``): a package whose maps nobody has touched gives back
+``config/fleet_map`` holds the stored layers exactly (``environment.content``): a package whose maps nobody has touched gives back
 the very environment, and in one that was edited the maps count. Added files that no format reads (a README,
 ``.DS_Store``) are no edit.
 

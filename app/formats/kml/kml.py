@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from xml.sax.saxutils import unescape
 
 from app.formats import Claims, Files, Format, ReadContext, Traits, WriteContext, register
-from app.formats.kml import rules as _kml_rules
+from app.formats.kml import rules
 from app.formats.kml.reading import read_kml
 from app.formats.kml.words import MAIN
 from app.formats.kml.writing import NEEDS, write_kml
@@ -76,7 +76,7 @@ register(
         layers=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery"}),
         detect=detect,
         read=read,
-        check=_kml_rules.check,
+        check=rules.check,
         write=write,
         needs=NEEDS,
         version=2,

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Claims, Files, Format, ReadContext, Traits, WriteContext, register
-from app.formats.kml import rules as _kml_rules
+from app.formats.kml import rules
 from app.formats.kml.reading import read_kml
 from app.formats.kml.words import FAMILY
 from app.formats.kml.writing import NEEDS, write_kml
@@ -83,7 +83,7 @@ register(
         layers=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery", "resources"}),
         detect=detect,
         read=read,
-        check=_kml_rules.check_archive,
+        check=rules.check_archive,
         write=write,
         needs=replace(NEEDS, one_of=(*NEEDS.one_of, frozenset({"imagery"}))),
         version=2,

@@ -22,7 +22,7 @@ from typing import Any
 import orjson
 
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, register
-from app.formats.lif import rules as _lif_rules
+from app.formats.lif import rules
 from app.formats.lif.reading import read
 from app.formats.lif.vocabulary import NAME
 from app.formats.lif.writing import WriteOptions, write
@@ -63,7 +63,7 @@ register(
         layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
-        check=_lif_rules.check,
+        check=rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", missing_content=lacks),
         write_options=WriteOptions,

@@ -19,7 +19,7 @@ between unknown nodes (an edge with one known end is kept with that node).
 from __future__ import annotations
 
 from app.formats import Claims, Format, LayerRequirements, Traits, register
-from app.formats.nav2_route import rules as _nav2_route_rules
+from app.formats.nav2_route import rules
 from app.formats.nav2_route.reading import read
 from app.formats.nav2_route.vocabulary import NAME
 from app.formats.nav2_route.writing import WriteOptions, write
@@ -50,7 +50,7 @@ register(
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local", missing_content=lacks),
         write_options=WriteOptions,
-        check=_nav2_route_rules.check,
+        check=rules.check,
         extensions=(".geojson", ".json"),
         version=2,
         claims=Claims(priority=36),

@@ -65,7 +65,7 @@ def check(files: Files) -> Iterator[Problem]:
                 far += max(abs(at[0]), abs(at[1])) > MAX_EXACT_METRES
         else:
             edges.append((properties["id"], properties.get("startid"), properties.get("endid")))
-        yield from _types(properties, main, f"{location}.properties", is_node=kind == "Point")
+        yield from _types(properties, main, location, is_node=kind == "Point")
         if "metadata" in properties:
             yield from _metadata(properties["metadata"], main, f"{location}.properties.metadata")
         if "operations" in properties:
@@ -84,14 +84,14 @@ def _types(properties: Mapping[str, Any], main: str, location: str, *, is_node: 
     if is_node:
         if not isinstance(properties.get("frame", ""), str):
             reason = f"must be a text, is {shown(properties['frame'])}"
-            yield error_finding(reason, main, where=f"{location}.frame")
+            yield error_finding(reason, main, where=f"{location}.properties.frame")
         return
     if not is_number(properties.get("cost", 0.0)):
         reason = f"must be a number, is {shown(properties['cost'])}"
-        yield error_finding(reason, main, where=f"{location}.cost")
+        yield error_finding(reason, main, where=f"{location}.properties.cost")
     if not isinstance(properties.get("overridable", True), bool):
         reason = f"must be true or false, is {shown(properties['overridable'])}"
-        yield error_finding(reason, main, where=f"{location}.overridable")
+        yield error_finding(reason, main, where=f"{location}.properties.overridable")
 
 
 def _is_id(value: Any) -> bool:

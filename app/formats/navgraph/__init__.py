@@ -20,7 +20,7 @@ from __future__ import annotations
 import re
 
 from app.formats import Claims, Format, LayerRequirements, Traits, register
-from app.formats.navgraph import rules as _navgraph_rules
+from app.formats.navgraph import rules
 from app.formats.navgraph.reading import read
 from app.formats.navgraph.vocabulary import NAME
 from app.formats.navgraph.writing import WriteOptions, write
@@ -44,7 +44,7 @@ register(
         layers=frozenset({"topology"}),
         detect=detect,
         read=read,
-        check=_navgraph_rules.check,
+        check=rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,

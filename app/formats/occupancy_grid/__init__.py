@@ -18,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from app.errors import FleetMapError
 from app.formats import BAD_INPUT, Claims, Format, LayerRequirements, Parts, Selection, _masks, register
 from app.formats._select import file_stem
-from app.formats.occupancy_grid import rules as _occupancy_grid_rules
+from app.formats.occupancy_grid import rules
 from app.formats.occupancy_grid.reading import IMAGE_ENDS, YAML_ENDS, ReadOptions, find_image, is_image, read
 from app.formats.occupancy_grid.words import NAME
 from app.formats.occupancy_grid.writing import WriteOptions, choose, write
@@ -79,7 +79,7 @@ register(
         needs=LayerRequirements(one_of=(frozenset({"occupancy"}),)),
         read_options=ReadOptions,
         write_options=WriteOptions,
-        check=_occupancy_grid_rules.check,
+        check=rules.check,
         version=4,
         extensions=(*YAML_ENDS, *IMAGE_ENDS),
         selection=Selection(choose, options_from_filename, Parts("occupancy", "grid", file_stem)),

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from app.errors import NotFound, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Format, LayerRequirements, Parts, ReadContext, Selection, WriteContext, register
 from app.formats._select import file_stem, select_part
-from app.formats.octomap import rules as _octomap_rules
+from app.formats.octomap import rules
 from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
 from app.model.voxels import DEPTH, LOG_ODDS, UNSET, VoxelMap, coarser, cut, merge_to_parents, prune
@@ -536,7 +536,7 @@ register(
         layers=frozenset({"voxels"}),
         detect=detect,
         read=read,
-        check=_octomap_rules.check,
+        check=rules.check,
         write=write,
         needs=LayerRequirements((frozenset({"voxels"}),)),
         write_options=WriteOptions,

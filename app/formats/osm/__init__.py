@@ -38,7 +38,7 @@ from __future__ import annotations
 import re
 
 from app.formats import Claims, Format, LayerRequirements, Traits, register
-from app.formats.osm import rules as _osm_rules
+from app.formats.osm import rules
 from app.formats.osm.parsing import is_pbf, unpack
 from app.formats.osm.reading import read
 from app.formats.osm.tags import CARRIES
@@ -67,7 +67,7 @@ register(
         layers=CARRIES,
         detect=detect,
         read=read,
-        check=_osm_rules.check,
+        check=rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
         version=3,

@@ -9,8 +9,7 @@ of an edge: ``edge_id``, ``node``, ``action``, ``top_vel``, ``map_2d``, ``inflat
 from __future__ import annotations
 
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, WriteContext, register
-from app.formats.tmap import network as _tmap
-from app.formats.tmap import writing
+from app.formats.tmap import network, writing
 from app.formats.tmap.reading import read
 from app.model.layers import Layers
 
@@ -25,7 +24,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 def detect(name: str, data: bytes) -> bool:
     """A YAML list whose first entry is that of a node."""
-    return name.lower().endswith(ENDS) and _tmap.is_list(data)
+    return name.lower().endswith(ENDS) and network.is_list(data)
 
 
 register(
@@ -38,11 +37,11 @@ register(
         read=read,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
-        write_options=_tmap.ListOptions,
+        write_options=network.ListOptions,
         extensions=(".tmap",),
         version=2,
-        selection=Selection(_tmap.choose),
+        selection=Selection(network.choose),
         claims=Claims(priority=49, leads_folder="topological"),
-        traits=Traits(family=_tmap.NAME, keeps_bends="nodes", has_title=True),
+        traits=Traits(family=network.NAME, keeps_bends="nodes", has_title=True),
     )
 )

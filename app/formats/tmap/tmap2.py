@@ -6,9 +6,7 @@ See ``tmap.network``. The older list (``tmap``) is read too where a sender calls
 from __future__ import annotations
 
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, WriteContext, register
-from app.formats.tmap import network as _tmap
-from app.formats.tmap import rules as _tmap2_rules
-from app.formats.tmap import writing
+from app.formats.tmap import network, rules, writing
 from app.formats.tmap.reading import read
 from app.model.layers import Layers
 
@@ -24,28 +22,28 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 def detect(name: str, data: bytes) -> bool:
     """A topological map by its name, or YAML with its top-level keys; never the older list."""
     lower = name.lower()
-    if b"node" not in data or _tmap.is_list(data):
+    if b"node" not in data or network.is_list(data):
         return False
     if lower.endswith(NAMES):
         return True
-    return lower.endswith((".yaml", ".yml", ".tmap")) and _tmap.is_mapping(data)
+    return lower.endswith((".yaml", ".yml", ".tmap")) and network.is_mapping(data)
 
 
 register(
     Format(
-        name=_tmap.NAME,
+        name=network.NAME,
         title="Topological map (topological_navigation)",
         files={FILE: "application/yaml"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
-        check=_tmap2_rules.check,
+        check=rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
-        write_options=_tmap.WriteOptions,
+        write_options=network.WriteOptions,
         extensions=(*NAMES, ".tmap"),
         version=2,
-        selection=Selection(_tmap.choose),
+        selection=Selection(network.choose),
         claims=Claims(priority=50, leads_folder="topological"),
         traits=Traits(keeps_bends="nodes", has_title=True),
     )

@@ -30,8 +30,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, register
-from app.formats.rmf import common as _rmf
-from app.formats.rmf.building import rules as _openrmf_rules
+from app.formats.rmf import common
+from app.formats.rmf.building import rules
 from app.formats.rmf.building.reading import read
 from app.formats.rmf.building.vocabulary import FILE, NAME
 from app.formats.rmf.building.writing import write
@@ -81,10 +81,10 @@ register(
         layers=frozenset({"topology", "objects", "resources"}),
         detect=detect,
         read=read,
-        check=_openrmf_rules.check,
+        check=rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
-        write_options=_rmf.WriteOptions,
+        write_options=common.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),
         version=2,
         selection=Selection(choose),

@@ -21,9 +21,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, one_map_per_folder, register
-from app.formats.rmf import common as _rmf
+from app.formats.rmf import common
 from app.formats.rmf.common import BUILDING
-from app.formats.rmf.nav_graph import rules as _rmf_nav_graph_rules
+from app.formats.rmf.nav_graph import rules
 from app.formats.rmf.nav_graph.reading import read
 from app.formats.rmf.nav_graph.vocabulary import NAME
 from app.formats.rmf.nav_graph.writing import write
@@ -63,12 +63,12 @@ register(
         layers=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
-        check=_rmf_nav_graph_rules.check,
+        check=rules.check,
         write=write,
         needs=LayerRequirements(
             one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"}), missing_content=lacks
         ),
-        write_options=_rmf.WriteOptions,
+        write_options=common.WriteOptions,
         extensions=(".yaml", ".yml"),
         version=2,
         selection=Selection(choose),

@@ -23,7 +23,7 @@ from typing import Any
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, register
 from app.formats.rmf.common import BUILDING, NAV_GRAPH
 from app.formats.rmf.images import companion_hook
-from app.formats.rmf.site import rules as _rmf_site_rules
+from app.formats.rmf.site import rules
 from app.formats.rmf.site.draft import WriteOptions
 from app.formats.rmf.site.reading import read
 from app.formats.rmf.site.vocabulary import NAME
@@ -67,7 +67,7 @@ register(
         layers=frozenset({"topology", "objects", "resources"}),
         detect=detect,
         read=read,
-        check=_rmf_site_rules.check,
+        check=rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         write_options=WriteOptions,
