@@ -76,9 +76,7 @@ SAMPLES: Mapping[str, Sample] = {
             *((x, y, 0.4, 0.4) for y in (0.6, 1.6, 3.0, 4.2) for x in (3.3, 4.2)),
         ),
     ),
-    "pillars": Sample(
-        STYLES["wall"], tuple((x, y, 0.4, 0.4) for x in (0.4, 1.65, 2.9, 4.15) for y in (0.4, 1.65, 2.9, 4.15))
-    ),
+    "pillars": Sample(CellStyle("pillar", 2.5, "wall"), tuple((x, y, 0.4, 0.4) for x in PILLARS for y in PILLARS)),
 }
 
 

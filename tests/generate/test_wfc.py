@@ -121,6 +121,12 @@ def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
         assert windows(out, 5) <= sample_windows
 
 
+def test_pillars_stand_within_walls() -> None:
+    layers, _ = looks.make(NAME, sample="pillars", width=6, depth=6)
+    kinds = {i.split("/")[0] for part in layers.vector("objects").values() for i in part.ids}
+    assert kinds == {"pillar", "wall"}
+
+
 def test_what_is_fixed_stays() -> None:
     sample = SAMPLES["pillars"].cells(0.1)
     fixed = np.full((50, 50), -1)
