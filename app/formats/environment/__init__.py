@@ -10,8 +10,8 @@ Robots source the two scripts, so they are made anew and never copied: literal v
 that are there; as in the template those of maps that are missing are empty. The archive holds what is stored;
 ``complete`` adds what derivations can make of it.
 
-``config/fleet_map`` holds the stored layers exactly (``environment.content``): a package whose maps nobody has touched gives back
-the very environment, and in one that was edited the maps count. Added files that no format reads (a README,
+``config/fleet_map`` holds the stored layers exactly (``environment.content``): a package whose maps nobody has touched
+gives back the very environment, and in one that was edited the maps count. Added files that no format reads (a README,
 ``.DS_Store``) are no edit.
 
 Every map in it is another format's: reading is what an upload of the folder is (``app.upload_reader``), and writers
