@@ -37,6 +37,9 @@ from app.errors import Conflict, Invalid, Unavailable, Untrusted
 OLD_VERSIONS_KEPT = 2
 """Old versions that stay, beside the current one."""
 
+LOCK_SECONDS = 1.0
+"""How long the lock is waited for: a child that a killed agent was about to start holds it until it has started."""
+
 HOOKS_LOCK_SECONDS = 0.1
 """Interval between two attempts to get the lock for hooks."""
 
@@ -58,6 +61,16 @@ class MapDirectory:
         """Names of versions that are never removed: they may be switched to again."""
         self._lock: IO[str] | None = None
 
+    def _wait_for_lock(self, handle: IO[str]) -> None:
+        deadline = time.monotonic() + LOCK_SECONDS
+        while True:
+            try:
+                return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise Conflict(f"another agent keeps {self.path}") from None
+                time.sleep(HOOKS_LOCK_SECONDS)
+
     def open(self) -> None:
         """Make what is absent and take the lock; Conflict where another agent has it."""
         for folder in (self.path, self.versions, self.partial):
@@ -66,10 +79,10 @@ class MapDirectory:
             raise Conflict(f"{self.current} is there and is not an agent's link: use another folder")
         handle = (self.path / "lock").open("a")
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+            self._wait_for_lock(handle)
+        except Conflict:
             handle.close()
-            raise Conflict(f"another agent keeps {self.path}") from None
+            raise
         except OSError as error:
             handle.close()
             raise Invalid(f"{self.path} cannot be locked ({error.strerror}): use a folder on another disk") from None

@@ -230,7 +230,7 @@ def test_slow_download_is_resumed(fake: Fake, robot: Robot) -> None:
     assert not one.once()
     (part,) = (one.into / "partial").iterdir()
     size = part.stat().st_size
-    assert size > 100
+    assert size > 0
     starts: list[str] = []
 
     def honest(handler: BaseHTTPRequestHandler) -> bool:
