@@ -160,7 +160,9 @@ def test_the_server_code_is_imported_after_a_check_of_the_python() -> None:
 AFTER_THE_CHECK = {
     "_compile",
     "_store",
-    "_main",
+    "_run",
+    "application",
+    "check",
     "_companions",
     "_check_names",
     "_open",

@@ -419,5 +419,5 @@ def test_a_grid_alone_still_is_a_gazebo_world_of_its_cells() -> None:
     assert chain == recipe.DerivationChain((), (key,))
     # Objects that were made of it stand for it, unless it is named.
     both = [PartKey("objects", "ground", NAME), key]
-    assert gazebo.select_parts(both, gazebo.write_options()) == both[:1]
-    assert gazebo.select_parts(both, gazebo.write_options(grid=MAP)) == both
+    assert gazebo.selection.choose(both, gazebo.write_options()) == both[:1]
+    assert gazebo.selection.choose(both, gazebo.write_options(grid=MAP)) == both
