@@ -148,9 +148,9 @@ class Agent:
         self._zenoh = ZenohClient(
             self.options.environment,
             self._robot,
-            heard=self._on_event,
-            back=self._on_router_connected,
-            lost=self._on_router_lost,
+            on_event=self._on_event,
+            on_connected=self._on_router_connected,
+            on_lost=self._on_router_lost,
             config=self.options.zenoh_config,
             login=self._login,
         )

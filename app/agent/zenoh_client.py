@@ -34,8 +34,8 @@ MAX_EVENT_BYTES = 2**18
 class ZenohClient:
     """A session that is opened as soon as it can be, in a thread of its own. Methods are thread-safe.
 
-    heard: called with each event of the environment. back: called when the router is there (again). lost: called with
-    the reason when it is not, once for each reason.
+    on_event: called with each event of the environment. on_connected: called when the router is there (again).
+    on_lost: called with the reason when it is not, once for each reason.
     """
 
     def __init__(
@@ -43,18 +43,18 @@ class ZenohClient:
         environment: str,
         robot: str,
         *,
-        heard: Callable[[messages.Event], None],
-        back: Callable[[], None],
-        lost: Callable[[str], None] = lambda _: None,
+        on_event: Callable[[messages.Event], None],
+        on_connected: Callable[[], None],
+        on_lost: Callable[[str], None] = lambda _: None,
         config: Path | None = None,
         login: ZenohCredentials | None = None,
     ) -> None:
         self._environment, self._robot, self._on_event, self._on_connected, self._on_lost = (
             environment,
             robot,
-            heard,
-            back,
-            lost,
+            on_event,
+            on_connected,
+            on_lost,
         )
         self._config, self._login = config, login or ZenohCredentials()
         self._endpoint: tuple[str, str] | None = None

@@ -379,7 +379,7 @@ def _is_on_default_level(site: _Site, name: str | None) -> bool:
 
 
 def select(files: Iterable[Any], member: Member) -> list[Any]:
-    """The files of a member's map that belong to the site. made: with ``place``, the level and the name of the part."""
+    """The files of a member's map that belong to the site. ``place`` of each: level and name of the part."""
     candidates = [f for f in files if member.place is not None or _fits(f.place, member)]
     if not member.only_default:
         return candidates

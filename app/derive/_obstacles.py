@@ -149,7 +149,7 @@ def sites(
 
 
 def unreadable_error(reasons: Iterable[str], summary: str) -> MissingLayer:
-    """The error for a map that would be a guess, since solids cannot be read. what: what is therefore not known."""
+    """The error for a map that would be a guess, since solids cannot be read. summary: what is therefore unknown."""
     named = list(dict.fromkeys(reasons))
     more = f"; and {len(named) - 3} more" if len(named) > 3 else ""
     detail = f"{summary}, since solids of the objects cannot be read: {'; '.join(named[:3])}{more}"

@@ -175,8 +175,8 @@ def classes(model: ModelFiles, session: Any) -> tuple[tuple[str | None, ...], Ma
 
 
 def input_side(model: ModelFiles, file: LoadedModel, reason: str, usual: int) -> int:
-    """The side of the one picture [1, 3, h, w] that a model takes. told: of a model that takes something else, for the
-    error. CannotConvert says what it should take."""
+    """The side of the one picture [1, 3, h, w] that a model takes. reason: why another one is wrong, for the error.
+    CannotConvert says what it should take."""
     (kind, shape), *more = file.inputs.values()
     if more or kind != "tensor(float)" or len(shape) != 4 or shape[1] not in (3, "3"):
         raise CannotConvert(

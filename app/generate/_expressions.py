@@ -50,7 +50,7 @@ Value = Callable[[Mapping[str, float], np.random.Generator], float]
 
 @dataclass(frozen=True, slots=True)
 class Expression:
-    """A parsed expression. text: as it was written; where: the place it is named by in problems."""
+    """A parsed expression. text: as it was written; location: the place it is named by in problems."""
 
     text: str
     location: str

@@ -150,10 +150,10 @@ def open_field(
 ) -> Field:
     """A field on the site, with the rows and aisles that its fence holds.
 
-    lines: what comes one after another, at most; own: how many of them make the site where there is no fence, all where
-    it is None and they were asked for. spacing: metres from one to the next. half: metres from a row's middle to its
-    side, all that jitters included; word: the parameter that decides it. Raises CannotGenerate where a robot has no
-    room.
+    lines: what comes one after another, at most; row_count: how many of them make the site where there is no fence,
+    all where it is None and they were asked for. spacing: metres from one to the next. half: metres from a row's
+    middle to its side, all that jitters included; word: the parameter that decides it. Raises CannotGenerate where a
+    robot has no room.
     """
     margin = 2.0
     count = len(lines) if row_count is None else row_count

@@ -106,7 +106,7 @@ def learn(
     valid: Bool | None = None,
 ) -> Model:
     """A model of a sample. tile: cells along a tile, by which the sample's sides must divide. pattern: tiles along a
-    pattern; 1 is the simple tiled model. wrap: the sample goes on at its other side. known: windows with cells that are
+    pattern; 1 is the simple tiled model. wrap: the sample goes on at its other side. valid: windows with cells that are
     not so teach nothing. CannotGenerate where there are too many patterns, or none.
     """
     height, width = cells.shape
@@ -243,7 +243,7 @@ class Lattice:
     def from_shape(
         cls, shape: tuple[int, int], pattern: int, *, periodic: bool = False, target: Bool | None = None
     ) -> Lattice:
-        """All windows of so many tiles; wanted: bool [rows, columns] of tiles, only windows that cover one of these."""
+        """All windows of so many tiles; target: bool [rows, columns] of tiles, only windows that cover one of these."""
         height, width = shape
         if not periodic:
             height, width = height - pattern + 1, width - pattern + 1

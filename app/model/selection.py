@@ -18,7 +18,7 @@ P = TypeVar("P")
 
 
 def parts_with_name(parts: Mapping[PartKey, P], name: str, label: str) -> dict[PartKey, P]:
-    """The parts of this name. what: what errors call one. Raises NotFound with the names that there are."""
+    """The parts of this name. label: what errors call one. Raises NotFound with the names that there are."""
     matches = {key: part for key, part in parts.items() if key.name == name}
     if not matches:
         names = sorted({key.name for key in parts})

@@ -321,7 +321,7 @@ job = Table(
 
 
 def _report() -> list[Column[Any]]:
-    """What a robot says of itself. said: when, by its own clock; time: when it was heard, by the server's."""
+    """A robot's report. said: when, by the robot's clock; time: when it was received, by the server's."""
     return [
         Column("channel", String(63), nullable=False),
         Column("version", BigInteger, nullable=False),

@@ -718,7 +718,7 @@ def test_it_says_why_it_hears_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zenoh_client, "CONNECT_MS", 100)
     problems: list[str] = []
     port = free_port()
-    one = ZenohClient(PLACE, "robot", heard=lambda _: None, back=lambda: None, lost=problems.append)
+    one = ZenohClient(PLACE, "robot", on_event=lambda _: None, on_connected=lambda: None, on_lost=problems.append)
     try:
         one.set_endpoint(f"tcp/127.0.0.1:{port}", "fleetmap")
         eventually(lambda: problems)

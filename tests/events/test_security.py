@@ -325,7 +325,7 @@ def test_why_a_certificate_is_not_trusted_is_told(
         assert not bus.ensure_connected()
         assert bus.state["detail"] == f"no router at {endpoint}: its certificate is not to be trusted: {told}"
         refused(port, ZenohCredentials(authority.pem))
-        ear = ZenohClient("farm", "r1", heard=nothing, back=nothing, login=ZenohCredentials(authority.pem))
+        ear = ZenohClient("farm", "r1", on_event=nothing, on_connected=nothing, login=ZenohCredentials(authority.pem))
         monkeypatch.setattr("app.agent.zenoh_client.CONNECT_MS", int(REFUSED_SECONDS * 1000))
         ear.set_endpoint(endpoint, "fleetmap")
         try:

@@ -21,7 +21,7 @@ from app.formats import WriteContext
 from app.formats._network import natural_sort_key
 from app.model.features import Features, Properties
 from app.model.frame import MAX_METRES
-from app.model.layers import Layers
+from app.model.layers import Layers, PartKey
 from app.parameters import parameter
 from app.syntax import yaml
 
@@ -313,3 +313,14 @@ class Flow:
         if isinstance(value, (list, tuple)):
             return "[" + ", ".join(map(self, value)) + "]"
         return yaml.text(value)
+
+
+def choose_building(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
+    """The networks, the objects that came from Open-RMF's formats, and the images of the building."""
+    return [
+        key
+        for key in keys
+        if key.layer == "topology"
+        or (key.layer == "objects" and key.name in (BUILDING, NAV_GRAPH))
+        or (key.layer == "resources" and key.name == BUILDING)
+    ]

@@ -193,7 +193,7 @@ class _Writer:
         return {part.ids[k]: name for k, name in zip(places, names, strict=True)}
 
     def _edges(self, part: Features, kinds: Sequence[Any], name_texts: Mapping[str, str]) -> dict[str, Lines]:
-        """The edges by the id of the node that they start at. said: each node's name as YAML, by id."""
+        """The edges by the id of the node that they start at. name_texts: each node's name as YAML, by id."""
         edges: dict[str, Lines] = {i: [] for i in name_texts}
         a, b, c = self._edge_template({}, None, None, fill=True)
         plain = dropped_count = 0
@@ -299,7 +299,7 @@ class _Writer:
         }
 
     def _node(self, p: Properties, name: str, name_text: str, at: tuple[str, str, str], edges: Lines) -> str:
-        """The text of a node's entry. said: its name as YAML. at: its position as texts."""
+        """The text of a node's entry. name_text: its name as YAML. at: its position as texts."""
         source_properties = p.get(NAME)
         extra_members: dict[str, Any] = source_properties if isinstance(source_properties, dict) else {}
         node = _mapping_text(extra_members.get("node"))
@@ -354,7 +354,7 @@ class _Writer:
         )
 
     def _tolerances(self, has_yaw: bool) -> dict[str, float]:
-        """Of a node that has none. known: whether it has an orientation."""
+        """Of a node that has none. has_yaw: whether it has an orientation."""
         yaw = self.options.yaw_goal_tolerance if has_yaw else ANY_YAW
         return {"xy_goal_tolerance": self.options.xy_goal_tolerance, "yaw_goal_tolerance": yaw}
 

@@ -69,7 +69,7 @@ def all_chunks(draft: ChunkStage, name: bytes, existing_names: Container[bytes])
 
 
 def new_chunks(draft: ChunkStage, name: bytes, existing_names: Container[bytes]) -> tuple[list[bytes], list[bytes]]:
-    """The draft's own chunks that a part needs: (nodes and documents, tiles). known: chunks that the base has."""
+    """The draft's own chunks that a part needs: (nodes and documents, tiles). existing_names: of the base."""
     root = read_root(draft, name)
     nodes = [h for h in (name, *document_chunks(root)) if h in draft.new and not draft.was_read(h)]
     tiles: list[bytes] = []

@@ -26,8 +26,6 @@ that was moved by an edit gets vertices where it stands.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import Any
 
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, register
 from app.formats.rmf import common
@@ -35,9 +33,7 @@ from app.formats.rmf.building import rules
 from app.formats.rmf.building.reading import read
 from app.formats.rmf.building.vocabulary import FILE, NAME
 from app.formats.rmf.building.writing import write
-from app.formats.rmf.common import NAV_GRAPH
 from app.formats.rmf.images import companion_hook
-from app.model.layers import PartKey
 
 _FILENAME = re.compile(
     rb"\bfilename[\"']?[ \t]*:[ \t]*(?:\"([^\"\n]{1,500})\"|'([^'\n]{1,500})'|([^\s,}#\"'][^,}#\n]{0,500}))"
@@ -62,17 +58,6 @@ def detect(name: str, data: bytes) -> bool:
     return bool(not _OF_GRAPH.search(data) and _NAMED.search(data) and _VERTICES.search(data))
 
 
-def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
-    """The networks, the objects that came from a building or a navigation graph, and the building's images."""
-    return [
-        key
-        for key in keys
-        if key.layer == "topology"
-        or (key.layer == "objects" and key.name in (NAME, NAV_GRAPH))
-        or (key.layer == "resources" and key.name == NAME)
-    ]
-
-
 register(
     Format(
         name=NAME,
@@ -87,7 +72,7 @@ register(
         write_options=common.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),
         version=2,
-        selection=Selection(choose),
+        selection=Selection(common.choose_building),
         claims=Claims(priority=40, companions=companion_hook(_FILENAME)),
         traits=Traits(keeps_bends="nodes", has_title=True),
     )

@@ -17,18 +17,15 @@ Source: open-rmf/rmf_site, crates/rmf_site_format; crates/rmf_site_editor/src/si
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import Any
 
 from app.formats import Claims, Format, LayerRequirements, Selection, Traits, register
-from app.formats.rmf.common import BUILDING, NAV_GRAPH
+from app.formats.rmf.common import BUILDING, choose_building
 from app.formats.rmf.images import companion_hook
 from app.formats.rmf.site import rules
 from app.formats.rmf.site.draft import WriteOptions
 from app.formats.rmf.site.reading import read
 from app.formats.rmf.site.vocabulary import NAME
 from app.formats.rmf.site.writing import FILE, FILE_RON, write
-from app.model.layers import PartKey
 
 _JSON_SITE = re.compile(rb'"format_version"\s*:\s*"')
 _RON_SITE = re.compile(rb'\bformat_version\s*:\s*"')
@@ -48,17 +45,6 @@ def options_from_filename(name: str) -> dict[str, str]:
     return {"encoding": "ron" if name.endswith(".ron") else "json"} if name.endswith((".ron", ".json")) else {}
 
 
-def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
-    """The networks, the objects that came from Open-RMF, and the drawings."""
-    return [
-        key
-        for key in keys
-        if key.layer == "topology"
-        or (key.layer == "objects" and key.name in (BUILDING, NAV_GRAPH))
-        or (key.layer == "resources" and key.name == BUILDING)
-    ]
-
-
 register(
     Format(
         name=NAME,
@@ -72,7 +58,7 @@ register(
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         write_options=WriteOptions,
         extensions=(".site.json", ".site.ron", ".json", ".ron"),
-        selection=Selection(choose=choose, from_filename=options_from_filename),
+        selection=Selection(choose=choose_building, from_filename=options_from_filename),
         claims=Claims(
             priority=45, companions=companion_hook(re.compile(rb'\b(?:Local|Remote)"?\s*[:(]\s*"([^"\n]{1,500})"'))
         ),

@@ -484,7 +484,7 @@ def cabin_size(cabin: Cabin) -> list[float]:
 
 
 def parse_graphs(choice: Any, numbers_by_id: Mapping[str, int], location: str) -> tuple[int, int]:
-    """(the first graph of an element, how many it is of). known: the graphs' numbers by id, smallest first."""
+    """(the first graph of an element, how many it is of). numbers_by_id: the graphs' numbers by id, smallest first."""
     name, content = variant("All" if choice is None else choice, location)
     if name not in ("All", "Only", "AllExcept"):
         raise_unreadable(f"must be All, Only or AllExcept, is {name[:40]!r}", location)
