@@ -280,7 +280,7 @@ def _active_map_as_json(active_map: ActiveMap) -> dict[str, Any]:
     return {"version": active_map.version, "root": active_map.root, **overlays, "since": rfc3339(active_map.since)}
 
 
-def _report(report: RobotReport, heard: datetime) -> dict[str, Any]:
+def _report(report: RobotReport, received: datetime) -> dict[str, Any]:
     body: dict[str, Any] = {
         "channel": report.channel,
         "version": report.version,
@@ -293,4 +293,4 @@ def _report(report: RobotReport, heard: datetime) -> dict[str, Any]:
         body["sequence"] = report.sequence
     if report.overlays is not None:
         body["overlays"] = report.overlays
-    return body | {"time": rfc3339(report.reported_at or heard)}
+    return body | {"time": rfc3339(report.reported_at or received)}

@@ -106,17 +106,17 @@ class ReportQueue:
                 return
             self._shares[robot] += 1
 
-    def store_report(self, heard: ReceivedReport) -> None:
+    def store_report(self, received: ReceivedReport) -> None:
         """A report that came over HTTP: blocks until it is stored. Raises what the store has against it."""
-        wait_until_stored(self.submit_report(heard), WARN_SECONDS)
+        wait_until_stored(self.submit_report(received), WARN_SECONDS)
 
-    def submit_report(self, heard: ReceivedReport) -> Future[FleetMapError | None]:
+    def submit_report(self, received: ReceivedReport) -> Future[FleetMapError | None]:
         """The same without waiting: what the store has against it comes as the future's result."""
         result: Future[FleetMapError | None] = Future()
         if self._thread is None or self._stopping.is_set():
             raise Unavailable("the server is starting or stopping: try again in a few seconds")
         try:
-            self._queue.put_nowait(_QueuedReport(heard, result))
+            self._queue.put_nowait(_QueuedReport(received, result))
         except queue.Full:
             raise Unavailable("too many reports of robots wait: try again in a few seconds") from None
         return result

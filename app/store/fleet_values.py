@@ -23,7 +23,7 @@ class Rollout:
     moves back, or does not move at all, when this share says that it failed. deadline: the move is given up then.
     window: seconds of watching. before: the version that it moves back to. state: ``waiting`` until it moves,
     ``watching`` after it, then how it ended. said_before: robots that said already that they failed with this version
-    when its present stage began, and when that was heard: what came after it is told by this, not by comparing clocks.
+    when its present stage began, and when the server received it: this orders later reports, not the robots' clocks.
     """
 
     version: int
@@ -122,7 +122,7 @@ class RobotReport:
 
 @dataclass(frozen=True, slots=True)
 class ReceivedReport:
-    """A report, of whom, and when it was heard by the server's clock.
+    """A report, of whom, and when it was received by the server's clock.
 
     vouched: whether it came with authority: with a token that may report for the robot, or over a router with users.
     """

@@ -30,25 +30,25 @@ class Robots:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def note_reports(self, heard: Sequence[ReceivedReport]) -> list[FleetMapError | None]:
+    def note_reports(self, reports: Sequence[ReceivedReport]) -> list[FleetMapError | None]:
         """Take in what robots say, in the order given, in one transaction: for each None, or why it was refused.
 
         The same said again, or the same report come by another way, only renews the time. NotFound where there is no
         such environment, Conflict where it has too many robots already.
         """
-        out: list[FleetMapError | None] = [None] * len(heard)
+        out: list[FleetMapError | None] = [None] * len(reports)
         with self._database.write(notify=False, upkeep=True) as connection:
             owners: dict[str, str | FleetMapError] = {}
             # One order for all writers, so that none waits for another that waits for it; each robot's own order stays.
-            for k in sorted(range(len(heard)), key=lambda k: (heard[k].environment, heard[k].robot)):
-                name = heard[k].environment
+            for k in sorted(range(len(reports)), key=lambda k: (reports[k].environment, reports[k].robot)):
+                name = reports[k].environment
                 if name not in owners:
                     try:
                         owners[name] = environment_row(connection, name).id
                     except NotFound as error:
                         owners[name] = error
                 owner = owners[name]
-                out[k] = owner if isinstance(owner, FleetMapError) else _note(connection, owner, heard[k])
+                out[k] = owner if isinstance(owner, FleetMapError) else _note(connection, owner, reports[k])
         return out
 
     def all(self, environment: str | None = None, robot: str | None = None) -> list[Robot]:
@@ -100,7 +100,7 @@ class Robots:
         return out[:limit], _cursor(out[limit - 1]) if len(out) > limit else None
 
     def history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, RobotReport]]:
-        """What a robot said in an environment and when it was heard, newest first, each time it was something new."""
+        """A robot's changed reports in an environment, each with the time of receipt, newest first."""
         table = tables.robot_history
         with self._database.read() as connection:
             row = environment_row(connection, environment)
@@ -136,9 +136,9 @@ class Robots:
                 upsert(connection, table, {"robot": name}, {"there": is_present, "time": now})
 
 
-def _note(connection: Connection, environment_id: str, heard: ReceivedReport) -> FleetMapError | None:
-    table, report = tables.robot, heard.report
-    conditions = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
+def _note(connection: Connection, environment_id: str, received: ReceivedReport) -> FleetMapError | None:
+    table, report = tables.robot, received.report
+    conditions = (table.c.environment_id == environment_id, table.c.robot == received.robot)
     row = connection.execute(select(table).where(*conditions).with_for_update()).one_or_none()
     report_columns: dict[str, Any] = {
         "channel": report.channel,
@@ -149,27 +149,27 @@ def _note(connection: Connection, environment_id: str, heard: ReceivedReport) ->
         "sequence": report.sequence,
         "overlays": report.overlays,
     }
-    values: dict[str, Any] = {**report_columns, "said": report.reported_at, "time": heard.time}
+    values: dict[str, Any] = {**report_columns, "said": report.reported_at, "time": received.time}
     again = row is not None and all(getattr(row, name) == value for name, value in report_columns.items())
-    if row is not None and not again and _is_duplicate_report(connection, environment_id, heard, report_columns):
+    if row is not None and not again and _is_duplicate_report(connection, environment_id, received, report_columns):
         connection.execute(
-            update(table).where(*conditions).values(time=heard.time, vouched=row.vouched or heard.vouched)
+            update(table).where(*conditions).values(time=received.time, vouched=row.vouched or received.vouched)
         )
         return None
     if not again:
-        values["since"] = heard.time
-    values["vouched"] = heard.vouched or (row is not None and row.vouched)
-    values |= _held_values(report, row, heard.time)
+        values["since"] = received.time
+    values["vouched"] = received.vouched or (row is not None and row.vouched)
+    values |= _held_values(report, row, received.time)
     if row is not None:
         connection.execute(update(table).where(*conditions).values(values))
     else:
         others = select(func.count()).select_from(table).where(table.c.environment_id == environment_id)
         if connection.execute(others).scalar_one() >= MAX_ROBOTS:
-            return Conflict(f"{heard.environment} has {MAX_ROBOTS} robots: remove some that are gone")
-        keys = {"environment_id": environment_id, "robot": heard.robot}
+            return Conflict(f"{received.environment} has {MAX_ROBOTS} robots: remove some that are gone")
+        keys = {"environment_id": environment_id, "robot": received.robot}
         upsert(connection, table, keys, values)  # in a race the later one wins
     if not again:
-        _remember(connection, environment_id, heard, report_columns)
+        _remember(connection, environment_id, received, report_columns)
     return None
 
 
@@ -190,35 +190,35 @@ def _held_values(report: RobotReport, row: Row[Any] | None, time: datetime) -> d
 
 
 def _is_duplicate_report(
-    connection: Connection, environment_id: str, heard: ReceivedReport, report_columns: dict[str, Any]
+    connection: Connection, environment_id: str, received: ReceivedReport, report_columns: dict[str, Any]
 ) -> bool:
     """Whether this very report came before, by another way: robots tell over Zenoh and HTTP, and one may be late."""
     table = tables.robot_history
-    if heard.report.reported_at is None:
+    if received.report.reported_at is None:
         return False
     query = select(table.c.id).where(
         table.c.environment_id == environment_id,
-        table.c.robot == heard.robot,
-        table.c.said == heard.report.reported_at,
+        table.c.robot == received.robot,
+        table.c.said == received.report.reported_at,
         *(table.c[name].is_not_distinct_from(value) for name, value in report_columns.items()),
     )
     return connection.execute(query.limit(1)).scalar_one_or_none() is not None
 
 
 def _remember(
-    connection: Connection, environment_id: str, heard: ReceivedReport, report_columns: dict[str, Any]
+    connection: Connection, environment_id: str, received: ReceivedReport, report_columns: dict[str, Any]
 ) -> None:
     table = tables.robot_history
     connection.execute(
         insert(table).values(
             environment_id=environment_id,
-            robot=heard.robot,
-            said=heard.report.reported_at,
-            time=heard.time,
+            robot=received.robot,
+            said=received.report.reported_at,
+            time=received.time,
             **report_columns,
         )
     )
-    conditions = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
+    conditions = (table.c.environment_id == environment_id, table.c.robot == received.robot)
     oldest = select(table.c.id).where(*conditions).order_by(table.c.id.desc()).offset(HISTORY).limit(1)
     last = connection.execute(oldest).scalar_one_or_none()
     if last is not None:
