@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import socket
-import ssl
 import sys
 import threading
 import time
@@ -21,7 +20,7 @@ import httpx
 from app.agent.signed_manifest import ManifestFile
 from app.agent.state import digest
 from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
-from app.events.credentials import ca_ssl_context
+from app.events.credentials import server_ssl_context
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -136,7 +135,7 @@ class ServerClient:
             headers=headers,
             timeout=TIMEOUT,
             follow_redirects=False,
-            verify=self._ssl_context(ca),
+            verify=server_ssl_context(self.server, ca),
         )
         self._stopping = stopping
         self._sockets: list[socket.socket] = []
@@ -144,12 +143,6 @@ class ServerClient:
         self.received = 0
         self.deltas = 0
         self.failed_deltas = 0
-
-    def _ssl_context(self, ca: Path | None) -> ssl.SSLContext | bool:
-        if ca is not None:
-            return ca_ssl_context(ca)
-        # Over plain HTTP nobody's certificate is believed: no authorities are read for that.
-        return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if self.server.startswith("http://") else True
 
     def close(self) -> None:
         """Let go of the connections."""

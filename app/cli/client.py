@@ -21,7 +21,7 @@ import httpx
 from app.cli import variables
 from app.cli.output import ProgressBar, print_status, progress_bar
 from app.cli.problems import RequestFailed
-from app.events.credentials import ca_ssl_context
+from app.events.credentials import server_ssl_context
 from app.model.names import did_you_mean
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
@@ -125,7 +125,7 @@ class Client:
             headers=headers,
             timeout=TIMEOUT,
             follow_redirects=False,
-            verify=ca_ssl_context(Path(ca)) if ca else True,
+            verify=server_ssl_context(self.server, Path(ca) if ca else None),
         )
 
     def __enter__(self) -> Client:

@@ -63,6 +63,16 @@ def ca_ssl_context(ca: Path) -> ssl.SSLContext:
         raise Invalid(f"{ca} holds no certificate of a certification authority (PEM): {error}") from error
 
 
+def server_ssl_context(address: str, ca: Path | None) -> ssl.SSLContext | bool:
+    """TLS for an HTTP client of this server: by ``ca`` if given, else by the public certification authorities.
+
+    Raises Invalid. For an ``http://`` address no authorities are loaded, which would cost each client some 50 ms.
+    """
+    if ca is not None:
+        return ca_ssl_context(ca)
+    return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if address.startswith("http://") else True
+
+
 def _show(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
     """Have a certificate that is shown to who asks. Invalid where it and its key are none."""
     try:

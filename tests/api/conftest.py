@@ -34,7 +34,7 @@ class Api:
     url: str
     app: FastAPI
     token: str | None = ADMIN
-    verify: ssl.SSLContext | bool = True
+    verify: ssl.SSLContext | bool = False
 
     def __post_init__(self) -> None:
         headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
@@ -103,7 +103,7 @@ def problem(answer: httpx.Response) -> dict[str, Any]:
 
 
 @contextmanager
-def running(settings: Settings, verify: ssl.SSLContext | bool = True) -> Iterator[Api]:
+def running(settings: Settings, verify: ssl.SSLContext | bool = False) -> Iterator[Api]:
     """A server with these settings until the block ends. verify: whose certificate to believe, of HTTPS."""
     app = create_app(settings)
     server = uvicorn.Server(server_config(settings, app, port=0))
