@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
-from fastapi import APIRouter
 from fastapi.exceptions import RequestValidationError
 from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
@@ -37,7 +36,6 @@ from app.api.http.metrics import Metrics
 from app.api.http.middleware import Guard
 from app.api.http.protocol import BoundedProtocol, tls_context
 from app.api.http.response_cache import ResponseCache
-from app.api.http.responses import API
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
 from app.config import Settings
@@ -93,11 +91,8 @@ def create_app(settings: Settings) -> FleetMapApp:
     app.add_middleware(Guard)
     maps.add_routes(app)
     openapi.add_pages(app)
-    api = APIRouter(prefix=API)
-    for router in routers():
-        api.include_router(router)
-    app.include_router(api)
-    app.include_router(health.root_router)
+    for router in (*routers(), health.root_router):
+        app.router.routes.extend(router.routes)  # include_router() would build each route a second time, 10 ms each
     return app
 
 

@@ -48,9 +48,9 @@ register(
 '''
 NOUN = '''"""Papers: a noun that lists nothing."""
 
-from fastapi import APIRouter
+from app.api.http.responses import api_router
 
-router = APIRouter(prefix="/papers", tags=["papers"])
+router = api_router("papers", "/papers")
 
 
 @router.get("")

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
-from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app.api.http.auth import Editor
 from app.api.http.dependencies import ServicesDep
-from app.api.http.responses import StrictRoute, json_response, version_headers
+from app.api.http.responses import api_router, json_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
     EnvironmentPath,
@@ -80,7 +79,7 @@ class AlignmentOut(BaseModel):
     warnings: list[ProblemItem]
 
 
-router = APIRouter(tags=["alignments"], route_class=StrictRoute)
+router = api_router("alignments")
 
 
 @router.post(

@@ -5,13 +5,13 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request
+from fastapi import Query, Request
 from pydantic import BaseModel
 from starlette.responses import Response
 
 from app.api.http.auth import ServerAdmin
 from app.api.http.dependencies import ServicesDep
-from app.api.http.responses import StrictRoute, page_response
+from app.api.http.responses import api_router, page_response
 from app.api.http.schemas import Limit, problem_responses
 from app.errors import Invalid
 from app.store.audit import AuditEntry
@@ -41,7 +41,7 @@ class AuditOut(BaseModel):
     target: str | None
 
 
-router = APIRouter(prefix="/audit", tags=["audit"], route_class=StrictRoute)
+router = api_router("audit", "/audit")
 
 
 @router.get("", responses=problem_responses(list[AuditOut]), summary="Who changed what, from where")

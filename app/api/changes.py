@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import orjson
-from fastapi import APIRouter, Query, Request
+from fastapi import Query, Request
 from numpy.typing import NDArray
 from pydantic import BaseModel
 from starlette.responses import Response
@@ -17,7 +17,7 @@ from app.api.http.auth import Viewer
 from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
-from app.api.http.responses import StrictRoute, json_bytes, json_response
+from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import VERSION, EnvironmentPath, VersionPath, problem_responses
 from app.api.layers import Crs, feature_collection
 from app.errors import MissingDatum
@@ -47,7 +47,7 @@ class DeltaOut(BaseModel):
     other: list[dict[str, str]]
 
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=StrictRoute)
+router = api_router("versions", "/environments/{env}/versions/{v}")
 
 
 @router.get(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import Path, Query, Request
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
@@ -16,7 +16,7 @@ from app import fleet
 from app.api.http.auth import Editor, Viewer
 from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
-from app.api.http.responses import StrictRoute, json_bytes, json_response
+from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import CHANNEL, ApiTime, EnvironmentPath, RequestModel, problem_responses
 from app.errors import Invalid, Problem
 from app.store.fleet_values import Channel, Robot, Rollout
@@ -117,7 +117,7 @@ class ChannelOut(BaseModel):
 
 ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="A channel's name.", examples=["production"])]
 
-router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=StrictRoute)
+router = api_router("channels", "/environments/{env}/channels")
 
 
 def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import orjson
-from fastapi import APIRouter, Request
+from fastapi import Request
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
@@ -20,7 +20,7 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.forms import FormFields
 from app.api.http.parameters import numbers
 from app.api.http.problems import UnsupportedMedia
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import DatumBody, problem_responses
 from app.api.http.uploads import UploadForm
 from app.convert.files import Converted
@@ -31,7 +31,7 @@ from app.model.frame import Datum
 from app.model.names import did_you_mean
 from app.upload_reader import DRAWN_LAYERS
 
-router = APIRouter(tags=["formats"], route_class=StrictRoute)
+router = api_router("formats")
 
 _BODY: dict[str, Any] = {
     "requestBody": {

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import derive, parameters
 from app.api.http.auth import Editor, Viewer
 from app.api.http.dependencies import ServicesDep
-from app.api.http.responses import StrictRoute, commit_response, json_response
+from app.api.http.responses import api_router, commit_response, json_response
 from app.api.http.schemas import (
     MAX_TEXT,
     EnvironmentPath,
@@ -55,7 +54,7 @@ class DerivationOut(BaseModel):
     parameters: list[dict[str, Any]]
 
 
-router = APIRouter(tags=["derivations"], route_class=StrictRoute)
+router = api_router("derivations")
 
 
 def as_online() -> dict[str, Any]:

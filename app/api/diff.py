@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
-from fastapi import APIRouter, Query
+from fastapi import Query
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,7 +17,7 @@ from starlette.responses import Response
 from app.api.http.auth import Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import VERSION, EnvironmentPath, problem_responses
 from app.errors import Invalid
 from app.model.features import Features, features
@@ -38,7 +38,7 @@ class DiffOut(BaseModel):
     layers: dict[str, Any]
 
 
-router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=StrictRoute)
+router = api_router("versions", "/environments/{env}")
 
 Ref = Annotated[
     str | None,

@@ -5,14 +5,14 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Query, Request
+from fastapi import Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app.api.http.auth import Admin, Editor, Principal, Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_box, parse_position
-from app.api.http.responses import StrictRoute, api_path, json_response, page_response
+from app.api.http.responses import api_path, api_router, json_response, page_response
 from app.api.http.schemas import (
     MAX_TEXT,
     NAME,
@@ -122,7 +122,7 @@ class EnvironmentOut(BaseModel):
     match: MatchOut | None = Field(default=None, description="Only in the answer to `contains`.")
 
 
-router = APIRouter(prefix="/environments", tags=["environments"], route_class=StrictRoute)
+router = api_router("environments", "/environments")
 
 
 def as_dict(environment: Environment, match: Match | None = None) -> dict[str, Any]:

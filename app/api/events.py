@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import orjson
-from fastapi import APIRouter, Header, Query, Request
+from fastapi import Header, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
@@ -23,7 +23,7 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import closure_mode, parse_position, parse_version_ref
 from app.api.http.problems import Throttled
 from app.api.http.protocol import ON_STOP
-from app.api.http.responses import StrictRoute
+from app.api.http.responses import api_router
 from app.api.http.schemas import problem_responses
 from app.api.http.single_flight import SingleFlight
 from app.convert.cache import CachedFile
@@ -48,7 +48,7 @@ MAX_ENVIRONMENTS = 100
 STREAMS = 1000
 """So many streams at once for each worker."""
 
-router = APIRouter(tags=["events"], route_class=StrictRoute)
+router = api_router("events")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import APIRouter
 from pydantic import BaseModel
 from starlette.responses import Response
 
 from app.api.http.auth import Viewer
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import problem_responses
 from app.catalogue import describe_formats
 
@@ -27,7 +26,7 @@ class FormatOut(BaseModel):
     information: dict[str, str]
 
 
-router = APIRouter(prefix="/formats", tags=["formats"], route_class=StrictRoute)
+router = api_router("formats", "/formats")
 
 
 @router.get("", responses=problem_responses(list[FormatOut]), summary="All formats")

@@ -6,14 +6,14 @@ import itertools
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query
+from fastapi import Path, Query
 from pydantic import BaseModel
 from starlette.responses import Response
 
 from app.api.http.auth import Principal, Viewer
 from app.api.http.conversions import job_as_json
 from app.api.http.dependencies import ServicesDep
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import Limit, ProblemOut, problem_responses
 from app.errors import NotFound
 from app.store.values import Job, State
@@ -34,7 +34,7 @@ class JobOut(BaseModel):
 
 JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
 
-router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=StrictRoute)
+router = api_router("jobs", "/jobs")
 
 
 def _require_job_owner(services: ServicesDep, principal: Principal, id: str) -> Job:

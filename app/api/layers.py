@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import orjson
 import shapely
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import Path, Query, Request
 from numpy.typing import NDArray
 from PIL import Image
 from pydantic import BaseModel
@@ -23,7 +23,7 @@ from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import numbers, parse_box, parse_version_ref
 from app.api.http.problems import NotAcceptable
-from app.api.http.responses import StrictRoute, json_bytes, json_response
+from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
 from app.model.features import Features
@@ -57,7 +57,7 @@ LayerPath = Annotated[
     Path(description="A layer.", examples=["topology"]),
 ]
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}/layers", tags=["layers"], route_class=StrictRoute)
+router = api_router("layers", "/environments/{env}/versions/{v}/layers")
 
 LOCAL_CRS = "urn:fleetmap:crs:local"
 """The local frame's name in JSON-FG's ``coordRefSys``; where it lies stands in the member ``datum``."""

@@ -7,7 +7,7 @@ from datetime import datetime
 from functools import partial
 from urllib.parse import quote, urlencode
 
-from fastapi import APIRouter, Request
+from fastapi import Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
@@ -17,7 +17,7 @@ from app.api.http.auth import Principal, Viewer
 from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_options, parse_version_ref
-from app.api.http.responses import API, StrictRoute, api_path, json_response
+from app.api.http.responses import API, api_path, api_router, json_response
 from app.api.http.schemas import EnvironmentPath, RequestModel, VersionPath, problem_responses
 from app.api.http.signed import Grant
 from app.convert.cache import CachedFile
@@ -57,7 +57,7 @@ class LinkOut(BaseModel):
     sha256: str
 
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
+router = api_router("maps", "/environments/{env}/versions/{v}")
 
 
 @router.post(

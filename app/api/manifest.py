@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl
 
-from fastapi import APIRouter, Query, Request
+from fastapi import Query, Request
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
@@ -22,7 +22,7 @@ from app.api.http.caching import none_match
 from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_options, parse_version_ref, require_format
-from app.api.http.responses import StrictRoute, json_bytes, json_response
+from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
 from app.convert import site
 from app.convert.cache import CachedMap
@@ -121,7 +121,7 @@ ClosuresQuery = Annotated[
     ),
 ]
 
-router = APIRouter(tags=["manifest"], route_class=StrictRoute)
+router = api_router("manifest")
 
 
 @router.get("/keys", responses=problem_responses(list[KeyOut]), summary="Keys that sign manifests")

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
-from fastapi import APIRouter, FastAPI, Path, Query, Request
+from fastapi import FastAPI, Path, Query, Request
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
@@ -30,7 +30,7 @@ from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.response_cache import FRESH_SECONDS, CachedResponse, Key, request_key
-from app.api.http.responses import API, StrictRoute, api_path, json_response
+from app.api.http.responses import API, api_path, api_router, json_response
 from app.api.http.schemas import EnvironmentPath, ProblemItem, VersionPath, problem_responses
 from app.api.http.streams import IN_MEMORY, Headers, range_headers, raw_response, requested_range, stream_file
 from app.convert.cache import CachedFile, CachedMap, LostMap
@@ -320,7 +320,7 @@ FormatPath = Annotated[
     str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["geojson"])
 ]
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=StrictRoute)
+router = api_router("maps", "/environments/{env}/versions/{v}")
 
 
 @router.get("/maps", responses=problem_responses(list[CoverageOut], 404), summary="Which formats can be had")

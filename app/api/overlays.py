@@ -9,7 +9,7 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import shapely
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import Path, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
@@ -18,7 +18,7 @@ from app.api.http.addresses import request_address
 from app.api.http.auth import Editor, Principal, RobotRole, Viewer
 from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import ApiTime, EnvironmentPath, RequestModel, problem_responses
 from app.convert.cache import CachedMap
 from app.convert.closures import place_problem
@@ -136,7 +136,7 @@ class ZoneSetsOut(BaseModel):
 
 OverlayPath = Annotated[str, Path(max_length=100, description="An overlay's id.")]
 
-router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=StrictRoute)
+router = api_router("overlays", "/environments/{env}/overlays")
 
 Ref = Annotated[
     str | None,

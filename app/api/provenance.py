@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 from typing import Any
 from xml.sax.saxutils import escape
 
-from fastapi import APIRouter, Request
+from fastapi import Request
 from pydantic import BaseModel
 from starlette.responses import Response
 
 from app.api.http.auth import Viewer
 from app.api.http.dependencies import ServicesDep
 from app.api.http.parameters import parse_version_ref
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
 from app.convert.maps import Maps
 from app.store.values import Version
@@ -30,7 +30,7 @@ class ProvenanceOut(BaseModel):
     links: list[dict[str, str]]
 
 
-router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=StrictRoute)
+router = api_router("versions", "/environments/{env}/versions/{v}")
 
 ROW, WIDTH, GAP, TOP = 34, 250, 130, 60
 COLOURS = {

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Path, Query, Request
+from fastapi import Header, Path, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
@@ -15,7 +15,7 @@ from starlette.responses import Response
 from app import fleet
 from app.api.http.auth import Editor, Principal, RobotRole, Viewer
 from app.api.http.dependencies import Services, ServicesDep
-from app.api.http.responses import StrictRoute, json_response, page_response
+from app.api.http.responses import api_router, json_response, page_response
 from app.api.http.schemas import CHANNEL, NAME, ApiTime, Cursor, Limit, RequestModel, problem_responses
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.audit import set_audit_target
@@ -114,7 +114,7 @@ RobotPath = Annotated[
     Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$", description="A robot's name.", examples=["mower-3"]),
 ]
 
-router = APIRouter(prefix="/robots", tags=["robots"], route_class=StrictRoute)
+router = api_router("robots", "/robots")
 
 EnvironmentQuery = Annotated[
     str | None, Query(pattern=NAME, description="Only in this environment; else in all that the token reaches.")

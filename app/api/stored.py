@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path
+from fastapi import Path
 from starlette.responses import Response
 
 from app.api.http.auth import ServerAdmin
 from app.api.http.dependencies import ServicesDep
-from app.api.http.responses import StrictRoute
+from app.api.http.responses import api_router
 from app.api.http.schemas import problem_responses
 from app.api.http.streams import IN_MEMORY, stream_file
 from app.errors import Damaged, NotFound
 
 TYPE = "application/octet-stream"
 
-router = APIRouter(prefix="/stored", tags=["stored data"], route_class=StrictRoute)
+router = api_router("stored data", "/stored")
 
 
 @router.get(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query
+from fastapi import Path, Query
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
@@ -12,7 +12,7 @@ from app import formats, templates
 from app.api.http.auth import Editor, Principal, Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
-from app.api.http.responses import StrictRoute, commit_response, json_response, version_headers
+from app.api.http.responses import api_router, commit_response, json_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
     VERSION,
@@ -103,7 +103,7 @@ class TemplatesOut(BaseModel):
     formats: list[FormatTemplateOut]
 
 
-router = APIRouter(tags=["templates"], route_class=StrictRoute)
+router = api_router("templates")
 
 FormatPath = Annotated[
     str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["tmap2"])

@@ -5,13 +5,13 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path
+from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app.api.http.auth import ServerAdmin
 from app.api.http.dependencies import ServicesDep
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import ApiTime, RequestModel, problem_responses
 from app.errors import Conflict, Invalid, NotFound, Problem
 from app.events.messages import ROBOT_NAME
@@ -62,7 +62,7 @@ class NewTokenOut(TokenOut):
 
 TokenPath = Annotated[str, Path(max_length=100, description="A token's id.")]
 
-router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=StrictRoute)
+router = api_router("tokens", "/tokens")
 
 
 def as_dict(token: Token) -> dict[str, Any]:

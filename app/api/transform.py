@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from fastapi import APIRouter, Query
+from fastapi import Query
 from pydantic import BaseModel
 from starlette.responses import Response
 
 from app.api.http.auth import Viewer
 from app.api.http.dependencies import ServicesDep
 from app.api.http.parameters import numbers, parse_version_ref
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import VERSION, DatumOut, EnvironmentPath, problem_responses
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES
@@ -27,7 +27,7 @@ class TransformOut(BaseModel):
     datum: DatumOut
 
 
-router = APIRouter(prefix="/environments/{env}", tags=["transform"], route_class=StrictRoute)
+router = api_router("transform", "/environments/{env}")
 
 
 TOO_FAR = "the place is too far from the datum for the local frame"

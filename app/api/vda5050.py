@@ -7,7 +7,7 @@ import secrets
 from datetime import datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Body, Query, Request
+from fastapi import Body, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
@@ -17,7 +17,7 @@ from app.api.http.auth import Principal, RobotRole, Viewer
 from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
-from app.api.http.responses import StrictRoute, json_response
+from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import CHANNEL, NAME, EnvironmentPath, VersionPath, problem_responses
 from app.api.links import LinkedFile, link_to
 from app.api.robots import RobotOut, RobotPath, require_report_permission, store_report
@@ -94,7 +94,7 @@ SecondsQuery = Annotated[
     int | None, Query(ge=1, description="Life of the links. Default and maximum: `FLEETMAP_LINK_SECONDS`.")
 ]
 
-router = APIRouter(tags=["vda5050"], route_class=StrictRoute)
+router = api_router("vda5050")
 
 STATE: dict[str, Any] = {
     "timestamp": "2026-05-01T14:03:07Z",

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import Path, Query, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
@@ -18,7 +18,7 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.forms import FormFields
 from app.api.http.parameters import parse_version_ref
 from app.api.http.problems import MalformedBody, UnsupportedMedia
-from app.api.http.responses import StrictRoute, commit_response, json_response, page_response, version_headers
+from app.api.http.responses import api_router, commit_response, json_response, page_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
     VERSION,
@@ -135,7 +135,7 @@ class EditsBody(RequestModel):
     changes: list[Change] = Field(min_length=1, max_length=100_000)
 
 
-router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=StrictRoute)
+router = api_router("versions", "/environments/{env}")
 
 UPLOAD_BODY: dict[str, Any] = {
     "x-free-query": True,

@@ -20,7 +20,6 @@ from app.api.http import problems
 from app.api.http.auth import MAX_SOURCES, Principal, authorise, client_source, environment_in_path, is_open
 from app.api.http.dependencies import Services
 from app.api.http.problems import SlowBody, UnsupportedMedia
-from app.api.http.responses import API
 from app.api.http.signed import LINK, request_link
 from app.api.http.single_flight import SingleFlight
 from app.errors import FleetMapError, TooLarge
@@ -139,11 +138,8 @@ class Guard:
 
 
 def _template(scope: Scope) -> str:
-    """The answering route's whole path template: the API's routers tell theirs without its prefix."""
-    path = str(getattr(scope.get("route"), "path", ""))
-    if not path:
-        return "other"
-    return path if path.startswith(API) or not scope["path"].startswith(API) else API + path
+    """The path template of the route that answered, ``other`` if none did."""
+    return str(getattr(scope.get("route"), "path", "")) or "other"
 
 
 def _caller(scope: Scope, principal: Principal, environment: str | None) -> Caller | None:

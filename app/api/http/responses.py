@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import quote, urlencode
 
 import orjson
-from fastapi import Request
+from fastapi import APIRouter, Request
 from fastapi.routing import APIRoute
 from starlette.responses import Response
 
@@ -105,6 +105,11 @@ class StrictRoute(APIRoute):
             return await handler(_StrictRequest(request.scope, request.receive))
 
         return exact
+
+
+def api_router(tag: str, prefix: str = "") -> APIRouter:
+    """A router for one noun, below ``/api/v1`` and ``prefix``; tag: its heading in the documentation."""
+    return APIRouter(prefix=API + prefix, tags=[tag], route_class=StrictRoute)
 
 
 def _query_fields(dependant: Any) -> list[Any]:
