@@ -63,8 +63,10 @@ class Container:
         defaulted = {k: re.sub(r"\$\{\w+:-(.*?)\}", r"\1", str(v)) for k, v in environment.items()}
         self.environment = {k: self._mapped(v) for k, v in defaulted.items()}
         self.environment["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-        if "PYTHONPYCACHEPREFIX" in os.environ:  # in the image all is compiled when it is built
-            self.environment["PYTHONPYCACHEPREFIX"] = os.environ["PYTHONPYCACHEPREFIX"]
+        # What is compiled is compiled already: bytecode when the image is built, native code at an earlier start.
+        compiled = {k: os.environ[k] for k in ("PYTHONPYCACHEPREFIX", "NUMBA_CACHE_DIR") if k in os.environ}
+        self.environment |= compiled
+        if "PYTHONPYCACHEPREFIX" in compiled:
             self.environment.pop("PYTHONDONTWRITEBYTECODE", None)
         self.command = [*configuration["entrypoint"], *(service.get("command") or configuration["cmd"])]
         self.healthcheck = configuration["healthcheck"]
