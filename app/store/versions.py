@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
-from app.errors import Conflict, Damaged, Invalid, NotFound, Problem, StaleParent, Unavailable
+from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent, Unavailable
 from app.model.templates import template_changes
 from app.store import chunks, index, outbox, parts, tables
 from app.store.area import area_after, write_area
@@ -365,12 +365,10 @@ def _remember(
     connection: Connection, environment_id: str, idempotency: Idempotency | None, version: int, now: datetime
 ) -> None:
     if idempotency is not None:
-        if not 1 <= len(idempotency.key) <= 255:
-            raise Invalid("an Idempotency-Key must have 1 to 255 characters")
         connection.execute(
             insert(tables.idempotency).values(
                 environment_id=environment_id,
-                key=checked_text(idempotency.key, "an Idempotency-Key", 255),
+                key=idempotency.key,
                 fingerprint=idempotency.fingerprint,
                 version=version,
                 time=now,
