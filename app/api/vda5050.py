@@ -22,8 +22,9 @@ from app.api.http.schemas import CHANNEL, NAME, EnvironmentPath, VersionPath, pr
 from app.api.links import LinkedFile, link_to
 from app.api.robots import RobotOut, RobotPath, require_report_permission, store_report
 from app.errors import CannotConvert, Invalid, NotFound, Problem
+from app.event_types import RobotState
 from app.fleet import vda5050
-from app.store.fleet_values import Channel, RobotReport, RobotState
+from app.store.fleet_values import Channel, RobotReport
 from app.store.values import Version
 
 
