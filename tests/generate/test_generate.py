@@ -50,7 +50,7 @@ def fence() -> Features:
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two generators for these tests alone."""
     generate.all_generators()
-    monkeypatch.setattr(generate, "_registry", dict(generate._registry))
+    monkeypatch.setattr(generate._registry, "entries", dict(generate._registry.entries))
 
     @generates({"objects", "location"}, parameters=Posts)
     def some_posts(given: Layers, options: Posts, source: RandomSource, notes: DerivationNotes) -> Layers:
