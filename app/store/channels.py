@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, insert, select, update
 from app.errors import Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
-from app.store.base import CHANNEL_NAME, checked_text, environment_row, nearest_channel, utcnow
+from app.store.base import CHANNEL_NAME, checked_text, environment_row, nearest_channel
 from app.store.database import Database
 from app.store.fleet_values import (
     OPEN_ROLLOUTS,
@@ -124,7 +124,8 @@ class Channels:
             raise Invalid("activate_at needs a time zone, for example 2026-05-01T04:00:00Z")
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            write, author_name = _ChannelWrite(connection, row, channel, utcnow()), checked_text(author, "an author")
+            write = _ChannelWrite(connection, row, channel, self._database.now())
+            author_name = checked_text(author, "an author")
             if rollout is not None:
                 root = read_version(connection, row, version).root
                 rollout = replace(rollout, version=version, root=root, activate_at=activate_at, started=write.now)
@@ -159,7 +160,7 @@ class Channels:
         """Forget a planned move; NotFound where there is none."""
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            write = _ChannelWrite(connection, row, channel, utcnow())
+            write = _ChannelWrite(connection, row, channel, self._database.now())
             channel_row = write.read_row()
             if channel_row is None or channel_row.planned_version is None:
                 raise NotFound(f"channel {channel!r} of {environment} has no planned move")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -20,7 +21,6 @@ from app.store.base import (
     environment_row,
     nearest_channel,
     storable_text,
-    utcnow,
 )
 from app.store.blobs import Blobs
 from app.store.changes import KEEP, Changes, Keep, Prepared
@@ -154,7 +154,7 @@ def insert_sources(
 
 def lock_blobs(connection: Connection, hashes: set[str]) -> None:
     """Keep a collection in progress away from blobs that this transaction refers to; Unavailable where one is gone."""
-    now = int(utcnow().timestamp())
+    now = int(time.time())
     names = sorted(hashes)
     for start in range(0, len(names), 500):
         batch = names[start : start + 500]
@@ -239,7 +239,7 @@ class Versions:
                 skip_audit()
                 return read_version(connection, row, previous)
             _check_head(row, prepared.base)
-            now = utcnow()
+            now = self._database.now()
             chunks.insert(connection, prepared.chunks)  # where nothing changed, what was found damaged
             if not prepared.changed:
                 _append_sources(connection, row.id, row.head, sources)
