@@ -487,16 +487,6 @@ class Settings(BaseSettings):
         """The folder of uploads on their way in."""
         return self.data_dir / "spool"
 
-    def as_environment(self) -> dict[str, str]:
-        """The settings as environment variables, for worker processes; unset ones are left out."""
-        out = {}
-        for name in type(self).model_fields:
-            value = getattr(self, name)
-            if value is not None:
-                text = value.get_secret_value() if isinstance(value, SecretStr) else str(value)
-                out[f"FLEETMAP_{name.upper()}"] = text
-        return out
-
 
 def is_loopback(host: str) -> bool:
     """Whether an address to listen on is reached from this machine alone."""

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 EventType = str
 """The name of an event type, such as ``version.created``."""
+
+RobotState = Literal["downloading", "ready", "active", "failed"]
+"""State of the map that a robot reports."""
 
 T = TypeVar("T")
 

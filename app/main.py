@@ -122,15 +122,14 @@ async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]
 
 
 def from_environment() -> FleetMapApp:
-    """For ``uvicorn --factory app.main:from_environment`` and for worker processes."""
+    """For ``uvicorn --factory app.main:from_environment``."""
     return create_app(Settings())
 
 
 def server_config(settings: Settings, app: Any = "app.main:from_environment", **more: Any) -> uvicorn.Config:
     """uvicorn as this server needs it: fast loop and parser, bounded connections, no access log, no version in headers.
 
-    app: an application, or the import string of a factory (needed for several workers, who read the settings from the
-    environment: ``os.environ.update(settings.as_environment())`` first).
+    app: an application; for several workers a factory that can be pickled, or its import string.
     """
     if settings.workers > 1:
         folder = settings.data_dir / "metrics"
@@ -149,7 +148,7 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         tls = settings.tls_certificate, settings.tls_key
         tls_context(*tls)  # a file that cannot be used is reported at the start
     options: dict[str, Any] = {
-        "factory": isinstance(app, str),
+        "factory": isinstance(app, str | partial),
         "host": settings.host,
         "port": settings.port,
         "workers": settings.workers,

@@ -18,6 +18,7 @@ import shutil
 import signal
 import tempfile
 from collections.abc import Callable
+from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
@@ -26,6 +27,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 FOLDER = "NUMBA_CACHE_DIR"
 """numba's own variable for the folder; without it the user's cache folder is taken."""
+
+_base: ContextVar[Path | None] = ContextVar("base", default=None)
+"""Folder to compile into, before what ``FOLDER`` names."""
 
 _KERNELS = "_kernels_"
 """Modules of this name hold kernels and nothing else; they are imported when first needed."""
@@ -40,7 +44,7 @@ _PARENT_DEATH_SIGNAL = 1
 
 def folder() -> Path:
     """Where compiled code of this release, machine and user is kept; it need not exist."""
-    setting = os.environ.get(FOLDER)
+    setting = _base.get() or os.environ.get(FOLDER)
     base = Path(setting) if setting else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fleetmap"
     return base / _key()
 
@@ -71,9 +75,12 @@ def fill(directory: Path) -> None:
     for old in directory.glob(f"{_PREFIX}*"):  # of other releases
         shutil.rmtree(old, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=directory, prefix=f"{_PREFIX}part-") as scratch:
-        os.environ[FOLDER] = scratch
-        for module in _modules():
-            importlib.import_module(module).compile_all()
+        token = _base.set(Path(scratch))
+        try:
+            for module in _modules():
+                importlib.import_module(module).compile_all()
+        finally:
+            _base.reset(token)
         build = Path(scratch) / _key()
         if build.is_dir():
             with contextlib.suppress(OSError):  # another process was quicker

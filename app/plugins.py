@@ -6,14 +6,56 @@ A plug-in's module is written like one of ours, and states the version of the in
 
 from __future__ import annotations
 
+import importlib
 import logging
+import pkgutil
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
 
 INTERFACE = 1
 """Raised when plug-ins must be changed to go on working."""
 
 log = logging.getLogger(__name__)
+
+
+class Registry(Generic[T]):
+    """Values by name, which the modules of a package and plug-ins declare when they are imported.
+
+    package: its public modules are imported. noun: for errors. group: entry point group of the plug-ins; empty: none.
+    """
+
+    def __init__(self, package: str, noun: str, group: str = "") -> None:
+        self.entries: dict[str, T] = {}
+        self._package, self._noun, self._group = package, noun, group
+        self._complete = False
+
+    def add(self, name: str, value: T) -> None:
+        """Register a value. Raises ValueError if its name is taken."""
+        if name in self.entries:
+            raise ValueError(f"there is a {self._noun} {name} already, and it stays")
+        self.entries[name] = value
+
+    def all(self) -> dict[str, T]:
+        """Return every value by name, in alphabetical order. The first call imports the modules."""
+        if not self._complete:
+            self._import_modules()
+            self._complete = True
+        return dict(sorted(self.entries.items()))
+
+    def _import_modules(self) -> None:
+        for module in sorted(m.name for m in pkgutil.iter_modules(importlib.import_module(self._package).__path__)):
+            if not module.startswith("_"):
+                importlib.import_module(f"{self._package}.{module}")
+        if self._group:
+            load(self._group, self.entries)
+
+
+def title(function: object) -> str:
+    """Return the first line of a declared function's docstring, or its name."""
+    name: str = function.__name__  # type: ignore[attr-defined]
+    return (function.__doc__ or name).strip().splitlines()[0]
 
 
 def load(group: str, registry: dict[str, Any]) -> None:

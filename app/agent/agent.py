@@ -29,8 +29,8 @@ from app.agent.status import StatusReporter, Subject, describe_status, loaded_ve
 from app.agent.waking import CLOSURE_EVENTS, LATEST, Alarm, is_relevant
 from app.agent.zenoh_client import ZenohClient
 from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
+from app.event_types import RobotState
 from app.events import messages
-from app.events.messages import RobotState
 
 __all__ = ["Agent", "AgentOptions", "robot_name"]
 

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 from app.agent.http_client import ServerClient
 from app.agent.signed_manifest import Manifest
 from app.errors import FleetMapError, Unavailable
-from app.events.messages import RobotState, RobotStatus
+from app.event_types import RobotState
+from app.events.messages import RobotStatus
 
 CONFIRM_SECONDS = 60.0
 """Maximum time until a status sent over Zenoh is confirmed over HTTP: the bus acknowledges nothing. A fleet that

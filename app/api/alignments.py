@@ -8,14 +8,11 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
-from app.api.http.auth import Editor
-from app.api.http.dependencies import ServicesDep
+from app.api.http.dependencies import CommitDep, ServicesDep
 from app.api.http.responses import api_router, json_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
     EnvironmentPath,
-    IdempotencyKey,
-    IfMatch,
     ProblemItem,
     RequestModel,
     VersionOut,
@@ -91,14 +88,7 @@ router = api_router("alignments")
     },
     summary="Lay a grid onto another map",
 )
-def create_alignment(
-    env: EnvironmentPath,
-    body: AlignmentBody,
-    services: ServicesDep,
-    principal: Editor,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
-) -> Response:
+def create_alignment(env: EnvironmentPath, body: AlignmentBody, services: ServicesDep, commit: CommitDep) -> Response:
     """Find the turn and the shift that lay a stored grid onto another grid, a slice of the objects, or given points.
 
     The grid's origin changes, its cells do not; `normalize=true` of `occupancy_grid` bakes a turn into the cells.
@@ -121,9 +111,7 @@ def create_alignment(
         least=body.least,
         dry_run=body.dry_run,
     )
-    outcome = services.ingest.align(
-        env, request, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
-    )
+    outcome = services.ingest.align(env, request, commit.with_message(body.message))
     version = outcome.version
     if version is None or outcome.status == "unchanged":
         return json_response(outcome.body)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import Path, Query, Request
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -19,7 +19,7 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import CHANNEL, ApiTime, EnvironmentPath, RequestModel, problem_responses
 from app.errors import Invalid, Problem
-from app.store.fleet_values import Channel, Robot, Rollout
+from app.store.fleet_values import Channel, Robot, Rollout, RolloutState
 from app.store.values import LATEST, rfc3339
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
@@ -84,7 +84,7 @@ class RolloutOut(BaseModel):
     activate_at: datetime | None
     deadline: datetime | None
     window: float
-    state: Literal["waiting", "watching", "done", "expired", "failed", "rolled_back", "cancelled"]
+    state: RolloutState
     before: int | None
     moved: datetime | None
     detail: str

@@ -8,14 +8,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import derive, parameters
-from app.api.http.auth import Editor, Viewer
-from app.api.http.dependencies import ServicesDep
+from app.api.http.auth import Viewer
+from app.api.http.dependencies import CommitDep, ServicesDep
 from app.api.http.responses import api_router, commit_response, json_response
 from app.api.http.schemas import (
     MAX_TEXT,
     EnvironmentPath,
-    IdempotencyKey,
-    IfMatch,
     RequestModel,
     VersionOut,
     problem_responses,
@@ -85,14 +83,7 @@ def list_derivations(services: ServicesDep, _: Viewer) -> Response:
     },
     summary="Compute a layer and commit it",
 )
-def create_derivation(
-    env: EnvironmentPath,
-    body: DerivationBody,
-    services: ServicesDep,
-    principal: Editor,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
-) -> Response:
+def create_derivation(env: EnvironmentPath, body: DerivationBody, services: ServicesDep, commit: CommitDep) -> Response:
     """A version whose provenance says how the layer was made and from what. It goes stale when that changes.
 
     409 where a source has told that layer, unless `replace` is true. `location_to_imagery` fetches a picture of the
@@ -102,9 +93,7 @@ def create_derivation(
     request = DerivationRequest(body.method, body.parameters, body.replace)
     try:
         carry_out = services.ingest.fetch_imagery if body.method == online.METHOD else services.ingest.derive
-        outcome = carry_out(
-            env, request, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
-        )
+        outcome = carry_out(env, request, commit.with_message(body.message))
     except NotFound as error:
         if body.method in derive.all_derivations():
             raise

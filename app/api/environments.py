@@ -26,6 +26,7 @@ from app.api.http.schemas import (
     problem_responses,
 )
 from app.errors import Conflict, Gone, Invalid, NotFound, Problem
+from app.ingest import CommitRequest
 from app.ingest.service import check_if_match
 from app.model.frame import Datum
 from app.store.area import DATUM_METRES, MARGIN_METRES, NEIGHBOURHOOD_METRES
@@ -258,7 +259,9 @@ def update_environment(
         _check_free(services, body.name, principal)
     warnings: list[Any] = []
     if body.datum is not None:
-        outcome = services.ingest.set_datum(env, parse_datum(body.datum), author=principal.name, if_match=if_match)
+        outcome = services.ingest.set_datum(
+            env, parse_datum(body.datum), CommitRequest(principal.name, if_match=if_match)
+        )
         warnings = outcome.body.get("warnings", []) if outcome.status == "created" else []
     if set(given) != {"datum"}:
         environment = services.store.environments.update(

@@ -8,14 +8,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import generate
-from app.api.http.auth import Editor, Viewer
-from app.api.http.dependencies import ServicesDep
+from app.api.http.auth import Viewer
+from app.api.http.dependencies import CommitDep, ServicesDep
 from app.api.http.responses import api_router, commit_response, json_response
 from app.api.http.schemas import (
     MAX_TEXT,
     EnvironmentPath,
-    IdempotencyKey,
-    IfMatch,
     RequestModel,
     VersionOut,
     problem_responses,
@@ -72,23 +70,14 @@ def list_generators(_: Viewer) -> Response:
     },
     summary="Make up a site and commit it",
 )
-def create_generation(
-    env: EnvironmentPath,
-    body: GenerationBody,
-    services: ServicesDep,
-    principal: Editor,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
-) -> Response:
+def create_generation(env: EnvironmentPath, body: GenerationBody, services: ServicesDep, commit: CommitDep) -> Response:
     """A version whose provenance says generator, seed and parameters: the same ones give the same layers again.
 
     What was made up here before gives way; 409 where a source has told a part, unless `replace` is true.
     """
     order = GenerationRequest(body.generator, body.seed, body.parameters, body.replace)
     try:
-        outcome = services.ingest.generate(
-            env, order, message=body.message, author=principal.name, if_match=if_match, idempotency=idempotency_key
-        )
+        outcome = services.ingest.generate(env, order, commit.with_message(body.message))
     except NotFound as error:
         if body.generator in generate.all_generators():
             raise

@@ -24,6 +24,7 @@ from app.convert.cache import CachedMap
 from app.convert.closures import place_problem
 from app.errors import Conflict, Denied, Invalid, NotFound, Problem
 from app.fleet import live, overlays
+from app.ingest import CommitRequest
 from app.ingest.edits import parse_geometry
 from app.model.closures import Closures
 from app.model.frame import GROUND
@@ -309,8 +310,7 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, p
     outcome = services.ingest.amend(
         env,
         partial(overlays.permanent_edits, services.store, overlay=overlay),
-        message=f"{obstruction} is blocked permanently (reported by {overlay.reporter})",
-        author=principal.name,
+        CommitRequest(principal.name, f"{obstruction} is blocked permanently (reported by {overlay.reporter})"),
     )
     assert outcome.version is not None
     return json_response(services.store.overlays.note_kept(env, id, outcome.version.number).as_dict())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import Header, Path, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
@@ -18,6 +18,7 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_response, page_response
 from app.api.http.schemas import CHANNEL, NAME, ApiTime, Cursor, Limit, RequestModel, problem_responses
 from app.errors import Denied, Invalid, NotFound, Problem
+from app.event_types import RobotState
 from app.store.audit import set_audit_target
 from app.store.fleet_values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport
 from app.store.values import rfc3339
@@ -45,7 +46,7 @@ class StatusBody(RequestModel):
     channel: str = Field(pattern=CHANNEL, description="The channel that it follows.")
     version: int = Field(ge=0, lt=2**63)
     root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Of the version, as the manifest says it.")
-    state: Literal["downloading", "ready", "active", "failed"] = Field(
+    state: RobotState = Field(
         description="`ready`: it has the version and does not drive on it yet; `active`: it does."
     )
     detail: str | None = Field(None, max_length=2000)
@@ -86,7 +87,7 @@ class RobotOut(BaseModel):
     channel: str
     version: int
     root: str
-    state: Literal["downloading", "ready", "active", "failed"]
+    state: RobotState
     detail: str | None = None
     sequence: int | None = None
     overlays: str | None = None

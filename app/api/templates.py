@@ -9,22 +9,20 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import formats, templates
-from app.api.http.auth import Editor, Principal, Viewer
-from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.auth import Viewer
+from app.api.http.dependencies import CommitDep, Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, commit_response, json_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
     VERSION,
     EnvironmentPath,
-    IdempotencyKey,
-    IfMatch,
     RequestModel,
     VersionOut,
     problem_responses,
 )
 from app.formats import Format
-from app.ingest import TemplateUpdate
+from app.ingest import CommitRequest, TemplateUpdate
 from app.model.templates import FormatTemplate, Templates
 
 
@@ -157,33 +155,24 @@ def get_templates(
 
 
 @router.put("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Choose a template set")
-def put_templates(
-    env: EnvironmentPath,
-    body: TemplatesBody,
-    services: ServicesDep,
-    principal: Editor,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
-) -> Response:
+def put_templates(env: EnvironmentPath, body: TemplatesBody, services: ServicesDep, commit: CommitDep) -> Response:
     """A version in which another set holds, or other values of several formats at once. What is left out stays."""
     format_templates = {name: FormatTemplate(template.set, template.values) for name, template in body.formats.items()}
     update = TemplateUpdate(body.set, format_templates, dry_run=body.dry_run).validated()
-    return _commit_templates(services, env, update, body.message, principal, if_match, idempotency_key)
+    return _commit_templates(services, env, update, commit.with_message(body.message))
 
 
 @router.delete("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Take all templates back")
 def delete_templates(
     env: EnvironmentPath,
     services: ServicesDep,
-    principal: Editor,
+    commit: CommitDep,
     message: Message = "",
     dry_run: DryRun = False,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which the formats' own defaults hold."""
     update = TemplateUpdate(clear=True, dry_run=dry_run)
-    return _commit_templates(services, env, update, message, principal, if_match, idempotency_key)
+    return _commit_templates(services, env, update, commit.with_message(message))
 
 
 @router.get(
@@ -213,9 +202,7 @@ def put_format_templates(
     format: FormatPath,
     body: FormatTemplatesBody,
     services: ServicesDep,
-    principal: Editor,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
+    commit: CommitDep,
 ) -> Response:
     """A version with these values of the format's parameters, instead of all that was said of the format before.
 
@@ -224,7 +211,7 @@ def put_format_templates(
     update = TemplateUpdate(None, {format: FormatTemplate(body.set, body.values)}, dry_run=body.dry_run).validated(
         "body"
     )
-    return _commit_templates(services, env, update, body.message, principal, if_match, idempotency_key)
+    return _commit_templates(services, env, update, commit.with_message(body.message))
 
 
 @router.delete(
@@ -237,30 +224,22 @@ def delete_format_templates(
     env: EnvironmentPath,
     format: FormatPath,
     services: ServicesDep,
-    principal: Editor,
+    commit: CommitDep,
     message: Message = "",
     dry_run: DryRun = False,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
 ) -> Response:
     """A version in which the environment's set holds for the format again."""
     update = TemplateUpdate(None, {format: FormatTemplate()}, dry_run=dry_run).validated()
-    return _commit_templates(services, env, update, message, principal, if_match, idempotency_key)
+    return _commit_templates(services, env, update, commit.with_message(message))
 
 
 def _commit_templates(
     services: Services,
     env: str,
     update: TemplateUpdate,
-    message: str,
-    principal: Principal,
-    if_match: str | None,
-    key: str | None,
+    commit: CommitRequest,
 ) -> Response:
-    outcome = services.ingest.template(
-        env, update, message=message, author=principal.name, if_match=if_match, idempotency=key
-    )
-    return commit_response(outcome)
+    return commit_response(services.ingest.template(env, update, commit))
 
 
 def _line(stored_templates: Templates, fmt: Format) -> dict[str, Any]:

@@ -22,8 +22,9 @@ from app.api.http.schemas import CHANNEL, NAME, EnvironmentPath, VersionPath, pr
 from app.api.links import LinkedFile, link_to
 from app.api.robots import RobotOut, RobotPath, require_report_permission, store_report
 from app.errors import CannotConvert, Invalid, NotFound, Problem
+from app.event_types import RobotState
 from app.fleet import vda5050
-from app.store.fleet_values import Channel, RobotReport, RobotState
+from app.store.fleet_values import Channel, RobotReport
 from app.store.values import Version
 
 
@@ -282,8 +283,14 @@ def _collect_reports(
     maps = vda5050.merge_levels(floors)
     usual = stored_robot.report.channel if stored_robot else "production" if "production" in channels else "latest"
     follows = channels.get(channel or usual)
-    reports = [report for state, text, detail in _states(maps, follows) for report in _report(
-        services, env, maps.map_id, channel or usual, state, text, detail, out)]  # fmt: skip
+    reports = []
+    for state, text, detail in _states(maps, follows):
+        try:
+            version = _reported_version(services, env, text)
+        except NotFound as error:
+            out["ignored"].append({"mapId": maps.map_id, "mapVersion": text, "why": error.detail})
+            continue
+        reports.append(RobotReport(channel or usual, version.number, version.root, state, detail and detail[:2000]))
     # What it drives on is told only where it is news: else every message would be a change there and back.
     if (
         len(reports) > 1
@@ -314,21 +321,7 @@ def _states(maps: vda5050.VehicleMaps, channel: Channel | None) -> list[tuple[Ro
     return out
 
 
-def _report(
-    services: Services,
-    env: str,
-    map_id: str,
-    channel: str,
-    state: RobotState,
-    text: str,
-    detail: str | None,
-    out: dict[str, list[dict[str, Any]]],
-) -> list[RobotReport]:
-    try:
-        if not (text.isascii() and text.isdigit() and len(text) < 10):
-            raise NotFound("its mapVersion is no version's number")
-        version = services.store.versions.get(env, int(text))
-    except NotFound as error:
-        out["ignored"].append({"mapId": map_id, "mapVersion": text, "why": error.detail})
-        return []
-    return [RobotReport(channel, version.number, version.root, state, detail and detail[:2000])]
+def _reported_version(services: Services, env: str, text: str) -> Version:
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise NotFound("its mapVersion is no version's number")
+    return services.store.versions.get(env, int(text))

@@ -12,9 +12,9 @@ from pydantic import ConfigDict, Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.http.auth import Editor, Viewer
+from app.api.http.auth import Viewer
 from app.api.http.caching import content_disposition, none_match
-from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.dependencies import CommitDep, Services, ServicesDep
 from app.api.http.forms import FormFields
 from app.api.http.parameters import parse_version_ref
 from app.api.http.problems import MalformedBody, UnsupportedMedia
@@ -24,8 +24,6 @@ from app.api.http.schemas import (
     VERSION,
     Cursor,
     EnvironmentPath,
-    IdempotencyKey,
-    IfMatch,
     Limit,
     RequestModel,
     SourceOut,
@@ -214,24 +212,15 @@ async def create_version(
     env: EnvironmentPath,
     request: Request,
     services: ServicesDep,
-    principal: Editor,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
+    commit: CommitDep,
 ) -> Response:
     """One upload is one version, all or nothing. Files are taken as they are; what is doubtful comes as warnings."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media == "multipart/form-data":
         async with services.intake.receive(request) as form:
-            upload = _upload(form, request)
+            upload, message = _upload(form, request)
             outcome = await run_in_threadpool(
-                _counted,
-                services,
-                services.ingest.upload,
-                env,
-                upload,
-                author=principal.name,
-                if_match=if_match,
-                idempotency=idempotency_key,
+                _counted, services, services.ingest.upload, env, upload, commit.with_message(message)
             )
     elif media == "application/json" or media.endswith("+json"):
         _no_query(request)
@@ -240,10 +229,7 @@ async def create_version(
             services.ingest.revert,
             env,
             body.revert_to,
-            message=body.message,
-            author=principal.name,
-            if_match=if_match,
-            idempotency=idempotency_key,
+            commit.with_message(body.message),
         )
     else:
         raise UnsupportedMedia("send multipart/form-data with files, or application/json with revert_to")
@@ -259,26 +245,10 @@ async def create_version(
     },
     summary="Edit features and cells",
 )
-def create_edit(
-    env: EnvironmentPath,
-    body: EditsBody,
-    services: ServicesDep,
-    principal: Editor,
-    if_match: IfMatch = None,
-    idempotency_key: IdempotencyKey = None,
-) -> Response:
+def create_edit(env: EnvironmentPath, body: EditsBody, services: ServicesDep, commit: CommitDep) -> Response:
     """Some features put or deleted, some cells set: one version, or none. Edges that would dangle are refused."""
     changes = [change.model_dump(exclude_none=True) for change in body.changes]
-    outcome = _counted(
-        services,
-        services.ingest.edit,
-        env,
-        changes,
-        message=body.message,
-        author=principal.name,
-        if_match=if_match,
-        idempotency=idempotency_key,
-    )
+    outcome = _counted(services, services.ingest.edit, env, changes, commit.with_message(body.message))
     return commit_response(outcome)
 
 
@@ -358,26 +328,26 @@ def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Sourc
     return next((s for s in fitting if s.used), fitting[0])
 
 
-def _upload(form: UploadForm, request: Request) -> Upload:
-    """What the form and the query say, checked."""
+def _upload(form: UploadForm, request: Request) -> tuple[Upload, str]:
+    """The upload and the message that the form and the query describe, checked."""
     fields = FormFields(form, request.query_params.multi_items())
     mode = fields.take("mode") or "replace"
     if mode not in ("replace", "merge"):
         raise Invalid("mode must be replace or merge", [Problem("unknown", where="mode")])
     hints, message, dry_run = fields.take_hints(), fields.take("message"), fields.take_flag("dry_run")
-    return Upload(
+    upload = Upload(
         files=tuple(form.files),
         hints=replace(hints, options=fields.take_rest()),
         mode=mode,  # type: ignore[arg-type]  # checked above
-        message=message,
         dry_run=dry_run,
     )
+    return upload, message
 
 
-def _counted(services: Services, change: Callable[..., CommitResult], *args: Any, **kwargs: Any) -> CommitResult:
+def _counted(services: Services, change: Callable[..., CommitResult], *args: Any) -> CommitResult:
     """Carry out an upload or edit, and count what became of it."""
     try:
-        outcome = change(*args, **kwargs)
+        outcome = change(*args)
     except FleetMapError:
         services.metrics.uploads.labels("refused").inc()
         raise

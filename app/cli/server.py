@@ -17,6 +17,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
@@ -85,7 +86,6 @@ def serve(*, demo: bool = False, **values: Any) -> None:
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         check(settings)
         main.check_bus(settings)
-        os.environ.update(settings.as_environment())  # what worker processes read
         _compile(settings.data_dir / "native")
         output.print_result(f"Fleet Map Server: {address} · documentation: {address}/docs")
         sys.stdout.flush()
@@ -161,26 +161,22 @@ def demo(server: options.Server = None, token: options.Token = None, as_json: op
         output.print_result(f"  {line}")
 
 
-def application() -> Any:
+def application(settings: Settings) -> Any:
     """The ASGI application, in a server process of its own: it ends with the process that started it."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_stop_with_parent, args=(parent,), daemon=True).start()
     from app.main import create_app
 
-    server_app = create_app(load_settings({}, warn=False))  # the process that started it has warned
+    server_app = create_app(settings)
     gc.freeze()
     gc.unfreeze()  # all of it counts as old now, without a look at any of it
     gc.enable()
     return server_app
 
 
-def load_settings(values: Mapping[str, Any], *, warn: bool = True) -> Settings:
-    """The settings: flags first, then the environment, ``.env``, mounted secrets. BadParameter for unusable ones.
-
-    Args:
-        warn: whether FLEETMAP_ variables that nothing reads are warned of.
-    """
+def load_settings(values: Mapping[str, Any]) -> Settings:
+    """The settings: flags first, then the environment, ``.env``, mounted secrets. BadParameter for unusable ones."""
     local.require_server_python("serve")
     from pydantic import ValidationError
 
@@ -192,8 +188,7 @@ def load_settings(values: Mapping[str, Any], *, warn: bool = True) -> Settings:
         if not Path(folder).is_dir():
             raise typer.BadParameter(f"{SECRETS_DIR}: there is no folder {folder}")
         given["_secrets_dir"] = folder
-    if warn:
-        _warn_unknown(Settings.model_fields, Path(".env"))
+    _warn_unknown(Settings.model_fields, Path(".env"))
     try:
         return Settings(**given)
     except ValidationError as error:
@@ -353,7 +348,7 @@ def _run(settings: Settings, listener: socket.socket) -> None:
 
     from app.main import server_config
 
-    config = server_config(settings, "app.cli.server:application")
+    config = server_config(settings, partial(application, settings))
     # Uvicorn raises the signal again once it has shut down; after a clean stop the exit status shall be 0.
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: None)

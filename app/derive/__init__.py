@@ -10,11 +10,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import heapq
-import importlib
-import pkgutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, TypeVar
 
 from app import parameters, plugins
@@ -102,7 +99,7 @@ class Plan:
     cost: float
 
 
-_registry: dict[str, Derivation] = {}
+_registry = plugins.Registry[Derivation](__name__, "derivation", "fleetmap.derivations")
 
 
 def derives(
@@ -121,28 +118,28 @@ def derives(
 
     def declare(function: Function) -> Function:
         name = function.__name__
-        if name in _registry:
-            raise ValueError(f"there is a derivation {name} already, and it stays")
-        title = (function.__doc__ or name).strip().splitlines()[0]
-        fields = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes, last, trial)
-        _registry[name] = Derivation(name, *fields)
+        fields = (
+            plugins.title(function),
+            gives,
+            frozenset(needs),
+            cost,
+            version,
+            parameters,
+            function,
+            also,
+            makes,
+            last,
+            trial,
+        )
+        _registry.add(name, Derivation(name, *fields))
         return function
 
     return declare
 
 
-@cache
-def _discover() -> None:
-    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
-        if not module.startswith("_"):
-            importlib.import_module(f"{__name__}.{module}")
-    plugins.load("fleetmap.derivations", _registry)
-
-
 def all_derivations() -> Mapping[str, Derivation]:
     """Every derivation by name, in alphabetical order."""
-    _discover()
-    return dict(sorted(_registry.items()))
+    return _registry.all()
 
 
 def ends_in_display_step(steps: Iterable[Mapping[str, Any]]) -> bool:

@@ -145,7 +145,7 @@ def sites(
         if len(one):
             reader.read(one, out.setdefault(key.level, LevelObstacles()), key.level)
     reader.report()
-    return {level: reader.finish(site, level) for level, site in out.items()}
+    return {level: reader.finish(site) for level, site in out.items()}
 
 
 def unreadable_error(reasons: Iterable[str], summary: str) -> MissingLayer:
@@ -310,7 +310,7 @@ class _Reader:
             if reason not in site.unreadable:
                 site.unreadable.append(reason)
 
-    def finish(self, site: LevelObstacles, level: str) -> LevelObstacles:  # noqa: ARG002
+    def finish(self, site: LevelObstacles) -> LevelObstacles:
         """The site with its solids' triangles."""
         pieces = self.shapes.get(id(site), [])
         if pieces:

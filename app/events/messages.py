@@ -9,10 +9,10 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from app.errors import Invalid, Problem
-from app.event_types import EVENT_TYPES, EventType
+from app.event_types import EVENT_TYPES, EventType, RobotState
 
 PREFIX = "fleetmap"
 """The usual start of every key."""
@@ -22,7 +22,6 @@ JSON = "application/json"
 SIGNATURE = "fleetmap-signature"
 """Header of a manifest: ``<key id>:<base64 of the Ed25519 signature over the body>``."""
 
-RobotState = Literal["downloading", "ready", "active", "failed"]
 ROBOT_STATES: tuple[RobotState, ...] = get_args(RobotState)
 
 ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")

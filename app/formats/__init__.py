@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import importlib
-import pkgutil
 import re
 import struct
 import zipfile
@@ -18,7 +16,6 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any
 
 import yaml
@@ -80,29 +77,18 @@ class FileGroup:
     shared_files: Files = field(default_factory=dict)
 
 
-_registry: dict[str, Format] = {}
+_registry = plugins.Registry[Format](__name__, "format", "fleetmap.formats")
 
 
 def register(new: Format) -> Format:
     """Make a format known. The last statement of its module."""
-    if new.name in _registry:
-        raise ValueError(f"there is a format {new.name} already, and it stays")
-    _registry[new.name] = new
+    _registry.add(new.name, new)
     return new
-
-
-@cache
-def _discover() -> None:
-    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
-        if not module.startswith("_"):
-            importlib.import_module(f"{__name__}.{module}")
-    plugins.load("fleetmap.formats", _registry)
 
 
 def all_formats() -> dict[str, Format]:
     """Every format by name, in alphabetical order."""
-    _discover()
-    return dict(sorted(_registry.items()))
+    return _registry.all()
 
 
 def get_format(name: str) -> Format:

@@ -87,7 +87,9 @@ def node_points(xyz: Array) -> NDArray[np.object_]:
     return out
 
 
-def edge_lines(xyz: Array, sources: Sequence[int], targets: Sequence[int]) -> NDArray[np.object_]:
+def edge_lines(
+    xyz: Array, sources: Sequence[int] | NDArray[np.intp], targets: Sequence[int] | NDArray[np.intp]
+) -> NDArray[np.object_]:
     """Lines of two points between the places of nodes, two-dimensional where both lie at 0."""
     ends = np.stack([xyz[np.array(sources, np.intp)], xyz[np.array(targets, np.intp)]], axis=1)
     out: NDArray[np.object_] = np.empty(len(ends), object)

@@ -8,16 +8,13 @@ transcendental function is rounded before it is kept.
 from __future__ import annotations
 
 import hashlib
-import importlib
-import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 
-from app import parameters
+from app import parameters, plugins
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, MissingLayer, NotFound, Problem
 from app.model.frame import Datum
@@ -91,7 +88,7 @@ class Generator:
         }
 
 
-_registry: dict[str, Generator] = {}
+_registry = plugins.Registry[Generator](__name__, "generator")
 
 
 def generates(
@@ -107,27 +104,17 @@ def generates(
 
     def declare(function: Function) -> Function:
         name = function.__name__
-        if name in _registry:
-            raise ValueError(f"generator {name} is declared twice")
-        title = (function.__doc__ or name).strip().splitlines()[0]
         layers = (frozenset(gives), frozenset(needs), frozenset(also))
-        _registry[name] = Generator(name, title, *layers, version, parameters, function, frozenset(changes))
+        values = (plugins.title(function), *layers, version, parameters, function, frozenset(changes))
+        _registry.add(name, Generator(name, *values))
         return function
 
     return declare
 
 
-@cache
-def _discover() -> None:
-    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
-        if not module.startswith("_"):
-            importlib.import_module(f"{__name__}.{module}")
-
-
 def all_generators() -> Mapping[str, Generator]:
     """Every generator by name, in alphabetical order."""
-    _discover()
-    return dict(sorted(_registry.items()))
+    return _registry.all()
 
 
 def get_generator(name: str) -> Generator:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 import shapely
@@ -18,6 +20,7 @@ from app.generate._site import SLACK, Site, SiteOptions, invalid_option_error
 from app.generate._site_frame import place_site
 from app.model.frame import GROUND, Level
 from app.model.layers import Layers
+from app.parameters import parameter
 
 RASTER = 0.8
 """Metres: doors on both sides of the corridor stand on multiples of it, so that they face each other or stand apart."""
@@ -33,11 +36,44 @@ MAX_ROOMS = 5000
 MAX_LEVELS = 20
 MARGIN = 2.0
 
+Furnish = Callable[[Furniture, Room, np.random.Generator], None]
+"""Puts the things of a room into it."""
+
 Kinds = Callable[[int, int, list[float], np.random.Generator], list[str]]
 """(level from 0, side, widths of the rooms, chance) -> what each room is."""
 
 NodeOf = Callable[[Room], tuple[float, float]]
 """Where in a room its node stands: metres along and inward."""
+
+
+@dataclass(frozen=True, slots=True)
+class BuildingOptions(SiteOptions):
+    """How large the building is, and how fine its rooms. The defaults are those of an office."""
+
+    levels: int = parameter(2, "levels; from two on a lift joins them", minimum=1, maximum=MAX_LEVELS)
+    length: float = parameter(32.0, "of the corridor", minimum=4.0, maximum=500.0, unit="m")
+    depth: float = parameter(5.5, "of the rooms on each side of it", minimum=2.5, maximum=50.0, unit="m")
+    corridor: float = parameter(2.4, "width of the corridor", minimum=1.2, maximum=20.0, unit="m")
+    room_width: tuple[float, float] = parameter(
+        (3.2, 6.4), "least,most width of a room", minimum=2.0, maximum=100.0, unit="m"
+    )
+    door_width: float = parameter(1.1, "of the rooms' doors", minimum=0.6, maximum=3.0, unit="m")
+    storey_height: float = parameter(3.4, "from floor to floor", minimum=2.0, maximum=20.0, unit="m")
+    furniture: bool = parameter(True, "whether there are desks, tables and cupboards")
+
+
+def redefine(name: str, default: Any, doc: str = "") -> Any:
+    """Declare a parameter of BuildingOptions again with another default, within the same bounds."""
+    metadata = next(f.metadata for f in fields(BuildingOptions) if f.name == name)
+    return field(default=default, metadata={**metadata, "doc": doc or metadata["doc"]})
+
+
+def _measures(options: BuildingOptions) -> Storeys:
+    least, most = options.room_width
+    return Storeys(
+        options.levels, options.length, options.depth, options.corridor, least, most, options.door_width,
+        options.storey_height, options.levels > 1,
+    )  # fmt: skip
 
 
 def check(measures: Storeys, radius: float) -> None:
@@ -66,11 +102,11 @@ def fits_robot(site: Site, measures: Storeys, radius: float) -> None:
     widths = {"door_width": measures.door, "corridor": measures.corridor - ENTRANCE}
     if measures.lift:
         widths["robot_radius"] = LIFT_DOOR
-    for parameter, width in widths.items():
+    for option, width in widths.items():
         if width < need - 1e-9:
-            label = {"robot_radius": "the lift's doors are", "corridor": "its entrance is"}.get(parameter, "it is")
+            label = {"robot_radius": "the lift's doors are", "corridor": "its entrance is"}.get(option, "it is")
             raise invalid_option_error(
-                parameter, f"{label} {width:.3g} m wide; a robot of {radius:g} m needs {need:.2f} m here"
+                option, f"{label} {width:.3g} m wide; a robot of {radius:g} m needs {need:.2f} m here"
             )
 
 
@@ -273,16 +309,16 @@ def goal(room: Room, radius: float) -> tuple[float, float]:
 
 def build_site(
     given: Layers,
-    options: SiteOptions,
-    measures: Storeys,
+    options: BuildingOptions,
     source: RandomSource,
     notes: DerivationNotes,
     kinds: Kinds,
-    furnish: Callable[[Furniture, Room, np.random.Generator], None] | None,
+    furnish: Mapping[str, Furnish],
     charged: Callable[[int, Room], bool],
 ) -> Layers:
-    """A whole building with its network. kinds: see ``build``. furnish: puts a room's things, None: it stays empty.
+    """A whole building with its network. kinds: see ``build``. furnish: by kind of room.
     charged: whether a room (of the level of that number) has a charger for robots."""
+    measures = _measures(options)
     check(measures, options.robot_radius)
     site = Site(given, options, notes, levels=building_levels(measures))
 
@@ -296,7 +332,16 @@ def build_site(
             things = building.furnish(room, node_of(room))
             if charged(k, room):
                 building.charger(things, node_of(room))
-            if furnish is not None:
-                furnish(things, room, chance)
+            if options.furniture:
+                furnish[room.kind](things, room, chance)
     slow_zones(building)
     return site.finish(ground="grass")
+
+
+def put_shelves(things: Furniture, room: Room, chance: np.random.Generator) -> None:
+    """Shelves along both side walls."""
+    width = room.box[2] - room.box[0]
+    for k in range(int((room.depth - 0.4) / 1.1)):
+        for along in (0.3, width - 0.3):
+            if chance.random() < 0.85:
+                things.add_item("shelf", along, 0.75 + 1.1 * k, (0.5, 1.0, 2.0), "shelf")

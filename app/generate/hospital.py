@@ -8,28 +8,23 @@ import numpy as np
 
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _storeys, generates
-from app.generate._building import Furniture, Room, Storeys
-from app.generate._site import SiteOptions
+from app.generate._building import Furniture, Room
+from app.generate._storeys import BuildingOptions, redefine
 from app.model.layers import Layers
-from app.parameters import parameter
 
 
 @dataclass(frozen=True, slots=True)
-class Options(SiteOptions):
+class Options(BuildingOptions):
     """How large the wards are, and how many lie above each other."""
 
-    levels: int = parameter(
-        1, "wards above each other; from two on a lift joins them", minimum=1, maximum=_storeys.MAX_LEVELS
-    )
-    length: float = parameter(36.0, "of the corridor", minimum=4.0, maximum=500.0, unit="m")
-    depth: float = parameter(6.0, "of the rooms on each side of it", minimum=2.5, maximum=50.0, unit="m")
-    corridor: float = parameter(3.0, "width of the corridor", minimum=1.2, maximum=20.0, unit="m")
-    room_width: tuple[float, float] = parameter(
-        (4.0, 6.6), "least,most width of a room", minimum=2.0, maximum=100.0, unit="m"
-    )
-    door_width: float = parameter(1.4, "of the rooms' doors", minimum=0.6, maximum=3.0, unit="m")
-    storey_height: float = parameter(3.8, "from floor to floor", minimum=2.0, maximum=20.0, unit="m")
-    furniture: bool = parameter(True, "whether there are beds, cabinets and counters")
+    levels: int = redefine("levels", 1, "wards above each other; from two on a lift joins them")
+    length: float = redefine("length", 36.0)
+    depth: float = redefine("depth", 6.0)
+    corridor: float = redefine("corridor", 3.0)
+    room_width: tuple[float, float] = redefine("room_width", (4.0, 6.6))
+    door_width: float = redefine("door_width", 1.4)
+    storey_height: float = redefine("storey_height", 3.8)
+    furniture: bool = redefine("furniture", True, "whether there are beds, cabinets and counters")
 
 
 @generates(
@@ -39,16 +34,7 @@ class Options(SiteOptions):
 )
 def hospital(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """A hospital ward: rooms with beds, a nurse station and a corridor; several wards are joined by a lift."""
-    min_width, max_width = options.room_width
-    lift = options.levels > 1
-    measures = Storeys(
-        options.levels, options.length, options.depth, options.corridor, min_width, max_width, options.door_width,
-        options.storey_height, lift,
-    )  # fmt: skip
-    furnish = _furnish if options.furniture else None
-    return _storeys.build_site(
-        given, options, measures, source, notes, _kinds, furnish, lambda _, room: room.kind == "supply"
-    )
+    return _storeys.build_site(given, options, source, notes, _kinds, _FURNISH, lambda _, room: room.kind == "supply")
 
 
 def _kinds(level: int, side: int, widths: list[float], chance: np.random.Generator) -> list[str]:  # noqa: ARG001
@@ -94,15 +80,6 @@ def _station(things: Furniture, room: Room, chance: np.random.Generator) -> None
             things.add_item("chair", 1.1 + 1.9 * k + shift, room.depth - 1.25, (0.5, 0.5, 0.9), "goods")
 
 
-def _supply(things: Furniture, room: Room, chance: np.random.Generator) -> None:
-    """Shelves along both side walls."""
-    width = room.box[2] - room.box[0]
-    for k in range(int((room.depth - 0.4) / 1.1)):
-        for along in (0.3, width - 0.3):
-            if chance.random() < 0.85:
-                things.add_item("shelf", along, 0.75 + 1.1 * k, (0.5, 1.0, 2.0), "shelf")
-
-
 def _treatment(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     """A couch, cupboards along a wall, a trolley."""
     width = room.box[2] - room.box[0]
@@ -124,11 +101,7 @@ def _lounge(things: Furniture, room: Room, chance: np.random.Generator) -> None:
 _FURNISH = {
     "patients": _beds,
     "nurse_station": _station,
-    "supply": _supply,
+    "supply": _storeys.put_shelves,
     "treatment": _treatment,
     "lounge": _lounge,
 }
-
-
-def _furnish(things: Furniture, room: Room, chance: np.random.Generator) -> None:
-    _FURNISH[room.kind](things, room, chance)

@@ -2,53 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from app.derive import DerivationNotes
 from app.generate import RandomSource, _storeys, generates
-from app.generate._building import Furniture, Room, Storeys
-from app.generate._site import SiteOptions
+from app.generate._building import Furniture, Room
+from app.generate._storeys import BuildingOptions
 from app.model.layers import Layers
-from app.parameters import parameter
 
 CHARGER_ROOMS = ("storage", "copy")
 """Rooms on the ground with a charger for robots."""
 
 
-@dataclass(frozen=True, slots=True)
-class Options(SiteOptions):
-    """How large the building is, and how fine its rooms."""
-
-    levels: int = parameter(2, "levels; from two on a lift joins them", minimum=1, maximum=_storeys.MAX_LEVELS)
-    length: float = parameter(32.0, "of the corridor", minimum=4.0, maximum=500.0, unit="m")
-    depth: float = parameter(5.5, "of the rooms on each side of it", minimum=2.5, maximum=50.0, unit="m")
-    corridor: float = parameter(2.4, "width of the corridor", minimum=1.2, maximum=20.0, unit="m")
-    room_width: tuple[float, float] = parameter(
-        (3.2, 6.4), "least,most width of a room", minimum=2.0, maximum=100.0, unit="m"
-    )
-    door_width: float = parameter(1.1, "of the rooms' doors", minimum=0.6, maximum=3.0, unit="m")
-    storey_height: float = parameter(3.4, "from floor to floor", minimum=2.0, maximum=20.0, unit="m")
-    furniture: bool = parameter(True, "whether there are desks, tables and cupboards")
-
-
 @generates(
     {"location", "objects", "occupancy", "topology", "zones", "imagery"},
     also=frozenset({"location"}),
-    parameters=Options,
+    parameters=BuildingOptions,
 )
-def office(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
+def office(given: Layers, options: BuildingOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """An office building: rooms with doors along corridors, two levels or more with a lift, furniture."""
-    min_width, max_width = options.room_width
-    lift = options.levels > 1
-    measures = Storeys(
-        options.levels, options.length, options.depth, options.corridor, min_width, max_width, options.door_width,
-        options.storey_height, lift,
-    )  # fmt: skip
-    furnish = _furnish if options.furniture else None
     return _storeys.build_site(
-        given, options, measures, source, notes, _kinds, furnish, lambda k, room: k == 0 and room.kind in CHARGER_ROOMS
+        given, options, source, notes, _kinds, _FURNISH, lambda k, room: k == 0 and room.kind in CHARGER_ROOMS
     )
 
 
@@ -104,15 +78,6 @@ def _kitchen(things: Furniture, room: Room, chance: np.random.Generator) -> None
     things.add_item("table", side, 1.4, (0.8, 0.8, 0.74), "wood", style="table")
 
 
-def _storage(things: Furniture, room: Room, chance: np.random.Generator) -> None:
-    """Shelves along both side walls."""
-    width = room.box[2] - room.box[0]
-    for k in range(int((room.depth - 0.4) / 1.1)):
-        for along in (0.3, width - 0.3):
-            if chance.random() < 0.85:
-                things.add_item("shelf", along, 0.75 + 1.1 * k, (0.5, 1.0, 2.0), "shelf")
-
-
 def _copy(things: Furniture, room: Room, chance: np.random.Generator) -> None:
     """Machines along the outer wall."""
     width = room.box[2] - room.box[0]
@@ -134,11 +99,7 @@ _FURNISH = {
     "office": _desks,
     "meeting": _meeting,
     "kitchen": _kitchen,
-    "storage": _storage,
+    "storage": _storeys.put_shelves,
     "copy": _copy,
     "reception": _reception,
 }
-
-
-def _furnish(things: Furniture, room: Room, chance: np.random.Generator) -> None:
-    _FURNISH.get(room.kind, _desks)(things, room, chance)

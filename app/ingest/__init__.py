@@ -4,6 +4,7 @@
 """
 
 from app.ingest.alignment import AlignmentRequest
+from app.ingest.commit_request import CommitRequest
 from app.ingest.derivation import DerivationRequest
 from app.ingest.generation import GenerationRequest
 from app.ingest.online import Provider
@@ -12,6 +13,7 @@ from app.ingest.templates import TemplateUpdate
 
 __all__ = [
     "AlignmentRequest",
+    "CommitRequest",
     "CommitResult",
     "DerivationRequest",
     "GenerationRequest",

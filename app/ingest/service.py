@@ -16,6 +16,7 @@ from app import parameters
 from app.errors import CannotDerive, Conflict, Invalid, Problem, StaleParent, UnreadableFile
 from app.ingest import online
 from app.ingest.alignment import AlignmentRequest, AlignmentResult, prepare_alignment, previous_alignment
+from app.ingest.commit_request import CommitRequest
 from app.ingest.derivation import DerivationRequest, input_line, prepare_derivation
 from app.ingest.derivation import check as check_wish
 from app.ingest.edits import edit_changes
@@ -60,7 +61,6 @@ class Upload:
     files: tuple[SpooledFile, ...]
     hints: UploadHints = field(default_factory=UploadHints)
     mode: Mode = "replace"
-    message: str = ""
     dry_run: bool = False
 
 
@@ -80,22 +80,14 @@ class Ingest:
         self._store, self._run, self._limits = store, run, limits
         self.provider = provider
 
-    def upload(
-        self,
-        environment: str,
-        upload: Upload,
-        *,
-        author: str,
-        if_match: str | None = None,
-        idempotency: str | None = None,
-    ) -> CommitResult:
+    def upload(self, environment: str, upload: Upload, commit: CommitRequest) -> CommitResult:
         """Files -> one version, all or nothing.
 
         Raises BadUpload (nothing is stored), Invalid, StaleParent (``if_match`` names another version), Conflict (the
         idempotency key was used for something else), Unavailable.
         """
         _check_upload(upload)
-        key = _idempotency(idempotency, _fingerprint(upload))
+        key = commit.idempotency(_fingerprint(upload, commit.message))
         paths = {f.name: f.path for f in upload.files}
 
         def once(base: Version) -> CommitResult:
@@ -107,47 +99,35 @@ class Ingest:
                 sources = [
                     Source(f.name, f.size, f.sha256, notes[f.name].format, notes[f.name].used) for f in upload.files
                 ]
-                p, warnings = proposal.prepared, proposal.warnings
-                return CommitResult("dry_run", None, self._preview(base, p, warnings, sources, author, upload.message))
+                return CommitResult(
+                    "dry_run", None, self._preview(base, proposal.prepared, commit, proposal.warnings, sources)
+                )
             sources = self._store_sources(upload, proposal)
-            return self._commit(
-                environment, base, proposal.prepared, author, upload.message, sources, proposal.warnings, key
-            )
+            return self._commit(environment, base, proposal.prepared, commit, key, proposal.warnings, sources)
 
-        return self._commit_on_head(environment, key, if_match, once, "this upload can be taken in")
+        return self._commit_on_head(environment, key, commit.if_match, once, "this upload can be taken in")
 
-    def edit(
-        self,
-        environment: str,
-        changes: Sequence[Mapping[str, Any]],
-        *,
-        message: str,
-        author: str,
-        if_match: str | None = None,
-        idempotency: str | None = None,
-    ) -> CommitResult:
+    def edit(self, environment: str, changes: Sequence[Mapping[str, Any]], commit: CommitRequest) -> CommitResult:
         """Edits -> one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
         if _exceeds_depth(MAX_DEPTH, changes):
             reason = f"nested deeper than {MAX_DEPTH} lists and objects"
             raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
-        key = _idempotency(idempotency, _digest(["edit", list(changes), message]))
-        return self._edit(environment, lambda _: changes, message, author, if_match, key)
+        key = commit.idempotency(_digest(["edit", list(changes), commit.message]))
+        return self._edit(environment, lambda _: changes, commit, key)
 
     def amend(
-        self, environment: str, edits: Callable[[Version], Sequence[Mapping[str, Any]]], *, message: str, author: str
+        self, environment: str, edits: Callable[[Version], Sequence[Mapping[str, Any]]], commit: CommitRequest
     ) -> CommitResult:
         """Edits that follow from the version they are made on. Where the head moves meanwhile ``edits`` is asked again,
         so that nothing of what others wrote is put back; where it finds none, nothing changes.
         """
-        return self._edit(environment, edits, message, author, None, None)
+        return self._edit(environment, edits, commit, None)
 
     def _edit(
         self,
         environment: str,
         edits: Callable[[Version], Sequence[Mapping[str, Any]]],
-        message: str,
-        author: str,
-        if_match: str | None,
+        commit: CommitRequest,
         key: Idempotency | None,
     ) -> CommitResult:
         def once(base: Version) -> CommitResult:
@@ -156,75 +136,47 @@ class Ingest:
                 return CommitResult("unchanged", base, base.as_dict())
             change_set, warnings = edit_changes(self._store, base, changes)
             prepared: Prepared = self._run_in_worker(prepare_changes, base, change_set)
-            return self._commit(environment, base, prepared, author, message, (), warnings, key)
+            return self._commit(environment, base, prepared, commit, key, warnings)
 
-        return self._commit_on_head(environment, key, if_match, once, "this edit can be taken in")
+        return self._commit_on_head(environment, key, commit.if_match, once, "this edit can be taken in")
 
-    def derive(
-        self,
-        environment: str,
-        request: DerivationRequest,
-        *,
-        message: str,
-        author: str,
-        if_match: str | None = None,
-        idempotency: str | None = None,
-    ) -> CommitResult:
+    def derive(self, environment: str, request: DerivationRequest, commit: CommitRequest) -> CommitResult:
         """A layer computed from others -> one version.
 
         Raises NotFound, Invalid, CannotConvert, Conflict (a source has told that layer), StaleParent.
         """
         check_wish(request)
-        key = _idempotency(
-            idempotency, _digest(["derive", request.method, dict(request.values), request.replace, message])
-        )
-        text = message or f"Derived by {request.method}"
+        fingerprint = ["derive", request.method, dict(request.values), request.replace, commit.message]
+        key = commit.idempotency(_digest(fingerprint))
+        described = commit.with_default_message(f"Derived by {request.method}")
 
         def once(base: Version) -> CommitResult:
             prepared, warnings = self._run_in_worker(
                 prepare_derivation, base, request, failure="the layer could not be derived"
             )
-            return self._commit(environment, base, prepared, author, text, (), warnings, key)
+            return self._commit(environment, base, prepared, described, key, warnings)
 
-        return self._commit_on_head(environment, key, if_match, once, "a layer can be derived")
+        return self._commit_on_head(environment, key, commit.if_match, once, "a layer can be derived")
 
-    def generate(
-        self,
-        environment: str,
-        order: GenerationRequest,
-        *,
-        message: str,
-        author: str,
-        if_match: str | None = None,
-        idempotency: str | None = None,
-    ) -> CommitResult:
+    def generate(self, environment: str, order: GenerationRequest, commit: CommitRequest) -> CommitResult:
         """A site made up from parameters and a seed -> one version.
 
         Raises NotFound, Invalid, CannotGenerate, MissingLayer, Conflict (a source has told that part), StaleParent.
         """
         generators.check(order.generator, order.seed, order.values)
-        fingerprint = ["generate", order.generator, order.seed, dict(order.values), order.replace, message]
-        key = _idempotency(idempotency, _digest(fingerprint))
-        text = message or f"Generated by {order.generator}, seed {order.seed}"
+        fingerprint = ["generate", order.generator, order.seed, dict(order.values), order.replace, commit.message]
+        key = commit.idempotency(_digest(fingerprint))
+        described = commit.with_default_message(f"Generated by {order.generator}, seed {order.seed}")
 
         def once(base: Version) -> CommitResult:
             prepared, warnings = self._run_in_worker(
                 prepare_generation, base, order, failure="the site could not be made"
             )
-            return self._commit(environment, base, prepared, author, text, (), warnings, key)
+            return self._commit(environment, base, prepared, described, key, warnings)
 
-        return self._commit_on_head(environment, key, if_match, once, "a site can be made up")
+        return self._commit_on_head(environment, key, commit.if_match, once, "a site can be made up")
 
-    def fetch_imagery(
-        self,
-        environment: str,
-        request: DerivationRequest,
-        *,
-        message: str,
-        author: str,
-        if_match: str | None = None,
-        idempotency: str | None = None,
-    ) -> CommitResult:
+    def fetch_imagery(self, environment: str, request: DerivationRequest, commit: CommitRequest) -> CommitResult:
         """A picture of the site from the configured provider -> one version.
 
         Raises CannotDerive (no provider, or what it sends is of no use), MissingLayer or MissingDatum, Invalid,
@@ -238,8 +190,8 @@ class Ingest:
                 step=online.METHOD,
             )
         chosen = parameters.parse(online.Parameters, request.values, f"parameter of {online.METHOD}")
-        key = _idempotency(idempotency, _digest(["fetch", dict(request.values), request.replace, message]))
-        text = message or f"Fetched from {provider.host}"
+        key = commit.idempotency(_digest(["fetch", dict(request.values), request.replace, commit.message]))
+        described = commit.with_default_message(f"Fetched from {provider.host}")
         fetches: list[tuple[online.Mosaic, tuple[bytes | None, ...]]] = []
 
         def once(base: Version) -> CommitResult:
@@ -254,32 +206,23 @@ class Ingest:
             prepared, warnings = self._run_in_worker(
                 online.prepare_picture, base, fetched, self._limits, failure="the fetched picture could not be read"
             )
-            return self._commit(environment, base, prepared, author, text, (), warnings, key)
+            return self._commit(environment, base, prepared, described, key, warnings)
 
-        return self._commit_on_head(environment, key, if_match, once, "a picture can be fetched")
+        return self._commit_on_head(environment, key, commit.if_match, once, "a picture can be fetched")
 
-    def align(
-        self,
-        environment: str,
-        request: AlignmentRequest,
-        *,
-        message: str,
-        author: str,
-        if_match: str | None = None,
-        idempotency: str | None = None,
-    ) -> CommitResult:
+    def align(self, environment: str, request: AlignmentRequest, commit: CommitRequest) -> CommitResult:
         """A grid laid onto another map -> one version, or only what was found. body: {alignment, version, warnings}.
 
         Raises NotFound, Invalid, CannotConvert (nothing fits), StaleParent.
         """
-        key = _idempotency(idempotency, _digest(["align", dataclasses.asdict(request), message]))
+        key = commit.idempotency(_digest(["align", dataclasses.asdict(request), commit.message]))
         replayed = None if request.dry_run else self._previous_result(environment, key)
         if replayed is not None and replayed.version is not None:
             report = previous_alignment(replayed.version, request)
             return dataclasses.replace(
                 replayed, body=_alignment_as_json(report, replayed.version, replayed.version.warnings)
             )
-        text = message or f"Aligned the grid {request.level}/{request.grid}"
+        described = commit.with_default_message(f"Aligned the grid {request.level}/{request.grid}")
 
         def once(base: Version) -> CommitResult:
             result: AlignmentResult = self._run_in_worker(
@@ -287,75 +230,56 @@ class Ingest:
             )
             if result.prepared is None:
                 return CommitResult("dry_run", None, _alignment_as_json(result.summary, None, result.warnings))
-            outcome = self._commit(environment, base, result.prepared, author, text, (), result.warnings, key)
+            outcome = self._commit(environment, base, result.prepared, described, key, result.warnings)
             return dataclasses.replace(
                 outcome, body=_alignment_as_json(result.summary, outcome.version, result.warnings)
             )
 
-        return self._commit_on_head(environment, None, if_match, once, "a grid can be aligned")
+        return self._commit_on_head(environment, None, commit.if_match, once, "a grid can be aligned")
 
-    def revert(
-        self,
-        environment: str,
-        to: int,
-        *,
-        message: str,
-        author: str,
-        if_match: str | None = None,
-        idempotency: str | None = None,
-    ) -> CommitResult:
+    def revert(self, environment: str, to: int, commit: CommitRequest) -> CommitResult:
         """A new version with an old one's content."""
-        key = _idempotency(idempotency, _digest(["revert", to, message]))
-        text = message or f"Revert to version {to}"
+        key = commit.idempotency(_digest(["revert", to, commit.message]))
+        text = commit.message or f"Revert to version {to}"
 
         def once(base: Version) -> CommitResult:
             same = self._store.versions.get(environment, to).root == base.root
             noted = Idempotency(key.key, UNCHANGED + key.fingerprint) if same and key is not None else key
             version = self._store.versions.revert(
-                environment, to, author=author, message=text, expected=base.number, idempotency=noted
+                environment, to, author=commit.author, message=text, expected=base.number, idempotency=noted
             )
             return CommitResult("unchanged" if same else "created", version, version.as_dict())
 
-        return self._commit_on_head(environment, key, if_match, once, "it can be reverted")
+        return self._commit_on_head(environment, key, commit.if_match, once, "it can be reverted")
 
-    def set_datum(
-        self, environment: str, datum: Datum, *, author: str, if_match: str | None = None, message: str = ""
-    ) -> CommitResult:
+    def set_datum(self, environment: str, datum: Datum, commit: CommitRequest) -> CommitResult:
         """A version with another datum: local items keep their metres, wgs84 items their place on earth."""
 
         def once(base: Version) -> CommitResult:
             if base.datum == datum:
                 return CommitResult("unchanged", base, base.as_dict())
             prepared = self._store.versions.prepare(base, Changes((), datum, KEEP))
-            text = message or "Set the datum"
-            return self._commit(environment, base, prepared, author, text, (), datum_moved_warnings(base, datum), None)
+            described = commit.with_default_message("Set the datum")
+            return self._commit(environment, base, prepared, described, None, datum_moved_warnings(base, datum))
 
-        return self._commit_on_head(environment, None, if_match, once, "its datum can be set")
+        return self._commit_on_head(environment, None, commit.if_match, once, "its datum can be set")
 
-    def template(
-        self,
-        environment: str,
-        update: TemplateUpdate,
-        *,
-        message: str,
-        author: str,
-        if_match: str | None = None,
-        idempotency: str | None = None,
-    ) -> CommitResult:
+    def template(self, environment: str, update: TemplateUpdate, commit: CommitRequest) -> CommitResult:
         """What formats ask for and no layer has, said anew -> one version: robots get other maps by it.
 
         update: checked. Raises StaleParent, Conflict.
         """
-        key = None if update.dry_run else _idempotency(idempotency, _digest(["template", update.as_dict(), message]))
-        text = message or update.summary()
+        fingerprint = _digest(["template", update.as_dict(), commit.message])
+        key = None if update.dry_run else commit.idempotency(fingerprint)
+        described = commit.with_default_message(update.summary())
 
         def once(base: Version) -> CommitResult:
             prepared = self._store.versions.prepare(base, Changes(templates=update.apply_to(base.templates)))
             if update.dry_run:
-                return CommitResult("dry_run", None, self._preview(base, prepared, (), (), author, text))
-            return self._commit(environment, base, prepared, author, text, (), (), key)
+                return CommitResult("dry_run", None, self._preview(base, prepared, described))
+            return self._commit(environment, base, prepared, described, key)
 
-        return self._commit_on_head(environment, key, if_match, once, "its templates can be set")
+        return self._commit_on_head(environment, key, commit.if_match, once, "its templates can be set")
 
     def _commit_on_head(
         self,
@@ -387,11 +311,10 @@ class Ingest:
         environment: str,
         base: Version,
         prepared: Prepared,
-        author: str,
-        message: str,
-        sources: Sequence[Source],
-        warnings: Sequence[Problem],
+        commit: CommitRequest,
         key: Idempotency | None,
+        warnings: Sequence[Problem] = (),
+        sources: Sequence[Source] = (),
     ) -> CommitResult:
         if not prepared.changed:
             # The key is remembered too: sent again after others have changed the map, this must not undo their work.
@@ -399,14 +322,19 @@ class Ingest:
             same = base
             if noted is not None or sources or prepared.chunks:
                 same = self._store.versions.commit(
-                    environment, prepared, author=author, message=message, sources=tuple(sources), idempotency=noted
+                    environment,
+                    prepared,
+                    author=commit.author,
+                    message=commit.message,
+                    sources=tuple(sources),
+                    idempotency=noted,
                 )
             return CommitResult("unchanged", same, {**same.as_dict(), "warnings": [w.as_dict() for w in warnings]})
         version = self._store.versions.commit(
             environment,
             prepared,
-            author=author,
-            message=message,
+            author=commit.author,
+            message=commit.message,
             sources=tuple(sources),
             warnings=tuple(warnings),
             idempotency=key,
@@ -452,10 +380,9 @@ class Ingest:
         self,
         base: Version,
         p: Prepared,
-        warnings: Sequence[Problem],
-        sources: Sequence[Source],
-        author: str,
-        message: str,
+        commit: CommitRequest,
+        warnings: Sequence[Problem] = (),
+        sources: Sequence[Source] = (),
     ) -> dict[str, Any]:
         """The version that a change would make, without a number."""
         preview = Version(
@@ -463,8 +390,8 @@ class Ingest:
             number=base.number,
             root=p.root,
             parent=base.number,
-            author=author,
-            message=message,
+            author=commit.author,
+            message=commit.message,
             time=base.time,
             changes=p.changes,
             sources=tuple(sources),
@@ -554,17 +481,9 @@ def _tries(if_match: str | None) -> list[bool]:
     return [k == count - 1 for k in range(count)]
 
 
-def _idempotency(key: str | None, fingerprint: str) -> Idempotency | None:
-    if key is None:
-        return None
-    if not 1 <= len(key) <= 255 or not key.isprintable():
-        raise Invalid("an Idempotency-Key must have 1 to 255 printable characters")
-    return Idempotency(key, fingerprint)
-
-
-def _fingerprint(upload: Upload) -> str:
+def _fingerprint(upload: Upload, message: str) -> str:
     hints = upload.hints
-    values = [hints.format, hints.layer, hints.level, hints.grid, upload.mode, upload.message, upload.dry_run]
+    values = [hints.format, hints.layer, hints.level, hints.grid, upload.mode, message, upload.dry_run]
     files = sorted([f.name, f.sha256] for f in upload.files)
     return _digest(["upload", values, dict(sorted(hints.options.items())), files])
 

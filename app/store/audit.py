@@ -12,7 +12,6 @@ from typing import Any
 from sqlalchemy import Connection, Row, insert, select
 
 from app.store import tables
-from app.store.base import utcnow
 from app.store.database import Database
 
 MAX_PATH = 1000
@@ -72,13 +71,13 @@ def skip_audit() -> None:
         caller.recorded = True
 
 
-def record(connection: Connection) -> Caller | None:
+def record(connection: Connection, now: datetime) -> Caller | None:
     """Write the current request's row into its transaction, unless an earlier one has it; the caller, where it did."""
     caller = CALLER.get()
     if caller is None or caller.recorded:
         return None
     values = {
-        "time": utcnow(),
+        "time": now,
         "token_id": caller.token_id,
         "token": caller.token,
         "role": caller.role,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any, Final, Literal
 
@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, insert, select, update
 from app.errors import Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
-from app.store.base import CHANNEL_NAME, checked_text, environment_row, nearest_channel, utcnow
+from app.store.base import CHANNEL_NAME, checked_text, environment_row, nearest_channel
 from app.store.database import Database
 from app.store.fleet_values import (
     OPEN_ROLLOUTS,
@@ -124,15 +124,16 @@ class Channels:
             raise Invalid("activate_at needs a time zone, for example 2026-05-01T04:00:00Z")
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            now, author_name = utcnow(), checked_text(author, "an author")
+            write = _ChannelWrite(connection, row, channel, self._database.now())
+            author_name = checked_text(author, "an author")
             if rollout is not None:
                 root = read_version(connection, row, version).root
-                rollout = replace(rollout, version=version, root=root, activate_at=activate_at, started=now)
+                rollout = replace(rollout, version=version, root=root, activate_at=activate_at, started=write.now)
             if activate_at is None and (rollout is None or rollout.ready is None):
-                _move(connection, row, channel, version, author_name, now, rollout=rollout)
+                _move(write, version, author_name, rollout=rollout)
             else:
-                _plan(connection, row, channel, version, author_name, activate_at, rollout)
-            return _read(connection, row, channel)
+                _plan(write, version, author_name, activate_at, rollout)
+            return write.read()
 
     def moves(self, environment: str, channel: str) -> list[ChannelMove]:
         """The newest events that brought a channel somewhere, oldest first; of ``latest`` each new version.
@@ -159,16 +160,17 @@ class Channels:
         """Forget a planned move; NotFound where there is none."""
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            channel_row = _row(connection, row, channel)
+            write = _ChannelWrite(connection, row, channel, self._database.now())
+            channel_row = write.read_row()
             if channel_row is None or channel_row.planned_version is None:
                 raise NotFound(f"channel {channel!r} of {environment} has no planned move")
             why, author_name = "the plan was cancelled", checked_text(author, "an author")
             if channel_row.rollout_state == "waiting":
-                _end_rollout(connection, row, channel_row, "cancelled", why, author_name)
+                _end_rollout(write, channel_row, "cancelled", why, author_name)
             else:
-                _store(connection, row, channel, channel_row, **_NO_PLAN)
-                _append_cancelled_event(connection, row, channel_row, why, author_name)
-            return _read(connection, row, channel)
+                write.store(channel_row, **_NO_PLAN)
+                _append_cancelled_event(write, channel_row, why, author_name)
+            return write.read()
 
     def apply_due_moves(self, now: datetime) -> list[tuple[str, Channel]]:
         """Carry out the planned moves whose time has come: (environment, channel), in the order of their times."""
@@ -185,14 +187,14 @@ class Channels:
         out = []
         for environment, name in due:
             with self._database.write() as connection:
-                row = environment_row(connection, environment, lock=True)
-                channel_row = _row(connection, row, name)
+                write = _ChannelWrite(connection, environment_row(connection, environment, lock=True), name, now)
+                channel_row = write.read_row()
                 if channel_row is None or channel_row.planned_at is None or channel_row.planned_at > now:
                     continue
                 if channel_row.rollout_state == "waiting":
                     continue
-                _move(connection, row, name, channel_row.planned_version, channel_row.planned_author or "", now)
-                out.append((environment, _read(connection, row, name)))
+                _move(write, channel_row.planned_version, channel_row.planned_author or "")
+                out.append((environment, write.read()))
         return out
 
     def advance_rollouts(self, now: datetime, decide: Decide) -> list[tuple[str, Channel]]:
@@ -215,17 +217,58 @@ class Channels:
         for due_row in due:
             with self._database.write() as connection:
                 row = environment_row(connection, due_row.environment, lock=True)
-                channel_row = _row(connection, row, due_row.name)
+                write = _ChannelWrite(connection, row, due_row.name, now)
+                channel_row = write.read_row()
                 if channel_row is None or channel_row.rollout_state not in OPEN_ROLLOUTS:
                     continue
                 step = _next(connection, channel_row, now, decide)
                 if step is not None:
-                    _apply_step(connection, row, channel_row, step, now)
-                    out.append((due_row.environment, _read(connection, row, due_row.name)))
+                    _apply_step(write, channel_row, step)
+                    out.append((due_row.environment, write.read()))
         return out
 
 
 Decide = Callable[[Rollout, Sequence[Robot], datetime], RolloutStep | None]
+
+
+@dataclass(frozen=True, slots=True)
+class _ChannelWrite:
+    """A channel in a transaction that has locked its environment. now: the time of what is written."""
+
+    connection: Connection
+    environment: Row[Any]
+    name: str
+    now: datetime
+
+    def read_row(self) -> Row[Any] | None:
+        table = tables.channel
+        return self.connection.execute(
+            select(table).where(table.c.environment_id == self.environment.id, table.c.name == self.name)
+        ).one_or_none()
+
+    def read_version(self, number: int) -> Version:
+        return read_version(self.connection, self.environment, number)
+
+    def read(self) -> Channel:
+        row = self.read_row()
+        if row is None:
+            near = nearest_channel(self.connection, self.environment, self.name)
+            raise NotFound(f"{self.environment.name} has no channel {self.name!r}{near}")
+        root = None if row.version is None else self.read_version(row.version).root
+        planned = None if row.planned_version is None else self.read_version(row.planned_version).root
+        return _as_channel(row, root, planned, self.environment, read_closures(self.connection, self.environment))
+
+    def store(self, row: Row[Any] | None, **values: Any) -> None:
+        """Update the channel's row; row: None inserts one."""
+        table = tables.channel
+        if row is None:
+            self.connection.execute(insert(table).values(environment_id=self.environment.id, name=self.name, **values))
+        else:
+            self.connection.execute(
+                update(table)
+                .where(table.c.environment_id == self.environment.id, table.c.name == self.name)
+                .values(**values)
+            )
 
 
 def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Decide) -> RolloutStep | None:
@@ -234,47 +277,33 @@ def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Deci
     )
 
 
-def _with_prior_failures(connection: Connection, environment: Row[Any], channel: str, rollout: Rollout) -> Rollout:
+def _with_prior_failures(write: _ChannelWrite, rollout: Rollout) -> Rollout:
     """The roll-out at the beginning of a stage: which robots said before it that they failed with this version."""
-    failed_robots = (r for r in channel_robots(connection, environment.id, channel) if r.has_failed_with(rollout.root))
+    robots = channel_robots(write.connection, write.environment.id, write.name)
+    failed_robots = (r for r in robots if r.has_failed_with(rollout.root))
     return replace(rollout, said_before={r.robot: rfc3339(r.time) for r in failed_robots})
 
 
-def _apply_step(
-    connection: Connection, environment: Row[Any], channel: Row[Any], step: RolloutStep, now: datetime
-) -> None:
+def _apply_step(write: _ChannelWrite, channel: Row[Any], step: RolloutStep) -> None:
     """One step of a roll-out: the move or the way back with its event, or the end."""
     rollout = Rollout.from_row(channel.rollout)
     ended = replace(rollout, state=step.state, detail=step.detail)
     if step.do == "move":
-        author = channel.planned_author or ""
-        _move(connection, environment, channel.name, rollout.version, author, now, rollout=ended, reason=step.detail)
+        _move(write, rollout.version, channel.planned_author or "", rollout=ended, reason=step.detail)
     elif step.do == "move_back" and rollout.before is not None:
-        _move(
-            connection,
-            environment,
-            channel.name,
-            rollout.before,
-            channel.author,
-            now,
-            rollout=ended,
-            reason=step.detail,
-            rollback=True,
-        )
+        _move(write, rollout.before, channel.author, rollout=ended, reason=step.detail, rollback=True)
     else:
-        _end_rollout(connection, environment, channel, step.state, step.detail, channel.planned_author or "")
+        _end_rollout(write, channel, step.state, step.detail, channel.planned_author or "")
 
 
-def _end_rollout(
-    connection: Connection, environment: Row[Any], channel: Row[Any], state: RolloutState, detail: str, author: str
-) -> None:
+def _end_rollout(write: _ChannelWrite, channel: Row[Any], state: RolloutState, detail: str, author: str) -> None:
     """A roll-out is over; a move that still waits for it is dropped, which is told."""
     rollout = replace(Rollout.from_row(channel.rollout), state=state, detail=detail)
     values: dict[str, Any] = {"rollout": rollout.as_row(), "rollout_state": state}
     dropped = channel.rollout_state == "waiting" and channel.planned_version is not None
-    _store(connection, environment, channel.name, channel, **values, **(_NO_PLAN if dropped else {}))
+    write.store(channel, **values, **(_NO_PLAN if dropped else {}))
     if dropped:
-        _append_cancelled_event(connection, environment, channel, detail, author)
+        _append_cancelled_event(write, channel, detail, author)
 
 
 def _check_name(channel: str) -> None:
@@ -284,25 +313,6 @@ def _check_name(channel: str) -> None:
         raise Invalid(
             f"a channel cannot be called {channel[:80]!r}: use at most 63 of a-z, 0-9, _ and -, starting with a letter"
         )
-
-
-def _row(connection: Connection, environment: Row[Any], channel: str) -> Row[Any] | None:
-    table = tables.channel
-    return connection.execute(
-        select(table).where(table.c.environment_id == environment.id, table.c.name == channel)
-    ).one_or_none()
-
-
-def _read(connection: Connection, environment: Row[Any], channel: str) -> Channel:
-    row = _row(connection, environment, channel)
-    if row is None:
-        near = nearest_channel(connection, environment, channel)
-        raise NotFound(f"{environment.name} has no channel {channel!r}{near}")
-    root = None if row.version is None else read_version(connection, environment, row.version).root
-    planned = None
-    if row.planned_version is not None:
-        planned = read_version(connection, environment, row.planned_version).root
-    return _as_channel(row, root, planned, environment, read_closures(connection, environment))
 
 
 def _as_channel(
@@ -316,92 +326,55 @@ def _as_channel(
     return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time, rollout, *more)
 
 
-def _store(connection: Connection, environment: Row[Any], channel: str, channel_row: object, **values: Any) -> None:
-    table = tables.channel
-    if channel_row is None:
-        connection.execute(insert(table).values(environment_id=environment.id, name=channel, **values))
-    else:
-        connection.execute(
-            update(table).where(table.c.environment_id == environment.id, table.c.name == channel).values(**values)
-        )
-
-
 def _move(
-    connection: Connection,
-    environment: Row[Any],
-    channel: str,
+    write: _ChannelWrite,
     number: int,
     author: str,
-    now: datetime,
     *,
     rollout: Rollout | None = None,
     reason: str = "",
     rollback: bool = False,
 ) -> None:
     """Move a channel. rollout: what it belongs to; with a share of failures to look out for it is watched from now."""
-    target = read_version(connection, environment, number)
-    channel_row = _row(connection, environment, channel)
+    target = write.read_version(number)
+    channel_row = write.read_row()
     nothing: dict[str, Any] = {**_NO_PLAN}
     before = None
     if channel_row is not None and channel_row.version is not None:
-        before = read_version(connection, environment, channel_row.version)
+        before = write.read_version(channel_row.version)
     if rollout is not None and rollout.state in OPEN_ROLLOUTS:
         watched = rollout.failed is not None and before is not None and before.number != number
         state: RolloutState = "watching" if watched else "done"
-        rollout = replace(rollout, state=state, moved=now, before=before.number if before else None)
-        rollout = _with_prior_failures(connection, environment, channel, rollout)
+        rollout = replace(rollout, state=state, moved=write.now, before=before.number if before else None)
+        rollout = _with_prior_failures(write, rollout)
     nothing |= {"rollout": None, "rollout_state": None}
     if rollout is not None:
         nothing |= {"rollout": rollout.as_row(), "rollout_state": rollout.state}
     if before is not None and before.number == number:
-        _store(connection, environment, channel, channel_row, **nothing)
+        write.store(channel_row, **nothing)
         if channel_row is not None and channel_row.planned_version not in (None, number):
-            _append_cancelled_event(connection, environment, channel_row, "the channel stays where it is", author)
+            _append_cancelled_event(write, channel_row, "the channel stays where it is", author)
         return
-    sequence = environment.sequence + 1
-    _store(
-        connection,
-        environment,
-        channel,
-        channel_row,
-        version=number,
-        sequence=sequence,
-        author=author,
-        time=now,
-        **nothing,
-    )
-    _bump(connection, environment, sequence)
-    about: dict[str, Any] = {"sequence": sequence, "author": author, "time": now}
-    if reason:
-        about["reason"] = reason
-    _append_event(connection, environment, "channel.moved", channel, before, target, rollback=rollback, **about)
+    sequence = write.environment.sequence + 1
+    write.store(channel_row, version=number, sequence=sequence, author=author, time=write.now, **nothing)
+    about = {"reason": reason} if reason else {}
+    _append_event(write, "channel.moved", before, target, author, rollback=rollback, **about)
 
 
-def _plan(
-    connection: Connection,
-    environment: Row[Any],
-    channel: str,
-    number: int,
-    author: str,
-    at: datetime | None,
-    rollout: Rollout | None,
-) -> None:
-    target = read_version(connection, environment, number)
-    channel_row = _row(connection, environment, channel)
-    now = utcnow()
+def _plan(write: _ChannelWrite, number: int, author: str, at: datetime | None, rollout: Rollout | None) -> None:
+    target = write.read_version(number)
+    channel_row = write.read_row()
     before = None
     if channel_row is not None and channel_row.version is not None:
-        before = read_version(connection, environment, channel_row.version)
+        before = write.read_version(channel_row.version)
     if rollout is not None:
-        rollout = _with_prior_failures(connection, environment, channel, rollout)
-    sequence = environment.sequence + 1
+        rollout = _with_prior_failures(write, rollout)
     plan: dict[str, Any] = {"planned_version": number, "planned_at": at, "planned_author": author}
     plan |= {"rollout": rollout and rollout.as_row(), "rollout_state": rollout and rollout.state}
     if channel_row is None:
-        plan |= {"version": None, "sequence": 0, "author": author, "time": now}
-    _store(connection, environment, channel, channel_row, **plan)
-    _bump(connection, environment, sequence)
-    about: dict[str, Any] = {"sequence": sequence, "author": author, "time": now}
+        plan |= {"version": None, "sequence": 0, "author": author, "time": write.now}
+    write.store(channel_row, **plan)
+    about: dict[str, Any] = {}
     if at is not None:
         about["activate_at"] = rfc3339(at)
     if rollout is not None:
@@ -410,35 +383,32 @@ def _plan(
             "failed": rollout.failed,
             "deadline": None if rollout.deadline is None else rfc3339(rollout.deadline),
         }
-    _append_event(connection, environment, "channel.planned", channel, before, target, **about)
+    _append_event(write, "channel.planned", before, target, author, **about)
 
 
-def _append_cancelled_event(
-    connection: Connection, environment: Row[Any], channel: Row[Any], reason: str, author: str
-) -> None:
+def _append_cancelled_event(write: _ChannelWrite, channel: Row[Any], reason: str, author: str) -> None:
     """A plan that no longer holds, and that no move replaces: whoever heard of it is told. channel: with the plan."""
-    before = None if channel.version is None else read_version(connection, environment, channel.version)
-    target = read_version(connection, environment, channel.planned_version)
-    sequence = environment.sequence + 1
-    _bump(connection, environment, sequence)
-    about = {"sequence": sequence, "author": author, "time": utcnow(), "reason": reason}
-    _append_event(connection, environment, "channel.cancelled", channel.name, before, target, **about)
+    before = None if channel.version is None else write.read_version(channel.version)
+    target = write.read_version(channel.planned_version)
+    _append_event(write, "channel.cancelled", before, target, author, reason=reason)
 
 
 def _append_event(
-    connection: Connection,
-    environment: Row[Any],
+    write: _ChannelWrite,
     kind: Literal["channel.planned", "channel.cancelled", "channel.moved"],
-    channel: str,
     before: Version | None,
     target: Version,
+    author: str,
     *,
     rollback: bool = False,
     **about: Any,
 ) -> None:
     """The event of a channel that goes, is planned to go, or does not go after all, from one version to another."""
+    environment, sequence = write.environment, write.environment.sequence + 1
+    table = tables.environment
+    write.connection.execute(update(table).where(table.c.id == environment.id).values(sequence=sequence))
     outbox.append_event(
-        connection,
+        write.connection,
         environment_id=environment.id,
         environment=environment.name,
         kind=kind,
@@ -449,12 +419,10 @@ def _append_event(
         if kind == "channel.cancelled"
         else outbox.layer_changes(before.parts if before else (), target.parts),
         message=target.message,
-        channel=channel,
+        channel=write.name,
         rollback=rollback or (before is not None and target.number < before.number),
+        sequence=sequence,
+        author=author,
+        time=write.now,
         **about,
     )
-
-
-def _bump(connection: Connection, environment: Row[Any], sequence: int) -> None:
-    table = tables.environment
-    connection.execute(update(table).where(table.c.id == environment.id).values(sequence=sequence))

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,6 +21,7 @@ from sqlalchemy import Connection, Engine, create_engine, event, exc
 from sqlalchemy.engine import make_url
 
 from app.errors import DISK_FULL_ERRNOS, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
+from app.store.base import utcnow
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +122,7 @@ class Database:
     """Transactions on an engine. Every database error that another try may not have becomes Unavailable.
 
     written: called after each commit, so that caches in memory can tell. record: adds who makes the change to its
-    transaction. file: SQLite's; None on PostgreSQL.
+    transaction. clock: the present as an aware time, for what is stored. file: SQLite's; None on PostgreSQL.
     """
 
     def __init__(
@@ -129,10 +131,11 @@ class Database:
         *,
         readonly: bool,
         written: Callable[[], None] = lambda: None,
-        record: Callable[[Connection], AuditMark | None] = lambda _: None,
+        record: Callable[[Connection, datetime], AuditMark | None] = lambda *_: None,
+        clock: Callable[[], datetime] = utcnow,
     ) -> None:
         self.engine = engine(url, readonly=readonly)
-        self._written, self._record = written, record
+        self._written, self._record, self.now = written, record, clock
         self.sqlite = self.engine.dialect.name == "sqlite"
         name = self.engine.url.database if self.sqlite else None
         self.file = Path(name) if name and name != ":memory:" and not name.startswith("file:") else None
@@ -170,7 +173,7 @@ class Database:
             connection.execution_options(write=True)
             with connection.begin():
                 yield connection
-                caller = None if upkeep else self._record(connection)
+                caller = None if upkeep else self._record(connection, self.now())
         if caller is not None:
             caller.recorded = True
         if notify:

@@ -25,7 +25,6 @@ from app.store.base import (
     checked_text,
     environment_row,
     upsert,
-    utcnow,
 )
 from app.store.changes import KEEP
 from app.store.chunks import Chunks
@@ -67,7 +66,7 @@ class Environments:
         area = area_after(
             self._chunks.stage(), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
         )
-        now = utcnow()
+        now = self._database.now()
         with self._database.write() as connection:
             sequence = _last_sequence(connection, name) + 1
             values = {
@@ -156,7 +155,7 @@ class Environments:
         author: str = "",
     ) -> Environment:
         """Rename or describe. The history stays; listeners are told the end of the old name and the new one's start."""
-        now = utcnow()
+        now = self._database.now()
         with self._database.write() as connection:
             row = environment_row(connection, name, lock=True)
             values: dict[str, Any] = {"updated": now}
@@ -197,7 +196,7 @@ class Environments:
         return self._mark(name, author, deleted=False)
 
     def _mark(self, name: str, author: str, *, deleted: bool) -> Environment:
-        now = utcnow()
+        now = self._database.now()
         table = tables.environment
         with self._database.write() as connection:
             row = environment_row(connection, name, lock=True, deleted=not deleted)

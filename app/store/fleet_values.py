@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any, Final, Literal
 
+from app.event_types import RobotState
 from app.model.closures import NO_CLOSURES, Closure, Closures
 from app.store.values import rfc3339
 
-RobotState = Literal["downloading", "ready", "active", "failed"]
 RolloutState = Literal["waiting", "watching", "done", "expired", "failed", "rolled_back", "cancelled"]
 OPEN_ROLLOUTS: tuple[RolloutState, ...] = ("waiting", "watching")
 

@@ -14,7 +14,6 @@ from typing import Final
 from sqlalchemy import delete, select
 
 from app.store import chunks, parts, tables
-from app.store.base import utcnow
 from app.store.blobs import Blobs
 from app.store.chunks import Chunks
 from app.store.database import Database
@@ -88,7 +87,7 @@ class GarbageCollector:
             last = bytes(rows[-1].hash)
 
     def _tidy(self) -> None:
-        now = utcnow()
+        now = self._database.now()
         events, keys, jobs = tables.event, tables.idempotency, tables.job
         with self._database.write(upkeep=True) as connection:
             connection.execute(delete(keys).where(keys.c.time < now - timedelta(days=IDEMPOTENCY_DAYS)))

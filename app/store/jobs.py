@@ -9,7 +9,7 @@ from sqlalchemy import Row, delete, insert, select, update
 
 from app.errors import NotFound
 from app.store import tables
-from app.store.base import checked_text, storable_text, utcnow
+from app.store.base import checked_text, storable_text
 from app.store.database import Database
 from app.store.values import Job, State
 
@@ -22,7 +22,7 @@ class Jobs:
 
     def create(self, owner: str = "", detail: str = "") -> Job:
         """A queued job."""
-        now = utcnow()
+        now = self._database.now()
         new = secrets.token_hex(16)
         with self._database.write() as connection:
             connection.execute(
@@ -65,7 +65,7 @@ class Jobs:
             if row is None:
                 raise NotFound(f"there is no job {id[:80]!r}")
             if row.state not in ("done", "failed", "cancelled"):
-                connection.execute(update(table).where(table.c.id == id).values(updated=utcnow(), **values))
+                connection.execute(update(table).where(table.c.id == id).values(updated=self._database.now(), **values))
             return _as_job(connection.execute(select(table).where(table.c.id == id)).one())
 
     def get(self, id: str) -> Job:

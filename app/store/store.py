@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 
 from sqlalchemy import select
@@ -10,6 +11,7 @@ from sqlalchemy import select
 from app.errors import DatabaseDamaged
 from app.store import schema, tables
 from app.store.audit import Audit, record
+from app.store.base import utcnow
 from app.store.blobs import Blobs
 from app.store.channels import Channels
 from app.store.chunks import Chunks
@@ -40,12 +42,19 @@ class Store:
     with every committed write on this host.
     """
 
-    def __init__(self, database_url: str, blob_dir: Path, *, readonly: bool = False) -> None:
+    def __init__(
+        self,
+        database_url: str,
+        blob_dir: Path,
+        *,
+        readonly: bool = False,
+        clock: Callable[[], datetime] = utcnow,
+    ) -> None:
         self.database_url = database_url
         self.blob_dir = Path(blob_dir)
         self.generation = CommitCounter(self.blob_dir)
         self._database = database = Database(
-            database_url, readonly=readonly, written=self.generation.change, record=record
+            database_url, readonly=readonly, written=self.generation.change, record=record, clock=clock
         )
         self.chunks = Chunks(database)
         self.blobs = Blobs(database, self.blob_dir, readonly=readonly)

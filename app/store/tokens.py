@@ -15,7 +15,7 @@ from sqlalchemy.exc import IntegrityError
 from app.errors import Conflict, Invalid, NotFound, Unavailable
 from app.store import tables
 from app.store.audit import set_audit_target
-from app.store.base import checked_text, utcnow
+from app.store.base import checked_text
 from app.store.database import Database
 from app.store.values import Role, Token, rfc3339
 
@@ -60,7 +60,7 @@ class Tokens:
             "environments": None if environments is None else checked_text(environments, "a name pattern", 256),
             "robot": None if robot is None else checked_text(robot, "a robot's name", 256),
             "expires": expires,
-            "created": utcnow(),
+            "created": self._database.now(),
         }
         set_audit_target(target=f"token {values['id']}")
         try:
@@ -82,7 +82,8 @@ class Tokens:
             if connection.execute(select(table.c.id).where(table.c.role == "admin").limit(1)).first() is not None:
                 return None
             secret = secrets.token_urlsafe(SECRET_BYTES)
-            values = {"id": secrets.token_hex(8), "name": "administrator", "role": "admin", "created": utcnow()}
+            created = self._database.now()
+            values = {"id": secrets.token_hex(8), "name": "administrator", "role": "admin", "created": created}
             connection.execute(insert(table).values(hash=_hash(secret), **values))
         return secret
 
@@ -109,7 +110,7 @@ class Tokens:
         if row is None or not hmac.compare_digest(row.hash, digest):
             return None
         token = _as_token(row)
-        if token.ended is None and token.expires is not None and token.expires <= utcnow():
+        if token.ended is None and token.expires is not None and token.expires <= self._database.now():
             try:
                 self.end_expired()
             except Unavailable as error:  # it is refused all the same, and noted when it is seen again
@@ -119,7 +120,7 @@ class Tokens:
 
     def end_expired(self) -> int:
         """Note which tokens have expired, and return how many: they stay so, also where the clock is set back."""
-        table, now = tables.token, utcnow()
+        table, now = tables.token, self._database.now()
         expired = table.c.ended.is_(None) & (table.c.expires <= now)
         with self._database.read() as connection:
             if connection.execute(select(table.c.id).where(expired).limit(1)).first() is None:

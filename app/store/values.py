@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import Problem
+from app.errors import Invalid, Problem
 from app.model.closures import Closures
 from app.model.features import Features
 from app.model.frame import Datum, Level
@@ -329,10 +329,17 @@ class Token:
 
 @dataclass(frozen=True, slots=True)
 class Idempotency:
-    """A client's key for one request, and a fingerprint of the request's content."""
+    """A client's key for one request, and a fingerprint of the request's content.
+
+    Raises Invalid if the key is invalid.
+    """
 
     key: str
     fingerprint: str
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.key) <= 255 or not self.key.isprintable():
+            raise Invalid("an Idempotency-Key must have 1 to 255 printable characters")
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -9,7 +10,7 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
-from app.errors import Conflict, Damaged, Invalid, NotFound, Problem, StaleParent, Unavailable
+from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent, Unavailable
 from app.model.templates import template_changes
 from app.store import chunks, index, outbox, parts, tables
 from app.store.area import area_after, write_area
@@ -20,7 +21,6 @@ from app.store.base import (
     environment_row,
     nearest_channel,
     storable_text,
-    utcnow,
 )
 from app.store.blobs import Blobs
 from app.store.changes import KEEP, Changes, Keep, Prepared
@@ -154,7 +154,7 @@ def insert_sources(
 
 def lock_blobs(connection: Connection, hashes: set[str]) -> None:
     """Keep a collection in progress away from blobs that this transaction refers to; Unavailable where one is gone."""
-    now = int(utcnow().timestamp())
+    now = int(time.time())
     names = sorted(hashes)
     for start in range(0, len(names), 500):
         batch = names[start : start + 500]
@@ -239,7 +239,7 @@ class Versions:
                 skip_audit()
                 return read_version(connection, row, previous)
             _check_head(row, prepared.base)
-            now = utcnow()
+            now = self._database.now()
             chunks.insert(connection, prepared.chunks)  # where nothing changed, what was found damaged
             if not prepared.changed:
                 _append_sources(connection, row.id, row.head, sources)
@@ -365,12 +365,10 @@ def _remember(
     connection: Connection, environment_id: str, idempotency: Idempotency | None, version: int, now: datetime
 ) -> None:
     if idempotency is not None:
-        if not 1 <= len(idempotency.key) <= 255:
-            raise Invalid("an Idempotency-Key must have 1 to 255 characters")
         connection.execute(
             insert(tables.idempotency).values(
                 environment_id=environment_id,
-                key=checked_text(idempotency.key, "an Idempotency-Key", 255),
+                key=idempotency.key,
                 fingerprint=idempotency.fingerprint,
                 version=version,
                 time=now,

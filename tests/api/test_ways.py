@@ -40,7 +40,7 @@ class Nothing:
 def blank(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two more ways to a grid, of which the cheaper one never works."""
     derivations = dict(derive.all_derivations())
-    monkeypatch.setattr(derive, "_registry", {k: d for k, d in derivations.items() if d.gives != "occupancy"})
+    monkeypatch.setattr(derive._registry, "entries", {k: d for k, d in derivations.items() if d.gives != "occupancy"})
 
     @derives(gives="occupancy", needs={"objects"}, parameters=Blank, cost=5.0)
     def blank_grid(layers: Layers, parameters: Blank, notes: DerivationNotes) -> Layers:
@@ -69,7 +69,7 @@ def test_the_next_way_is_taken_and_notes_are_told(blank: None) -> None:
 
 
 def test_when_nothing_is_left_every_reason_is_told(blank: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(derive._registry, "blank_grid")
+    monkeypatch.delitem(derive._registry.entries, "blank_grid")
     with pytest.raises(MissingLayer, match="nothing red") as caught:
         offline({"a.geojson": SQUARE}, "occupancy_grid")
     assert "supply an occupancy grid" in caught.value.detail

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import httpx
@@ -70,12 +70,9 @@ def test_writers_at_once(api: Api, farm: str) -> None:
 
 def test_order_does_not_depend_on_clocks(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The server's clock goes back by a minute between commits, and forth by two."""
-    from app.store import channels, versions
-
-    now = versions.utcnow
+    database = api.app.state.services.store._database
     for shift in (60, -60, 0):
-        for module in (versions, channels):
-            monkeypatch.setattr(module, "utcnow", lambda s=shift: now() + timedelta(seconds=s))
+        monkeypatch.setattr(database, "now", lambda s=shift: datetime.now(UTC) + timedelta(seconds=s))
         edit = {"op": "put", "layer": "zones", "crs": "local", "feature": _zone(shift)}
         api.post(f"environments/{farm}/edits", {"message": f"{shift:+d}", "changes": [edit]})
         head = api.get(f"environments/{farm}").json()["version"]

@@ -25,6 +25,7 @@ import httpx
 import zenoh
 from zenoh import ext
 
+from app import native
 from app.agent.agent import Agent, AgentOptions
 from app.events import messages
 from app.events.bus import BusOptions, router_configuration
@@ -67,10 +68,10 @@ def network(moved: float = 0.0, count: int = 100) -> bytes:
 @contextlib.contextmanager
 def served(folder: Path, port: int, zenoh_port: int, **more: str) -> Iterator[httpx.Client]:
     """A server with an environment of one network, and a client of it."""
-    native = Path(tempfile.gettempdir()) / f"fleetmap-bench-native-{os.getuid()}"
-    native.fill(native)  # what a server compiles in its first minute ever is no part of this
+    compiled = Path(tempfile.gettempdir()) / f"fleetmap-bench-native-{os.getuid()}"
+    native.fill(compiled)  # what a server compiles in its first minute ever is no part of this
     env = {
-        "NUMBA_CACHE_DIR": str(native),
+        "NUMBA_CACHE_DIR": str(compiled),
         "FLEETMAP_DATA_DIR": str(folder),
         "FLEETMAP_ADMIN_TOKEN": TOKEN,
         "FLEETMAP_LOG_LEVEL": "warning",

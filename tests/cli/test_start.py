@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from app.cli import server
+from app.config import Settings
 from app.errors import Unavailable
 from app.pool import PRELOADED_MODULES
 
@@ -65,8 +66,7 @@ def test_workers_are_prepared_beside_the_start(workers: str, tmp_path: Path, mon
 
 
 @pytest.mark.usefixtures("collecting")
-def test_application_collects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FLEETMAP_DATA_DIR", str(tmp_path))
+def test_application_collects_again(tmp_path: Path) -> None:
     gc.disable()
-    server.application()
+    server.application(Settings(data_dir=tmp_path))
     assert gc.isenabled()

@@ -419,7 +419,7 @@ def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.Mo
 
     before = keys()
     assert keys() == before
-    monkeypatch.setitem(formats._registry, "tmap2", replace(get_format("tmap2"), version=99))
+    monkeypatch.setitem(formats._registry.entries, "tmap2", replace(get_format("tmap2"), version=99))
     after = keys()
     assert after[0] != before[0]
     assert after[1] == before[1]

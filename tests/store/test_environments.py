@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 
 import pytest
 import shapely
@@ -405,22 +404,21 @@ def test_a_plan_that_is_dropped_is_told(store: Store):
     assert Event.from_json(json.dumps(second)).type == "channel.cancelled"
 
 
-def test_expired_token_stays_expired_when_the_clock_is_set_back(
-    store: Store, database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    now = datetime.now(UTC)
+def test_expired_token_stays_expired_when_the_clock_is_set_back(store: Store):
+    now = present = datetime.now(UTC)
+    store = Store(store.database_url, store.blob_dir, clock=lambda: present)
     _, lasting = store.tokens.create("admin", "admin")
     _, seen = store.tokens.create("seen", "viewer", expires=now + timedelta(hours=1))
     _, unseen = store.tokens.create("unseen", "viewer", expires=now + timedelta(hours=2))
     _, long = store.tokens.create("long", "viewer", expires=now + timedelta(days=2))
     assert store.tokens.find(seen) is not None
-    monkeypatch.setattr("app.store.tokens.utcnow", lambda: now + timedelta(hours=1))
+    present = now + timedelta(hours=1)
     assert store.tokens.find(seen) is None
-    monkeypatch.setattr("app.store.tokens.utcnow", lambda: now + timedelta(days=1))
+    present = now + timedelta(days=1)
     assert store.tokens.end_expired() == 1, "nobody has sent it"
     assert store.tokens.end_expired() == 0
-    monkeypatch.setattr("app.store.tokens.utcnow", lambda: now)
-    other = Store(database_url, tmp_path / "blobs")  # after a restart
+    present = now
+    other = Store(store.database_url, store.blob_dir, clock=lambda: present)  # after a restart
     for each in (store, other):
         assert each.tokens.find(seen) is None
         assert each.tokens.find(unseen) is None
@@ -429,6 +427,7 @@ def test_expired_token_stays_expired_when_the_clock_is_set_back(
     assert {t.name for t in other.tokens.all() if t.ended} == {"seen", "unseen"}
     _, new = other.tokens.create("new", "viewer", expires=now + timedelta(minutes=1))
     assert store.tokens.find(new) is not None, "a clock that was ahead ends no token that is made afterwards"
+    store.close()
     other.close()
 
 

@@ -11,17 +11,18 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from app.api.http.auth import Authenticator
+from app.api.http.auth import Authenticator, Editor
 from app.api.http.conversions import ConversionJobs
 from app.api.http.deltas import Deltas
 from app.api.http.metrics import Metrics
 from app.api.http.response_cache import ResponseCache
+from app.api.http.schemas import IdempotencyKey, IfMatch
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
 from app.convert.maps import Maps
 from app.errors import Unavailable
 from app.fleet import ReportQueue as FleetIntake
-from app.ingest import Ingest
+from app.ingest import CommitRequest, Ingest
 from app.limits import Limits
 from app.pool import Pool
 from app.signing import Keys
@@ -118,3 +119,13 @@ async def services(request: Request) -> Services:
 
 
 ServicesDep = Annotated[Services, Depends(services)]
+
+
+async def commit_request(
+    principal: Editor, if_match: IfMatch = None, idempotency_key: IdempotencyKey = None
+) -> CommitRequest:
+    """The author and the headers of a request that makes a version; its message is in the body or the query."""
+    return CommitRequest(principal.name, if_match=if_match, idempotency_key=idempotency_key)
+
+
+CommitDep = Annotated[CommitRequest, Depends(commit_request)]

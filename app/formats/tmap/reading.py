@@ -10,12 +10,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, ReadContext, _fields, all_formats
-from app.formats._network import shorten_list
+from app.formats._network import edge_lines, node_points, shorten_list
 from app.formats.tmap.frames import to_local
 from app.formats.tmap.network import (
     EDGE_WORDS,
@@ -29,7 +28,7 @@ from app.formats.tmap.network import (
     Array,
     parse_number,
 )
-from app.model.features import Properties, from_columns, points, unique_ids
+from app.model.features import Properties, from_columns, unique_ids
 from app.model.layers import NETWORK, Layers, PartKey
 from app.syntax import yaml
 
@@ -69,7 +68,7 @@ def read(files: Files, context: ReadContext) -> Layers:
             source_properties["node"]["edges"] = dangling[k]
         _lift(node_properties, source_properties["node"])
         properties.append(node_properties)
-    geometry = _node_points(xyz)
+    geometry = node_points(xyz)
     collection_document = {**_credit(document), NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
     if kind == "poi":
         context.warn(f"no node has an edge: the {len(nodes)} nodes are taken as points of interest")
@@ -81,7 +80,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     _warn_isolated(names, sources, targets, dangling, context)
     edge_ids = unique_ids((_identifier(r[2]) for r in rows), set(ids))
     properties += _edge_properties(rows, edge_ids, ids, context)
-    both = np.concatenate([geometry, _edge_lines(xyz, sources, targets)])
+    both = np.concatenate([geometry, edge_lines(xyz, sources, targets)])
     key = PartKey("topology", context.level, NETWORK)
     return Layers({key: from_columns([*ids, *edge_ids], both, properties, "local", collection_document)})
 
@@ -323,24 +322,3 @@ def _lift(properties: dict[str, Any], extra_members: dict[str, Any]) -> None:
 def _families() -> frozenset[str]:
     """Names under which formats keep what only they know of an item."""
     return frozenset(all_formats())
-
-
-def _node_points(xyz: Array) -> NDArray[np.object_]:
-    """Points, 2-D where z is 0."""
-    out = points(np.ascontiguousarray(xyz[:, :2]))
-    high = xyz[:, 2] != 0
-    if high.any():
-        out[high] = points(xyz[high])
-    return out
-
-
-def _edge_lines(xyz: Array, sources: NDArray[np.intp], targets: NDArray[np.intp]) -> NDArray[np.object_]:
-    """Lines of two points from node to node, 2-D where both lie at 0."""
-    ends = np.stack([xyz[sources], xyz[targets]], axis=1)
-    out: NDArray[np.object_] = np.empty(len(ends), object)
-    high = (ends[:, :, 2] != 0).any(axis=1)
-    if not high.all():
-        out[~high] = shapely.linestrings(ends[~high][:, :, :2])
-    if high.any():
-        out[high] = shapely.linestrings(ends[high])
-    return out
