@@ -484,8 +484,8 @@ def _unreadable_error(error: OSError) -> _Unreadable:
 def _unavailable_error(error: OSError) -> Unavailable:
     if error.errno in DISK_FULL_ERRNOS:
         return NoRoom(
-            f"the server has no disk space left for files ({system_reason(error)}); nothing was stored. Try again after "
-            "its operator has freed space"
+            f"the server has no disk space left for files ({system_reason(error)}); nothing was stored. Try again "
+            "after its operator has freed space"
         )
     return Unavailable(f"the blob folder cannot be written: {system_reason(error)}. Try again later")
 
