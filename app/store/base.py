@@ -54,7 +54,7 @@ def check_environment_name(name: str) -> str:
     """Raise Invalid if a name is not allowed for an environment."""
     if not ENVIRONMENT_NAME.fullmatch(name) or name in RESERVED:
         raise Invalid(
-            f"an environment cannot be called {name[:80]!r}: use 1 to 63 of a-z, 0-9, _ and -, starting with a "
+            f"invalid environment name {name[:80]!r}: use 1 to 63 of a-z, 0-9, _ and -, starting with a "
             "letter or digit; 'robots' and 'server' are taken"
         )
     return name
@@ -77,7 +77,7 @@ def environment_row(connection: Connection, name: str, *, lock: bool = False, de
     if row is None:
         raise NotFound(f"there is no environment {name[:80]!r}")
     if row.deleted is not None and not deleted:
-        raise Gone(f"the environment {name!r} is deleted; POST /api/v1/environments/{name}/restore brings it back")
+        raise Gone(f"the environment {name!r} is deleted: restore it with POST /api/v1/environments/{name}/restore")
     return row
 
 

@@ -104,7 +104,7 @@ def test_kept_overlay_names_its_version_and_stays_in_force(farm: Store):
 def test_areas_in_force_are_bounded_in_size(farm: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(overlays, "MAX_IN_FORCE_BYTES", 100)
     farm.overlays.add(blocked(state="accepted"))
-    with pytest.raises(Conflict, match="simpler outlines"):
+    with pytest.raises(Conflict, match="simplify the polygon"):
         farm.overlays.add(blocked(state="accepted"))
 
 

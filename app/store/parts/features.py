@@ -342,7 +342,7 @@ def features_in_box(draft: ChunkStage, root: PartRoot, box: Box, crs: str, frame
         if not same and frame is None:
             raise MissingDatum(
                 f"the environment has no datum, so its {name} items cannot be found by a box in {crs} coordinates: "
-                f"ask with crs={name}, or set a datum"
+                f"use crs={name}, or set a datum"
             )
         boxes = split_box(box) if crs == "wgs84" else [box]
         coarse = boxes if same else [c for b in boxes for c in boxes_in_other_frame(b, crs, frame)]
