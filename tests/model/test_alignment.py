@@ -86,7 +86,7 @@ def test_align_grids_prefers_nearest_of_equal_fits() -> None:
 def test_align_grids_rejects_grids_without_outline() -> None:
     nothing = OccupancyGrid(np.zeros((10, 10), np.uint8), 0.1)
     for a, b in ((nothing, hall()), (hall(), nothing)):
-        with pytest.raises(CannotConvert, match="0 occupied cells"):
+        with pytest.raises(CannotConvert, match="0 occupied border cells"):
             alignment.align_grids(a, b)
     solid = OccupancyGrid(np.full((40, 40), OCCUPIED, np.uint8), 0.1)
     assert alignment.align_grids(solid, solid)[0].score > 0.9

@@ -28,7 +28,7 @@ def numbered(shape: tuple[int, int] = (60, 80), crs: str = UTM, transform: Any =
 
 
 def truth(image: GeoImage, source: GeoImage, to_source: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return for every pixel of the result the value at its position by PROJ alone, and its distance to a pixel's edge."""
+    """Return each result pixel's value at its position by PROJ alone, and its distance to a pixel's edge."""
     height, width = image.pixels.shape[:2]
     rows, columns = (v.ravel() + 0.5 for v in np.mgrid[0:height, 0:width])
     places = to_source(pixel_positions(image.transform, columns, rows))

@@ -205,7 +205,7 @@ def test_mesh_shared_by_many_objects_is_read_once(monkeypatch: pytest.MonkeyPatc
         ("box", "must be a list"),
         ([1], "must be a list"),
         ([{}], "has the unknown type 'None': use one of box"),
-        ([{"type": ["box"]}], "has the type"),
+        ([{"type": ["box"]}], "has the unknown type"),
         ([{"type": "box"}], r"shapes\[0\]\.size must be 3 numbers"),
         ([{"type": "box", "size": [1, 2]}], "must be 3 numbers"),
         ([{"type": "box", "size": [1, -2, 3]}], "at least 0"),
