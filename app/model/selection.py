@@ -69,9 +69,8 @@ def as_planned(grid: OccupancyGrid, name: str, warn: Callable[[str], None]) -> O
 def grey_warning(grid: OccupancyGrid, grey: NDArray[np.bool_], name: str, effect: str) -> str:
     """Return the warning about free cells with the grey of unknown ones. effect: the consequence."""
     return (
-        f"{name} has {int(np.count_nonzero(grey))} cells of the grey 205, map_saver's unknown, which its "
-        f"free_thresh of {grid.free_thresh:g} calls free: {effect}; write "
-        "free_thresh: 0.196 where such cells mean unknown"
+        f"{name} has {int(np.count_nonzero(grey))} cells of the grey 205 (map_saver's unknown), which are free by its "
+        f"free_thresh of {grid.free_thresh:g}: {effect}; set free_thresh to 0.196 if such cells mean unknown"
     )
 
 
