@@ -312,21 +312,21 @@ class Database:
         full = code == sqlite3.SQLITE_FULL or state == _DISK_FULL_STATE
         if full or (code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and self._is_full()):
             return NoRoom(
-                f"the server has no room left for its database ({_short(error)}); nothing was stored. Try again after "
-                "its operator has freed space"
+                f"the server has no disk space left for its database ({_short(error)}); nothing was stored. Try again "
+                "after its operator has freed space"
             )
         if code == sqlite3.SQLITE_READONLY:
             return Unavailable(
-                f"the database {self._name} cannot be written ({_short(error)}); nothing was stored. Its operator has "
-                "to make the file and its folder writable"
+                f"the database {self._name} cannot be written ({_short(error)}); nothing was stored. Its operator "
+                "must make the file and its folder writable"
             )
         if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
             return Unavailable(
-                f"the database {self._name} cannot be read or written ({_short(error)}): its operator has to check the "
+                f"the database {self._name} cannot be read or written ({_short(error)}): its operator must check the "
                 "file, its folder and its disk"
             )
         if isinstance(error, exc.OperationalError | exc.InterfaceError | exc.TimeoutError | exc.InternalError):
-            return Unavailable(f"the database does not answer as it should: {_short(error)}. Try again later")
+            return Unavailable(f"the database is unavailable ({_short(error)}): try again later")
         return None
 
     def _is_full(self) -> bool:

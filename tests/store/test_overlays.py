@@ -112,7 +112,7 @@ def test_overlays_are_bounded_and_tidied(farm: Store, monkeypatch: pytest.Monkey
     monkeypatch.setattr(overlays, "MAX_PENDING", 2)
     one, _ = farm.overlays.add(blocked(edge="1"))
     two, _ = farm.overlays.add(blocked(edge="2"))
-    with pytest.raises(Conflict, match="2 overlays"):
+    with pytest.raises(Conflict, match="2 pending"):
         farm.overlays.add(blocked(edge="3"))
     assert farm.overlays.add(blocked(edge="2"))[0].id == two.id
     farm.overlays.decide("farm", one.id, "pending", "rejected", "ann", NOW - timedelta(days=31))

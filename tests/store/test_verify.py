@@ -263,7 +263,7 @@ def test_full_or_read_only_database_rejects_writes(sqlite_store: Store) -> None:
 
     sqlite_store._database.engine.dispose()
     event.listen(sqlite_store._database.engine, "begin", limit)
-    with pytest.raises(NoRoom, match="room"):
+    with pytest.raises(NoRoom, match="no disk space"):
         save(sqlite_store, "farm", *replaces(everything()))
     event.remove(sqlite_store._database.engine, "begin", limit)
     assert sqlite_store.versions.get("farm").number == 0
