@@ -46,7 +46,7 @@ class Split:
     nodes: int = 0
 
 
-# --- on the way out ---
+# --- splitting ---
 
 
 def split(layers: Layers, shape_of: str | None = None) -> tuple[Layers, Split]:
@@ -261,7 +261,7 @@ def _bend_name(name: str, number: int) -> str:
     return f"{name}~{number}"
 
 
-# --- on the way back ---
+# --- joining ---
 
 
 def join(layers: Layers) -> Layers:

@@ -155,7 +155,7 @@ class Features:
             return self.geometry
         if frame is None:
             raise MissingDatum(
-                "the environment has no datum, so places on earth and local metres cannot be brought together: "
+                "the environment has no datum, which is needed to convert between WGS 84 and local metres: "
                 'set one with PATCH /api/v1/environments/{env} {"datum": {"latitude": …, "longitude": …}} '
                 "or upload a datum.yaml"
             )

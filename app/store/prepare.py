@@ -190,7 +190,7 @@ def merge_provenance(old: Provenance, new: Provenance) -> Provenance:
     )
 
 
-# --- what changed ---
+# --- changes ---
 
 
 def read_roots(draft: ChunkStage, key: PartKey, entries: Mapping[PartKey, PartEntry]) -> PartRoot | None:
@@ -335,7 +335,7 @@ def located_items(
     return tuple(out)
 
 
-# --- chunks that the base does not have ---
+# --- new chunks ---
 
 
 def _new_chunks(

@@ -179,7 +179,7 @@ class ChunkStage:
         return node
 
 
-# --- where to cut ---
+# --- cuts ---
 
 
 def key_hashes(keys: Iterable[bytes], level: int) -> NDArray[np.uint32]:

@@ -54,7 +54,7 @@ def test_segment_becomes_two_edges_and_two_nodes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("says", "expected"),
+    ("value", "expected"),
     [
         ("yes", "forward"),
         ("TRUE", "forward"),
@@ -68,10 +68,10 @@ def test_segment_becomes_two_edges_and_two_nodes() -> None:
         (None, "both"),
     ],
 )
-def test_oneway_is_found_at_any_depth(says: Any, expected: str) -> None:
-    assert direction({"oneway": says}) == expected
-    assert direction({"kml": {"data": {"oneway": says}}}) == expected
-    assert direction({"kml": {"data": [{"name": "oneway", "value": says}]}}) == expected
+def test_oneway_is_found_at_any_depth(value: Any, expected: str) -> None:
+    assert direction({"oneway": value}) == expected
+    assert direction({"kml": {"data": {"oneway": value}}}) == expected
+    assert direction({"kml": {"data": [{"name": "oneway", "value": value}]}}) == expected
 
 
 def test_oneway_line_has_edges_in_one_direction() -> None:
@@ -119,11 +119,11 @@ def test_collections_and_outlines_become_edges() -> None:
 
 
 def test_points_of_interest_become_nodes_with_their_properties() -> None:
-    says = {"name": "Dock", "orientation": [0, 0, 0, 1], "tmap2": {"verts": []}}
+    properties = {"name": "Dock", "orientation": [0, 0, 0, 1], "tmap2": {"verts": []}}
     network = from_drawing(
         drawing(
             a=line((0, 0), (10, 0), (20, 0)),
-            dock=(shapely.Point(10.04, 0), says),
+            dock=(shapely.Point(10.04, 0), properties),
             gate=shapely.Point(15, 0.02),
             far=shapely.Point(99, 99),
         )
@@ -131,7 +131,7 @@ def test_points_of_interest_become_nodes_with_their_properties() -> None:
     assert nodes(network) == {"dock": (10.04, 0), "gate": (15, 0.02), "far": (99, 99), "a/0": (0, 0), "a/2": (20, 0)}
     assert edges(network) == both(("a/0", "dock"), ("dock", "gate"), ("gate", "a/2"))
     dock = next(f for f in network if f.id == "dock")
-    assert dock.properties == {**says, "kind": "node", "drawn_from": "dock"}
+    assert dock.properties == {**properties, "kind": "node", "drawn_from": "dock"}
 
 
 def test_points_of_interest_never_join() -> None:

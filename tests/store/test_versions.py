@@ -153,13 +153,13 @@ def edits(seed: int) -> Callable[[Store], None]:
                 head = save(store, "a", *operations)
                 from app.model.features import concatenate
 
-                anew = concatenate(
+                uploaded = concatenate(
                     [
                         features([(i, g, p) for i, (g, p, is_local) in items.items() if is_local is flag], anchor)
                         for flag, anchor in ((True, "local"), (False, "wgs84"))
                     ]
                 )
-                fresh = save(store, "b", Replace(TOPOLOGY, anew))
+                fresh = save(store, "b", Replace(TOPOLOGY, uploaded))
                 assert head.root == fresh.root
                 entry = head.part(TOPOLOGY)
                 assert entry is not None
