@@ -4,7 +4,7 @@ A **chunk** is one MessagePack array. Its name is the SHA-256 of these bytes; th
 so another compressor or level changes no name. The first member is the encoding's version (1), the second its kind:
 
 ``[1, "features", tail, ids, cells, geometry, sizes, properties]``
-    a leaf of vector items in ascending order of (cell, id). ids: array of texts. cells: binary, 8 bytes big-endian an
+    a leaf of vector items in ascending order of (cell, id). ids: array of texts. cells: binary, 8 bytes big-endian per
     item, the z-order cell (below). geometry: array of binaries, ISO WKB, little endian, XY or XYZ, no SRID, no M, no
     negative zero. properties: array of maps with keys in ascending order; integers stay integers and floats stay
     floats (64 bit), no NaN, no infinity, no negative zero. sizes: binary, 4 bytes little endian per item, bytes of its
@@ -48,7 +48,7 @@ metre each. Without coordinates it is 0.
 
 The **root** of a version is the SHA-256 of ``[1, "version", parts, datum, levels]``: parts = ``[layer, level, name,
 hash]`` ascending, datum = ``[latitude, longitude, altitude, heading]`` or nil, levels = ``[name, elevation]``
-ascending.
+ascending. A version with templates has them as a sixth member, a map.
 
 A later encoding gets a new number; encoding 1 stays readable in all later releases.
 """

@@ -3,8 +3,8 @@
 The cuts depend on the items' keys only: a key whose hash at its level has ``bits`` low zero bits ends its node (2^bits
 items on average). A node with more than four times as many items is cut again at keys with fewer zero bits, and so on.
 The nodes' last keys are the sequence of the next level, until one node is left: the root. So equal items have equal
-roots, an edit rewrites the few nodes on its path, and two trees share every node without differences. The idea is that
-of the prolly trees of Noms and Dolt.
+roots, an edit rewrites the few nodes on its path, and two trees share every node outside their differences. The idea
+is that of the prolly trees of Noms and Dolt.
 
 The key's hash is public (CRC-32, mixed with the level), so a client that chooses ids could make every item a node of
 its own and slow down its own environment: more than 64 + n/8 leaves for n items are rejected.
