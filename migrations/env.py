@@ -1,4 +1,4 @@
-"""Alembic's entry: on the connection that the store hands over, or on the URL of alembic.ini for developers."""
+"""Alembic's entry point: uses the connection from the store, or for developers the URL of alembic.ini."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.store.tables import metadata
 
 
 def run(connection: Connection) -> None:
-    """The migrations, in the transaction of the connection."""
+    """Run the migrations in the transaction of the connection."""
     context.configure(
         connection=connection,
         target_metadata=metadata,

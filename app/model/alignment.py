@@ -1,10 +1,9 @@
-"""How one map lies on another: a turn and a shift in the plane, told with how well it fits.
+"""Alignment of one map onto another: a rotation and a shift in the plane, with the quality of the fit.
 
-Two ways. Grids: the outlines of what is occupied in one are laid on those of the other at every angle, all shifts of an
-angle at once by a correlation in the frequency domain (Lewis, Fast Normalized Cross-Correlation, 1995, without the
-norm); the best places are refined by iterative closest points (Besl and McKay 1992), each step the least-squares rigid
-motion (Umeyama 1991, without scale). Points: pairs that people give, the largest set of pairs that agree, by the same
-least squares.
+Two methods. Grids: the outlines of occupied cells are matched at every angle, all shifts of an angle at once by a
+correlation in the frequency domain (Lewis, Fast Normalized Cross-Correlation, 1995, without the norm); the best
+positions are refined by iterative closest points (Besl and McKay 1992), each step the least-squares rigid motion
+(Umeyama 1991, without scale). Points: given pairs, the largest set of pairs that agree, by the same least squares.
 """
 
 from __future__ import annotations
@@ -25,27 +24,28 @@ from app.model.grid import OCCUPIED, OccupancyGrid
 Array = NDArray[np.float64]
 
 SEARCH_CELLS = 128
-"""Cells along the longer side of a map in the search over all angles."""
+"""Number of cells along the longer side of a map in the search over all angles."""
 
 MAX_REFINED = 16
-"""Places that are refined."""
+"""Number of positions that are refined."""
 
 POINTS = 1500
-"""Cells of a map that take part in a refinement; of more, some evenly."""
+"""Maximum number of cells of a map in a refinement; of more, an even selection."""
 
 MAX_PAIRS = 1000
-"""Pairs of points."""
+"""Maximum number of pairs of points."""
 
 _CLOSE = 0.02
-"""Of two places whose cells agree by less than this share more or less, the nearer one is taken."""
+"""Difference of agreement below which two positions count as equal: then the nearer one is taken."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
     """A motion of one map onto another: p -> R(yaw) p + (x, y), metres and radians in the local frame.
 
-    residual: the root mean square distance in metres of what agrees. agreement: the share of the moved map's occupied
-    cells within the other one's outline (or of the pairs) that agree. overlap: the share that lies there at all.
+    residual: the root mean square distance in metres of the cells or pairs that agree. agreement: the share of the
+    moved map's occupied cells within the other one's outline (or of the pairs) that agree. overlap: the share of cells
+    within that outline.
     """
 
     x: float
@@ -57,21 +57,21 @@ class Fit:
 
     @property
     def score(self) -> float:
-        """The share of all that agrees."""
+        """Return the share of all cells that agree."""
         return self.agreement * self.overlap
 
     def apply_to(self, points: Array) -> Array:
-        """Points [n, 2] after the motion."""
+        """Move points [n, 2]."""
         return np.asarray(points @ _turn(self.yaw).T + np.array([self.x, self.y]), np.float64)
 
     def move_grid(self, grid: OccupancyGrid) -> OccupancyGrid:
-        """The grid at its new place; its cells stay as they are."""
+        """Move a grid; its cells stay unchanged."""
         x, y, yaw = grid.origin
         new = self.apply_to(np.array([[x, y]]))[0]
         return replace(grid, origin=(round(float(new[0]), 9), round(float(new[1]), 9), _angle(yaw + self.yaw)))
 
     def as_dict(self) -> dict[str, float]:
-        """The motion and its quality: metres, radians, shares."""
+        """Return the motion and its quality as JSON: metres, radians, shares."""
         return {
             "x": round(self.x, 6),
             "y": round(self.y, 6),
@@ -85,17 +85,20 @@ class Fit:
 def align_grids(
     moving: OccupancyGrid, onto: OccupancyGrid, *, angle: float = math.pi, reach: float | None = None, near: float = 0.1
 ) -> list[Fit]:
-    """The places where one grid's obstacles lie on another's, the best first; places that are much alike are one.
+    """Find the positions at which one grid's obstacles match another's, the best first; similar positions are merged.
 
-    angle: the largest turn, radians. reach: the farthest that the moving grid's middle may go, metres. near: cells this
-    near to each other agree, metres; at least a cell of the coarser grid counts as near. Raises CannotConvert where a
-    grid shows nothing.
+    Args:
+        angle: maximum rotation, radians.
+        reach: maximum distance that the moving grid's middle may move, metres.
+        near: distance at which two cells agree, metres; at least a cell of the coarser grid.
+
+    Raises CannotConvert if a grid has no outline to align, or if no position matches.
     """
     near = max(near, moving.resolution, onto.resolution)
     moving_points, onto_points = _outline(moving), _outline(onto)
     for points, role in ((moving_points, "that is moved"), (onto_points, "that it is moved onto")):
         if len(points) < 3:
-            raise CannotConvert(f"the grid {role} has {len(points)} occupied cells at borders: nothing to align by")
+            raise CannotConvert(f"the grid {role} has {len(points)} occupied border cells: it cannot be aligned")
     middle = moving_points.mean(axis=0)
     search = _Search(moving_points - middle, onto_points, near)
     limit = math.inf if reach is None else reach
@@ -113,8 +116,8 @@ def align_grids(
             fits.append(_with_quality(refined, every, judge, onto, near))
     fits = _distinct(sorted(fits, key=lambda f: (-f.score, abs(f.yaw))), middle, near)
     if not fits:
-        raise CannotConvert("the maps meet nowhere within this angle and reach")
-    # Of places that fit as well as the best, the one that moves the map least: sites have symmetries.
+        raise CannotConvert("the maps do not match at any position within this angle and reach")
+    # among equal fits the smallest motion: sites have symmetries
     rivals = [f for f in fits if f.score >= fits[0].score - _CLOSE]
     first = min(rivals, key=lambda f: float(np.linalg.norm(f.apply_to(moving_points) - moving_points, axis=1).mean()))
     polished = _polish(first, _subsample(moving_points, 2 * POINTS), tree, middle, near)
@@ -122,21 +125,24 @@ def align_grids(
 
 
 def fit_pairs(pairs: Array, *, near: float = 0.5) -> tuple[Fit, list[int], float]:
-    """(the motion that brings the first points of pairs onto the second ones, which pairs disagree, their scale).
+    """Fit the motion that moves the first points of pairs onto the second ones.
 
-    pairs: float64 [n, 2, 2], n ≥ 2: [from, to] in metres. near: how far apart, in metres, points that agree may be
-    afterwards. scale: how many times as far apart the second points are; a motion has none. Raises Invalid for
-    points that say nothing of a turn.
+    Args:
+        pairs: float64 [n, 2, 2], n ≥ 2: [from, to] in metres.
+        near: maximum distance, in metres, of points that agree after the motion.
+
+    Returns the motion, which pairs disagree, and their scale: how many times as far apart the second points are (a
+    motion has none). Raises Invalid for points that do not determine a rotation.
     """
     if pairs.ndim != 3 or pairs.shape[1:] != (2, 2) or not 2 <= len(pairs) <= MAX_PAIRS:
-        reason = f"from 2 to {MAX_PAIRS} pairs of points [[x, y], [x, y]] are needed"
+        reason = f"the number of pairs of points [[x, y], [x, y]] must be 2 to {MAX_PAIRS}"
         raise Invalid(reason, [Problem(reason, where="pairs")])
     if not np.isfinite(pairs).all() or (np.abs(pairs) > MAX_METRES).any():
         reason = f"coordinates must be finite metres within ±{MAX_METRES:g}"
         raise Invalid(reason, [Problem(reason, where="pairs")])
     a, b = pairs[:, 0], pairs[:, 1]
     if min(np.ptp(a, axis=0).max(), np.ptp(b, axis=0).max()) < 1e-6:
-        reason = "all points are in one place: a turn needs points apart"
+        reason = "all points have the same position: give points at different positions"
         raise Invalid(reason, [Problem(reason, where="pairs")])
     best = np.ones(len(pairs), bool)
     if len(pairs) > 2:
@@ -149,10 +155,10 @@ def fit_pairs(pairs: Array, *, near: float = 0.5) -> tuple[Fit, list[int], float
 
 
 def _largest(a: Array, b: Array, near: float) -> NDArray[np.bool_]:
-    """The most pairs that one motion brings together, of the motions that two of them say; at least two."""
+    """Find the largest set of pairs that agree with the motion of two of them; at least two."""
     count = len(a)
     seeds: Iterable[tuple[int, int]] = combinations(range(count), 2)
-    if count > 64:  # RANSAC with a fixed seed: the same answer each time
+    if count > 64:  # RANSAC with a fixed seed, which makes the result reproducible
         chance = np.random.default_rng(0).integers(0, count, (4000, 2))
         seeds = sorted({(min(i, j), max(i, j)) for i, j in chance.tolist() if i != j})
     best, best_error = np.zeros(count, bool), math.inf
@@ -166,7 +172,7 @@ def _largest(a: Array, b: Array, near: float) -> NDArray[np.bool_]:
         if (-good.sum(), error) < (-best.sum(), best_error):
             best, best_error = good, error
     if best.sum() < 2:
-        reason = f"no two pairs agree within {near:g} m on one motion without a scale"
+        reason = f"no two pairs agree on one motion without a scale within {near:g} m"
         raise Invalid(reason, [Problem(reason, where="pairs")])
     return best
 
@@ -175,7 +181,7 @@ def _largest(a: Array, b: Array, near: float) -> NDArray[np.bool_]:
 
 
 class _Search:
-    """Where points [n, 2] around 0 meet other points [m, 2], coarsely: cells of ``cell`` metres."""
+    """Coarse search for positions of points [n, 2] around 0 on other points [m, 2], in cells of ``cell`` metres."""
 
     def __init__(self, points: Array, target_points: Array, near: float) -> None:
         import cv2
@@ -191,13 +197,13 @@ class _Search:
         column, row = ((target_points - self.low) / self.cell).astype(int).T
         mask[row, column] = 0
         away = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
-        # A cell beside the outline counts half, and one that is two away next to nothing.
+        # a cell next to the outline counts half, and one at a distance of two next to nothing
         field = np.exp(-0.7 * away.astype(np.float64) ** 2)
         self.field = np.fft.rfft2(field)
         self.points = points
 
     def places(self, angle: float, reach: float, middle: Array) -> list[tuple[float, Array]]:
-        """(yaw, where the middle goes) of the best places, apart from each other."""
+        """Return (yaw, position of the middle) of the best positions, at a distance from each other."""
         step = min(math.radians(3.0), self.cell / max(self.radius, self.cell))
         count = math.ceil(min(angle, math.pi) / step)
         turns = np.linspace(-1, 1, 2 * count + 1) * min(angle, math.pi) if count else np.zeros(1)
@@ -225,7 +231,7 @@ class _Search:
         return out
 
     def _scores(self, yaw: float) -> Array:
-        """For each cell, how much meets where the middle lies there."""
+        """Return for each cell the number of matching cells with the middle at this cell."""
         turned = np.floor(self.points @ _turn(yaw).T / self.cell + 0.5).astype(int)
         image = np.zeros((self.height, self.width))
         image[turned[:, 1] % self.height, turned[:, 0] % self.width] = 1.0
@@ -243,7 +249,7 @@ class _Search:
 
 
 def _refine(start: Fit, points: Array, tree: Any, wide: float, near: float) -> Fit:
-    """Closest points, from a wide search to a narrow one."""
+    """Refine by closest points, from a wide search to a narrow one."""
     yaw, shift = start.yaw, np.array([start.x, start.y])
     for reach in (wide, wide / 2, 2 * near, near):
         for _ in range(25):
@@ -260,15 +266,17 @@ def _refine(start: Fit, points: Array, tree: Any, wide: float, near: float) -> F
 
 
 def _polish(fit: Fit, points: Array, tree: Any, middle: Array, near: float) -> Fit:
-    """The least distances both ways, cut off at ``near``: closest points rest a little before them, where round things
-    may turn or where cells lie on cells. By Nelder and Mead's simplex, from a few turns around the fit."""
+    """Minimise the distances both ways, cut off at ``near``, by Nelder and Mead's simplex from a few rotations.
+
+    Closest points stop shortly before the minimum if round shapes can rotate or if cells coincide.
+    """
     from scipy.optimize import minimize
     from scipy.spatial import cKDTree
 
     theirs = _subsample(np.asarray(tree.data), 2 * POINTS)
     centred = points - middle
     moving_tree = cKDTree(centred)
-    size = float(np.sqrt((centred**2).sum(axis=1).mean()))  # a turn in metres, as far as it moves a usual point
+    size = float(np.sqrt((centred**2).sum(axis=1).mean()))  # a rotation in metres, as the motion of an average point
 
     def cost(v: Array) -> float:
         turn, at = _turn(float(v[0]) / size), v[1:]
@@ -289,7 +297,7 @@ def _polish(fit: Fit, points: Array, tree: Any, middle: Array, near: float) -> F
 
 
 def _with_quality(fit: Fit, every: Array, judge: Any, onto: OccupancyGrid, near: float) -> Fit:
-    """The fit with its quality. every: the moving grid's occupied cells."""
+    """Return the fit with its quality. every: the moving grid's occupied cells."""
     placed = fit.apply_to(every)
     x, y, yaw = onto.origin
     inside = (placed - np.array([x, y])) @ _turn(yaw) / onto.resolution
@@ -317,7 +325,7 @@ def _distinct(fits: list[Fit], middle: Array, near: float) -> list[Fit]:
 
 
 def _rigid(a: Array, b: Array) -> tuple[float, Array]:
-    """(yaw, shift) with the least squares of R a + shift - b."""
+    """Solve for (yaw, shift) with the least squares of R a + shift - b."""
     low, high = a.mean(axis=0), b.mean(axis=0)
     p, q = a - low, b - high
     yaw = math.atan2(float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()), float((p * q).sum()))
@@ -330,28 +338,28 @@ def _turn(yaw: float) -> Array:
 
 
 def _angle(yaw: float) -> float:
-    """The same angle within ±π, to 1e-12."""
+    """Normalise an angle to ±π, rounded to 1e-12."""
     return round(math.remainder(yaw, 2 * math.pi), 12)
 
 
 def _shift_for(at: Array, yaw: float, middle: Array) -> tuple[float, float]:
-    """The shift of a motion that turns by yaw and brings the middle to ``at``."""
+    """Return the shift of a motion that rotates by yaw and moves the middle to ``at``."""
     x, y = (at - _turn(yaw) @ middle).tolist()
     return x, y
 
 
 def _subsample(points: Array, limit: int = POINTS) -> Array:
-    """At most so many of the points, evenly taken."""
+    """Return at most this number of points, evenly selected."""
     return points if len(points) <= limit else points[np.linspace(0, len(points) - 1, limit).astype(int)]
 
 
 def _occupied_points(grid: OccupancyGrid) -> Array:
-    """The middles of occupied cells in metres, float64 [n, 2]."""
+    """Return the middles of occupied cells in metres, float64 [n, 2]."""
     return _placed_cells(grid, grid.cells == OCCUPIED)
 
 
 def _outline(grid: OccupancyGrid) -> Array:
-    """The middles of occupied cells beside others, in metres: what a laser sees of a wall, however thick."""
+    """Return the middles of occupied cells next to others, in metres: the visible outline of walls of any thickness."""
     import cv2
 
     solid = (grid.cells == OCCUPIED).astype(np.uint8)

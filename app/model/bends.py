@@ -1,9 +1,9 @@
-"""Edges with bends for formats whose edges are straight: nodes at the bends, and the edges that they were.
+"""Straight edges for formats without shapes: nodes at the bends of an edge, and the way back to the bent edges.
 
-A robot that drives straight between the nodes of a bent edge cuts the corner, through whatever stands there. So such a
-format gets a node ``<a>~<b>~1``, ``<a>~<b>~2`` … at each bend of an edge between the nodes a and b (a before b in the
-alphabet, counted from a; both directions share them), and the edge ``e`` becomes ``e~1``, ``e~2`` … from its source.
-The names follow from the network alone, so they stay when a robot gets the map again. ``join`` recognises them.
+A robot that drives straight between the nodes of a bent edge cuts the corner, through any obstacle there. Such a format
+therefore gets a node ``<a>~<b>~1``, ``<a>~<b>~2`` … at each bend of an edge between the nodes a and b (a before b in
+the alphabet, counted from a; both directions share them), and the edge ``e`` becomes ``e~1``, ``e~2`` … from its
+source. The names follow from the network alone, so that they stay the same in later maps. ``join`` recognises them.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from app.model.layers import Layers, Part, PartKey
 from app.model.network import middle_frame
 
 TOLERANCE_METRES = 0.05
-"""Maximum distance of a straight edge from the bent one, in metres: vertices that matter less are no bends."""
+"""Maximum distance of a straight edge from the bent one, in metres: smaller deviations are no bends."""
 
 IDENTITY = frozenset({"id", "edge_id", "index", "lane", "line", "backward", "geometry"})
-"""Words by which formats identify one edge of a file, or its place in it: pieces of an edge do not have them."""
+"""Properties by which formats identify one edge of a file, or its index in it: pieces of an edge do not have them."""
 
 NAMED = re.compile(r"(.+)~([1-9][0-9]{0,5})\Z", re.DOTALL)
 BENDS = "bends"
-"""Word of an edge: the properties of the nodes at its bends in the file that it came from, from the lower end on."""
+"""Property of an edge: the properties of the nodes at its bends in its source file, from the lower end on."""
 
 POINT, LINE = 0, 1
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """What was split. edges: number of bent edges. nodes: number of nodes at bends."""
+    """Result of a split. edges: number of bent edges. nodes: number of nodes at bends."""
 
     edges: int = 0
     nodes: int = 0
 
 
-# --- on the way out ---
+# --- splitting ---
 
 
 def split(layers: Layers, shape_of: str | None = None) -> tuple[Layers, Split]:
@@ -68,7 +68,7 @@ def split(layers: Layers, shape_of: str | None = None) -> tuple[Layers, Split]:
     for key, part in networks.items():
         places = _bent(part, nodes[key.level], shape_of)
         if len(places) and (part.local.all() or not part.local.any() or layers.frame is not None):
-            # Distances are all that counts, so places on earth need no datum, and none that is near.
+            # only distances count, so that items on earth need no datum
             frame = layers.frame if part.local.any() else middle_frame(shapely.get_coordinates(part.geometry))
             parts[key], count = _split_part(part, places, frame)
             total = Split(total.edges + count.edges, total.nodes + count.nodes)
@@ -76,7 +76,7 @@ def split(layers: Layers, shape_of: str | None = None) -> tuple[Layers, Split]:
 
 
 def _bent(part: Features, nodes: Container[str], shape_of: str | None) -> NDArray[np.intp]:
-    """Places of the edges between these nodes with more than two coordinates."""
+    """Return indices of the edges between these nodes with more than two coordinates."""
     line = shapely.get_type_id(part.geometry) == LINE
     places = np.flatnonzero(line & (shapely.get_num_coordinates(part.geometry) > 2))
     rows = ((k, part.properties[k]) for k in places.tolist())
@@ -90,14 +90,14 @@ def _is_edge(properties: Properties) -> bool:
 
 
 def is_identified(properties: Properties, name: str | None) -> bool:
-    """Whether the edge has an id in this format's file."""
+    """Return whether the edge has an id in this format's file."""
     identity = properties.get(name) if name is not None else None
     return isinstance(identity, Mapping) and identity.get("id") is not None
 
 
 @dataclass(slots=True)
 class _Course:
-    """An edge's vertices from the lower to the higher of its ends. at: [n, 2 or 3] as anchored. metres: [n, 2]."""
+    """Vertices of an edge from the lower to the higher of its ends. at: [n, 2 or 3] as anchored. metres: [n, 2]."""
 
     place: int
     ends: tuple[str, str]
@@ -107,7 +107,7 @@ class _Course:
 
     @property
     def key(self) -> bytes:
-        """Equal for both directions of one line."""
+        """Return a key that is equal for both directions of a line."""
         return (np.round(self.metres[1:-1], 3) + 0.0).tobytes()
 
 
@@ -124,7 +124,7 @@ def _split_part(part: Features, places: NDArray[np.intp], frame: LocalFrame | No
     for ends, course_by_key in lines.items():
         for key, course in course_by_key.items():
             base = f"{ends[0]}~{ends[1]}"
-            if len(course_by_key) > 1:  # parallel edges: each line has a name of its own, whatever their order
+            if len(course_by_key) > 1:  # parallel edges: a name per line, independent of their order
                 base += f"~{hashlib.sha256(key).hexdigest()[:6]}"
             first[ends, key] = len(name_candidates)
             inner = course.at[1:-1]
@@ -154,7 +154,7 @@ def _split_part(part: Features, places: NDArray[np.intp], frame: LocalFrame | No
 
 
 def _stored_bend_nodes(part: Features, course: _Course) -> list[Properties]:
-    """What a file that was read said of the nodes at an edge's bends."""
+    """Return the stored properties of the nodes at an edge's bends, empty ones if there are none."""
     count = len(course.at) - 2
     node_properties = part.properties[course.place].get(BENDS)
     if (
@@ -168,7 +168,7 @@ def _stored_bend_nodes(part: Features, course: _Course) -> list[Properties]:
 
 @dataclass(slots=True)
 class _Columns:
-    """Features that are being made, as columns."""
+    """Columns of new features."""
 
     ids: list[str] = field(default_factory=list)
     geometry: list[Any] = field(default_factory=list)
@@ -185,7 +185,7 @@ class _Columns:
         self.local += [local] * (len(chain) - 1)
 
     def after(self, rest: Features) -> Features:
-        """These features behind others, with the others' document."""
+        """Append these features to others, with the others' document."""
         column: NDArray[np.object_] = np.empty(len(self.geometry), object)
         column[:] = self.geometry
         return Features(
@@ -198,7 +198,7 @@ class _Columns:
 
 
 def _courses(part: Features, places: NDArray[np.intp], frame: LocalFrame | None) -> Iterator[_Course]:
-    """The bent edges from node to node, with the vertices that are bends."""
+    """Return the bent edges from node to node, reduced to the vertices that are bends."""
     at_node = _node_positions(part, frame)
     for k, metric in zip(places.tolist(), part.select(places).in_local(frame), strict=True):
         p, shape = part.properties[k], part.geometry[k]
@@ -208,7 +208,7 @@ def _courses(part: Features, places: NDArray[np.intp], frame: LocalFrame | None)
             node = at_node.get(name)
             if node is None or node[2] != part.local[k]:
                 continue
-            if np.hypot(*(node[1] - metres[end])) > TOLERANCE_METRES:  # the node is where the edge begins, or ends
+            if np.hypot(*(node[1] - metres[end])) > TOLERANCE_METRES:  # an end of the edge is at its node
                 index = len(at) if end else 0
                 at = np.insert(at, index, node[0][: at.shape[1]], axis=0)
                 metres = np.insert(metres, index, node[1], axis=0)
@@ -223,7 +223,7 @@ def _courses(part: Features, places: NDArray[np.intp], frame: LocalFrame | None)
 def _node_positions(
     part: Features, frame: LocalFrame | None
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64], bool]]:
-    """By id: [x, y, z] as anchored (z 0 where there is none), [x, y] in metres, and whether it is anchored locally."""
+    """Return nodes by id: [x, y, z] as anchored (z 0 if absent), [x, y] in metres, and whether the anchor is local."""
     point = shapely.get_type_id(part.geometry) == POINT
     rows = [k for k in np.flatnonzero(point).tolist() if part.properties[k].get("kind") == "node"]
     nodes = part.select([k for k in rows if not part.geometry[k].is_empty])
@@ -233,7 +233,7 @@ def _node_positions(
 
 
 def _bends(metres: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Places of a line's ends and of the vertices that a line within the tolerance needs."""
+    """Return indices of a line's ends and of the vertices that a line within the tolerance needs."""
     line = shapely.simplify(shapely.linestrings(metres), TOLERANCE_METRES, preserve_topology=False)
     vertices = shapely.get_coordinates(line)
     if len(vertices) < 2:
@@ -245,7 +245,7 @@ def _bends(metres: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def drop_identity(properties: Properties) -> dict[str, Any]:
-    """An edge's properties without what identifies it in a file, and without its bends."""
+    """Return an edge's properties without its identity in a file, and without its bends."""
     return {
         name: {word: v for word, v in value.items() if word not in IDENTITY} if isinstance(value, Mapping) else value
         for name, value in properties.items()
@@ -254,18 +254,18 @@ def drop_identity(properties: Properties) -> dict[str, Any]:
 
 
 def _bend_name(name: str, number: int) -> str:
-    """``name~number``, with a hash for the end of a name that is too long for an id."""
+    """Return ``name~number``, with a hash for the end of a name that is too long for an id."""
     limit = MAX_ID - 40
     if len(name) > limit:
         name = f"{name[: limit - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
     return f"{name}~{number}"
 
 
-# --- on the way back ---
+# --- joining ---
 
 
 def join(layers: Layers) -> Layers:
-    """Make the edges whole again that ``split`` has split, where nothing else uses the nodes at their bends."""
+    """Restore the edges that ``split`` has split, if nothing else uses the nodes at their bends."""
     parts = {key: _join_part(part) for key, part in layers.vector("topology").items()}
     changed = {key: part for key, part in parts.items() if part is not layers.parts[key]}
     return replace(layers, parts={**layers.parts, **changed}) if changed else layers
@@ -287,7 +287,7 @@ def _join_part(part: Features) -> Features:
 
 
 def _parse_bend_name(i: str, p: Properties) -> tuple[str, int] | None:
-    """The base and the number in a bend's name; None for other nodes."""
+    """Split a bend's name into base and number; None for other nodes."""
     for name in (i, p.get("name")):
         match = NAMED.match(name) if isinstance(name, str) and "~" in name else None
         if match is not None and "~" in match[1]:
@@ -296,7 +296,7 @@ def _parse_bend_name(i: str, p: Properties) -> tuple[str, int] | None:
 
 
 class _Network:
-    """A network while edges are joined. touching: places of the edges at each node, by id."""
+    """A network while edges are joined. touching: indices of the edges at each node, by id."""
 
     def __init__(self, part: Features) -> None:
         self.part = part
@@ -341,7 +341,7 @@ class _Network:
             self._add(path, run, {BENDS: bend_properties} if any(bend_properties) else {})
 
     def _chain(self, base: str, ids: Sequence[str], pairs: Mapping[tuple[str, str], int]) -> list[str] | None:
-        """The nodes from one end over the bends to the other end; None where these are not the ends."""
+        """Return the nodes from one end over the bends to the other end; None if these are not the ends."""
         inner = set(ids)
         firsts, lasts = (
             {other for a, b in pairs for node, other in ((a, b), (b, a)) if node == end} - inner
@@ -361,7 +361,7 @@ class _Network:
         return [i, name] if isinstance(name, str) and name != i else [i]
 
     def _is_uniform(self, run: Sequence[int]) -> bool:
-        """Whether the pieces differ only in their ends: else somebody has edited them one by one."""
+        """Return whether the pieces differ only in their ends; otherwise they were edited one by one."""
         ends = {"source", "target"}
         run_properties = [drop_identity(self.part.properties[k]) for k in run]
         first, *others = ({name: v for name, v in p.items() if name not in ends} for p in run_properties)
@@ -382,7 +382,7 @@ class _Network:
         self.whole.local.append(bool(part.local[run[0]]))
 
     def join_edges(self) -> Features:
-        """The network with these edges."""
+        """Return the network with these edges."""
         if not self.gone:
             return self.part
         rest = self.part.select([k for k in range(len(self.part)) if k not in self.gone])

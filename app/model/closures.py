@@ -1,4 +1,4 @@
-"""Closures: overlays in force. Edges and areas that no robot may use for a time, on every channel, in no version."""
+"""Closures: overlays in force. No robot may use these edges and areas until they expire; they are in no version."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 ClosureMode = Literal["apply", "mark", "ignore"]
-"""How a map shows closures. ``apply``: closed edges are left out of formats that cannot express a blocked edge.
-``mark``: closed edges stay and are marked. ``ignore``: the map is the version's, whatever is in force.
+"""Display of closures in a map. ``apply``: formats that cannot express a blocked edge omit closed edges.
+
+``mark``: closed
+edges stay and are marked. ``ignore``: the map shows the version without closures.
 """
 CLOSURE_MODES: tuple[ClosureMode, ...] = get_args(ClosureMode)
 
@@ -29,7 +31,7 @@ class Closure:
     detail: str | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-like, without empty members."""
+        """Return the JSON members, without empty ones."""
         members = {
             "id": self.id,
             "kind": self.kind,
@@ -45,9 +47,9 @@ class Closure:
 
 @dataclass(frozen=True, slots=True)
 class Closures:
-    """The closures in force in an environment, sorted by id, and how a map shows them.
+    """The closures in force in an environment, sorted by id, with their display mode.
 
-    digest: SHA-256 (hex) of the list: robots with equal roots and equal digests hold the same map.
+    digest: SHA-256 (hex) of the list: robots with equal roots and equal digests have the same map.
     """
 
     items: tuple[Closure, ...] = ()
@@ -59,12 +61,12 @@ class Closures:
             object.__setattr__(self, "digest", closures_digest([closure.as_dict() for closure in self.items]))
 
     def for_mode(self, mode: ClosureMode) -> Closures | None:
-        """The same, shown in another way; None if they are ignored."""
+        """Return the same closures with another mode; None if they are ignored."""
         return None if mode == "ignore" else replace(self, mode=mode)
 
 
 def closures_digest(closures: list[dict[str, Any]]) -> str:
-    """SHA-256 (hex) of closures as they stand in a manifest."""
+    """Return the SHA-256 (hex) of closures as they are listed in a manifest."""
     data = json.dumps(closures, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(data.encode()).hexdigest()
 
@@ -73,5 +75,5 @@ NO_CLOSURES = Closures()
 
 
 def zone_id(overlay_id: str) -> str:
-    """Return the id of the zone that stands for an overlay's polygon."""
+    """Return the id of the zone for an overlay's polygon."""
     return f"overlay-{overlay_id}"

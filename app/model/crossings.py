@@ -1,4 +1,4 @@
-"""Edges of a network that lead through obstacles: a check of the network that a map holds."""
+"""Check of a map's network for edges that cross obstacles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from app.model.solids import Solids
 Array = NDArray[np.float64]
 
 BODIES = frozenset({"building", "wall", "fence", "barrier", "railing", "hedge", "rack", "shelf", "container"})
-"""Kinds whose ground plan no robot crosses."""
+"""Kinds with a ground plan that robots cannot cross."""
 
 CLEARANCE_METRES = 2.0
 """Minimum height of an underside that robots pass under, in metres."""
@@ -30,26 +30,26 @@ MIN_CROSSING_METRES = 0.1
 """Minimum length of an edge inside a ground plan, in metres."""
 
 END_METRES = 1e-6
-"""Maximum distance of an edge's end from the way inside a ground plan that begins or ends there, in metres."""
+"""Maximum distance between an edge's end and a stretch inside a ground plan that begins or ends there, in metres."""
 
 MAX_EDGES, MAX_BODIES = 500_000, 50_000
-"""What is checked of one level: more would slow a map down."""
+"""Maximum number of cells and bodies that are checked per level, so that maps stay fast."""
 
 SAMPLES, MAX_SAMPLES = 2**20, 2**25
-"""Places along edges that are looked up at once, and in all: of a longer network they are farther apart."""
+"""Maximum number of points along edges looked up at once, and in total: longer networks have a wider spacing."""
 
 MAX_LISTED = 5
 
 
 def crossings(networks: Layers, around: Layers, *, shape_of: str | None = None) -> list[Problem]:
-    """Warn of edges that cross occupied cells of their level's grid, or buildings and walls where it knows nothing.
+    """Warn of edges that cross occupied cells of their level's grid, or buildings and walls in its unknown cells.
 
     Args:
         networks: the network as it is stored, before bent edges are split.
         around: the grids and objects that are in memory.
         shape_of: a format with shapes that its consumers ignore: robots drive straight along edges that it identifies.
 
-    Networks on earth are not checked while there is no datum, or one that is far away.
+    Networks on earth are not checked if there is no datum, or if the datum is too far away.
     """
     out: list[Problem] = []
     for key, part in networks.vector("topology").items():
@@ -88,7 +88,7 @@ def _problems(ids: Sequence[str], obstacles: str, key: PartKey) -> list[Problem]
 def _courses(
     part: Features, geometry: NDArray[np.object_], edges: Sequence[int], shape_of: str | None
 ) -> NDArray[np.object_]:
-    """The lines that robots drive along edges, in metres."""
+    """Return the lines that robots drive along edges, in metres."""
     lines = geometry[list(edges)]
     if shape_of is None:
         return lines
@@ -104,22 +104,22 @@ def _courses(
 
 
 def _segments(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
-    """The straight pieces of lines as float64 [n, 2, 2], and the index of each piece's line."""
+    """Split lines into straight pieces, float64 [n, 2, 2], with the index of each piece's line."""
     at, owner = shapely.get_coordinates(lines, return_index=True)
     same = owner[1:] == owner[:-1]
     return np.stack([at[:-1], at[1:]], axis=1)[same], owner[:-1][same].astype(np.int64)
 
 
 def _obstacle_grid(grids: Mapping[PartKey, OccupancyGrid]) -> PartKey | None:
-    """A level's grid of obstacles: ``map``, else the only one that is no costmap filter mask."""
+    """Return a level's grid of obstacles: ``map``, else the only one that is no costmap filter mask."""
     keys = [k for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties]
     return next((k for k in keys if k.name == MAP), keys[0] if len(keys) == 1 else None)
 
 
 def _crossed_cells(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which pieces lead through an occupied cell, and which through an unknown one or beyond the grid.
+    """Return which pieces cross an occupied cell, and which an unknown one or the outside of the grid.
 
-    They are looked up twice a cell.
+    They are sampled at half the cell size.
     """
     grid = unknown_grey_as_unknown(grid)
     x, y, yaw = grid.origin
@@ -138,7 +138,7 @@ def _crossed_cells(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.boo
         at = turned[number, 0] + (turned[number, 1] - turned[number, 0]) * share[:, None]
         column, row = np.floor(at / grid.resolution).astype(np.int64).T
         inside = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
-        cells = grid.cells[row[inside], column[inside]]  # not of the whole grid, which may have 300 million
+        cells = grid.cells[row[inside], column[inside]]  # not of the whole grid, which may have 300 million cells
         occupied = (cells >= grid.occupied_thresh * OCCUPIED) & (cells != UNKNOWN)
         hit[number[inside][occupied]] = True
         unseen[number[~inside]] = True
@@ -148,7 +148,7 @@ def _crossed_cells(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.boo
 
 
 def _bodies(around: Layers, level: str) -> list[Any]:
-    """The ground plans of a level's buildings and walls, in metres."""
+    """Return the ground plans of a level's buildings and walls, in metres."""
     bodies: list[Any] = []
     solids = Solids({})
     for key, part in around.vector("objects").items():
@@ -161,7 +161,7 @@ def _bodies(around: Layers, level: str) -> list[Any]:
         for p, geometry in zip(chosen.properties, shapes, strict=True):
             try:
                 body = object_footprint({**p, "shapes": None}, geometry, solids)
-            except FleetMapError:  # what it is made of cannot be used: its derivations report it
+            except FleetMapError:  # invalid shapes or pose: its derivations report it
                 continue
             if body is not None and not body.is_empty:
                 bodies.append(body)
@@ -169,9 +169,9 @@ def _bodies(around: Layers, level: str) -> list[Any]:
 
 
 def _crosses_bodies(lines: NDArray[np.object_], bodies: Sequence[Any], grid: OccupancyGrid | None) -> NDArray[np.bool_]:
-    """Which lines lead through a ground plan, but for the way from an end inside to the outside.
+    """Return which lines cross a ground plan, except for the way from an end inside to the outside.
 
-    grid: of the obstacles: a way that it knows all along is not in a body's way.
+    grid: of the obstacles: a line whose cells are all known in it crosses no body.
     """
     hit = np.zeros(len(lines), bool)
     if not bodies:

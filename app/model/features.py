@@ -4,25 +4,25 @@ A feature has a stable id, a geometry, JSON-like properties and an anchor: ``loc
 metres in the environment's local frame, ``wgs84`` ones (longitude, latitude[, altitude]) in degrees and metres. Items
 are stored as they are anchored, so a round trip loses nothing and a new datum moves no wgs84 item.
 
-Words that every format shares, in ``properties``:
+Property names that all formats share, in ``properties``:
 
 ========== ================= =========================================================================================
 layer      property          meaning
 ========== ================= =========================================================================================
-all        ``kind``          what it is: ``node``, ``edge``, ``region``, ``poi``, ``building``, ``keepout`` …
+all        ``kind``          kind of item: ``node``, ``edge``, ``region``, ``poi``, ``building``, ``keepout`` …
 all        ``name``          the name people and robots use; need not be unique
 topology   ``source``        id of the node an edge starts at (edges only)
 topology   ``target``        id of the node an edge ends at (edges only; an edge is directed)
-topology   ``orientation``   [x, y, z, w], the quaternion of a node's pose in the local frame, as its source gives it
-topology   ``action``        what a robot does along an edge
+topology   ``orientation``   [x, y, z, w], the quaternion of a node's pose in the local frame, as in its source
+topology   ``action``        action of a robot along an edge
 topology   ``speed_limit``   metres per second along an edge
 topology   ``width``         metres of free width along an edge
-topology   ``surface``       what an edge's ground is made of (``asphalt``, ``gravel``: OpenStreetMap's words)
-topology   ``access``        who may use an edge (``yes``, ``private``, ``no`` …: OpenStreetMap's words)
-topology   ``stairs``        true where an edge goes over steps
-topology   ``bends``         what a file of straight edges says of the nodes at an edge's bends (``app.model.bends``)
-topology   ``blocked``       true: nobody is to take the edge, until ``blocked_until`` (an RFC 3339 time)
-zones      ``value``         what the kind needs: a speed in m/s, a priority …
+topology   ``surface``       surface of an edge's ground (``asphalt``, ``gravel``: OpenStreetMap's values)
+topology   ``access``        right to use an edge (``yes``, ``private``, ``no`` …: OpenStreetMap's values)
+topology   ``stairs``        true if an edge leads over steps
+topology   ``bends``         properties of the nodes at an edge's bends, from a straight-edge file (``app.model.bends``)
+topology   ``blocked``       true: no robot may use the edge, until ``blocked_until`` (an RFC 3339 time)
+zones      ``value``         value for the kind: a speed in m/s, a priority …
 zones      ``expires``       RFC 3339 time at which the zone ends
 objects    ``pose``          [x, y, z, roll, pitch, yaw], metres and radians, local frame
 objects    ``size``          [x, y, z], metres
@@ -30,7 +30,7 @@ objects    ``shapes``        its solids, see ``app.model.solids``
 objects    ``height``        metres of an extruded footprint's top above the level's floor
 objects    ``base``          metres of its underside above the level's floor, else 0
 objects    ``width``         metres across a line or a point
-all        ``<format>``      what only that format knows of the item, kept for the way back
+all        ``<format>``      format-specific data of the item, stored for export to that format
 ========== ================= =========================================================================================
 """
 
@@ -49,17 +49,17 @@ from app.model.frame import MAX_METRES, Anchor, is_writable
 from app.model.geodesy import LocalFrame
 
 Properties = Mapping[str, Any]
-"""JSON-like: keys are texts, values None, bool, int (64 bit), finite float, text, list or mapping of these."""
+"""JSON-like value: None, bool, int (64 bit), finite float, text, or a list or mapping (with text keys) of these."""
 
 NO_GEOMETRY = shapely.GeometryCollection()
-"""The geometry of an item that has none (a KML placemark without one): never None, so that arrays stay plain."""
+"""Geometry of an item without one (a KML placemark, for example): never None, so that arrays stay plain."""
 
 MAX_ID = 512
 
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """One item of a collection, for code that looks at few of them."""
+    """One item of a collection, for code that reads few of them."""
 
     id: str
     geometry: Any
@@ -69,11 +69,11 @@ class Feature:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """n features as parallel columns, checked when made and never changed.
+    """n features as parallel columns, checked at construction and immutable.
 
     ids: n distinct texts. geometry: object array [n] of shapely geometries. properties: n mappings.
-    local: bool array [n], True where the coordinates are metres in the local frame.
-    document: what the source says of the collection as a whole (a network's name, a drawing's styles), by format.
+    local: bool array [n], True if the coordinates are metres in the local frame.
+    document: the source's data about the whole collection (a network's name, a drawing's styles), by format.
     """
 
     ids: tuple[str, ...]
@@ -91,14 +91,16 @@ class Features:
         if self.local.dtype != bool or self.local.ndim != 1:
             raise ValueError(f"local must be bool [{n}], got {self.local.dtype} {self.local.shape}")
         if not bool(shapely.is_geometry(self.geometry).all()):
-            raise ValueError("geometry must hold shapely geometries; NO_GEOMETRY stands for none")
+            raise ValueError("geometry must contain shapely geometries, NO_GEOMETRY for an absent one")
         if len(set(self.ids)) != n:
             twice = next(i for i, seen in _repeats(self.ids) if seen)
-            raise Invalid(f"two features of one collection have the id {twice!r}")
+            raise Invalid(f"duplicate feature id {twice!r} in one collection")
         for i in self.ids:
             if not i or len(i) > MAX_ID or not is_writable(i):
-                bad = [Problem(f"an id must have 1 to {MAX_ID} characters, no control characters", where=repr(i[:80]))]
-                raise Invalid(f"the id {i[:80]!r} cannot be used", bad)
+                bad = [
+                    Problem(f"an id must have 1 to {MAX_ID} characters and no control characters", where=repr(i[:80]))
+                ]
+                raise Invalid(f"invalid id {i[:80]!r}", bad)
         _check_coordinates(self)
         self.geometry.flags.writeable = False
         self.local.flags.writeable = False
@@ -111,7 +113,7 @@ class Features:
             yield Feature(i, g, p, "local" if local else "wgs84")
 
     def select(self, index: NDArray[np.bool_] | NDArray[np.intp] | Sequence[int]) -> Features:
-        """The features at these places (a boolean mask or indexes), with the same document."""
+        """Return the features at these indices (or of a boolean mask), with the same document."""
         indices = np.asarray(index)
         indices = np.flatnonzero(indices) if indices.dtype == bool else indices.astype(np.intp)
         return Features(
@@ -123,7 +125,7 @@ class Features:
         )
 
     def select_kinds(self, *kinds: str) -> Features:
-        """The features whose ``kind`` is one of these."""
+        """Return the features whose ``kind`` is one of these."""
         return self.select([k for k, p in enumerate(self.properties) if p.get("kind") in kinds])
 
     def index(self) -> dict[str, int]:
@@ -131,20 +133,20 @@ class Features:
         return {i: k for k, i in enumerate(self.ids)}
 
     def with_document(self, document: Properties) -> Features:
-        """The same features under another document."""
+        """Return the same features with another document."""
         return replace(self, document=document)
 
     @property
     def needs_datum(self) -> bool:
-        """Whether any item stands on earth, so that metres need a datum."""
+        """Return whether any item is on earth, so that metres need a datum."""
         return bool(len(self.ids)) and not bool(self.local.all())
 
     def in_local(self, frame: LocalFrame | None) -> NDArray[np.object_]:
-        """All geometries in metres; MissingDatum if any is on earth and there is no frame."""
+        """Return all geometries in metres. Raises MissingDatum if any is on earth and there is no frame."""
         return self._geometries_in(True, frame)
 
     def in_wgs84(self, frame: LocalFrame | None) -> NDArray[np.object_]:
-        """All geometries in (longitude, latitude); MissingDatum if any is local and there is no frame."""
+        """Return all geometries in (longitude, latitude). Raises MissingDatum if any is local and there is no frame."""
         return self._geometries_in(False, frame)
 
     def _geometries_in(self, local: bool, frame: LocalFrame | None) -> NDArray[np.object_]:
@@ -153,7 +155,7 @@ class Features:
             return self.geometry
         if frame is None:
             raise MissingDatum(
-                "the environment has no datum, so places on earth and local metres cannot be brought together: "
+                "the environment has no datum, which is needed to convert between WGS 84 and local metres: "
                 'set one with PATCH /api/v1/environments/{env} {"datum": {"latitude": …, "longitude": …}} '
                 "or upload a datum.yaml"
             )
@@ -166,7 +168,7 @@ class Features:
 def features(
     rows: Iterable[tuple[str, Any, Properties]], anchor: Anchor, document: Properties | None = None
 ) -> Features:
-    """A collection from (id, shapely geometry or None, properties), all with one anchor."""
+    """Build a collection from (id, shapely geometry or None, properties), all with one anchor."""
     listed = list(rows)
     geometry = np.empty(len(listed), object)
     for k, (_, g, _) in enumerate(listed):
@@ -187,12 +189,12 @@ def from_columns(
     anchor: Anchor,
     document: Properties | None = None,
 ) -> Features:
-    """A collection from columns, all with one anchor: the quick way for readers that work with arrays."""
+    """Build a collection from columns, all with one anchor: faster, for readers that work with arrays."""
     return Features(tuple(ids), geometry, tuple(properties), np.full(len(ids), anchor == "local"), document or {})
 
 
 def concatenate(collections: Sequence[Features]) -> Features:
-    """All features of several collections; documents are merged, later ones win. Ids must be distinct."""
+    """Join the features of several collections; documents are merged, later ones win. Ids must be distinct."""
     document: Properties = {}
     for c in collections:
         document = merge_documents(document, c.document)
@@ -208,9 +210,9 @@ def concatenate(collections: Sequence[Features]) -> Features:
 
 
 def merge_documents(a: Properties, b: Properties) -> dict[str, Any]:
-    """Both mappings as one, nested ones too: so the drawings of several files keep their styles side by side.
+    """Merge two mappings, including nested ones, so that drawings of several files keep their styles side by side.
 
-    Where both say something else of the same key and not both with a mapping, ``b`` wins.
+    If both have different values for a key and these are not both mappings, ``b`` wins.
     """
     out = dict(a)
     for key, value in b.items():
@@ -221,20 +223,20 @@ def merge_documents(a: Properties, b: Properties) -> dict[str, Any]:
 
 
 def shared_key_dict(*keys: str) -> dict[str, Any]:
-    """A mapping with these keys, all None, whose copies (``.copy()``, then set) share its table of keys.
+    """Create a mapping with these keys, all None, whose copies (``.copy()``, then set) share its table of keys.
 
-    Such a copy is a usual dict that takes little more than half the memory: for readers that make very many mappings
+    A copy is an ordinary dict that takes little more than half the memory: for readers that create very many mappings
     of the same keys (PEP 412; a copy that gets another key becomes one with a table of its own).
     """
 
-    if any(key.startswith("__") for key in keys):  # names that Python gives a meaning
+    if any(key.startswith("__") for key in keys):  # Python reserves such names
         return dict.fromkeys(keys)
 
     class Pattern:
         pass
 
     holder = Pattern()
-    for _ in range(64):  # the first instances keep room for keys to come
+    for _ in range(64):  # the first instances reserve room for further keys
         holder = Pattern()
         for key in keys:
             setattr(holder, key, None)
@@ -242,17 +244,16 @@ def shared_key_dict(*keys: str) -> dict[str, Any]:
 
 
 class SharedKeyDicts:
-    """Mappings -> the same ones in less memory: those with the same keys share their table of keys
-    (``shared_key_dict``)."""
+    """Converter of mappings that saves memory: equal sets of keys share one table (``shared_key_dict``)."""
 
     MAX_LAYOUTS = 256
-    """Tables that are kept."""
+    """Maximum number of cached tables."""
 
     def __init__(self) -> None:
         self._patterns: dict[tuple[str, ...], dict[str, Any]] = {}
 
     def __call__(self, mapping: dict[str, Any]) -> dict[str, Any]:
-        """The mapping, with its keys in their order."""
+        """Return the mapping, with its keys in the same order."""
         keys = tuple(mapping)
         pattern = self._patterns.get(keys)
         if pattern is None:
@@ -266,17 +267,17 @@ class SharedKeyDicts:
 
 
 def points(coordinates: NDArray[np.float64]) -> NDArray[np.object_]:
-    """Point geometries from float64 [n, 2] or [n, 3]."""
+    """Create point geometries from float64 [n, 2] or [n, 3]."""
     return np.asarray(shapely.points(coordinates), object).reshape(len(coordinates))
 
 
 def segments(starts: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.object_]:
-    """Two-point LineStrings from float64 [n, 2 or 3] starts and ends."""
+    """Create two-point LineStrings from float64 [n, 2 or 3] starts and ends."""
     return np.asarray(shapely.linestrings(np.stack([starts, ends], axis=1)), object).reshape(len(starts))
 
 
 def unique_ids(names: Iterable[str], taken: set[str] | None = None) -> list[str]:
-    """The names as distinct ids: a repeated one gets ``#2``, ``#3`` … (names may repeat in files, ids may not)."""
+    """Make names distinct ids: a repeated one gets ``#2``, ``#3`` … (names may repeat in files, ids may not)."""
     used = set(taken or ())
     counts: dict[str, int] = {}
     out = []
@@ -298,20 +299,20 @@ def _repeats(ids: Iterable[str]) -> Iterator[tuple[str, bool]]:
 
 
 def _check_coordinates(f: Features) -> None:
-    """Finite everywhere; metres within MAX_METRES; latitude within ±90 and longitude within ±180 degrees."""
+    """Check coordinates: finite, metres within MAX_METRES, latitude within ±90, longitude within ±180 degrees."""
     for first in range(0, len(f.ids), CHECKED):
         some = slice(first, first + CHECKED)
         _check_batch(f.ids[some], f.geometry[some], f.local[some])
 
 
 CHECKED = 2**15
-"""Features that are checked at a time: the coordinates of all would take as much memory as the features do."""
+"""Number of features that are checked at a time: all coordinates would take as much memory as the features."""
 
 
 def _check_batch(ids: Sequence[str], geometry: NDArray[np.object_], is_local: NDArray[np.bool_]) -> None:
     coordinates, owner = shapely.get_coordinates(geometry, include_z=True, return_index=True)
     flat, z = coordinates[:, :2], coordinates[:, 2]
-    # shapely gives NaN as the z of a 2-D geometry: only a 3-D one's z is looked at.
+    # shapely gives NaN as the z of a 2-D geometry: only the z of 3-D ones is checked
     deep = shapely.has_z(geometry)[owner]
     local = is_local[owner]
     bound = np.where(local[:, None], MAX_METRES, np.array([180.0, 90.0]))

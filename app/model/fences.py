@@ -1,4 +1,4 @@
-"""The fences of a site: the polygons of the location layer, by level."""
+"""Fences of a site: the polygons of the location layer, by level."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.model.layers import Layers
 
 
 def fences(layers: Layers, warn: Callable[..., None]) -> dict[str, Any]:
-    """The polygons of the location layer by level, joined, in metres (shapely)."""
+    """Return the polygons of the location layer by level, joined, in metres (shapely)."""
     out: dict[str, Any] = {}
     for key, part in layers.vector("location").items():
         flat = np.isin(shapely.get_type_id(part.geometry), (3, 6)) & ~shapely.is_empty(part.geometry)
@@ -23,7 +23,7 @@ def fences(layers: Layers, warn: Callable[..., None]) -> dict[str, Any]:
         try:
             metres = chosen.in_local(layers.frame)
         except (MissingDatum, Invalid) as error:
-            warn(f"the fence is not used: {error.detail}", where=key.name)
+            warn(f"the fence is ignored: {error.detail}", where=key.name)
             continue
         joined = shapely.union_all(shapely.make_valid(shapely.force_2d(metres)))
         if not joined.is_empty and joined.area > 0:
@@ -32,5 +32,5 @@ def fences(layers: Layers, warn: Callable[..., None]) -> dict[str, Any]:
 
 
 def level_fence(fences: Mapping[str, Any], level: str, ground: str) -> Any:
-    """A level's fence, else that of the ground; None where there is none."""
+    """Return a level's fence, else that of the ground level, else None."""
     return fences.get(level, fences.get(ground))

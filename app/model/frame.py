@@ -1,4 +1,4 @@
-"""Where an environment is: its datum and its levels.
+"""Position of an environment: its datum and its levels.
 
 The local frame is x east, y north, z up, in metres, with its origin at the datum, turned by the datum's heading.
 """
@@ -13,31 +13,31 @@ from typing import Literal
 from app.errors import Invalid
 
 Anchor = Literal["local", "wgs84"]
-"""An item's coordinates: metres (x, y[, z]) in the local frame, or degrees (longitude, latitude[, altitude])."""
+"""Anchor of an item: metres (x, y[, z]) in the local frame, or degrees (longitude, latitude[, altitude])."""
 
 GROUND = "ground"
 
 MAX_DATUM_LATITUDE = 85.0
-"""Degrees. Nearer to a pole the local frame's axes lose their meaning."""
+"""Maximum latitude of a datum, in degrees: nearer to a pole the local frame's axes lose their meaning."""
 
 MAX_METRES = 1e7
-"""Bound of every local coordinate: far beyond any site, near enough for float64 to keep a nanometre."""
+"""Maximum of every local coordinate: far beyond any site, and float64 still resolves a nanometre."""
 
 
 _UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def is_writable(text: str) -> bool:
-    """Whether a name can stand in one line of any format: no control characters, line ends or lone surrogates.
+    """Return whether a name fits in one line of any format: no control characters, line ends or lone surrogates.
 
-    Zero-width and bidirectional marks and unusual spaces are fine: real names have them.
+    Zero-width and bidirectional marks and unusual spaces are accepted: real names have them.
     """
     return text.isprintable() or _UNWRITABLE.search(text) is None
 
 
 @dataclass(frozen=True, slots=True)
 class Datum:
-    """The place on earth (WGS 84) of an environment's local origin.
+    """Position of an environment's local origin on earth (WGS 84).
 
     ``latitude`` and ``longitude`` in degrees, ``altitude`` in metres above the ellipsoid, ``heading`` in degrees
     clockwise from true north to the local +y axis.
@@ -63,7 +63,7 @@ class Datum:
             object.__setattr__(self, name, float(value) + 0.0)
 
     def as_dict(self) -> dict[str, float]:
-        """The datum as JSON."""
+        """Return the datum as JSON."""
         return {
             "latitude": self.latitude,
             "longitude": self.longitude,
@@ -74,7 +74,7 @@ class Datum:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A storey: its name and the height of its floor in metres above the local origin."""
+    """A level: its name and the height of its floor in metres above the local origin."""
 
     name: str = GROUND
     elevation: float = 0.0

@@ -1,4 +1,7 @@
-"""GDAL, as pictures use it: in one thread, in memory, on pixels where they are. The only module that sets it up."""
+"""Configuration of GDAL for images: single-threaded, in memory, without copies of pixels.
+
+No other module sets it up.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 CACHE = 32 * 2**20
-"""Bytes of decoded blocks that GDAL keeps."""
+"""Size of GDAL's cache of decoded blocks, in bytes."""
 
 DATA_TYPES = {
     "uint8": "Byte",
@@ -30,15 +33,15 @@ DATA_TYPES = {
     "float32": "Float32",
     "float64": "Float64",
 }
-"""NumPy's names of the types of pixels -> GDAL's."""
+"""GDAL's pixel types by NumPy's names."""
 
 
 @contextlib.contextmanager
 def gdal(cache: int = CACHE) -> Iterator[Any]:
-    """GDAL with a small cache, deaf to files beside the one it is given. Gives rasterio, which is slow to import."""
+    """Return rasterio (slow to import) with a small GDAL cache and without access to sidecar files."""
     import rasterio
 
-    logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # what it has to say is raised, too
+    logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # errors are raised as exceptions, too
     settings = {
         "GDAL_CACHEMAX": cache,
         "COG_TMP_COMPRESSION": "DEFLATE",  # of overviews until they are in place; LZW makes noise larger than it is
@@ -54,12 +57,14 @@ def gdal(cache: int = CACHE) -> Iterator[Any]:
 
 
 PIECE = 2**24
-"""Bytes of a finished file that are taken over at a time."""
+"""Number of bytes of a finished file that are copied at a time."""
 
 
 def buffer_bytes(buffer: memoryview) -> bytes:
-    """The content of a file that GDAL has made in memory and nobody reads again: its pages are given back to the system
-    as they are copied, so that a large one is not in memory twice. The buffer holds nothing after that."""
+    """Copy a file that GDAL has created in memory, and free its pages on the way.
+
+    A large file is therefore never in memory twice. The buffer is empty afterwards.
+    """
     content = np.frombuffer(buffer, np.uint8)
     free = _free()
     page, start = mmap.PAGESIZE, content.__array_interface__["data"][0]
@@ -73,7 +78,7 @@ def buffer_bytes(buffer: memoryview) -> bytes:
 
 
 def _free() -> Callable[[int, int], Any] | None:
-    """(address, size) -> the pages there hold nothing any more; None where the system has no such call."""
+    """Return a function (address, size) that frees the pages of a buffer; None if the system does not support it."""
     call = getattr(ctypes.CDLL(None), "madvise", None) if sys.platform == "linux" else None
     if call is None:
         return None
@@ -82,7 +87,7 @@ def _free() -> Callable[[int, int], Any] | None:
 
 
 def native(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Pixels as GDAL can read them: the same ones where possible, else a copy (truth values become 0 and 1)."""
+    """Return pixels in a form that GDAL can read: without a copy if possible (booleans become 0 and 1)."""
     if pixels.dtype == np.bool_:
         pixels = pixels.view(np.uint8)
     elif pixels.dtype == np.float16:
@@ -93,8 +98,10 @@ def native(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 def open_memory_dataset(rasterio: Any, pixels: NDArray[Any], bands: int, *, described: bool = False) -> Any:
-    """A dataset of the first bands of ``native`` pixels [height, width, bands], which are not copied: they must outlive
-    it. described: it takes a place, colours, tags and a mask; the pixels themselves may not be written."""
+    """Create a dataset of the first bands of ``native`` pixels [height, width, bands] without a copy.
+
+    The pixels must outlive it. described: it accepts a transform, colours, tags and a mask; the pixels stay read-only.
+    """
     height, width, _ = pixels.shape
     row, column, band = pixels.strides
     name = (

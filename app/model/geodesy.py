@@ -1,4 +1,4 @@
-"""WGS 84 to the local frame and back: the only module that knows the ellipsoid.
+"""Conversion between WGS 84 and the local frame. No other module uses the ellipsoid.
 
 The local frame is the transverse Mercator projection centred on the datum with scale 1, turned by the datum's heading.
 PROJ's ``tmerc`` (Poder/Engsager) is exact to nanometres at these distances.
@@ -43,7 +43,7 @@ class LocalFrame:
 
     @property
     def crs(self) -> str:
-        """The frame before it is turned by the heading, as a CRS on WGS 84 in PROJ's words: east and north in metres.
+        """Return the frame without the heading as a CRS on WGS 84 in PROJ's syntax: east and north in metres.
 
         With a heading of 0 its coordinates are the local ones; ``from_local`` gives them for any heading.
         """
@@ -51,14 +51,14 @@ class LocalFrame:
 
     @property
     def from_local(self) -> tuple[float, float, float, float]:
-        """(p, q, r, s) with east = p·x + q·y and north = r·x + s·y in ``crs``."""
+        """Return (p, q, r, s) with east = p·x + q·y and north = r·x + s·y in ``crs``."""
         return self._cos, self._sin, -self._sin, self._cos
 
     def to_local(self, lonlat: Array) -> Array:
-        """(longitude, latitude[, altitude]) in degrees and metres -> (x, y[, z]) in metres.
+        """Convert (longitude, latitude[, altitude]) in degrees and metres to (x, y[, z]) in metres.
 
-        A third column passes through: heights are stored as given, relative to what their source says.
-        Far round the globe the projection has no answer: such places come out infinite.
+        A third column passes through: heights keep the reference of their source. Points far round the globe, which the
+        projection does not cover, become infinite.
         """
         points = np.asarray(lonlat, np.float64)
         out = points.copy()
@@ -66,13 +66,13 @@ class LocalFrame:
         if self._sin == 0.0 and self._cos == 1.0:
             out[:, 0], out[:, 1] = east, north
         else:
-            with np.errstate(invalid="ignore"):  # infinite places turn into no number, which callers refuse alike
+            with np.errstate(invalid="ignore"):  # infinite coordinates become NaN, which callers reject as well
                 out[:, 0] = east * self._cos - north * self._sin
                 out[:, 1] = east * self._sin + north * self._cos
         return out
 
     def _to_bounded_local(self, lonlat: Array) -> Array:
-        """``to_local`` for what is kept or written: nothing infinite or beyond the bound of local coordinates."""
+        """Convert like ``to_local``, but raise Invalid for coordinates that are infinite or beyond the maximum."""
         out = self.to_local(lonlat)
         far = ~(np.abs(out[:, :2]) <= MAX_METRES).all(axis=1)
         if far.any():
@@ -84,7 +84,7 @@ class LocalFrame:
         return out
 
     def to_wgs84(self, xy: Array) -> Array:
-        """(x, y[, z]) in metres -> (longitude, latitude[, altitude]); longitude in [-180, 180]."""
+        """Convert (x, y[, z]) in metres to (longitude, latitude[, altitude]); longitude in [-180, 180]."""
         points = np.asarray(xy, np.float64)
         out = points.copy()
         x, y = points[:, 0], points[:, 1]
@@ -98,20 +98,20 @@ class LocalFrame:
         return out
 
     def yaw_to_heading(self, yaw: float) -> float:
-        """A local yaw (radians, counter-clockwise from +x) as degrees clockwise from true north, in [0, 360)."""
+        """Convert a local yaw (radians, counter-clockwise from +x) to degrees clockwise from north, in [0, 360)."""
         return (90.0 - math.degrees(yaw) + self.datum.heading) % 360.0
 
     def geometries_to_local(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
-        """Shapely geometries in degrees -> metres; Invalid where one is too far from the datum for the local frame."""
+        """Convert shapely geometries from degrees to metres. Raises Invalid if one is too far from the datum."""
         return _transform(geometry, self._to_bounded_local)
 
     def geometries_to_wgs84(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
-        """Shapely geometries in metres -> degrees."""
+        """Convert shapely geometries from metres to degrees."""
         return _transform(geometry, self.to_wgs84)
 
 
 def _transform(geometry: NDArray[np.object_], function: object) -> NDArray[np.object_]:
-    """Apply to x and y of all coordinates at once; a z passes through (mixed 2-D and 3-D is fine)."""
+    """Transform x and y of all coordinates at once; a z passes through (mixed 2-D and 3-D is supported)."""
     if not len(geometry):
         return geometry
     has_z = shapely.has_z(geometry)
@@ -124,7 +124,7 @@ def _transform(geometry: NDArray[np.object_], function: object) -> NDArray[np.ob
 
 @lru_cache(maxsize=256)
 def local_frame(datum: Datum) -> LocalFrame:
-    """The frame of a datum; building one costs PROJ about a millisecond, so they are kept."""
+    """Return the frame of a datum; cached, since building one takes PROJ about a millisecond."""
     return LocalFrame(datum)
 
 
@@ -134,14 +134,14 @@ def _ellipsoid() -> Geod:
 
 
 def distance(a: tuple[float, float], b: tuple[float, float]) -> float:
-    """Metres along the ellipsoid between two (longitude, latitude) in degrees."""
+    """Return the metres along the ellipsoid between two (longitude, latitude) in degrees."""
     return float(_ellipsoid().inv(*a, *b)[2])
 
 
 def surface(polygon: object) -> float:
-    """Square metres on the ellipsoid of a shapely Polygon or MultiPolygon in degrees, without its holes.
+    """Return the square metres on the ellipsoid of a shapely Polygon or MultiPolygon in degrees, without its holes.
 
-    A ring whose longitudes go on beyond ±180 crosses the antimeridian.
+    A ring with longitudes beyond ±180 crosses the antimeridian.
     """
     total = 0.0
     for piece in shapely.get_parts(polygon):
@@ -152,7 +152,7 @@ def surface(polygon: object) -> float:
 
 
 def crs_bounds(crs: str, points: Array) -> tuple[float, float, float, float] | None:
-    """(west, south, east, north) in degrees around points (x, y) of a named CRS; None where PROJ cannot tell.
+    """Return (west, south, east, north) in degrees around points (x, y) of a named CRS; None if PROJ cannot convert.
 
     points: float64 [n, 2], x first (easting, longitude) whatever the CRS's own order.
     """
@@ -166,14 +166,14 @@ def crs_bounds(crs: str, points: Array) -> tuple[float, float, float, float] | N
 
 
 def between(source: str, target: str, points: Array) -> Array:
-    """Points (x, y) of one CRS in another: float64 [n, 2], x (easting, longitude) first in both.
+    """Convert points (x, y) of one CRS to another: float64 [n, 2], x (easting, longitude) first in both.
 
-    Places that the target cannot say come out infinite. Raises Invalid where PROJ knows no way between the two.
+    Points outside the target CRS become infinite. Raises Invalid if PROJ has no conversion between the two.
     """
     try:
         x, y = _transformer(source, target).transform(points[:, 0], points[:, 1])
     except ProjError as error:
-        raise Invalid(f"there is no way from the CRS {_short(source)} to {_short(target)}: {error}") from error
+        raise Invalid(f"cannot convert from the CRS {_short(source)} to {_short(target)}: {error}") from error
     return np.column_stack([x, y])
 
 
@@ -182,17 +182,17 @@ def _short(crs: str) -> str:
 
 
 def crs_to_wgs84(crs: str, points: Array) -> Array:
-    """Points of a CRS (a code or WKT) as (longitude, latitude, height): float64 [n, 3], x first whatever its own order.
+    """Convert points of a CRS (a code or WKT) to (longitude, latitude, height): float64 [n, 3], x first in any CRS.
 
-    Heights keep their reference and come out in metres, by the unit of the CRS's vertical axis where it has one. What
-    PROJ has no answer for comes out infinite. Raises Invalid for a CRS that PROJ does not know.
+    Heights keep their reference and become metres, by the unit of the CRS's vertical axis if it has one. Points that
+    PROJ cannot convert become infinite. Raises Invalid for a CRS that PROJ does not know.
     """
     out = np.array(points, np.float64)
     try:
         out[:, :2] = between(crs, WGS84, points)
         out[:, 2] *= _vertical_unit(crs)
     except (ProjError, Invalid) as error:
-        raise Invalid(f"the CRS {_short(crs)} is not known: name one like EPSG:32632") from error
+        raise Invalid(f"unknown CRS {_short(crs)!r}: use a code such as EPSG:32632") from error
     return out
 
 
@@ -201,12 +201,12 @@ def check_crs(crs: str) -> None:
     try:
         CRS.from_user_input(crs)
     except ProjError as error:
-        raise Invalid(f"the CRS {_short(crs)!r} does not exist: name one like EPSG:32632") from error
+        raise Invalid(f"the CRS {_short(crs)!r} does not exist: use a code such as EPSG:32632") from error
 
 
 @lru_cache(maxsize=64)
 def _vertical_unit(crs: str) -> float:
-    """Metres of one unit of height; 1 where the CRS does not say."""
+    """Return the metres of one unit of height; 1 if the CRS has no vertical axis."""
     axes = CRS.from_user_input(crs).axis_info
     return next((axis.unit_conversion_factor for axis in axes if axis.direction in ("up", "down")), 1.0)
 

@@ -1,4 +1,4 @@
-"""Occupancy: named 2-D grids in the local frame, as Nav2 reads them."""
+"""Occupancy grids: named 2-D grids in the local frame, with Nav2's semantics."""
 
 from __future__ import annotations
 
@@ -20,22 +20,25 @@ Mode = Literal["trinary", "scale", "raw"]
 FREE = 0
 OCCUPIED = 100
 UNKNOWN = 255
-"""Cell values: 0…100 is Nav2's cell value, 255 its -1."""
+"""Cell values: 0…100 as in Nav2, and 255 for its -1 (unknown)."""
 
 
 def outline(height: int, width: int) -> NDArray[np.uint8]:
-    """Unknown cells that take no memory: for a grid of which only the place matters."""
+    """Unknown cells without memory, for a grid of which only the outline matters."""
     return np.broadcast_to(np.uint8(UNKNOWN), (height, width))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OccupancyGrid:
-    """Cells and where they lie.
+    """Cells with their position.
 
-    cells: uint8 [height, width], 0…100 or 255; row 0 is the *bottom* row (smallest y), as in nav_msgs/OccupancyGrid;
-    images have row 0 on top, so readers and writers flip. resolution: metres a cell. origin: (x, y, yaw) of the lower
-    left corner of cell (0, 0), metres and radians. mode and thresholds: how the source's image is to be read again.
-    properties: what else the source says, by format.
+    Attributes:
+        cells: uint8 [height, width], 0…100 or 255; row 0 is the *bottom* row (smallest y), as in
+            nav_msgs/OccupancyGrid; images have row 0 on top, so readers and writers flip.
+        resolution: metres per cell.
+        origin: (x, y, yaw) of the lower left corner of cell (0, 0), metres and radians.
+        mode, free_thresh, occupied_thresh, negate: interpretation of the source's image.
+        properties: further data of the source, by format.
     """
 
     cells: NDArray[np.uint8]
@@ -51,7 +54,7 @@ class OccupancyGrid:
         if self.cells.dtype != np.uint8 or self.cells.ndim != 2 or 0 in self.cells.shape:
             raise Invalid(f"a grid needs uint8 cells of at least 1 × 1, got {self.cells.dtype} {self.cells.shape}")
         if not (math.isfinite(self.resolution) and 1e-6 <= self.resolution <= 1e4):
-            raise Invalid(f"a grid's resolution must be between 1e-6 and 1e4 metres a cell, got {self.resolution!r}")
+            raise Invalid(f"a grid's resolution must be between 1e-6 and 1e4 metres per cell, got {self.resolution!r}")
         if len(self.origin) != 3 or not all(math.isfinite(v) and abs(v) <= MAX_METRES for v in self.origin):
             raise Invalid(f"a grid's origin must be three finite numbers [x, y, yaw], got {list(self.origin)!r}")
         for name in ("occupied_thresh", "free_thresh"):
@@ -70,41 +73,42 @@ class OccupancyGrid:
 
     @property
     def width(self) -> int:
-        """Cells along x."""
+        """Return the number of cells along x."""
         return int(self.cells.shape[1])
 
     @property
     def height(self) -> int:
-        """Cells along y."""
+        """Return the number of cells along y."""
         return int(self.cells.shape[0])
 
     def corners(self) -> NDArray[np.float64]:
-        """The four corners (x, y) in metres, counter-clockwise from the origin: float64 [4, 2]."""
+        """Return the four corners (x, y) in metres, counter-clockwise from the origin: float64 [4, 2]."""
         x, y, yaw = self.origin
         w, h = self.width * self.resolution, self.height * self.resolution
         c, s = math.cos(yaw), math.sin(yaw)
         return np.array([[x + c * u - s * v, y + s * u + c * v] for u, v in ((0, 0), (w, 0), (w, h), (0, h))])
 
     def counts(self) -> dict[str, int]:
-        """How many cells are occupied (100), free (0), unknown, and anything else."""
+        """Count the cells that are occupied (100), free (0), unknown, and anything else."""
         occupied, free, unknown = (int(np.count_nonzero(self.cells == v)) for v in (OCCUPIED, FREE, UNKNOWN))
         other = int(self.cells.size) - occupied - free - unknown
         return {"occupied": occupied, "free": free, "unknown": unknown, "other": other}
 
 
 UNKNOWN_GREY = "unknown_grey"
-"""Word among a grid's properties: the free cells whose grey is map_saver's for unknown (205). Nav2 takes them as free,
-since the grid's free_thresh says so; whether anybody has seen them is not known."""
+"""Property of a grid: the free cells with map_saver's grey for unknown (205). Nav2 treats them as free by the grid's
+free_thresh; whether they were observed is unknown.
+"""
 
 
 def pack_cells(chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """Chosen cells of a grid, bool [height, width], as a JSON-like value."""
+    """Encode chosen cells of a grid, bool [height, width], as a JSON-like value."""
     packed = zlib.compress(np.packbits(chosen).tobytes(), 9)
     return {"height": chosen.shape[0], "width": chosen.shape[1], "bits": base64.b64encode(packed).decode()}
 
 
 def unknown_grey(grid: OccupancyGrid) -> NDArray[np.bool_] | None:
-    """The free cells of a grid that have the grey of unknown ones; None where there are none."""
+    """Return the free cells of a grid that have the grey of unknown ones; None if there are none."""
     record = grid.properties.get(UNKNOWN_GREY)
     if not isinstance(record, Mapping) or [record.get("height"), record.get("width")] != [grid.height, grid.width]:
         return None
@@ -121,7 +125,7 @@ def unknown_grey(grid: OccupancyGrid) -> NDArray[np.bool_] | None:
 
 
 def unknown_grey_as_unknown(grid: OccupancyGrid) -> OccupancyGrid:
-    """The grid with its free cells of unknown's grey as unknown: for whatever takes free cells as known to be free."""
+    """Set free cells with the grey of unknown ones to unknown, for consumers that need observed free cells."""
     grey = unknown_grey(grid)
     if grey is None:
         return without_unknown_grey(grid)
@@ -129,7 +133,7 @@ def unknown_grey_as_unknown(grid: OccupancyGrid) -> OccupancyGrid:
 
 
 def without_unknown_grey(grid: OccupancyGrid, seen: NDArray[np.bool_] | None = None) -> OccupancyGrid:
-    """The grid after people have said what these cells are (seen: bool [height, width]; None: all of them)."""
+    """Mark cells as confirmed by people (seen: bool [height, width]; None: all of them)."""
     if UNKNOWN_GREY not in grid.properties:
         return grid
     rest = {word: value for word, value in grid.properties.items() if word != UNKNOWN_GREY}
@@ -141,7 +145,7 @@ def without_unknown_grey(grid: OccupancyGrid, seen: NDArray[np.bool_] | None = N
 
 
 def _beyond(cells: NDArray[np.uint8]) -> bool:
-    """Whether any cell is neither 0…100 nor 255, a strip of rows at a time: every grid passes here."""
+    """Return whether any cell is neither 0…100 nor 255, checked in strips of rows, since every grid is checked."""
     rows = max(1, 2**18 // cells.shape[1])
     shift = np.uint8(256 - UNKNOWN)  # in uint8 arithmetic 255 becomes 0, and 0…100 become 1…101
     return any(int((cells[y : y + rows] + shift).max()) > OCCUPIED + int(shift) for y in range(0, len(cells), rows))

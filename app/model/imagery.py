@@ -1,4 +1,4 @@
-"""Imagery: georeferenced pictures (satellite images, terrain models, floor plans)."""
+"""Imagery: georeferenced images (satellite images, terrain models, floor plans)."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from app.errors import Invalid
 
 Affine = tuple[float, float, float, float, float, float]
-"""(a, b, c, d, e, f): x = a·column + b·row + c, y = d·column + e·row + f."""
+"""Affine transform (a, b, c, d, e, f): x = a·column + b·row + c, y = d·column + e·row + f."""
 
 LOCAL = "local"
 STRIP = 2**18
-"""Pixels that are converted at a time: small enough for the processor's cache, so memory stays near the result's."""
+"""Number of pixels that are converted at a time: they fit into the processor's cache and bound the memory."""
 
 DEFAULT_COLOURS: Mapping[int, tuple[str, ...]] = {
     1: ("gray",),
@@ -25,23 +25,23 @@ DEFAULT_COLOURS: Mapping[int, tuple[str, ...]] = {
     3: ("red", "green", "blue"),
     4: ("red", "green", "blue", "alpha"),
 }
-"""What the bands of a picture are where nothing else is said."""
+"""Colours of an image's bands if the source states none."""
 
 CLEAR = ("alpha", "mask")
-"""Bands that say where there is a picture at all: ``alpha`` in shades, ``mask`` yes (not 0) or no (0)."""
+"""Bands of validity: ``alpha`` in shades, ``mask`` yes (not 0) or no (0)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeoImage:
-    """Pixels and where they lie.
+    """Pixels with their position.
 
     pixels: [height, width, bands], row 0 on top. transform: (a, b, c, d, e, f) with x = a·column + b·row + c and
     y = d·column + e·row + f for the outer corner of a pixel. crs: ``local`` (metres in the local frame) or a CRS
     that PROJ knows (``EPSG:32630``, or its WKT); x is always easting or longitude.
 
     properties: ``bands`` [{colour, description?, unit?, scale?, offset?}], one for each band, where colour is GDAL's
-    word (gray, red, green, blue, alpha, palette, undefined …) or ``mask``; ``nodata`` a number, or ``nan``, ``inf``,
-    ``-inf``; ``palette`` [[red, green, blue, alpha], …] that the values of a ``palette`` band index; ``attribution``
+    name (gray, red, green, blue, alpha, palette, undefined …) or ``mask``; ``nodata`` a number, or ``nan``, ``inf``,
+    ``-inf``; ``palette`` [[red, green, blue, alpha], …], indexed by the values of a ``palette`` band; ``attribution``
     [texts].
     """
 
@@ -52,19 +52,19 @@ class GeoImage:
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 3 or 0 in self.pixels.shape:
-            raise Invalid(f"a picture needs pixels [height, width, bands], got {self.pixels.shape}")
+            raise Invalid(f"pixels of an image must be [height, width, bands], got {self.pixels.shape}")
         if len(self.transform) != 6 or not all(math.isfinite(v) for v in self.transform):
-            raise Invalid(f"a picture's transform must be six finite numbers, got {self.transform!r}")
+            raise Invalid(f"an image's transform must be six finite numbers, got {self.transform!r}")
         a, b, _, d, e, _ = self.transform
         if a * e - b * d == 0.0:
-            raise Invalid("a picture's transform must not be singular: its pixels would have no area")
+            raise Invalid("an image's transform must not be singular: its pixels would have no area")
         if not self.crs:
-            raise Invalid("a picture needs a CRS: local, or a name such as EPSG:32630")
+            raise Invalid("missing CRS of an image: use local, or a code such as EPSG:32630")
         self.pixels.flags.writeable = False
 
     @property
     def colours(self) -> tuple[str, ...]:
-        """What each band is."""
+        """Return the colour of each band."""
         count = int(self.pixels.shape[2])
         bands = self.properties.get("bands")
         if isinstance(bands, list | tuple) and len(bands) == count and all(isinstance(b, Mapping) for b in bands):
@@ -73,7 +73,7 @@ class GeoImage:
 
     @property
     def nodata(self) -> float | int | None:
-        """The value of pixels that hold nothing; None where there is no such value."""
+        """Return the no-data value; None if there is none."""
         value = self.properties.get("nodata")
         if isinstance(value, str):
             return float(value) if value in ("nan", "inf", "-inf") else None
@@ -81,12 +81,12 @@ class GeoImage:
 
     @property
     def attribution(self) -> tuple[str, ...]:
-        """Licences and credits of the picture."""
+        """Return licences and credits of the image."""
         texts = self.properties.get("attribution")
         return tuple(text for text in texts if isinstance(text, str)) if isinstance(texts, list | tuple) else ()
 
     def outline(self, steps: int = 1) -> NDArray[np.float64]:
-        """Points (x, y) along the border, from the upper left corner on clockwise: float64 [4 · steps, 2]."""
+        """Return points (x, y) along the border, clockwise from the upper left corner: float64 [4 · steps, 2]."""
         height, width = self.pixels.shape[:2]
         part = np.arange(steps) / steps
         u = np.concatenate([part, np.ones(steps), 1 - part, np.zeros(steps)]) * width
@@ -95,17 +95,17 @@ class GeoImage:
 
 
 def pixel_positions(transform: Affine, column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where places of the picture (columns and rows from the outer corner of the first pixel) lie: float64 [n, 2]."""
+    """Convert positions in the image (columns, rows from the outer corner of the first pixel) to float64 [n, 2]."""
     a, b, c, d, e, f = transform
     return np.column_stack([a * column + b * row + c, d * column + e * row + f])
 
 
 def display_pixels(picture: GeoImage) -> NDArray[np.uint8]:
-    """A picture as screens show it: uint8 [height, width, 1…4] (grey, grey + alpha, RGB, RGBA).
+    """Convert an image for display: uint8 [height, width, 1…4] (grey, grey + alpha, RGB, RGBA).
 
-    8-bit values stay as they are (the picture's own pixels, where nothing has to be changed); others are stretched, so
-    that the least becomes 0 and the greatest 255, all bands alike. Bands beyond the colours are left out, a palette is
-    looked up. No-data and numbers that are none become transparent.
+    8-bit values stay as they are (without a copy if nothing changes); others are stretched so that the minimum becomes
+    0 and the maximum 255, all bands alike. Bands beyond the colours are dropped, a palette is looked up. No-data and
+    NaN become transparent.
     """
     pixels, colours = picture.pixels, picture.colours
     height, width, _ = pixels.shape
@@ -137,7 +137,7 @@ def display_pixels(picture: GeoImage) -> NDArray[np.uint8]:
         elif pixels.dtype == np.uint8:
             out[y : y + rows, :, : len(shown)] = values
         else:
-            # Halved, since the distance of two float64 may be beyond float64.
+            # halved, since the difference of two float64 may overflow
             scaled = np.where(valid[..., None], values, low).astype(np.float64) / 2 - low / 2
             scaled = scaled / (high / 2 - low / 2) * 255.0
             out[y : y + rows, :, : len(shown)] = np.clip(np.round(scaled), 0, 255)
@@ -151,7 +151,7 @@ def display_pixels(picture: GeoImage) -> NDArray[np.uint8]:
 
 
 def _valid_mask(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.bool_]:
-    """Which pixels hold something: [rows, columns] of values [rows, columns, bands]."""
+    """Return which pixels have data: [rows, columns] of values [rows, columns, bands]."""
     valid = np.isfinite(values).all(axis=-1) if values.dtype.kind == "f" else np.ones(values.shape[:-1], bool)
     if nodata is not None and math.isfinite(nodata):
         valid &= ~(values == nodata).all(axis=-1)
@@ -159,14 +159,14 @@ def _valid_mask(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.
 
 
 def _range(picture: GeoImage, shown: list[int], rows: int) -> tuple[float, float]:
-    """The least and the greatest value that is shown."""
+    """Return the minimum and maximum value that is shown."""
     low, high = math.inf, -math.inf
     for y in range(0, len(picture.pixels), rows):
         values = picture.pixels[y : y + rows][..., shown]
         values = values[_valid_mask(values, picture.nodata)]
         if values.size:
             low, high = min(low, float(values.min())), max(high, float(values.max()))
-    if not low < high:  # nothing known, or one value everywhere
+    if not low < high:  # no data, or one value everywhere
         return (low, low + 1.0) if math.isfinite(low) and low + 1.0 > low else (0.0, 1.0)
     return low, high
 
@@ -177,12 +177,12 @@ def _opacity(values: NDArray[Any], colour: str) -> NDArray[np.uint8]:
     if values.dtype == np.uint8:
         return values
     maximum = float(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else 1.0
-    shares = np.clip(np.nan_to_num(values.astype(np.float64) / maximum, nan=0.0), 0.0, 1.0)  # no number is no picture
+    shares = np.clip(np.nan_to_num(values.astype(np.float64) / maximum, nan=0.0), 0.0, 1.0)  # NaN is not shown
     return np.round(shares * 255.0).astype(np.uint8)
 
 
 def _palette(picture: GeoImage) -> NDArray[np.uint8] | None:
-    """RGBA [256, 4] of the values, where the picture has a palette of that size."""
+    """Return RGBA [256, 4] of the values if the image has a palette of that size."""
     palette = picture.properties.get("palette")
     if "palette" not in picture.colours or not isinstance(palette, list | tuple) or picture.pixels.dtype != np.uint8:
         return None

@@ -1,12 +1,12 @@
-"""Nav2's costmap filter masks: grids that say keepout zones or speed limits, and what their cells mean.
+"""Nav2's costmap filter masks: grids of keepout zones or speed limits, and the meaning of their cells.
 
 A mask is an occupancy grid of its own; the value in filter space is ``base + multiplier * cell`` of ``type`` 0 (keepout
 and preferred lanes, 0…100), 1 (speed limit in % of the robot's), 2 (speed limit in m/s), 3 (binary) or 4 (zone
-parameters). In a speed mask cell 0 is no limit, and unknown an error. Users give these to the node
-``costmap_filter_info_server`` in a YAML of ROS parameters; the mask's own map server may stand in the same file.
-Source: docs.nav2.org, Costmap Filter Info Server; nav2_costmap_2d, costmap_filters.
+parameters). In a speed mask cell 0 is no limit, and unknown an error. The node ``costmap_filter_info_server`` gets
+these values from a YAML file of ROS parameters; the mask's own map server may be in the same file. Source:
+docs.nav2.org, Costmap Filter Info Server; nav2_costmap_2d, costmap_filters.
 
-A grid keeps this file under ``properties.costmap_filter`` as ``{params: …}``.
+A grid stores this file under ``properties.costmap_filter`` as ``{params: …}``.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ PARAMETERS = "ros__parameters"
 KEEPOUT, SPEED_PERCENT, SPEED_METRES = 0, 1, 2
 TYPES = range(5)
 MASKS = frozenset({"keepout", "speed", "nogo", "preferred"})
-"""Names of grids that tell where robots should go, not what stands there."""
+"""Names of grids that mark where robots should drive, not obstacles."""
 
 MAX_NAMESPACES = 4
-"""Namespaces around a node that are looked into."""
+"""Maximum depth of namespaces around a node."""
 
 
 @dataclass(frozen=True, slots=True)
 class FilterInfo:
-    """What a mask's cells mean: value = base + multiplier * cell."""
+    """Meaning of a mask's cells: value = base + multiplier * cell."""
 
     type: int
     base: float
     multiplier: float
 
     def as_dict(self) -> dict[str, Any]:
-        """In Nav2's words."""
+        """Return Nav2's parameters."""
         return {"type": self.type, "base": self.base, "multiplier": self.multiplier}
 
 
 def params(name: str, info: FilterInfo) -> dict[str, Any]:
-    """The parameter file of a mask that has none: of its filter info server and its map server. name: of the grid."""
+    """Return default parameters of a mask's filter info server and map server. name: of the grid."""
     word = re.sub(r"[^A-Za-z0-9_]", "_", name)
     topic = f"/{word}_filter_mask"
     filter_parameters = {**info.as_dict(), "filter_info_topic": f"/{word}_costmap_filter_info", "mask_topic": topic}
@@ -51,13 +51,13 @@ def params(name: str, info: FilterInfo) -> dict[str, Any]:
 
 
 def is_filter_info(name: str, node: Any) -> bool:
-    """Whether this entry of a parameter file is a filter info server's."""
+    """Return whether this entry of a parameter file is a filter info server's."""
     parameters = node.get(PARAMETERS) if isinstance(node, Mapping) else None
     return isinstance(parameters, Mapping) and ("mask_topic" in parameters or NODE in name)
 
 
 def servers(document: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
-    """The parameters of each filter info server in a parameter file, in order."""
+    """Iterate over the parameters of each filter info server in a parameter file, in order."""
     if not isinstance(document, Mapping) or depth > MAX_NAMESPACES:
         return
     for name, node in document.items():

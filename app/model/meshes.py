@@ -1,12 +1,12 @@
-"""Meshes of simulators and CAD tools from memory: STL, OBJ and COLLADA as vertices and triangles.
+"""Readers of simulators' and CAD tools' meshes in memory: STL, OBJ and COLLADA as vertices and triangles.
 
-Read here rather than through a library, since a mesh is hostile input like any other file: pycollada allocates by the
-counts that a file states, takes positions as 32-bit numbers and follows images; these readers look at positions and
-faces only, resolve nothing, and check every count against the bytes that are there before memory is taken. (The tests
-compare with trimesh and pycollada.)
+They replace libraries, since a mesh is hostile input like any other file: pycollada allocates by the counts that a file
+states, reads positions as 32-bit numbers and follows images; these readers use positions and faces only, resolve
+nothing, and check every count against the size of the file before they allocate memory. (The tests compare with trimesh
+and pycollada.)
 
-Units and axes as Gazebo takes them: COLLADA's ``unit meter`` is applied, its ``up_axis`` is not; STL and OBJ are
-metres. A polygon is cut into a fan of triangles.
+Units and axes as in Gazebo: COLLADA's ``unit meter`` is applied, its ``up_axis`` is not; STL and OBJ are metres. A
+polygon is cut into a fan of triangles.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
 MAX_FACES = 5_000_000
-"""Triangles of one mesh. A real collision mesh has some thousands."""
+"""Maximum number of triangles of one mesh. A real collision mesh has some thousands."""
 
 MAX_NODES = 100_000
-"""Elements of a COLLADA scene, instances counted each time: they can be nested so that each level doubles them."""
+"""Maximum number of elements of a COLLADA scene, counted per instance: nested instances may double at each level."""
 
 MAX_DEPTH = 64
-"""Nodes of a COLLADA scene within each other, instances followed."""
+"""Maximum depth of nested nodes of a COLLADA scene, instances followed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
     """A mesh in its file's frame: vertices float64 [n, 3] metres, faces int64 [m, 3] of vertex indexes.
 
-    part: int64 [m], which of ``names`` a face belongs to; names: of each part all names that it goes by (COLLADA: the
-    scene node's, the geometry's name and id; OBJ: its object's and group's), the one that Gazebo knows first.
+    part: int64 [m], index into ``names`` of each face; names: all names of each part (COLLADA: the scene node's, the
+    geometry's name and id; OBJ: its object's and group's), the one that Gazebo uses first.
     """
 
     vertices: Array
@@ -53,15 +53,18 @@ class Mesh:
     names: tuple[tuple[str, ...], ...]
 
     def triangles(self, submesh: str | None = None, *, centre: bool = False) -> Array:
-        """float64 [m, 3, 3], of the whole mesh or of one part; ``centre`` moves the middle of that part's box to the
-        origin, as SDF's ``<center>`` does. Invalid where no part has the name."""
+        """Return triangles float64 [m, 3, 3] of the whole mesh or of one part.
+
+        ``centre`` moves the middle of that part's box to the origin, as SDF's ``<center>`` does. Raises Invalid if no
+        part has the name.
+        """
         faces = self.faces
         if submesh is not None:
             chosen = [k for k, names in enumerate(self.names) if submesh in names[:1]]
             chosen = chosen or [k for k, names in enumerate(self.names) if submesh in names]
             if not chosen:
                 submeshes = ", ".join(dict.fromkeys(names[0] for names in self.names if names[0])) or "none"
-                raise Invalid(f"there is no submesh {submesh[:80]!r}; there are: {submeshes[:400]}")
+                raise Invalid(f"unknown submesh {submesh[:80]!r}: the mesh has {submeshes[:400]}")
             faces = faces[np.isin(self.part, chosen)]
         out: Array = self.vertices[faces]
         if centre and len(out):
@@ -71,14 +74,14 @@ class Mesh:
 
 
 def read_mesh(data: bytes, name: str, max_faces: int = MAX_FACES) -> Mesh:
-    """A mesh file by its name's ending: .stl, .obj or .dae.
+    """Read a mesh file by the ending of its name: .stl, .obj or .dae.
 
-    Raises Invalid (TooLarge beyond ``max_faces`` triangles) that names the file.
+    Raises Invalid (TooLarge beyond ``max_faces`` triangles) with the file's name.
     """
     ending = PurePosixPath(name).suffix.lower()
     reader = _READERS.get(ending)
     if reader is None:
-        _raise_unreadable(name, f"is no mesh that can be read: {', '.join(sorted(_READERS))} can")
+        _raise_unreadable(name, f"is not a supported mesh format: use one of {', '.join(sorted(_READERS))}")
     try:
         vertices, faces, part, names = reader(data, max_faces)
     except TooLarge as error:
@@ -92,12 +95,12 @@ def read_mesh(data: bytes, name: str, max_faces: int = MAX_FACES) -> Mesh:
     if not bool((np.abs(vertices) <= MAX_METRES).all()):
         _raise_unreadable(name, f"has vertices that are not finite metres within ±{MAX_METRES:g}")
     if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
-        _raise_unreadable(name, "has faces of vertices that are not there")
+        _raise_unreadable(name, "has faces with missing vertices")
     return Mesh(vertices, faces, part, names)
 
 
 def load_mesh(data: bytes, name: str, max_faces: int = MAX_FACES) -> tuple[Array, Faces]:
-    """(vertices float64 [n, 3] in metres, faces int64 [m, 3]) of a mesh file; see ``read_mesh``."""
+    """Read a mesh file as (vertices float64 [n, 3] in metres, faces int64 [m, 3]); see ``read_mesh``."""
     mesh = read_mesh(data, name, max_faces)
     return mesh.vertices, mesh.faces
 
@@ -115,7 +118,7 @@ def _check_count(count: int, max_faces: int) -> None:
 
 
 def _numbers(text: str, label: str) -> Array:
-    """The decimal numbers of a text; ValueError where there is anything else."""
+    """Parse the decimal numbers of a text. Raises ValueError for anything else."""
     if not text.isascii() or "_" in text:
         raise ValueError(f"{label} must be numbers")
     return np.array(text.split(), np.float64)
@@ -136,14 +139,14 @@ _STL_FACET = re.compile(rb"^\s*facet\b", re.IGNORECASE | re.MULTILINE)
 
 
 def _stl(data: bytes, max_faces: int) -> _ParsedMesh:
-    """Binary where the count in its head fits its size (also behind a head that starts with ``solid``), else text."""
+    """Read STL: binary if the count in its header fits its size (even if it starts with ``solid``), else text."""
     count = int.from_bytes(data[80:_STL_HEAD], "little") if len(data) >= _STL_HEAD else -1
     fits = _STL_HEAD + count * _STL_FACE.itemsize
     if count >= 0 and fits <= len(data) and (fits == len(data) or not _is_text(data)):
         _check_count(count, max_faces)
         corners = np.frombuffer(data, _STL_FACE, count, _STL_HEAD)["corners"].astype(np.float64)
     elif _is_text(data):
-        _check_count(len(data) // 40, 16 * max_faces)  # no face is said in fewer than 40 characters
+        _check_count(len(data) // 40, 16 * max_faces)  # a face has at least 40 characters
         facets = sum(1 for _ in _STL_FACET.finditer(data))
         _check_count(facets, max_faces)
         rows = b" ".join(_STL_VERTEX.findall(data)).decode("ascii")
@@ -153,7 +156,7 @@ def _stl(data: bytes, max_faces: int) -> _ParsedMesh:
         corners = flat.reshape(-1, 3, 3)
     else:
         face_count = max(0, len(data) - _STL_HEAD) // _STL_FACE.itemsize
-        raise ValueError(f"its head says {max(count, 0)} triangles, but there are {face_count}")
+        raise ValueError(f"the header states {max(count, 0)} triangles, but there are {face_count}")
     faces = np.arange(3 * len(corners), dtype=np.int64).reshape(-1, 3)
     return corners.reshape(-1, 3), faces, np.zeros(len(faces), np.int64), (("",),)
 
@@ -166,7 +169,7 @@ def _is_text(data: bytes) -> bool:
 
 
 def _obj(data: bytes, max_faces: int) -> _ParsedMesh:
-    """``v`` and ``f`` lines; ``o`` and ``g`` name the parts. Indexes count from 1, negative ones from the end."""
+    """Read ``v`` and ``f`` lines; ``o`` and ``g`` name the parts. Indexes count from 1, negative ones from the end."""
     text = data.decode("utf-8", "replace").replace("\\\n", " ").replace("\\\r\n", " ")
     rows: list[str] = []
     corners: list[int] = []
@@ -187,7 +190,7 @@ def _obj(data: bytes, max_faces: int) -> _ParsedMesh:
                 continue
             n = len(rows) // 3
             if not all(0 < v <= n or -n <= v < 0 for v in face):
-                raise ValueError("a face names a vertex that is not there")
+                raise ValueError("a face refers to a missing vertex")
             corners += [v - 1 if v > 0 else n + v for v in face]
             sizes.append(len(face))
             parts.append(current)
@@ -203,7 +206,7 @@ def _obj(data: bytes, max_faces: int) -> _ParsedMesh:
 
 
 def _fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[Faces, NDArray[np.int64]]:
-    """Polygons (their corners one after another, and how many each has) as triangles, and the polygon of each."""
+    """Split polygons (corners in sequence, and the number of each) into triangles, with the polygon of each."""
     counts = np.maximum(sizes - 2, 0)
     owner = np.repeat(np.arange(len(sizes)), counts)
     first = np.cumsum(sizes) - sizes
@@ -216,9 +219,9 @@ def _fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[Faces, 
 
 
 def _dae(data: bytes, max_faces: int) -> _ParsedMesh:
-    """The triangles of the scene, or of all geometries where there is no scene."""
+    """Read the triangles of the scene, or of all geometries if there is no scene."""
     check_prolog(data)
-    # Real number arrays are longer than libxml2's usual bound for a text; without a DOCTYPE there is nothing to unfold.
+    # number arrays exceed libxml2's default limit of a text; without a DOCTYPE there are no entities to expand
     parser = etree.XMLParser(
         resolve_entities=False,
         no_network=True,
@@ -239,7 +242,7 @@ def _dae(data: bytes, max_faces: int) -> _ParsedMesh:
 
 
 class _Scene:
-    """A COLLADA document being read: what has an id, and the triangles that the scene places."""
+    """Reader of a COLLADA document: elements by id, and the triangles that the scene places."""
 
     def __init__(self, root: etree._Element, max_faces: int) -> None:
         self.root, self.max_faces, self.count = root, max_faces, 0
@@ -257,10 +260,10 @@ class _Scene:
         unit = root.find("{*}asset/{*}unit")
         self.metres = float(_numbers(unit.get("meter", "1"), "unit meter")[0]) if unit is not None else 1.0
         if not (math.isfinite(self.metres) and 0 < self.metres <= 1e6):
-            raise ValueError(f"the unit of {self.metres:g} metres is none")
+            raise ValueError(f"invalid unit of {self.metres:g} metres")
 
     def walk(self) -> None:
-        """All that the scene shows, depth first, each instance with its own transform."""
+        """Collect the triangles of the scene, depth first, each instance with its own transform."""
         scene = self._target(self.root.find("{*}scene/{*}instance_visual_scene"))
         if scene is None:
             scene = self.root.find("{*}library_visual_scenes/{*}visual_scene")
@@ -276,7 +279,7 @@ class _Scene:
             node, above, named, depth = stack.pop()
             visited += 1 + len(node)
             if visited > MAX_NODES or depth > MAX_DEPTH:
-                raise ValueError(f"its scene has more than {MAX_NODES} elements, or {MAX_DEPTH} within each other")
+                raise ValueError(f"its scene has more than {MAX_NODES} elements, or is nested deeper than {MAX_DEPTH}")
             named = node.get("name") or node.get("id") or named
             placement = above @ _transform(node)
             further: list[tuple[etree._Element, Array, str, int]] = []
@@ -299,14 +302,14 @@ class _Scene:
             stack += reversed(further)
 
     def result(self) -> _ParsedMesh:
-        """Everything placed, in metres."""
+        """Return all triangles in metres."""
         if not self.faces:
-            raise ValueError("its scene shows no triangles")
+            raise ValueError("its scene has no triangles")
         vertices = np.concatenate(self.vertices) * self.metres
         return vertices, np.concatenate(self.faces), np.concatenate(self.part), tuple(self.names)
 
     def _target(self, element: etree._Element | None, attribute: str = "url") -> etree._Element | None:
-        """What a reference names inside this document; None for anything else: nothing is ever fetched."""
+        """Return the element that a reference names in this document; None for external references."""
         url = None if element is None else element.get(attribute)
         return self.by_id.get(url[1:]) if url and url.startswith("#") else None
 
@@ -326,7 +329,7 @@ class _Scene:
             return
         self.count += len(faces)
         _check_count(self.count, self.max_faces)
-        with np.errstate(all="ignore"):  # what is not finite is refused for the whole mesh
+        with np.errstate(all="ignore"):  # a mesh with infinite or NaN vertices is rejected as a whole
             self.vertices.append(vertices @ transform[:3, :3].T + transform[:3, 3])
         self.faces.append(faces + self.offset)
         self.part.append(np.full(len(faces), len(self.names), np.int64))
@@ -334,7 +337,7 @@ class _Scene:
         self.offset += len(vertices)
 
     def _geometry(self, geometry: etree._Element) -> tuple[Array, Faces]:
-        """Vertices of all its primitives one after another, and triangles among them."""
+        """Return the vertices of all primitives in sequence, and triangles among them."""
         vertices: list[Array] = []
         faces: list[Faces] = []
         offset = 0
@@ -359,14 +362,14 @@ class _Scene:
                     offset += len(at)
                 at, start = arrays[source]
                 if len(indices) and (int(indices.min()) < 0 or int(indices.max()) >= len(at)):
-                    raise ValueError("a face names a vertex that is not there")
+                    raise ValueError("a face refers to a missing vertex")
                 faces.append(indices + start)
         if not faces:
             return np.empty((0, 3)), np.empty((0, 3), np.int64)
         return np.concatenate(vertices), np.concatenate(faces)
 
     def _positions(self, element: etree._Element | None) -> etree._Element:
-        """The source of the positions behind a VERTEX input."""
+        """Return the source of the positions of a VERTEX input."""
         if element is not None and etree.QName(element).localname == "vertices":
             inputs = [i for i in element.findall("{*}input") if i.get("semantic") == "POSITION"]
             element = self._target(inputs[0], "source") if inputs else None
@@ -375,7 +378,7 @@ class _Scene:
         return element
 
     def _source(self, source: etree._Element) -> Array:
-        """float64 [n, 3] of a source, as its accessor says."""
+        """Return float64 [n, 3] of a source, as its accessor specifies."""
         accessor = source.find("{*}technique_common/{*}accessor")
         array = self._target(accessor, "source")
         array = source.find("{*}float_array") if array is None else array
@@ -399,7 +402,7 @@ def _offset(element: etree._Element) -> int:
 
 
 def _lists(primitive: etree._Element, width: int, column: int) -> Iterator[NDArray[np.int64]]:
-    """The vertex indexes of each ``<p>``, also of polygons with holes (whose holes are left out)."""
+    """Return the vertex indexes of each ``<p>``, also of polygons with holes (without their holes)."""
     for p in primitive.iterfind("{*}p"):
         yield _column(p, width, column)
     for p in primitive.iterfind("{*}ph/{*}p"):
@@ -456,7 +459,7 @@ _PRIMITIVES: Mapping[str, _Cut] = {
 
 
 def _transform(node: etree._Element) -> Array:
-    """A node's own transforms, in the order in which they stand: float64 [4, 4]."""
+    """Return a node's own transforms, multiplied in document order: float64 [4, 4]."""
     out = np.eye(4)
     for child in node.iterchildren(etree.Element):
         kind = etree.QName(child).localname
@@ -477,7 +480,7 @@ def _transform(node: etree._Element) -> Array:
 
 
 def _rotation(axis_angle: Array) -> Array:
-    """Rotation about an axis (x, y, z) by an angle in degrees (Rodrigues)."""
+    """Return the rotation about an axis (x, y, z) by an angle in degrees (Rodrigues)."""
     length = float(np.linalg.norm(axis_angle[:3]))
     if not length or not math.isfinite(length):
         return np.eye(3)
@@ -488,4 +491,4 @@ def _rotation(axis_angle: Array) -> Array:
 
 
 _READERS: Mapping[str, Callable[[bytes, int], _ParsedMesh]] = {".stl": _stl, ".obj": _obj, ".dae": _dae}
-"""By the ending of the file's name."""
+"""Readers by the ending of the file's name."""

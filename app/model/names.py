@@ -1,4 +1,4 @@
-"""Names that others have chosen: which file names are safe below a folder, and what a mistyped name may mean."""
+"""Names from outside: file names that are safe below a folder, and suggestions for mistyped names."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterable
 
 MAX_NAME = 1024
 MAX_DEPTH = 64
-"""Longest path in an archive, in characters and in folders."""
+"""Maximum length of a path in an archive in characters, and its depth in folders."""
 
 
 def name_problem(name: str) -> str | None:
-    """Why a relative path must not be used, or None: said as ``it …``."""
+    """Return why a relative path must not be used, as a predicate (``it …``), or None."""
     if not name or len(name) > MAX_NAME:
-        return f"has not 1 to {MAX_NAME} characters"
+        return f"does not have 1 to {MAX_NAME} characters"
     if "\\" in name:
         return "has a backslash"
     if not name.isprintable() and any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
@@ -31,15 +31,15 @@ def name_problem(name: str) -> str | None:
 
 
 MIN_SIMILARITY = 0.7
-"""Similarity, 0 to 1, from which a name counts as mistyped for another."""
+"""Minimum similarity, 0 to 1, of a name and the name that it may be mistyped for."""
 
 MAX_COMPARED = 10_000
-"""Names that a mistyped one is compared with."""
+"""Maximum number of names that a mistyped one is compared with."""
 
 
 def nearest(name: str, choices: Iterable[str], *, similarity: float = MIN_SIMILARITY) -> str | None:
-    """Return the choice that a mistyped name most probably means, upper and lower case alike."""
-    import difflib  # only for a name that is wrong
+    """Return the choice most similar to a mistyped name, case-insensitive; None if none is similar."""
+    import difflib  # slow to import, and needed for wrong names only
 
     lowered: dict[str, str] = {}
     for choice in list(choices)[:MAX_COMPARED]:
@@ -49,6 +49,6 @@ def nearest(name: str, choices: Iterable[str], *, similarity: float = MIN_SIMILA
 
 
 def did_you_mean(name: str, choices: Iterable[str]) -> str:
-    """Return ` (did you mean NAME?)` for an error about an unknown name, or an empty text if none is near."""
+    """Return ` (did you mean NAME?)` for an error about an unknown name, or an empty text if none is similar."""
     suggestion = nearest(name, choices)
     return f" (did you mean {suggestion}?)" if suggestion is not None else ""

@@ -1,8 +1,8 @@
-"""Drawn lines become a network: vertices are nodes, segments are directed edges.
+"""Networks from drawn lines: vertices become nodes, segments become directed edges.
 
-Drawings (KML, GeoJSON) know no junctions. Vertices nearer than ``join`` metres are one node, and a line that ends on
+Drawings (KML, GeoJSON) have no junctions. Vertices nearer than ``join`` metres are one node, and a line that ends on
 another's segment splits it; lines that merely cross do not join, since a bridge crosses too. The drawing itself stays
-an object: what is made from it says so in ``drawn_from``, so that a drawing format need not write it a second time.
+an object: its nodes and edges name it in ``drawn_from``, so that a drawing format need not write it a second time.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Metres = NDArray[np.float64]
 Places = NDArray[np.intp]
 
 JOIN = 0.1
-"""Metres. Drawings snapped by eye miss by millimetres; two robots' goals are never this close."""
+"""Default join distance in metres: drawings snapped by eye are off by millimetres, robots' goals are farther apart."""
 
 CARRIED = ("action", "speed_limit", "width", "tmap2")
-"""Words of a line that its edges take over; the rest stays with the drawing."""
+"""Properties of a line that its edges inherit; the rest stays with the drawing."""
 
 _FORWARD = frozenset({"yes", "true", "1", "1.0", "on", "forward"})
 _BACKWARD = frozenset({"-1", "-1.0", "reverse", "backward"})
@@ -44,21 +44,20 @@ def from_drawing(
     outlines: bool = False,
     origins: Sequence[str] | None = None,
 ) -> Features:
-    """The network that lines (and points of interest) draw.
+    """Build the network that lines (and points of interest) draw.
 
-    Lines are LineStrings, rings and their collections, whatever their kind; outlines: those of polygons too. Points
-    count where their kind is ``poi``: such a node keeps the point's id, place and properties, and takes in vertices
-    within ``join`` metres. A vertex is called ``<object id>/<index>`` (counted through the object), an edge
-    ``<a>_<b>``; the first vertex in the objects' order gives a node its id, its exact place and its anchor. Each
-    segment is two edges, one where the line says ``oneway`` (yes, true, 1; or -1 for against the drawing). origins:
-    what ``drawn_from`` shall say of each object, by default its id. Distances are measured in ``frame``, or without
-    one and with items on earth in a local frame at the middle of the data. Raises Invalid where lines cover more than
-    that frame can.
+    Lines are LineStrings, rings and their collections, of any kind; outlines: those of polygons too. Points count if
+    their kind is ``poi``: such a node gets the point's id, position and properties, and absorbs vertices within
+    ``join`` metres. A vertex is called ``<object id>/<index>`` (counted through the object), an edge ``<a>_<b>``; the
+    first vertex in the objects' order gives a node its id, its exact position and its anchor. Each segment becomes two
+    edges, one if the line has ``oneway`` (yes, true, 1; or -1 for against the drawing). origins: value of
+    ``drawn_from`` for each object, by default its id. Distances are measured in ``frame``, or, without one and with
+    items on earth, in a local frame at the middle of the data. Raises Invalid if lines cover more than that frame can.
     """
     drawing = _Drawing(objects, outlines)
     xy = _metres(drawing, frame)
     if not np.isfinite(xy).all() or (np.abs(xy) > MAX_METRES).any():
-        reason = "the lines spread over too much of the earth to be one network: give those of one site"
+        reason = "the lines cover too much of the earth for one network: upload the lines of one site"
         raise Invalid(reason, [Problem(reason)])
     node = _cluster(xy, join, len(drawing.poi_owner))
     leaders = np.flatnonzero(node == np.arange(len(node)))
@@ -67,7 +66,7 @@ def from_drawing(
 
 
 def direction(properties: Properties) -> Direction:
-    """Which way a line may be used: what ``oneway`` says, wherever a format keeps its further attributes."""
+    """Return the direction of use of a line: its ``oneway``, at any depth of a format's further attributes."""
     value = _find(properties, 3)
     word = str(value).strip().lower()
     if word in _FORWARD:
@@ -76,7 +75,7 @@ def direction(properties: Properties) -> Direction:
 
 
 def _find(value: Any, depth: int) -> Any:
-    """The value of ``oneway`` in nested properties, or in a list of ``{name, value}``; the outermost wins."""
+    """Return ``oneway`` from nested properties, or from a list of ``{name, value}``; the outermost wins."""
     if isinstance(value, Mapping):
         if "oneway" in value:
             return value["oneway"]
@@ -92,8 +91,8 @@ def _find(value: Any, depth: int) -> Any:
 class _Drawing:
     """The vertices of all points and lines: pois first, then line vertices in the objects' order.
 
-    raw: [v, 3] coordinates as they are anchored, z NaN where there is none. owner: [v] place of the object.
-    number: [v] the vertex' index within its object. first, last: places of the ends of each line. closed: per line.
+    raw: [v, 3] coordinates as they are anchored, z NaN if absent. owner: [v] index of the object. number: [v] the
+    vertex' index within its object. first, last: indices of the ends of each line. closed: per line.
     """
 
     def __init__(self, objects: Features, outlines: bool) -> None:
@@ -122,7 +121,7 @@ class _Drawing:
 
 
 def _lines(geometry: NDArray[np.object_], outlines: bool) -> tuple[NDArray[np.object_], Places]:
-    """All lines among the geometries, also inside collections, and the place of the object each belongs to."""
+    """Return all lines among the geometries, also inside collections, with the index of the object of each."""
     owner = np.arange(len(geometry), dtype=np.intp)
     parts = geometry
     while len(parts) and (shapely.get_type_id(parts) > _POLYGON).any():
@@ -135,21 +134,21 @@ def _lines(geometry: NDArray[np.object_], outlines: bool) -> tuple[NDArray[np.ob
         areas = np.flatnonzero(types == _POLYGON)
         rings, index = shapely.get_rings(parts[areas], return_index=True)
         place = np.concatenate([np.flatnonzero(line), areas[index]])
-        # Back into drawing order: an object's lines and outlines stand where they stood.
+        # back into drawing order: an object's lines and outlines keep their position
         order = np.argsort(place, kind="stable")
         out, owners = np.concatenate([out, rings])[order], np.concatenate([owners, owner[areas][index]])[order]
     return out, owners
 
 
 def _metres(drawing: _Drawing, frame: LocalFrame | None) -> Metres:
-    """[v, 2] metres; without a frame and with everything on earth, in a frame at the middle of the data."""
+    """Return [v, 2] metres; without a frame and with all items on earth, in a frame at the middle of the data."""
     flat = np.ascontiguousarray(drawing.raw[:, :2])
     local = drawing.objects.local[drawing.owner]
     if local.all():
         return flat
     if frame is None:
         if local.any():
-            # Says how to give the environment a datum.
+            # raises MissingDatum, which explains how to set a datum
             drawing.objects.in_local(None)
         frame = middle_frame(flat)
     out = flat.copy()
@@ -158,7 +157,7 @@ def _metres(drawing: _Drawing, frame: LocalFrame | None) -> Metres:
 
 
 def middle_frame(lonlat: Metres) -> LocalFrame:
-    """A local frame at the middle of places on earth: float64 [n, 2], longitude and latitude."""
+    """Build a local frame at the middle of points on earth: float64 [n, 2], longitude and latitude."""
     longitude = lonlat[:, 0]
     if longitude.max() - longitude.min() > 180.0:
         longitude = np.where(longitude < 0.0, longitude + 360.0, longitude)
@@ -169,7 +168,7 @@ def middle_frame(lonlat: Metres) -> LocalFrame:
 
 
 def _cluster(xy: Metres, join: float, fixed: int) -> Places:
-    """For each vertex the place of the vertex that stands for its node; the first ``fixed`` stand for themselves.
+    """Return for each vertex the index of its node's main vertex; the first ``fixed`` are main vertices.
 
     Greedy in order: a vertex joins the nearest node within ``join``, else it is a node of its own. (Linking neighbours
     in chains would shrink a densely digitised line to one node.)
@@ -178,7 +177,7 @@ def _cluster(xy: Metres, join: float, fixed: int) -> Places:
     node = np.arange(n)
     if n == fixed:
         return node
-    # Equal places first: that is nearly all of it, and vectorised.
+    # equal positions first: they are the majority, and vectorised
     _, first, inverse = np.unique(xy.view(np.complex128).ravel(), return_index=True, return_inverse=True)
     node[fixed:] = first[inverse[fixed:]]
     if join <= 0.0:
@@ -186,7 +185,7 @@ def _cluster(xy: Metres, join: float, fixed: int) -> Places:
     heads = np.flatnonzero(node == np.arange(n))
     cell = np.floor(xy[heads] / join).astype(np.int64)
     crowded = _near_others(cell)
-    # At most four nodes fit into a cell, so each vertex looks at 36 at most, however dense the drawing is.
+    # a cell contains at most four nodes, so each vertex is compared with at most 36, however dense the drawing is
     taken: dict[tuple[int, int], list[int]] = {}
     moved: dict[int, int] = {}
     limit = join * join
@@ -213,7 +212,7 @@ def _cluster(xy: Metres, join: float, fixed: int) -> Places:
 
 
 def _near_others(cell: NDArray[np.int64]) -> Places:
-    """Places whose cell or one of its eight neighbours holds another item."""
+    """Return indices of items whose cell or one of its eight neighbours contains another item."""
     row, column = _compact(cell[:, 0]), _compact(cell[:, 1])
     width = int(column.max()) + 3
     key = (row + 1) * width + column + 1
@@ -229,14 +228,14 @@ def _near_others(cell: NDArray[np.int64]) -> Places:
 
 
 def _compact(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Small numbers in the same order that are neighbours exactly where the values are: no key can overflow."""
+    """Map values to small numbers in the same order that keep gaps between values: keys cannot overflow."""
     distinct, inverse = np.unique(values, return_inverse=True)
     rank = np.concatenate([np.zeros(1, np.int64), np.minimum(np.diff(distinct), 2).cumsum()])
     return np.asarray(rank[inverse], np.int64)
 
 
 def _split(drawing: _Drawing, xy: Metres, node: Places, join: float) -> tuple[Places, Places, Places]:
-    """The segments between nodes as (start, end, object), in drawing order, split where a line or poi ends on one."""
+    """Return the segments between nodes as (start, end, object) in drawing order, split at line ends and pois."""
     place = np.arange(len(drawing.poi_owner), len(xy))
     inner = np.ones(len(xy), bool)
     inner[drawing.last] = False
@@ -262,7 +261,7 @@ def _split(drawing: _Drawing, xy: Metres, node: Places, join: float) -> tuple[Pl
     if not inside.any():
         return start, end, owner
     p, segment, t = p[inside], segment[inside], t[inside]
-    # One chain for each segment: its start, the nodes on it by distance, its end.
+    # one chain for each segment: its start, the nodes on it by distance, its end
     n = len(start)
     chain_segment = np.concatenate([np.arange(n), segment, np.arange(n)])
     chain_t = np.concatenate([np.full(n, -1.0), t, np.full(n, 2.0)])
@@ -276,7 +275,7 @@ def _split(drawing: _Drawing, xy: Metres, node: Places, join: float) -> tuple[Pl
 def _points_near_lines(
     points: NDArray[np.object_], lines: NDArray[np.object_], distance: float
 ) -> tuple[Places, Places]:
-    """Pairs (point, line) within a distance, sorted; in portions, so that a hostile drawing cannot fill the memory."""
+    """Find pairs (point, line) within a distance, sorted; in portions of bounded memory (hostile drawings)."""
     tree = shapely.STRtree(lines)
     limit = 1_000_000 + 10 * (len(points) + len(lines))
     portion = max(1, 50_000_000 // len(lines))
@@ -286,7 +285,7 @@ def _points_near_lines(
         pairs = tree.query(points[begin : begin + portion], predicate="dwithin", distance=distance)
         total += pairs.shape[1]
         if total > limit:
-            reason = "too many lines lie on each other: draw each path once, or use a smaller join distance"
+            reason = "too many overlapping lines: draw each path once, or use a smaller join distance"
             raise Invalid(reason, [Problem(reason)])
         pairs[0] += begin
         pair_blocks.append(pairs)
@@ -336,7 +335,7 @@ def _assemble(
     mixed = anchors[p] != anchors[q]
     geometry = np.concatenate([_geometries(at, shapely.points), _geometries(ends, shapely.linestrings)])
     if mixed.any():
-        reason = "a local line meets one on earth: bring the drawing into one kind of coordinates first"
+        reason = "a line in local metres meets one in degrees: convert the drawing to one kind of coordinates first"
         raise Invalid(reason, [Problem(reason, where=edges[int(np.flatnonzero(mixed)[0])])])
     return Features((*ids, *edges), geometry, tuple(properties), local)
 
@@ -344,7 +343,7 @@ def _assemble(
 def _directed_edges(
     objects: Features, start: Places, end: Places, owner: Places
 ) -> tuple[list[int], list[int], list[int]]:
-    """(from, to, object) of all directed edges, each pair of nodes once, the first in drawing order."""
+    """Return (from, to, object) of all directed edges, each pair of nodes once, the first in drawing order."""
     directions = {k: direction(objects.properties[k]) for k in set(owner.tolist())}
     pairs: dict[tuple[int, int], int] = {}
     for p, q, k in zip(start.tolist(), end.tolist(), owner.tolist(), strict=True):
@@ -357,7 +356,7 @@ def _directed_edges(
 
 
 def _geometries(coordinates: Metres, make: Any) -> NDArray[np.object_]:
-    """Geometries from [n, …, 3], two-dimensional where any z is absent."""
+    """Build geometries from [n, …, 3], two-dimensional if any z is absent."""
     n = len(coordinates)
     out = np.empty(n, object)
     if not n:
@@ -371,7 +370,7 @@ def _geometries(coordinates: Metres, make: Any) -> NDArray[np.object_]:
 
 
 def _short(text: str, limit: int) -> str:
-    """The text, or where it is too long for an id its beginning and a hash of all of it."""
+    """Return the text, or, if it is too long for an id, its beginning and a hash of all of it."""
     if len(text) <= limit:
         return text
     return f"{text[: limit - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"

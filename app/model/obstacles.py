@@ -1,27 +1,26 @@
-"""What is solid: the objects of a site that stand in a robot's way, by kind, as solids and as extruded footprints.
+"""Obstacles: objects of a site that block robots, by kind, as solids and as extruded footprints.
 
-The one place that decides it, for worlds (``app.formats.gazebo``), grids, voxels and pictures of grids.
+Worlds (``app.formats.gazebo``), grids, voxels and images of grids all use this module.
 
 =========== ===========================================================================================================
 an object   counts
 =========== ===========================================================================================================
 of kind     ``floor``, ``lift``: as ground that is free (a lift's cabin by its ``pose`` and ``size``)
-of kind     ``lift``: also by the walls around its cabin, open at its doors, where Open-RMF says where these are
+of kind     ``lift``: also by the walls around its cabin, open at its doors, if Open-RMF states their positions
 of kind     ``hole``: as an obstacle, since a robot would fall in
-of kind     in ``OBSTACLES``: by its geometry; an OpenStreetMap kind only where the tag's value is one of ``OF_OSM``
-with        ``shapes``: by its solids (``app.model.solids``), whatever its kind but those of ``IGNORED``
-with        ``height`` or ``size``: by its geometry, or a box of its size where it is a point, whatever its kind
-of kind     ``door``: as an obstacle only where doors are taken as closed, whatever its shapes
-of kind     in ``BROAD_KINDS``: as a point without width and size also as ground of which nothing is known
-of kind     in ``SOLID``: without shapes and size as ground of which nothing is known (``object_surroundings``), but
-from a
-            world, which tells all solids of its models: there it has none
+of kind     in ``OBSTACLES``: by its geometry; an OpenStreetMap kind only if the tag's value is one of ``OF_OSM``
+with        ``shapes``: by its solids (``app.model.solids``), whatever its kind, except for those of ``IGNORED``
+with        ``height`` or ``size``: by its geometry, or by a box of its size if it is a point, whatever its kind
+of kind     ``door``: as an obstacle only if doors count as closed, whatever its shapes
+of kind     in ``BROAD_KINDS``: as a point without width and size also as unknown ground
+of kind     in ``SOLID``: without shapes and size as unknown ground (``object_surroundings``), except for objects of
+            a world, which contains all solids of its models: there it has none
 else        not: regions, points of interest, paths, roads, lights, measurements …
 =========== ===========================================================================================================
 
 An area counts as it is, a line as wide as it is (``width``, else its kind's), a point as a disc or as a box of its
-size. It reaches from ``base`` (else OpenStreetMap's ``min_height`` and ``building:min_level``, else the floor) to
-``height`` (else ``height`` and ``building:levels`` among the tags, else without end; ``app.model.osm_tags``).
+size. It extends from ``base`` (else OpenStreetMap's ``min_height`` and ``building:min_level``, else the floor) to
+``height`` (else ``height`` and ``building:levels`` among the tags, else without limit; ``app.model.osm_tags``).
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from app.model.features import Properties
 from app.model.frame import MAX_METRES
 
 Role = Literal["mark", "ground", "solids", "outline", "bodiless"]
-"""How an object counts: a mark stands in no way, ground is free, an outline is extruded, of others no body is known."""
+"""Role of an object: a mark is no obstacle, ground is free, an outline is extruded, others have no known body."""
 
 FREE = frozenset({"floor", "lift"})
 DOORS = frozenset({"door"})
@@ -50,17 +49,18 @@ IGNORED = frozenset(
         *("ground_overlay", "overlay", "photo", "screen", "tour", "camera", "population", "road", "zone"),
     }
 )
-"""Marks, moving things and things without a body."""
+"""Marks, moving objects and objects without a body."""
 
 CABIN_WALL = 0.05
-"""Metres: the thickness of a lift cabin's walls in rmf_building_map_tools."""
+"""Thickness of a lift cabin's walls in metres, as in rmf_building_map_tools."""
 
 SOLID = frozenset({"model", "include"})
-"""Kinds that have a body, which may be in files that nobody has supplied."""
+"""Kinds that have a body, which may be in files that were not uploaded."""
 
 UNKNOWN_RADIUS_METRES = 0.7
-"""Unknown ground around an object of unknown extent, in metres: Open-RMF's chairs, desks and cabinets reach about as
-far from their origin, and its buildings have their lanes no nearer."""
+"""Radius of unknown ground around an object of unknown extent, in metres: Open-RMF's chairs, desks and cabinets extend
+about as far from their origin, and its buildings have their lanes no nearer.
+"""
 
 OBSTACLES: Mapping[str, float] = {
     **dict.fromkeys(("wall", "fence", "hedge", "barrier", "railing"), 0.1),
@@ -69,8 +69,9 @@ OBSTACLES: Mapping[str, float] = {
     **dict.fromkeys(("tree", "trunk", "bush", "shrub", "plant", "vegetation"), 0.3),
     **dict.fromkeys(("water", "pond", "ditch", "stream"), 1.0),
 }
-"""Kinds that stand in the way, and how wide a line of that kind, or a point's disc, is where nothing says: metres.
-The 0.1 m of a wall is what rmf_building_map_tools builds."""
+"""Kinds of obstacles, with the default width in metres of a line of that kind, or diameter of a point's disc. The 0.1 m
+of a wall is what rmf_building_map_tools builds.
+"""
 
 BROAD_KINDS = frozenset(
     {
@@ -78,10 +79,10 @@ BROAD_KINDS = frozenset(
         *("water", "pond", "ditch", "stream"),
     }
 )
-"""Kinds that cover more ground than the disc of a point of which nothing says how wide it is."""
+"""Kinds that cover more ground than the default disc of a point without a stated width."""
 
 MAX_WIDTH_METRES = 1000.0
-"""Metres of a line's or a point's width: beyond it is a mistake."""
+"""Maximum width of a line or a point in metres: a larger value is an error of the source."""
 
 OF_OSM: Mapping[str, Mapping[str, float]] = {
     "building": {"*": 0.1, "no": 0.0, "roof": 0.0},
@@ -117,23 +118,25 @@ OF_OSM: Mapping[str, Mapping[str, float]] = {
     "amenity": dict.fromkeys(("fountain", "bench", "post_box", "waste_basket", "telephone", "vending_machine"), 0.6),
     "historic": dict.fromkeys(("monument", "memorial", "wayside_cross", "wayside_shrine"), 0.6),
 }
-"""OpenStreetMap: by a tag's key and value (``*``: any other), how wide a line or a point is; 0 stands in no way."""
+"""OpenStreetMap: default width of a line or a point by a tag's key and value (``*``: any other); 0 is no obstacle."""
 
 KEYS: Mapping[str, tuple[str, ...]] = {
     "building": ("building", "building:part"),
     "tree": ("natural",),
     "water": ("natural", "waterway", "landuse", "leisure"),
 }
-"""The tags that an OpenStreetMap object's kind may come from, where it is not called as its main tag is."""
+"""Tags that an OpenStreetMap object's kind may come from, if it differs from its main tag."""
 
 SQUARE = frozenset({"wall"})
-"""Kinds whose lines reach half their width beyond their ends, so that walls that meet at a corner close it."""
+"""Kinds whose lines extend half their width beyond their ends, so that walls that meet at a corner close it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """The ground that an object covers (polygons, metres), and from which height above its floor to which it reaches;
-    infinite where nothing says."""
+    """The ground that an object covers (polygons, metres), and its lower and upper height above its floor.
+
+    The upper height is infinite if unknown.
+    """
 
     area: Any
     base: float
@@ -141,7 +144,7 @@ class Body:
 
 
 def object_role(properties: Properties, *, doors_closed: bool = False) -> Role:
-    """How an object counts. doors_closed: whether doors are obstacles."""
+    """Return the role of an object. doors_closed: whether doors are obstacles."""
     kind = str(properties.get("kind") or "")
     if kind in FREE:
         return "ground"
@@ -155,10 +158,10 @@ def object_role(properties: Properties, *, doors_closed: bool = False) -> Role:
 
 
 def object_body(properties: Properties, geometry: Any, width: float | None = None) -> Body | None:
-    """The body of an object whose role is ``outline``, or of a lift's walls; None where it has none.
+    """Return the body of an object with the role ``outline``, or of a lift's walls; None if it has none.
 
-    geometry: in local metres. width: of a line, or of a point's disc, instead of the object's own. Raises Invalid where
-    its pose cannot be used.
+    geometry: in local metres. width: of a line, or of a point's disc, instead of the object's own. Raises Invalid if
+    its pose is invalid.
     """
     if properties.get("kind") == "lift":
         return None if properties.get("shapes") else _cabin(properties, geometry)
@@ -167,20 +170,20 @@ def object_body(properties: Properties, geometry: Any, width: float | None = Non
 
 
 def object_ground(properties: Properties, geometry: Any) -> Any | None:
-    """The ground of a floor or a lift's cabin, on which robots stand: polygons; None where it has none."""
+    """Return the ground of a floor or a lift's cabin, on which robots stand: polygons; None if it has none."""
     area = _area(shapely.force_2d(geometry), properties, 0.0)
     return area if area is not None and area.area > 0 else None
 
 
 def is_unsized(properties: Properties, geometry: Any) -> bool:
-    """Whether an object is a mere point and covers more ground than its disc."""
+    """Return whether an object is a mere point and covers more ground than its disc."""
     is_point = shapely.get_type_id(geometry) in (0, 4)
     is_broad = is_point and str(properties.get("kind")) in BROAD_KINDS
     return is_broad and box_size(properties) is None and not has_width(properties)
 
 
 def object_surroundings(properties: Properties, geometry: Any, radius: float) -> Any | None:
-    """The ground that an object of unknown extent may cover; None if it has neither a geometry nor a place.
+    """Return the ground that an object of unknown extent may cover; None if it has neither a geometry nor a pose.
 
     Args:
         geometry: in local metres.
@@ -196,9 +199,9 @@ def object_surroundings(properties: Properties, geometry: Any, radius: float) ->
 
 
 def object_footprint(properties: Properties, geometry: Any, solid_reader: solids.Solids) -> Any | None:
-    """The ground that an object covers, whatever its height: polygons in metres; None where it stands in no way.
+    """Return the ground that an object covers, at any height: polygons in metres; None if it is no obstacle.
 
-    geometry: in local metres. Raises Invalid or BadUpload where its solids cannot be read.
+    geometry: in local metres. Raises Invalid or BadUpload if its solids cannot be read.
     """
     role = object_role(properties)
     if role == "solids":
@@ -209,8 +212,9 @@ def object_footprint(properties: Properties, geometry: Any, solid_reader: solids
 
 
 def _cabin(p: Properties, geometry: Any) -> Body | None:
-    """The walls around a lift's cabin, with gaps where its doors are; None where nothing says where these are: walls
-    without a way in would lock the cabin.
+    """Return the walls around a lift's cabin, with gaps at its doors; None if the doors are unknown.
+
+    Walls without a way in would lock the cabin.
 
     Source: rmf_building_map_tools, lift.py (doors: x, y in the cabin's frame, width along motion_axis_orientation).
     """
@@ -232,7 +236,7 @@ def _cabin(p: Properties, geometry: Any) -> Body | None:
         if not numbers or not all(isinstance(v, (int, float)) and abs(v) <= MAX_METRES for v in numbers):
             return None
         along = float(numbers[3]) / 2
-        across = max(x, y, CABIN_WALL) / 2  # through the wall that it is in, and not through the one opposite
+        across = max(x, y, CABIN_WALL) / 2  # cut through the door's own wall, not through the opposite one
         gap = shapely.box(-along, -across, along, across)
         turned = solids.apply_pose(_flat(gap), (float(numbers[0]), float(numbers[1]), 0.0, 0.0, 0.0, float(numbers[2])))
         gaps.append(shapely.Polygon(turned[:, :2]))
@@ -244,12 +248,12 @@ def _cabin(p: Properties, geometry: Any) -> Body | None:
 
 
 def _flat(polygon: Any) -> Any:
-    """The corners of a polygon at height 0: float64 [n, 3]."""
+    """Return the corners of a polygon at height 0: float64 [n, 3]."""
     return np.column_stack([shapely.get_coordinates(polygon), np.zeros(shapely.get_num_coordinates(polygon))])
 
 
 def _pose(p: Properties, geometry: Any) -> tuple[float, ...] | None:
-    """An object's pose; where it has none, its point; None where it has neither."""
+    """Return an object's pose; without one, its point; None if it has neither."""
     if p.get("pose") is not None:
         return solids.parse_pose(p)
     at = shapely.get_coordinates(geometry)
@@ -263,12 +267,12 @@ def _tags(p: Properties) -> Mapping[str, Any]:
 
 
 def has_width(properties: Properties) -> bool:
-    """Whether an object itself says how wide it is."""
+    """Return whether an object itself states its width."""
     return bool(_positive(properties.get("width")) or osm_tags.width(_tags(properties)))
 
 
 def object_width(properties: Properties) -> float | None:
-    """How wide a line or a point of an object is in metres; None where the object stands in no way."""
+    """Return the width of an object's line or point in metres; None if the object is no obstacle."""
     p, kind = properties, str(properties.get("kind") or "")
     tags = _tags(p)
     if kind in DOORS or kind in HOLES:
@@ -290,7 +294,7 @@ def object_width(properties: Properties) -> float | None:
 
 
 def _area(geometry: Any, p: Properties, width: float) -> Any:
-    """The ground that an object covers: a polygon in metres; None where it has none."""
+    """Return the ground that an object covers: a polygon in metres; None if it has none."""
     kind = int(shapely.get_type_id(geometry))
     size = box_size(p)
     if size is not None and (kind in (0, 4) or geometry.is_empty):
@@ -313,7 +317,7 @@ def _area(geometry: Any, p: Properties, width: float) -> Any:
 
 
 def object_heights(properties: Properties, geometry: Any) -> tuple[float, float]:
-    """(base, top) of an extruded footprint in metres above the floor; the top is infinite where nothing says."""
+    """Return (base, top) of an extruded footprint in metres above the floor; the top is infinite if unknown."""
     p = properties
     if str(p.get("kind")) in HOLES:
         return -math.inf, math.inf
@@ -338,7 +342,7 @@ def _positive(value: Any) -> float | None:
 
 
 def box_size(p: Properties) -> tuple[float, ...] | None:
-    """[x, y(, z)] of a box; None where nothing says so."""
+    """Return [x, y(, z)] of a box; None if the object has no valid size."""
     size = p.get("size")
     if not isinstance(size, (list, tuple)) or len(size) < 2:
         return None

@@ -1,7 +1,7 @@
-"""OpenStreetMap's multipolygons: areas whose outer and inner rings are ways, each of them whole or split.
+"""OpenStreetMap's multipolygons: areas whose outer and inner rings are ways, each of them complete or split.
 
-Source: OSM wiki, Relation:multipolygon. Which ring is outer follows from how the rings lie in each other, by even and
-odd, as osmium's assembler has it; the members' roles are not needed for it.
+Source: OSM wiki, Relation:multipolygon. Which ring is outer follows from the nesting of the rings by the even-odd rule,
+as in osmium's assembler; the members' roles are not needed.
 """
 
 from __future__ import annotations
@@ -19,19 +19,21 @@ from app.model.features import Features, Properties
 Lines = Sequence[NDArray[np.float64]]
 
 LINES = frozenset({"barrier", "waterway", "highway"})
-"""Tags of closed ways that stand along their course and not on the ground inside."""
+"""Tags of closed ways that apply to their course and not to the ground inside."""
 
 
 def is_multipolygon(properties: Properties) -> bool:
-    """Whether an object is a relation that says that it is an area."""
+    """Return whether an object is a relation that is tagged as an area."""
     source_properties = properties.get("osm")
     tags = source_properties.get("tags") if isinstance(source_properties, Mapping) else None
     return isinstance(tags, Mapping) and tags.get("type") == "multipolygon"
 
 
 def multipolygon_areas(part: Features, rows: Iterable[int]) -> dict[int, Any | None]:
-    """The area of each multipolygon among these rows, in the coordinates of its ways; None where its rings do not
-    close. Ways that are missing are left out."""
+    """Return the area of each multipolygon among these rows, as its ways are anchored; None if its rings are open.
+
+    Missing ways are skipped.
+    """
     relation_rows = [k for k in rows if part.ids[k].startswith("r") and is_multipolygon(part.properties[k])]
     index = part.index() if relation_rows else {}
     out: dict[int, Any | None] = {}
@@ -44,10 +46,10 @@ def multipolygon_areas(part: Features, rows: Iterable[int]) -> dict[int, Any | N
 
 
 def incomplete_areas(part: Features, rows: Iterable[int]) -> dict[int, Any]:
-    """The ways that are there of each incomplete area among these rows: a collection in their coordinates, maybe empty.
+    """Return the available ways of each incomplete area among these rows: a collection, possibly empty.
 
-    Incomplete: a multipolygon of which rings do not close or outer ways are absent, and a closed way of an area without
-    some of its nodes.
+    Incomplete: a multipolygon with open rings or missing outer ways, and a closed way of an area without some of its
+    nodes.
     """
     out: dict[int, Any] = {}
     chosen = [k for k in rows if isinstance(part.properties[k].get("osm"), Mapping)]
@@ -65,10 +67,10 @@ def incomplete_areas(part: Features, rows: Iterable[int]) -> dict[int, Any]:
 
 
 def ground_around(ways: Any, radius: float) -> Any:
-    """The ground that an area may cover of which only these ways are there: polygons; empty if there are none.
+    """Return the ground that an area may cover if only these ways are available: polygons; empty if there are none.
 
     It is their convex hull and a disc over each gap from a loose end to the next one: a missing way with a right angle
-    runs along its rim.
+    follows its rim.
 
     Args:
         ways: a collection in metres.
@@ -88,7 +90,7 @@ def ground_around(ways: Any, radius: float) -> Any:
 
 
 def _ways(p: Properties) -> list[tuple[str, Any]]:
-    """(id, role) of a relation's ways."""
+    """Return (id, role) of a relation's ways."""
     members = p["osm"].get("members")
     return [
         (f"w{member[1]}", member[2])
@@ -98,14 +100,14 @@ def _ways(p: Properties) -> list[tuple[str, Any]]:
 
 
 def _has_missing_nodes(source_properties: Mapping[str, Any]) -> bool:
-    """Whether a way goes around an area and some of its nodes have no place."""
+    """Return whether a way goes around an area and some of its nodes have no coordinates."""
     refs, tags = source_properties.get("refs"), source_properties.get("tags")
     is_ring = isinstance(refs, (list, tuple)) and len(refs) > 3 and refs[0] == refs[-1]
     return is_ring and bool(source_properties.get("missing")) and isinstance(tags, Mapping) and not LINES & tags.keys()
 
 
 def assemble_area(lines: Lines) -> Any | None:
-    """The area that ways enclose (float64 [n, 2] each): a polygon or several; None where they leave a ring open."""
+    """Return the area that ways (float64 [n, 2] each) enclose: one or several polygons; None if a ring stays open."""
     rings = _rings(lines)
     if not rings:
         return None
@@ -118,7 +120,7 @@ def assemble_area(lines: Lines) -> Any | None:
 
 
 def _rings(lines: Lines) -> list[NDArray[np.float64]] | None:
-    """The lines joined end to end to closed rings; None where one stays open."""
+    """Join lines end to end to closed rings; None if one stays open."""
     ends: dict[tuple[float, ...], list[int]] = {}
     for k, line in enumerate(lines):
         if len(line) < 2:

@@ -1,8 +1,8 @@
-"""OpenStreetMap's values in SI units: lengths, widths, heights, speeds; for the format and for what looks at its tags.
+"""OpenStreetMap's values in SI units: lengths, widths, heights, speeds; for the format and for users of its tags.
 
 Sources: OSM wiki, Map features/Units (metres unless a unit is given; ``7'6"`` are feet and inches), Key:maxspeed (km/h
-unless a unit is given), Key:lanes, Simple 3D buildings (``height`` and ``min_height`` count from the ground; where they
-are missing a storey has 3 m).
+unless a unit is given), Key:lanes, Simple 3D buildings (``height`` and ``min_height`` count from the ground; if they
+are missing, a storey has 3 m).
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 LEVEL_HEIGHT = 3.0
-"""Metres of a storey, where only the number of storeys is known (Simple 3D buildings)."""
+"""Height of a storey in metres, if only the number of storeys is known (Simple 3D buildings)."""
 
 LANE = 3.0
-"""Metres of a lane, where only the number of lanes is known: the narrow end of what is built (Key:lanes)."""
+"""Width of a lane in metres, if only the number of lanes is known: the lower end of built widths (Key:lanes)."""
 
 WALK = 6 / 3.6
-"""Metres per second of ``maxspeed=walk``: 6 km/h, as GraphHopper has it."""
+"""Speed of ``maxspeed=walk`` in metres per second: 6 km/h, as in GraphHopper."""
 
 MAX_METRES = 1e6
-"""Metres; beyond it is a mistake."""
+"""Maximum length in metres: a larger value is an error."""
 
 _LENGTH = re.compile(r"\s*(\d{1,9}(?:[.,]\d{1,9})?)\s*(m|cm|mm|km|mi|ft|feet|in|'|\")?\s*", re.ASCII)
 _FEET = re.compile(r"\s*(\d{1,6})\s*'\s*(\d{1,3}(?:\.\d{1,9})?)\s*\"\s*", re.ASCII)
@@ -40,7 +40,7 @@ _COUNT = re.compile(r"\s*(\d{1,3}(?:\.\d{1,3})?)\s*", re.ASCII)
 
 
 def metres(text: Any) -> float | None:
-    """A length; None where it is none."""
+    """Parse a length in metres; None if it is none."""
     if not isinstance(text, str) or len(text) > 40:
         return None
     if match := _FEET.fullmatch(text):
@@ -53,7 +53,7 @@ def metres(text: Any) -> float | None:
 
 
 def speed(value: Any) -> float | None:
-    """A speed limit in m/s, of several the lowest; None for what is none (``none``, ``RO:urban``, a condition)."""
+    """Parse a speed limit in m/s, the lowest of several; None for others (``none``, ``RO:urban``, a condition)."""
     if not isinstance(value, str) or len(value) > 80:
         return None
     speeds = []
@@ -66,19 +66,19 @@ def speed(value: Any) -> float | None:
 
 
 def count(value: Any) -> float | None:
-    """A number of storeys or lanes; None where it is none."""
+    """Parse a number of storeys or lanes; None if it is none."""
     match = _COUNT.fullmatch(value) if isinstance(value, str) and len(value) < 40 else None
     return None if match is None else float(match[1])
 
 
 def is_understood(key: str, value: Any) -> bool:
-    """Whether a tag's value means something to the functions below; true of all tags that they do not look at."""
+    """Return whether the functions below understand a tag's value; true for all tags that they do not read."""
     read = _PARSERS.get(key)
     return read is None or read(value) is not None or (read is speed and value in _NO_LIMIT)
 
 
 def width(tags: Mapping[str, Any]) -> float | None:
-    """Metres across a line or a point: ``width``, ``est_width``, what its ``diameter`` or ``circumference`` says."""
+    """Return metres across a line or a point: ``width``, ``est_width``, or from ``diameter`` or ``circumference``."""
     value = metres(tags.get("width")) or metres(tags.get("est_width"))
     if not value and tags.get("natural") == "tree":
         value = metres(tags.get("diameter"))
@@ -88,7 +88,7 @@ def width(tags: Mapping[str, Any]) -> float | None:
 
 
 def way_width(tags: Mapping[str, Any]) -> float | None:
-    """Metres across a way that is driven or walked on: its width, else its lanes'."""
+    """Return metres across a way that is driven or walked on: its width, else its lanes'."""
     value = width(tags)
     if value:
         return value
@@ -97,7 +97,7 @@ def way_width(tags: Mapping[str, Any]) -> float | None:
 
 
 def height(tags: Mapping[str, Any]) -> float | None:
-    """Metres of the top above the ground: ``height``, else its storeys'."""
+    """Return metres of the top above the ground: ``height``, else its storeys'."""
     value = metres(tags.get("height"))
     if not value and (storeys := count(tags.get("building:levels"))):
         value = round(storeys * LEVEL_HEIGHT, 9)
@@ -105,7 +105,7 @@ def height(tags: Mapping[str, Any]) -> float | None:
 
 
 def base(tags: Mapping[str, Any]) -> float | None:
-    """Metres of the underside above the ground: ``min_height``, else the storeys that are left out."""
+    """Return metres of the underside above the ground: ``min_height``, else that of the omitted storeys."""
     value = metres(tags.get("min_height"))
     if value is None and (storeys := count(tags.get("building:min_level"))) is not None:
         value = round(storeys * LEVEL_HEIGHT, 9)
@@ -113,12 +113,12 @@ def base(tags: Mapping[str, Any]) -> float | None:
 
 
 def speed_limit(tags: Mapping[str, Any], direction: Literal["forward", "backward"]) -> float | None:
-    """Metres per second along a way's direction or against it; that of the direction wins."""
+    """Return metres per second along a way's direction or against it; the limit of the direction wins."""
     return speed(tags.get(f"maxspeed:{direction}")) or speed(tags.get("maxspeed"))
 
 
 _NO_LIMIT = frozenset({"none", "signals", "variable"})
-"""Values of ``maxspeed`` that mean no lasting limit (Key:maxspeed)."""
+"""Values of ``maxspeed`` that mean no permanent limit (Key:maxspeed)."""
 
 _PARSERS: Mapping[str, Callable[[Any], float | None]] = {
     **dict.fromkeys(("width", "est_width", "height", "min_height"), metres),

@@ -1,14 +1,14 @@
-"""Which cells of a grid, or of a stack of grids, triangles and polygons touch or enclose: exact, and without loops.
+"""Rasterisation of triangles and polygons: the cells of a grid or of a stack of grids that they touch or enclose.
 
-Everything becomes **spans**: runs of cells (layer, row, first column, end column). A cell is touched where a surface
-meets it; it is enclosed where its middle lies inside. What ends exactly on the border of two cells belongs to the cell
-on its own inner side: triangles are moved a micrometre against their normals (counter-clockwise seen from outside) and
-outlines to their inner side, and what has an extent is half a micrometre shorter at its ends, so that a box of one
-metre covers ten cells of 0.1 m and not eleven.
+Everything becomes **spans**: runs of cells (layer, row, first column, end column). A cell is touched if a surface meets
+it; it is enclosed if its middle is inside. A surface exactly on the border of two cells belongs to the cell on its own
+inner side: triangles are moved a micrometre against their normals (counter-clockwise seen from outside) and outlines to
+their inner side, and lines are half a micrometre shorter at their ends, so that a box of one metre covers ten cells of
+0.1 m and not eleven. The result is exact, without Python loops over cells.
 
-Inside is where the winding number of a closed surface is not zero, row by row: solids that overlap join, a solid with
-its inside turned out is a solid all the same, and a row in which a surface is open encloses nothing. Coordinates are
-counted in cells from the grid's corner once they are here; row 0 is the lowest.
+A point is inside if the winding number of a closed surface is not zero, row by row: solids that overlap join, a solid
+with inverted faces is a solid as well, and a row in which a surface is open encloses nothing. Coordinates are counted
+in cells from the grid's corner after conversion; row 0 is the lowest.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from app.errors import CannotConvert
 
 Array = NDArray[np.float64]
 Spans = NDArray[np.int64]
-"""int64 [n, 4]: layer, row, first column, end column (exclusive)."""
+"""Spans, int64 [n, 4]: layer, row, first column, end column (exclusive)."""
 
 INSET_METRES = 1e-6
-"""Metres that surfaces are moved inwards; half of it, their ends."""
+"""Distance in metres by which surfaces are moved inwards; half of it for ends."""
 
 BLOCK_SIZE = 2**18
-"""Triangles, or edges times the rows that they cross, that are worked on at a time."""
+"""Number of triangles, or of edges times the rows that they cross, per block of work."""
 
 NONE: Spans = np.empty((0, 4), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class RasterFrame:
-    """Where a grid lies: origin (x, y) of its lower left corner in metres, metres a cell, cells along x and y."""
+    """Position of a grid: origin (x, y) of its lower left corner in metres, metres per cell, cells along x and y."""
 
     origin: tuple[float, float]
     resolution: float
@@ -47,7 +47,7 @@ class RasterFrame:
 
     @classmethod
     def from_box(cls, box: tuple[float, float, float, float], resolution: float) -> RasterFrame:
-        """The grid of whole cells around a box (min x, min y, max x, max y), its origin a multiple of a cell."""
+        """Return the grid of whole cells around a box (min x, min y, max x, max y), its origin a multiple of a cell."""
         first = [math.floor(v / resolution + 1e-6) for v in box[:2]]
         end = [math.ceil(v / resolution - 1e-6) for v in box[2:]]
         width, height = (max(1, b - a) for a, b in zip(first, end, strict=True))
@@ -55,11 +55,11 @@ class RasterFrame:
 
     @property
     def cells(self) -> int:
-        """How many cells it has."""
+        """Return the number of cells."""
         return self.width * self.height
 
     def to_cells(self, xy: Array) -> Array:
-        """Metres [..., 2] as cells."""
+        """Convert metres [..., 2] to cells."""
         return np.asarray((xy - np.array(self.origin)) / self.resolution, np.float64)
 
 
@@ -67,10 +67,10 @@ class RasterFrame:
 
 
 def surfaces(triangles: Array, frame: RasterFrame, slabs: Array) -> Iterator[Spans]:
-    """The cells that triangles (float64 [n, 3, 3], metres) touch between the heights of each slab.
+    """Return the cells that triangles (float64 [n, 3, 3], metres) touch between the heights of each slab.
 
-    slabs: float64 [k, 2], low and high in metres, ascending and one after another, or one of any thickness; its number
-    is the spans' layer. A slab of no thickness is a slice.
+    slabs: float64 [k, 2], low and high in metres, ascending and adjacent, or one of any thickness; its index is the
+    spans' layer. A slab without thickness is a slice.
     """
     if not len(triangles):
         return
@@ -93,14 +93,14 @@ def surfaces(triangles: Array, frame: RasterFrame, slabs: Array) -> Iterator[Spa
 
 
 def _clip(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Convex pieces of triangles [n, 3, 3] between two heights each: edges float64 [m, 2, 2] and whose they are.
+    """Cut triangles [n, 3, 3] into convex pieces between two heights each: edges float64 [m, 2, 2], and their owners.
 
-    A piece is what its edges' projections enclose; where a triangle only touches, an edge may be a point.
+    A piece is enclosed by its edges' projections; if a triangle only touches, an edge may be a point.
     """
     a, b = corners, np.roll(corners, -1, axis=1)
     run = b[..., 2] - a[..., 2]
     owner = np.repeat(np.arange(len(corners)), 3).reshape(-1, 3)
-    # The part of each edge between the heights, as parameters from a to b; level edges have none.
+    # the part of each edge between the heights, as parameters from a to b; level edges have none
     with np.errstate(all="ignore"):
         t0, t1 = (low[:, None] - a[..., 2]) / run, (high[:, None] - a[..., 2]) / run
     level = run == 0
@@ -112,7 +112,7 @@ def _clip(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np.in
     q = a[..., :2] + (b[..., :2] - a[..., :2]) * leave[..., None]
     parts = [np.stack([p, q], axis=2)[mask]]
     owners = [owner[mask]]
-    # Where the heights cut through, two edges meet the cut: the line between these points closes the piece.
+    # two edges meet each cutting height: the line between their points closes the piece
     for z in (low, high):
         side = a[..., 2] > z[:, None]
         crossing = side != np.roll(side, -1, axis=1)
@@ -129,8 +129,11 @@ def _clip(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np.in
 def _touched_cells(
     edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], frame: RasterFrame
 ) -> Iterator[Spans]:
-    """The cells that convex pieces touch, a span for each row: between the leftmost and the rightmost of what their
-    edges (float64 [m, 2, 2], in cells) have in that row. layer: of each piece."""
+    """Return the cells that convex pieces touch, a span for each row.
+
+    A span extends from the leftmost to the rightmost point of the piece's edges (float64 [m, 2, 2], in cells) in the
+    row. layer: of each piece.
+    """
     order = np.argsort(owner, kind="stable")
     edges, owner = edges[order], owner[order]
     starts = np.flatnonzero(np.diff(owner, prepend=-1)) if len(owner) else np.empty(0, np.int64)
@@ -176,7 +179,7 @@ def _touched_cells(
 
 
 def _shorten(low: Array, high: Array, end: float) -> tuple[Array, Array]:
-    """Ranges without their ends; of short ones the middle is left."""
+    """Move the ends of ranges inwards; short ranges become their middle."""
     less = np.minimum(end, (high - low) / 2)
     return low + less, high - less
 
@@ -185,15 +188,18 @@ def _shorten(low: Array, high: Array, end: float) -> tuple[Array, Array]:
 
 
 def insides(triangles: Array, owner: NDArray[np.int64], frame: RasterFrame, heights: Array) -> Iterator[Spans]:
-    """The cells whose middle lies inside solids at each of the heights (metres, ascending): the height's number is the
-    spans' layer. owner: int64 [n], the solid that a triangle belongs to; a solid is judged on its own."""
+    """Return the cells whose middle is inside solids at each of the heights (metres, ascending).
+
+    The height's index is the spans' layer. owner: int64 [n], the solid that a triangle belongs to; each solid is
+    evaluated separately.
+    """
     if not len(triangles):
         return
     z = triangles[:, :, 2]
     first = np.searchsorted(heights, z.min(axis=1), side="left")  # a vertex at a height counts as below it
     end = np.searchsorted(heights, z.max(axis=1), side="left")
     count = np.maximum(end - first, 0)
-    # A solid's crossings at one height must be looked at together.
+    # all crossings of a solid at one height must be in one block
     solids, of_solid = np.unique(owner, return_inverse=True)
     load = np.bincount(of_solid, count, len(solids)).astype(np.int64)
     order = np.argsort(of_solid, kind="stable")
@@ -211,8 +217,10 @@ def insides(triangles: Array, owner: NDArray[np.int64], frame: RasterFrame, heig
 
 
 def _crossings(corners: Array, height: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Where triangles cross a height each: from the edge that goes up to the edge that comes down, float64 [n, 2, 2],
-    and which triangles do."""
+    """Intersect triangles with a height each: from the ascending edge to the descending edge.
+
+    Returns float64 [n, 2, 2], and which triangles cross.
+    """
     a, b = corners, np.roll(corners, -1, axis=1)
     above = a[..., 2] > height[:, None]
     then = np.roll(above, -1, axis=1)
@@ -226,8 +234,10 @@ def _crossings(corners: Array, height: Array) -> tuple[Array, NDArray[np.bool_]]
 
 
 def _enclosed_cells(edges: Array, group: NDArray[np.int64], layers: int, frame: RasterFrame) -> Iterator[Spans]:
-    """The cells whose middle lies inside closed directed edges (float64 [m, 2, 2], in cells), each group on its own;
-    the layer is the group modulo ``layers``."""
+    """Return the cells whose middle is inside closed directed edges (float64 [m, 2, 2], in cells), by group.
+
+    The layer is the group modulo ``layers``.
+    """
     y0, y1 = edges[:, 0, 1], edges[:, 1, 1]
     low = np.clip(np.ceil(np.minimum(y0, y1) - 0.5), 0, frame.height).astype(np.int64)
     end = np.clip(np.ceil(np.maximum(y0, y1) - 0.5), 0, frame.height).astype(np.int64)
@@ -266,9 +276,11 @@ def _enclosed_cells(edges: Array, group: NDArray[np.int64], layers: int, frame: 
 
 
 def areas(polygons: Iterable[object], frame: RasterFrame, *, touched: bool) -> Iterator[Spans]:
-    """The cells that polygons (shapely, metres) enclose, and with ``touched`` also those that their outlines meet.
-    The layer is 0. Lines and points count by the cells that they touch, in both cases."""
-    # Twice: a collection may hold several polygons in one of its parts.
+    """Return the cells that polygons (shapely, metres) enclose, with ``touched`` also those that their outlines touch.
+
+    The layer is 0. Lines and points count by the cells that they touch, in both cases.
+    """
+    # twice: a collection may contain several polygons in one of its parts
     parts = shapely.get_parts(shapely.get_parts(np.array(list(polygons), object)))
     parts = parts[~shapely.is_empty(parts)]
     flat = shapely.get_type_id(parts) == 3
@@ -290,14 +302,14 @@ def areas(polygons: Iterable[object], frame: RasterFrame, *, touched: bool) -> I
 
 
 def _merge_spans(parts: Iterable[Spans]) -> Iterator[Spans]:
-    """The spans, all in the layer 0."""
+    """Return the spans, all in layer 0."""
     for spans in parts:
         spans[:, 0] = 0
         yield spans
 
 
 def lines(edges: Array, frame: RasterFrame) -> Iterator[Spans]:
-    """The cells that straight lines (float64 [n, 2, 2], metres) touch; a line's number is the spans' layer."""
+    """Return the cells that straight lines (float64 [n, 2, 2], metres) touch; a line's index is the spans' layer."""
     if len(edges):
         xy = frame.to_cells(edges)
         aside = (xy.max(axis=1) < 0).any(axis=1) | (xy.min(axis=1) > [frame.width, frame.height]).any(axis=1)
@@ -306,7 +318,7 @@ def lines(edges: Array, frame: RasterFrame) -> Iterator[Spans]:
 
 
 def _edges(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
-    """Consecutive vertices of lines or rings as float64 [m, 2, 2], and whose they are."""
+    """Return consecutive vertices of lines or rings as float64 [m, 2, 2], and the index of their line."""
     at, owner = shapely.get_coordinates(lines, return_index=True)
     same = owner[1:] == owner[:-1]
     return np.stack([at[:-1], at[1:]], axis=1)[same], owner[:-1][same]
@@ -316,7 +328,7 @@ def _edges(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
 
 
 def paint(cells: NDArray[np.uint8], spans: Iterable[Spans], value: int) -> None:
-    """Give the cells of spans (of any layer) a value; cells: uint8 [height, width], row 0 the lowest."""
+    """Set the cells of spans (of any layer) to a value; cells: uint8 [height, width], row 0 the lowest."""
     width = cells.shape[1]
     rows = max(1, 2**22 // width)
     for part in spans:
@@ -338,14 +350,14 @@ def paint(cells: NDArray[np.uint8], spans: Iterable[Spans], value: int) -> None:
 
 
 def expand_spans(spans: Spans) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """(layer, row, column) of every cell of the spans, with repeats."""
+    """Return (layer, row, column) of every cell of the spans, with repeats."""
     times = spans[:, 3] - spans[:, 2]
     layer, row = np.repeat(spans[:, 0], times), np.repeat(spans[:, 1], times)
     return layer, row, np.repeat(spans[:, 2], times) + _within(times)
 
 
 def flood(cells: NDArray[np.uint8], value: int, new: int) -> None:
-    """Give a new value to all cells of a value that are joined to the border by their sides through such cells."""
+    """Set all cells of a value that are connected to the border, by their sides through such cells, to a new value."""
     import cv2
 
     height, width = cells.shape
@@ -358,7 +370,7 @@ def flood(cells: NDArray[np.uint8], value: int, new: int) -> None:
 
 
 def grow(cells: NDArray[np.uint8], value: int, distance: float) -> None:
-    """Give a value to all cells whose middle is at most ``distance`` (in cells) from the middle of one that has it."""
+    """Set all cells whose middle is at most ``distance`` cells from the middle of a cell of a value to it."""
     import cv2
 
     if distance <= 0 or not (cells == value).any():
@@ -377,24 +389,24 @@ def grow(cells: NDArray[np.uint8], value: int, distance: float) -> None:
 
 
 def check_frame(frame: RasterFrame, cap: int, longest: int) -> RasterFrame:
-    """The frame; CannotConvert where it has more cells than ``cap`` or a side longer than ``longest`` cells."""
+    """Check a frame. Raises CannotConvert if it has more cells than ``cap`` or a side longer than ``longest`` cells."""
     if frame.cells > cap or max(frame.width, frame.height) > longest:
         side = max(frame.width, frame.height) * frame.resolution
         needed = max(math.sqrt(frame.cells * frame.resolution**2 / cap), side / longest)
         raise CannotConvert(
             f"{frame.width} × {frame.height} cells of {frame.resolution:g} m are needed; the limit is {cap} cells and "
-            f"{longest} along a side: ask for a resolution of at least {needed:.3g} m, or supply a smaller fence"
+            f"{longest} along a side: set a resolution of at least {needed:.3g} m, or draw a smaller fence"
         )
     return frame
 
 
 def _within(times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """0 … n-1 for each n, one after another."""
+    """Return 0 … n-1 for each n, concatenated."""
     return np.arange(int(times.sum())) - np.repeat(np.cumsum(times) - times, times)
 
 
 def _portions(load: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Consecutive indexes whose loads together are about AT_ONCE; none that has no load at the ends of the list."""
+    """Split indexes into runs with a total load of about BLOCK_SIZE each; runs without load are skipped."""
     if not len(load) or not int(load.sum()):
         return
     bucket = (np.cumsum(load) - load) // BLOCK_SIZE

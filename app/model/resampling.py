@@ -1,7 +1,7 @@
-"""A picture in any CRS -> the same place on another grid: north up, square pixels, in the local frame or in a CRS.
+"""Resampling of an image in any CRS to a north-up grid of square pixels, in the local frame or in a CRS.
 
-Stored pictures keep their pixels and their grid; whoever needs them elsewhere resamples them here, on use. Every target
-pixel is looked up through PROJ, to a ten thousandth of a pixel: nothing else is approximated but values between pixels.
+Stored images keep their pixels and their grid; users that need another grid resample them on use. Every target pixel is
+looked up through PROJ, to a ten thousandth of a pixel; the only other approximation is the interpolation of values.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from app.model.imagery import CLEAR, LOCAL, Affine, GeoImage, pixel_positions
 
 Method = Literal["nearest", "bilinear", "cubic"]
 TOLERANCE = 1e-4
-"""Pixels of the source by which the place of a pixel may be off; GDAL takes no 0."""
+"""Maximum error of a pixel's position in pixels of the source; GDAL rejects 0."""
 
 STEPS = 64
-"""Points on each side of a picture by which its extent in the target is found."""
+"""Number of points on each side of an image from which its extent in the target is computed."""
 
 MAX_PIXELS = 2**28
 _NO_CRS = "EPSG:3857"
-"""Stands for the local frame on both sides where neither is placed on earth: a CRS to itself is no transformation."""
+"""Placeholder for the local frame on both sides if neither is on earth: a CRS to itself is no transformation."""
 
 
 def resample(
@@ -41,15 +41,18 @@ def resample(
     method: Method | None = None,
     most_pixels: int = MAX_PIXELS,
 ) -> GeoImage:
-    """The picture on a grid of ``crs`` (``local``: metres of ``frame``; else a name that PROJ knows).
+    """Resample an image to a grid of ``crs`` (``local``: metres of ``frame``; else a name that PROJ knows).
 
-    The grid's rows run along x, its columns against y, its pixels are squares of ``resolution`` (metres or degrees of
-    that CRS; default: as many pixels as the picture has on its area) and its upper left corner is a whole multiple of
-    it. method: how a value between pixels is made; default: ``bilinear``, ``nearest`` for palettes and truth values.
-    Outside of the picture stands its no-data value, NaN for floats without one; else a further band says so
-    (``alpha`` for 8 bit, ``mask`` for others). A picture that lies on such a grid already is returned as it is.
+    Args:
+        resolution: side of the square pixels, metres or degrees of that CRS. Default: as many pixels as the image has
+            on its area.
+        method: interpolation. Default: ``bilinear``, ``nearest`` for palettes and booleans.
 
-    Raises MissingDatum where a datum would be needed, Invalid where there is no way, or for too many pixels.
+    The grid's rows run along x, its columns against y, and its upper left corner is a whole multiple of the resolution.
+    Pixels outside the image get its no-data value, NaN for floats without one; otherwise a further band marks them
+    (``alpha`` for 8 bit, ``mask`` for others). An image on such a grid is returned unchanged.
+
+    Raises MissingDatum if a datum is needed, Invalid if there is no conversion, or for too many pixels.
     """
     if frame is None and (picture.crs == LOCAL) != (crs == LOCAL):
         raise MissingDatum('the picture can only be placed with a datum: PATCH the environment with {"datum": {…}}')
@@ -68,9 +71,7 @@ def resample(
     height, width = picture.pixels.shape[:2]
     outline = to_target(_transform_points(picture.outline(STEPS), forth))
     if not np.isfinite(outline).all() or (crs == LOCAL and np.abs(outline).max() > MAX_METRES):
-        raise Invalid(
-            "the picture reaches places that the target cannot say: it is too large, or too far from the datum"
-        )
+        raise Invalid("the picture extends beyond the target CRS: it is too large, or too far from the datum")
     if resolution is None:
         u, v = width / 2, height / 2
         near = pixel_positions(base, np.array([u, u + 1, u]), np.array([v, v, v + 1]))
@@ -78,14 +79,14 @@ def resample(
         area = abs((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
         resolution = float(f"{math.sqrt(area):.9g}")
     if not (math.isfinite(resolution) and resolution > 0.0):
-        raise Invalid("the picture has no size in the target")
+        raise Invalid("the picture has no area in the target CRS")
     low = np.floor(outline.min(axis=0) / resolution + 1e-6)
     high = np.maximum(np.ceil(outline.max(axis=0) / resolution - 1e-6), low + 1)
     columns, rows = (float(n) for n in high - low)
     if columns * rows > most_pixels:
         raise Invalid(
-            f"the picture would have {columns:.0f} × {rows:.0f} pixels; at most {most_pixels} are made: ask for a "
-            "coarser resolution"
+            f"the picture would have {columns:.0f} × {rows:.0f} pixels, more than the maximum of "
+            f"{most_pixels}: set a coarser resolution"
         )
     grid = (resolution, 0.0, float(low[0]) * resolution, 0.0, -resolution, float(high[1]) * resolution)
     shape = (int(rows), int(columns))
@@ -102,14 +103,14 @@ Turn = tuple[float, float, float, float]
 
 
 def _target_crs(crs: str, frame: LocalFrame | None) -> tuple[str, Turn]:
-    """The CRS for PROJ, and how coordinates are turned into its own."""
+    """Return the CRS for PROJ, and the rotation of coordinates into its own."""
     if crs == LOCAL:
         return (frame.crs, frame.from_local) if frame is not None else (_NO_CRS, (1.0, 0.0, 0.0, 1.0))
     return crs, (1.0, 0.0, 0.0, 1.0)
 
 
 def _rotate_transform(transform: Affine, turn: Turn) -> Affine:
-    """A transform whose coordinates are turned further."""
+    """Return a transform with rotated coordinates."""
     a, b, c, d, e, f = transform
     p, q, r, s = turn
     return (p * a + q * d, p * b + q * e, p * c + q * f, r * a + s * d, r * b + s * e, r * c + s * f)
@@ -121,7 +122,7 @@ def _transform_points(points: NDArray[np.float64], turn: Turn) -> NDArray[np.flo
 
 
 def _rotate_back(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
-    """Turned back: the inverse of a rotation is its transpose."""
+    """Rotate back: the inverse of a rotation is its transpose."""
     p, q, r, s = turn
     return _transform_points(points, (p, r, q, s))
 
@@ -183,12 +184,12 @@ def _warp(
 
 
 def _opaque(band: NDArray[Any], colour: str) -> float:
-    """The value of an alpha or mask band that means fully opaque."""
+    """Return the value of an alpha or mask band that means fully opaque."""
     if colour == "mask":
         return float(max(1, band.max()))
     return float(np.iinfo(band.dtype).max) if band.dtype.kind in "iu" else 1.0
 
 
 def to_wgs84(picture: GeoImage, frame: LocalFrame | None = None, **options: Any) -> GeoImage:
-    """``resample`` on a grid of longitude and latitude."""
+    """Resample like ``resample``, to a grid of longitude and latitude."""
     return resample(picture, frame, crs=WGS84, **options)

@@ -1,4 +1,4 @@
-"""Which of several stored parts of a layer a step looks at: one for each level."""
+"""Selection among several stored parts of a layer: one for each level."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ P = TypeVar("P")
 
 
 def parts_with_name(parts: Mapping[PartKey, P], name: str, label: str) -> dict[PartKey, P]:
-    """The parts of this name. label: what errors call one. Raises NotFound with the names that there are."""
+    """Return the parts of this name. label: their kind in errors. Raises NotFound with the existing names."""
     matches = {key: part for key, part in parts.items() if key.name == name}
     if not matches:
         names = sorted({key.name for key in parts})
@@ -28,7 +28,10 @@ def parts_with_name(parts: Mapping[PartKey, P], name: str, label: str) -> dict[P
 
 
 def select_per_level(parts: Mapping[PartKey, P], usual: str, label: str, option: str) -> dict[PartKey, P]:
-    """For each level the part of the usual name, else the only one. Ambiguous says which option names one."""
+    """Return for each level the part of the default name, else the only one.
+
+    Raises Ambiguous with the option to use.
+    """
     out: dict[PartKey, P] = {}
     for level in dict.fromkeys(key.level for key in parts):
         level_parts = {key: part for key, part in parts.items() if key.level == level}
@@ -41,36 +44,36 @@ def select_per_level(parts: Mapping[PartKey, P], usual: str, label: str, option:
 
 
 def select_grids(layers: Layers, name: str | None, label: str) -> dict[PartKey, OccupancyGrid]:
-    """One grid for each level: the named one, else ``map``, else the only one that is no costmap filter mask.
+    """Return one grid per level: the named one, else ``map``, else the only one that is no costmap filter mask.
 
-    label: what masks do not tell, for the error. Raises NotFound, MissingLayer where there are masks alone, Ambiguous.
+    label: kind of information that masks lack, for the error. Raises NotFound, MissingLayer if there are only masks,
+    Ambiguous.
     """
     grids = layers.grids()
     if name is not None:
         return parts_with_name(grids, name, "occupancy grid")
     maps = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
     if not maps:
-        raise MissingLayer(f"costmap filter masks alone tell no {label}: upload an occupancy grid of what stands there")
+        raise MissingLayer(f"costmap filter masks contain no {label}: upload an occupancy grid of the obstacles")
     return select_per_level(maps, MAP, "occupancy grid", "grid")
 
 
 def as_planned(grid: OccupancyGrid, name: str, warn: Callable[[str], None]) -> OccupancyGrid:
-    """The grid with free cells of unknown's grey as unknown, and a warning where there are such cells."""
+    """Set free cells with the grey of unknown ones to unknown, and warn of them."""
     grey = unknown_grey(grid)
     if grey is not None:
-        warn(grey_warning(grid, grey, name, "they are taken as unknown"))
+        warn(grey_warning(grid, grey, name, "they count as unknown"))
     return unknown_grey_as_unknown(grid)
 
 
 def grey_warning(grid: OccupancyGrid, grey: NDArray[np.bool_], name: str, effect: str) -> str:
-    """The warning of free cells of unknown's grey. effect: what happens to them."""
+    """Return the warning about free cells with the grey of unknown ones. effect: the consequence."""
     return (
-        f"{name} has {int(np.count_nonzero(grey))} cells of the grey 205, map_saver's unknown, which its "
-        f"free_thresh of {grid.free_thresh:g} calls free: {effect}; write "
-        "free_thresh: 0.196 where such cells mean unknown"
+        f"{name} has {int(np.count_nonzero(grey))} cells of the grey 205 (map_saver's unknown), which are free by its "
+        f"free_thresh of {grid.free_thresh:g}: {effect}; set free_thresh to 0.196 if such cells mean unknown"
     )
 
 
 def grid_label(key: PartKey) -> str:
-    """What errors call a grid."""
+    """Return a grid's name in errors."""
     return f"the occupancy grid {key.name!r} of level {key.level!r}"

@@ -1,28 +1,28 @@
 """Solids of objects: ``properties.shapes`` and mesh files -> triangles, footprints and boxes in the local frame.
 
-An object's collision solids are a list of mappings under ``shapes``, each with a ``type`` and, where it is not the
+An object's collision solids are a list of mappings under ``shapes``, each with a ``type`` and, unless it is the
 identity, a ``pose`` [x, y, z, roll, pitch, yaw] (metres, radians) in the object's own frame; the object's ``pose`` is
 in the local frame. Rotations are SDF's: about the fixed axes x, y, z in this order, R = Rz·Ry·Rx.
 
 ========== ============================================= ==============================================================
-type       further words                                 origin and extent
+type       further keys                                  origin and extent
 ========== ============================================= ==============================================================
 box        size [x, y, z]                                its middle
 cylinder   radius, length                                its middle, length along z
 capsule    radius, length                                its middle; length of the cylinder between two half spheres
 sphere     radius                                        its middle
 ellipsoid  radii [x, y, z]                               its middle
-plane      normal [x, y, z], size [x, y]                 its middle; a solver takes it as endless, see ``planes``
-polyline   points [[[x, y], …], …], height               rings by even and odd, z from 0 to height
+plane      normal [x, y, z], size [x, y]                 its middle; infinite in physics engines, see ``planes``
+polyline   points [[[x, y], …], …], height               rings by the even-odd rule, z from 0 to height
 mesh       file, scale [x, y, z], submesh, center        the file's
-heightmap  file, size [x, y, z], position [x, y, z]      its middle; the picture's brightest pixel is at size z
+heightmap  file, size [x, y, z], position [x, y, z]      its middle; the image's brightest pixel is at size z
 ========== ============================================= ==============================================================
 
-A shape with a ``uri`` and no ``file`` is a solid that the upload does not tell: a mesh that is not in it, a geometry of
-an unknown type; the type ``model`` stands for all solids of a model that is not in it. ``Solids.read`` reports them.
+A shape with a ``uri`` and no ``file`` is a solid that is missing in the upload: a missing mesh, a geometry of an
+unknown type; the type ``model`` represents all solids of a missing model. ``Solids.read`` reports them.
 
-``visual: true`` marks a shape that only visuals have: nothing collides with it; ``unseen: true`` one that is only
-collided with. ``colour`` [r, g, b] or [r, g, b, a], 0 to 1, is how it is shown.
+``visual: true`` marks a shape that is only visible, without collision; ``unseen: true`` one with collision only.
+``colour`` [r, g, b] or [r, g, b, a], 0 to 1, is its display colour.
 """
 
 from __future__ import annotations
@@ -47,29 +47,29 @@ from app.model.frame import MAX_METRES
 Array = NDArray[np.float64]
 
 MAX_TRIANGLES = 5_000_000
-"""Of one object."""
+"""Maximum number of triangles of one object."""
 
 MAX_SHAPES = 10_000
-"""Of one object."""
+"""Maximum number of shapes of one object."""
 
 MAX_PIXELS = 4097 * 4097
-"""Of a height map's picture."""
+"""Maximum number of pixels of a height map's image."""
 
 MAX_HEIGHTMAP_SIDE = 1400
-"""Rows and columns of a height map that are told apart: of a larger picture's neighbouring pixels the highest stays."""
+"""Maximum number of rows and columns of a height map; of a larger image the brightest pixel of each block is used."""
 
 TOLERANCE = 0.002
-"""Metres that a round solid's flat sides may lie within the true one."""
+"""Maximum distance in metres of a round solid's flat sides from the true surface."""
 
 MAX_OUTLINES = 5_000
-"""Triangles whose outlines are joined for a footprint; of a mesh with more the convex hull is taken."""
+"""Maximum number of triangles whose outlines are joined for a footprint; larger meshes use the convex hull."""
 
 _NOTHING: Array = np.empty((0, 3, 3))
 
 
 @dataclass(frozen=True, slots=True)
 class Unreadable:
-    """A solid of unknown extent: why it cannot be read, and its origin (x, y) in metres, local frame."""
+    """A solid of unknown extent: the error of reading it, and its origin (x, y) in metres, local frame."""
 
     error: Invalid | TooLarge
     at: tuple[float, float]
@@ -77,10 +77,10 @@ class Unreadable:
 
 @dataclass(slots=True)
 class Solids:
-    """Objects' files, each mesh of which is read once, however many shapes show it.
+    """Reader of objects' solids; each mesh file is read once, however many shapes use it.
 
-    resources: by path, as ``Layers.resources()`` gives them. planes: whether planes count, as rectangles of their size.
-    visuals: whether shapes that nothing collides with count too.
+    resources: by path, as returned by ``Layers.resources()``. planes: whether planes count, as rectangles of their
+    size. visuals: whether shapes without collision count too.
     """
 
     resources: Mapping[str, bytes]
@@ -89,10 +89,10 @@ class Solids:
     _read: dict[str, meshes.Mesh | Invalid] = field(default_factory=dict, init=False, repr=False)
 
     def triangles(self, properties: Properties) -> Array:
-        """An object's solids as triangles, float64 [n, 3, 3], metres, local frame; counter-clockwise from outside where
-        the source says so.
+        """Return an object's solids as triangles, float64 [n, 3, 3], metres, local frame.
 
-        Raises Invalid that names the file or the shape; the detail says what to supply for a missing file.
+        They are counter-clockwise seen from outside if the source is. Raises Invalid with the file or the shape; the
+        detail states what to upload for a missing file.
         """
         triangles, unreadable = self.read(properties)
         if unreadable:
@@ -100,9 +100,9 @@ class Solids:
         return triangles
 
     def read(self, properties: Properties) -> tuple[Array, list[Unreadable]]:
-        """Those of an object's solids that can be read, as ``triangles`` gives them, and those that cannot.
+        """Return the readable solids of an object, as ``triangles`` does, and the unreadable ones.
 
-        Raises Invalid or TooLarge where that is so of the object as a whole.
+        Raises Invalid or TooLarge if the object as a whole is invalid or too large.
         """
         placement = matrix(parse_pose(properties))
         arrays: list[Array] = []
@@ -124,8 +124,10 @@ class Solids:
         ), unreadable
 
     def footprint(self, properties: Properties) -> Any:
-        """The ground that an object's solids stand over: a valid shapely geometry, metres, local frame; empty where it
-        has none. Of a mesh with very many triangles it is the convex hull."""
+        """Return the ground below an object's solids: a valid shapely geometry in local metres, possibly empty.
+
+        For a mesh with very many triangles it is the convex hull.
+        """
         outlines = []
         placement = matrix(parse_pose(properties))
         for k, shape in enumerate(object_shapes(properties)):
@@ -135,7 +137,7 @@ class Solids:
         return shapely.union_all(outlines) if outlines else shapely.Polygon()
 
     def bounds(self, properties: Properties) -> tuple[float, float, float, float, float, float] | None:
-        """(min x, min y, min z, max x, max y, max z) of an object's solids, metres, local frame; None without any."""
+        """Return min x, min y, min z, max x, max y, max z of an object's solids, local metres; None without any."""
         flat = self.triangles(properties).reshape(-1, 3)
         if not len(flat):
             return None
@@ -143,24 +145,24 @@ class Solids:
         return low[0], low[1], low[2], high[0], high[1], high[2]
 
     def size(self, properties: Properties) -> tuple[float, float, float] | None:
-        """[x, y, z] of the box around an object's solids in its own frame, metres; None without any."""
+        """Return [x, y, z] of the box around an object's solids in its own frame, metres; None without any."""
         b = self.bounds({key: value for key, value in properties.items() if key != "pose"})
         return None if b is None else (b[3] - b[0], b[4] - b[1], b[5] - b[2])
 
     def shape(self, shape: Mapping[str, Any], location: str = "shape") -> Array:
-        """One shape as triangles in its object's frame, float64 [n, 3, 3]."""
+        """Convert one shape into triangles in its object's frame, float64 [n, 3, 3]."""
         kind = shape.get("type")
         make = _MAKERS.get(kind) if isinstance(kind, str) else None
         if "file" not in shape and isinstance(shape.get("uri"), str):
             _raise_missing_file(str(shape["uri"]))
         if make is None:
-            _raise_invalid(f"has the type {str(kind)[:80]!r}; there are {', '.join(_MAKERS)}", location)
+            _raise_invalid(f"has the unknown type {str(kind)[:80]!r}: use one of {', '.join(_MAKERS)}", location)
         return _check_corners(
             _apply_transform(make(self, shape, location), matrix(parse_pose(shape, location))), location
         )
 
     def mesh(self, file: str) -> meshes.Mesh:
-        """A mesh file, read once. Raises Invalid that names it."""
+        """Read a mesh file once. Raises Invalid with its name."""
         if file not in self._read:
             try:
                 self._read[file] = meshes.read_mesh(self.file(file), file)
@@ -174,7 +176,7 @@ class Solids:
         return cached
 
     def file(self, path: str) -> bytes:
-        """A resource's bytes; Invalid says that it is to be supplied."""
+        """Return a resource's bytes. Raises Invalid with the advice to upload it."""
         data = self.resources.get(path)
         if data is None:
             _raise_missing_file(path)
@@ -187,33 +189,33 @@ class Solids:
 def triangles(
     properties: Properties, resources: Mapping[str, bytes], *, planes: bool = False, visuals: bool = False
 ) -> Array:
-    """See ``Solids.triangles``; for many objects make one ``Solids``."""
+    """Call ``Solids.triangles``; for many objects create one ``Solids``."""
     return Solids(resources, planes, visuals).triangles(properties)
 
 
 def footprint(
     properties: Properties, resources: Mapping[str, bytes], *, planes: bool = False, visuals: bool = False
 ) -> Any:
-    """See ``Solids.footprint``."""
+    """Call ``Solids.footprint``."""
     return Solids(resources, planes, visuals).footprint(properties)
 
 
 def bounds(
     properties: Properties, resources: Mapping[str, bytes], *, planes: bool = False, visuals: bool = False
 ) -> tuple[float, float, float, float, float, float] | None:
-    """See ``Solids.bounds``."""
+    """Call ``Solids.bounds``."""
     return Solids(resources, planes, visuals).bounds(properties)
 
 
 def size(
     properties: Properties, resources: Mapping[str, bytes], *, planes: bool = False, visuals: bool = False
 ) -> tuple[float, float, float] | None:
-    """See ``Solids.size``."""
+    """Call ``Solids.size``."""
     return Solids(resources, planes, visuals).size(properties)
 
 
 def object_shapes(properties: Properties) -> Sequence[Mapping[str, Any]]:
-    """An object's shapes; empty where it says none. Raises Invalid where they are no list of mappings."""
+    """Return an object's shapes; empty if it has none. Raises Invalid if they are no list of mappings."""
     shapes = properties.get("shapes")
     if shapes is None:
         return []
@@ -225,7 +227,7 @@ def object_shapes(properties: Properties) -> Sequence[Mapping[str, Any]]:
 
 
 def parse_pose(members: Mapping[str, Any], location: str = "pose") -> tuple[float, ...]:
-    """[x, y, z, roll, pitch, yaw]; missing ones are 0. Raises Invalid where it is no list of finite numbers."""
+    """Return [x, y, z, roll, pitch, yaw]; missing numbers are 0. Raises Invalid if it is no list of finite numbers."""
     pose = members.get("pose")
     if pose is None:
         return (0.0,) * 6
@@ -236,7 +238,7 @@ def parse_pose(members: Mapping[str, Any], location: str = "pose") -> tuple[floa
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Array:
-    """R = Rz(yaw)·Ry(pitch)·Rx(roll), float64 [3, 3]."""
+    """Return R = Rz(yaw)·Ry(pitch)·Rx(roll), float64 [3, 3]."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))
     return np.array(
         [
@@ -248,7 +250,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def matrix(pose: Sequence[float]) -> Array:
-    """A pose [x, y, z, roll, pitch, yaw] as float64 [4, 4]."""
+    """Convert a pose [x, y, z, roll, pitch, yaw] to float64 [4, 4]."""
     out = np.eye(4)
     out[:3, :3] = rotation(*pose[3:6])
     out[:3, 3] = pose[:3]
@@ -256,7 +258,7 @@ def matrix(pose: Sequence[float]) -> Array:
 
 
 def apply_pose(corners: Array, pose: Sequence[float]) -> Array:
-    """Points float64 [..., 3] of a frame with this pose in the frame around it."""
+    """Transform points float64 [..., 3] of a frame with this pose to the frame around it."""
     return _apply_transform(corners, matrix(pose))
 
 
@@ -273,7 +275,7 @@ def _check_corners(corners: Array, location: str) -> Array:
 
 
 def _shadow(corners: Array) -> Any:
-    """The union of triangles [n, 3, 2] seen from above; of very many the convex hull."""
+    """Return the union of triangles [n, 3, 2] seen from above; of very many the convex hull."""
     if not len(corners):
         return shapely.Polygon()
     if len(corners) > MAX_OUTLINES:
@@ -283,7 +285,7 @@ def _shadow(corners: Array) -> Any:
     seen = np.abs(area) > 1e-12
     if not seen.any():  # a wall without thickness
         return shapely.convex_hull(shapely.multipoints(corners.reshape(-1, 2)))
-    # A grid of a micrometre makes the union of hundreds of touching slivers sure.
+    # a grid of a micrometre makes the union of hundreds of touching slivers robust
     return shapely.union_all(shapely.polygons(corners[seen]), grid_size=1e-6)
 
 
@@ -316,7 +318,7 @@ def _cylinder(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:
 
 
 def _plane(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:  # noqa: ARG001
-    """A rectangle of the plane's size, turned from +z to its normal the shortest way."""
+    """Return a rectangle of the plane's size, rotated from +z to its normal by the smallest angle."""
     x, y = _vector(shape, "size", 2, location, (1.0, 1.0)) / 2.0
     flat = np.array([[[-x, -y, 0], [x, -y, 0], [x, y, 0]], [[-x, -y, 0], [x, y, 0], [-x, y, 0]]], np.float64)
     normal = _vector(shape, "normal", 3, location, (0.0, 0.0, 1.0), minimum=-MAX_METRES)
@@ -344,9 +346,9 @@ def _polyline(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:
 
 
 def extrude(area: Any, low: float, high: float) -> Array:
-    """A polygon or several (shapely, metres), from one height to another, as closed triangles: float64 [n, 3, 3]."""
+    """Extrude polygons (shapely, metres) from one height to another: closed triangles, float64 [n, 3, 3]."""
     faces = []
-    for polygon in shapely.get_parts(shapely.get_parts(area)):  # a collection may hold several polygons in one part
+    for polygon in shapely.get_parts(shapely.get_parts(area)):  # a collection may contain several polygons in one part
         if shapely.get_type_id(polygon) != 3 or shapely.is_empty(polygon):
             continue
         oriented = shapely.orient_polygons(polygon)
@@ -375,13 +377,13 @@ def _mesh(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:
         corners = solids.mesh(file).triangles(part or None, centre=shape.get("center") is True) * scale
     except Invalid as error:
         raise Invalid(error.detail, error.problems or [Problem(error.detail, file)]) from error
-    return corners[:, ::-1] if np.prod(scale) < 0 else corners  # a mirror turns the inside out
+    return corners[:, ::-1] if np.prod(scale) < 0 else corners  # a mirrored solid has inverted faces
 
 
 def _heightmap(solids: Solids, shape: Mapping[str, Any], location: str) -> Array:
-    """A closed solid from a picture: its brightest pixel at the full height, black at 0, the top row at the largest y.
+    """Convert an image to a closed solid: brightest pixel at full height, black at 0, top row at maximum y.
 
-    Source: gz-common ImageHeightmap and HeightmapShape (a pixel over the picture's maximum, times the size's z).
+    Source: gz-common ImageHeightmap and HeightmapShape (a pixel over the image's maximum, times the size's z).
     """
     file = shape.get("file")
     if not isinstance(file, str) or not file:
@@ -409,7 +411,7 @@ def _heightmap(solids: Solids, shape: Mapping[str, Any], location: str) -> Array
 
 
 def _highest(grey: Array) -> Array:
-    """A picture with at most FINEST rows and columns, each of its pixels the brightest of a block."""
+    """Reduce an image to the maximum number of rows and columns, each pixel the brightest of a block."""
     step = [math.ceil(n / MAX_HEIGHTMAP_SIDE) for n in grey.shape]
     if max(step) == 1:
         return grey
@@ -418,14 +420,14 @@ def _highest(grey: Array) -> Array:
 
 
 def _sheet(at: Array) -> Array:
-    """A grid of points [rows, columns, 3] as triangles, two for each of its squares."""
+    """Convert a grid of points [rows, columns, 3] into triangles, two for each of its squares."""
     a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
     both = np.stack([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)], axis=-3)
     return both.reshape(-1, 3, 3)
 
 
 def _picture(data: bytes, file: str) -> Array:
-    """A picture's grey values, float64 [rows, columns]."""
+    """Read an image's grey values, float64 [rows, columns]."""
     from PIL import Image
 
     kinds = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF", ".bmp": "BMP"}
@@ -460,7 +462,7 @@ _MAKERS: Mapping[str, _Maker] = {
 }
 
 TYPES = frozenset(_MAKERS)
-"""The types of shapes."""
+"""Readers by type of shape."""
 
 
 @cache
@@ -470,14 +472,14 @@ def _unit_box() -> Array:
 
 
 def _sides(radius: float) -> int:
-    """Flat sides of a circle, a multiple of 4 so that the extremes on the axes are exact."""
+    """Return the number of flat sides of a circle, a multiple of 4 so that the extremes on the axes are exact."""
     ratio = TOLERANCE / radius if radius > 0 else 1.0
     side_count = math.pi / math.acos(1.0 - ratio) if ratio < 1.0 else 0.0
     return int(min(max(4 * math.ceil(side_count / 4.0), 16), 128))
 
 
 def _arc(radius: float, length: float, sides: int = 0) -> tuple[Array, Array]:
-    """(radii, heights) of half a circle from its lowest to its highest point, its halves ``length`` apart."""
+    """Return (radii, heights) of half a circle from its lowest to its highest point, its halves ``length`` apart."""
     quarter = (sides or _sides(radius)) // 4
     angle = np.linspace(0.0, math.pi / 2.0, quarter + 1)
     r, z = np.sin(angle) * radius, np.cos(angle) * radius + length / 2.0
@@ -488,7 +490,7 @@ def _arc(radius: float, length: float, sides: int = 0) -> tuple[Array, Array]:
 
 
 def _revolve(radii: Array, heights: Array, sides: int) -> Array:
-    """A curve (radii, heights), upwards, turned round the z axis: triangles without those of no area at the poles."""
+    """Revolve a curve (radii, heights), upwards, about the z axis: triangles without empty ones at the poles."""
     angle = np.arange(sides + 1) * (2.0 * math.pi / sides)
     c, s = np.cos(angle), np.sin(angle)
     quarter = sides // 4
@@ -505,7 +507,7 @@ def _add_height(flat: Array, z: float) -> Array:
 
 
 def _origin(placement: Array, shape: Mapping[str, Any]) -> tuple[float, float]:
-    """A shape's origin seen from above, in the frame around its object; the object's own where its pose is invalid."""
+    """Return a shape's origin seen from above, in the frame around its object; the object's if its pose is invalid."""
     try:
         at = (placement @ matrix(parse_pose(shape)))[:2, 3]
     except Invalid:
@@ -514,7 +516,7 @@ def _origin(placement: Array, shape: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def _raise_missing_file(path: str) -> NoReturn:
-    reason = f"the file {path[:200]} is not there: upload it together with the objects"
+    reason = f"the file {path[:200]} is missing: upload it together with the objects"
     raise Invalid(reason, [Problem(reason, path[:200])])
 
 

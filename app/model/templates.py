@@ -1,6 +1,6 @@
-"""What an environment fills in where a format asks for something that no layer has: a named set, and values of its own.
+"""Template values of an environment, for formats that need more than the layers have: a named set, and own values.
 
-Kept with each version; ``app.templates`` has the sets and says what holds for a format.
+Stored with each version; ``app.templates`` defines the sets and resolves the values of a format.
 """
 
 from __future__ import annotations
@@ -10,40 +10,42 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 DEFAULT_SET: Final = "default"
-"""The set that leaves each format's own defaults as they are."""
+"""Name of the set that leaves each format's own defaults unchanged."""
 
 
 @dataclass(frozen=True, slots=True)
 class FormatTemplate:
-    """What an environment says of one format. set: another set than the environment's, or None. values: by parameter,
-    as JSON has them; they go before those of any set."""
+    """An environment's template for one format.
+
+    set: another set than the environment's, or None. values: by parameter, as JSON; they take precedence over any set.
+    """
 
     set: str | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-like members, without the empty ones; values by name."""
+        """Return the JSON members, without the empty ones; values by name."""
         out: dict[str, Any] = {} if self.set is None else {"set": self.set}
         return out | ({"values": dict(sorted(self.values.items()))} if self.values else {})
 
 
 @dataclass(frozen=True, slots=True)
 class Templates:
-    """The set that an environment has chosen, and by format what it says itself."""
+    """An environment's chosen set, and its own values by format."""
 
     set: str = DEFAULT_SET
     formats: Mapping[str, FormatTemplate] = field(default_factory=dict)
 
     def for_format(self, name: str) -> FormatTemplate:
-        """What is said of a format."""
+        """Return the template of a format."""
         return self.formats.get(name) or FormatTemplate()
 
     def set_of(self, name: str) -> str:
-        """The set that holds for a format."""
+        """Return the set that applies to a format."""
         return self.for_format(name).set or self.set
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-like members in one order; empty where nothing was ever said."""
+        """Return the JSON members in a fixed order; empty if nothing was ever set."""
         format_values = {name: template.as_dict() for name, template in sorted(self.formats.items())}
         format_values = {name: template for name, template in format_values.items() if template}
         out: dict[str, Any] = {} if self.set == DEFAULT_SET else {"set": self.set}
@@ -51,7 +53,7 @@ class Templates:
 
     @classmethod
     def from_dict(cls, members: Mapping[str, Any]) -> Templates:
-        """The reverse of ``as_dict``."""
+        """Read the result of ``as_dict``."""
         format_templates = {
             str(name): FormatTemplate(template.get("set"), dict(template.get("values", {})))
             for name, template in members.get("formats", {}).items()
@@ -66,13 +68,13 @@ class Templates:
 
 
 NO_TEMPLATES: Final = Templates()
-"""An environment that has said nothing."""
+"""Templates of an environment without settings."""
 
 
 def template_changes(old: Templates, new: Templates) -> dict[str, Any]:
-    """``{templates: {set: {from, to}, FORMAT: {PARAMETER: {from, to}, set: {from, to}}}}`` of what differs, or {}.
+    """Return the differences ``{templates: {set: {from, to}, FORMAT: {PARAMETER: {from, to}, set: …}}}``, or {}.
 
-    None stands for what is not said.
+    None means not set.
     """
     out: dict[str, Any] = {}
     if old.set != new.set:

@@ -1,9 +1,9 @@
-"""Voxels: named 3-D occupancy as the leaves of an octree of depth 16, as OctoMap keeps it.
+"""Voxels: named 3-D occupancy as the leaves of an octree of depth 16, as in OctoMap.
 
 A leaf's **code** at its depth d has d groups of three bits, the octant on the way from the root down, x in the lowest
-bit of each. Its **place** is the code of its first smallest voxel: code << 3·(16 - d). Leaves stand in ascending order
-of place, which is also the order in which a depth-first walk meets them. Frame: local; the tree is centred on the
-origin, so voxel v of an axis spans (v - 32768 … v - 32767) · resolution metres.
+bit of each. Its **place** is the code of its first smallest voxel: code << 3·(16 - d). Leaves are in ascending order of
+place, which is also the order of a depth-first traversal. Frame: local; the tree is centred on the origin, so voxel v
+of an axis spans (v - 32768 … v - 32767) · resolution metres.
 """
 
 from __future__ import annotations
@@ -19,31 +19,35 @@ from numpy.typing import NDArray
 from app.errors import Invalid
 
 DEPTH = 16
-"""Levels of the tree: 65536 smallest voxels along each axis, centred on the local origin."""
+"""Number of levels of the tree: 65536 smallest voxels along each axis, centred on the local origin."""
 
 HALF = 2 ** (DEPTH - 1)
-"""The smallest voxels between the tree's edge and its middle."""
+"""Number of smallest voxels between the tree's edge and its middle."""
 
 UNSET = 255
-"""A voxel of the colour (255, 255, 255) has none: OctoMap's convention."""
+"""Colour that means "no colour": OctoMap's convention."""
 
 LOG_ODDS = (np.float32(math.log(0.1192 / (1 - 0.1192))), np.float32(math.log(0.971 / (1 - 0.971))))
-"""What free and occupied become where only they are known: OctoMap's clamping thresholds."""
+"""Log-odds of free and occupied voxels without measured values: OctoMap's clamping thresholds."""
 
 Box3 = tuple[float, float, float, float, float, float]
-"""min x, min y, min z, max x, max y, max z in metres."""
+"""A box: min x, min y, min z, max x, max y, max z in metres."""
 
 Codes = NDArray[np.uint64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelMap:
-    """n leaves in ascending order of their place; none lies in another.
+    """n leaves in ascending order of their place; none is inside another.
 
-    resolution: metres an edge of the smallest voxel. depth: uint8 [n], 1…16 (16 = smallest). code: uint64 [n], the
-    Morton code at that depth. log_odds: float32 [n], finite, ≥ 0 occupied. colour: uint8 [n, 3] red, green, blue, or
-    None. binary: whether only free and occupied were told apart (a ``.bt``). properties: what else the source says, by
-    format.
+    Attributes:
+        resolution: side of the smallest voxel in metres.
+        depth: uint8 [n], 1…16 (16 = smallest).
+        code: uint64 [n], the Morton code at that depth.
+        log_odds: float32 [n], finite, ≥ 0 occupied.
+        colour: uint8 [n, 3] red, green, blue, or None.
+        binary: whether the source distinguishes only free and occupied (a ``.bt``).
+        properties: further data of the source, by format.
     """
 
     resolution: float
@@ -80,33 +84,35 @@ class VoxelMap:
         up = _bits_below(self.depth)
         start = self.code << up
         if bool((start >> up != self.code).any()) or int(start.max()) >= 1 << 3 * DEPTH:
-            raise Invalid("a voxel's code lies outside the tree")
+            raise Invalid("a voxel's code is outside the tree")
         end = start + (np.uint64(1) << up)
         if bool((start[1:] < end[:-1]).any()):
-            raise Invalid("voxels must stand in ascending order of their place, and none within another")
+            raise Invalid("voxels must be in ascending order of their place, and none inside another")
 
     def __len__(self) -> int:
         return len(self.depth)
 
     @property
     def place(self) -> Codes:
-        """uint64 [n]: the code of each leaf's first smallest voxel, ascending."""
+        """Return uint64 [n]: the code of each leaf's first smallest voxel, ascending."""
         return self.code << _bits_below(self.depth)
 
     @property
     def occupied(self) -> NDArray[np.bool_]:
-        """bool [n]: log-odds of 0 and more are occupied, the others free; what has no leaf is unknown."""
+        """Return bool [n]: log-odds of 0 and more are occupied, others free; space without a leaf is unknown."""
         return self.log_odds >= 0
 
     def axis(self, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First and end (exclusive) smallest voxel of each leaf along axis k (0 x, 1 y, 2 z), counted from the origin:
-        int64 [n] each, times the resolution metres."""
+        """Return the first and end (exclusive) smallest voxel of each leaf along axis k (0 x, 1 y, 2 z).
+
+        Counted from the origin, int64 [n] each; times the resolution in metres.
+        """
         up = DEPTH - self.depth.astype(np.int64)
         low = (gather(self.code >> np.uint64(k)).astype(np.int64) << up) - HALF
         return low, low + (np.int64(1) << up)
 
     def bounds(self) -> Box3 | None:
-        """The box around all leaves, metres; None where there are none."""
+        """Return the box around all leaves, metres; None if there are none."""
         if not len(self):
             return None
         sides = [(low.min(), high.max()) for low, high in map(self.axis, range(3))]
@@ -114,19 +120,19 @@ class VoxelMap:
         return x[0], y[0], z[0], x[1], y[1], z[1]
 
     def voxel_counts(self) -> dict[str, int]:
-        """``{occupied, free}`` in smallest voxels, however leaves were merged."""
+        """Return ``{occupied, free}`` in smallest voxels, independent of how leaves were merged."""
         volume = np.int64(1) << _bits_below(self.depth).astype(np.int64)
         occupied = int(volume[self.occupied].sum())
         return {"occupied": occupied, "free": int(volume.sum()) - occupied}
 
     def leaf_counts(self) -> dict[str, int]:
-        """``{occupied, free}`` in leaves."""
+        """Return ``{occupied, free}`` in leaves."""
         occupied = int(np.count_nonzero(self.occupied))
         return {"occupied": occupied, "free": len(self) - occupied}
 
 
 def gather(code: Codes) -> Codes:
-    """Every third bit, from the lowest, moved together: one axis of Morton codes, uint64 [n]."""
+    """Compact every third bit, from the lowest: one axis of Morton codes, uint64 [n]."""
     out = code & np.uint64(0x1249249249249249)
     for shift, mask in (
         (2, 0x10C30C30C30C30C3),
@@ -140,7 +146,7 @@ def gather(code: Codes) -> Codes:
 
 
 def spread(axis: Codes) -> Codes:
-    """The reverse for numbers below 2^21: two zero bits between one and the next."""
+    """Spread the bits of numbers below 2^21: two zero bits between one and the next (reverse of ``compact``)."""
     out = axis & np.uint64(0x1FFFFF)
     for shift, mask in (
         (32, 0x1F00000000FFFF),
@@ -154,7 +160,7 @@ def spread(axis: Codes) -> Codes:
 
 
 def morton(x: NDArray[np.int64], y: NDArray[np.int64], z: NDArray[np.int64]) -> Codes:
-    """Codes at depth 16 of smallest voxels counted from the origin, -32768…32767: uint64 [n]."""
+    """Return codes at depth 16 of smallest voxels counted from the origin, -32768…32767: uint64 [n]."""
     code = np.zeros(np.shape(x), np.uint64)
     for k, axis in enumerate((x, y, z)):
         code |= spread((axis + HALF).astype(np.uint64)) << np.uint64(k)
@@ -162,7 +168,7 @@ def morton(x: NDArray[np.int64], y: NDArray[np.int64], z: NDArray[np.int64]) -> 
 
 
 def expand_leaves(voxels: VoxelMap, mask: NDArray[np.bool_]) -> tuple[Codes, NDArray[np.intp]]:
-    """All smallest voxels of some leaves: their codes at depth 16, ascending, uint64 [m], and the leaf of each.
+    """Return all smallest voxels of some leaves: their codes at depth 16, ascending, uint64 [m], and their leaf.
 
     mask: bool [n]. The caller bounds m (``voxel_counts``): a leaf at depth 1 has 2^45 of them.
     """
@@ -175,11 +181,10 @@ def expand_leaves(voxels: VoxelMap, mask: NDArray[np.bool_]) -> tuple[Codes, NDA
 
 
 def prune(voxels: VoxelMap, deepest: int = DEPTH) -> VoxelMap:
-    """Eight sibling leaves of equal log-odds as one, from ``deepest`` upwards, as OctoMap prunes.
+    """Merge eight sibling leaves of equal log-odds into one, from ``deepest`` upwards, as OctoMap prunes.
 
-    It stops at the first level on which nothing merges, never makes the root a leaf, and does not look at colours: a
-    merged leaf gets the mean of the set ones, unless the first is not set. Source: OcTreeBaseImpl::prune,
-    ColorOcTree::pruneNode.
+    It stops at the first level without a merge, never makes the root a leaf, and ignores colours: a merged leaf gets
+    the mean of the set ones, unless the first is not set. Source: OcTreeBaseImpl::prune, ColorOcTree::pruneNode.
     """
     depth, code, odds = voxels.depth.copy(), voxels.code.copy(), voxels.log_odds
     colour = None if voxels.colour is None else voxels.colour.copy()
@@ -191,7 +196,7 @@ def prune(voxels: VoxelMap, deepest: int = DEPTH) -> VoxelMap:
         for k in range(1, 8):
             same = (depth[first + k] == d) & (odds[first + k] == odds[first])
             first = first[same]
-        # Disjoint leaves of one depth, eight in a row and the first an octant 0: they are siblings if the last is.
+        # disjoint leaves of one depth, eight in a row and the first an octant 0, are siblings if the last is
         first = first[code[first + 7] == code[first] + np.uint64(7)]
         if not len(first):
             break
@@ -210,8 +215,11 @@ def prune(voxels: VoxelMap, deepest: int = DEPTH) -> VoxelMap:
 
 
 def coarser(voxels: VoxelMap, depth: int) -> VoxelMap:
-    """Leaves below ``depth`` (1…16) merged into their ancestors of that depth, as inner nodes tell of what is below:
-    the highest log-odds (no obstacle gets lost; unknown counts least), the mean of the set colours, level by level."""
+    """Merge leaves below ``depth`` (1…16) into their ancestors of that depth, with OctoMap's values of inner nodes.
+
+    These are the highest log-odds below (no obstacle is lost; unknown counts least), and the mean of the set colours,
+    level by level.
+    """
     depths, code, odds, colour = voxels.depth, voxels.code, voxels.log_odds, voxels.colour
     if not len(voxels) or int(depths.max()) <= depth:
         return voxels
@@ -238,8 +246,10 @@ def coarser(voxels: VoxelMap, depth: int) -> VoxelMap:
 
 
 def cut(voxels: VoxelMap, box: Box3, limit: int = 2**24) -> VoxelMap:
-    """The smallest voxels that meet a box (metres, local; a touching face does not count), large leaves cut into
-    pieces where its faces cross them. Invalid where that would give more than ``limit`` leaves."""
+    """Return the smallest voxels that intersect a box (metres, local; a touching face does not count).
+
+    Large leaves are cut at the box's faces. Raises Invalid if that would give more than ``limit`` leaves.
+    """
     low, high = _voxel_range(box, voxels.resolution)
     depth, code = voxels.depth, voxels.code
     source = np.arange(len(voxels), dtype=np.intp)
@@ -258,7 +268,7 @@ def cut(voxels: VoxelMap, box: Box3, limit: int = 2**24) -> VoxelMap:
         crossed = meets & ~inside
         total += int(np.count_nonzero(contained))
         if total + 8 * int(np.count_nonzero(crossed)) > limit:
-            raise Invalid(f"cutting to this box would give more than {limit} voxels: ask for a smaller box")
+            raise Invalid(f"cutting to this box would give more than {limit} voxels: use a smaller box")
         depth = np.repeat(depth[crossed] + np.uint8(1), 8)
         octants = np.tile(np.arange(8, dtype=np.uint64), int(np.count_nonzero(crossed)))
         code = np.repeat(code[crossed] << np.uint64(3), 8) | octants
@@ -276,8 +286,10 @@ def cut(voxels: VoxelMap, box: Box3, limit: int = 2**24) -> VoxelMap:
 def merge_to_parents(
     code: Codes, odds: NDArray[np.float32], colour: NDArray[np.uint8] | None
 ) -> tuple[NDArray[np.intp], Codes, NDArray[np.float32], NDArray[np.uint8] | None]:
-    """The nodes above some nodes of one depth in ascending order: where each one's children start, its code, log-odds
-    and colour. Source: OcTreeNode::updateOccupancyChildren, ColorOcTreeNode::updateColorChildren."""
+    """Return the parents of nodes of one depth in ascending order: start of their children, code, log-odds and colour.
+
+    Source: OcTreeNode::updateOccupancyChildren, ColorOcTreeNode::updateColorChildren.
+    """
     above = code >> np.uint64(3)
     start = _starts(above)
     colours = None if colour is None else _mean_colour(colour, start)
@@ -285,12 +297,12 @@ def merge_to_parents(
 
 
 def _bits_below(depth: NDArray[np.uint8]) -> Codes:
-    """3·(16 - depth): how far a code at that depth is from one of the smallest voxels."""
+    """Return 3·(16 - depth): the shift from a code at that depth to one of the smallest voxels."""
     return (np.uint8(3) * (np.uint8(DEPTH) - depth)).astype(np.uint64)
 
 
 def _starts(codes: Codes) -> NDArray[np.intp]:
-    """Where each run of equal codes starts."""
+    """Return the start of each run of equal codes."""
     new = np.empty(len(codes), bool)
     new[:1] = True
     np.not_equal(codes[1:], codes[:-1], out=new[1:])
@@ -302,7 +314,7 @@ def _is_set(colour: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _mean_colour(colour: NDArray[np.uint8], start: NDArray[np.intp]) -> NDArray[np.uint8]:
-    """The mean of the set colours of each run, rounded down; unset where none is set."""
+    """Return the mean of the set colours of each run, rounded down; unset if none is set."""
     given = _is_set(colour)
     total = np.add.reduceat(np.where(given[:, None], colour, 0).astype(np.int64), start, axis=0)
     count = np.add.reduceat(given.astype(np.int64), start)[:, None]
@@ -310,9 +322,9 @@ def _mean_colour(colour: NDArray[np.uint8], start: NDArray[np.intp]) -> NDArray[
 
 
 def _voxel_range(box: Box3, resolution: float) -> tuple[list[int], list[int]]:
-    """The smallest voxels that meet a box: first and end (exclusive) along each axis, at least one."""
+    """Return the smallest voxels that intersect a box: first and end (exclusive) along each axis, at least one."""
     if not all(map(math.isfinite, box)) or any(box[k] > box[k + 3] for k in range(3)):
-        raise Invalid("a box must be min x, min y, min z, max x, max y, max z in metres, the smaller ones first")
+        raise Invalid("a box must be min x, min y, min z, max x, max y, max z in metres, minima first")
     low, high = [], []
     for k in range(3):
         a, b = (_snap_to_integer(min(max(v / resolution, -HALF - 1.0), HALF + 1.0)) for v in (box[k], box[k + 3]))
@@ -322,6 +334,6 @@ def _voxel_range(box: Box3, resolution: float) -> tuple[list[int], list[int]]:
 
 
 def _snap_to_integer(value: float) -> float:
-    """A whole number where it is one but for the rounding of a division (0.3 / 0.1)."""
+    """Round to a whole number if it is one except for the rounding of a division (0.3 / 0.1)."""
     integer = round(value)
     return float(integer) if abs(value - integer) < 1e-6 else value

@@ -1,8 +1,8 @@
-"""Several worlds of one upload lie side by side in one part of objects: which of them is meant.
+"""Selection among several worlds of one upload, which are side by side in one part of objects.
 
-The part's ``document.gazebo.worlds`` lists them by the path of their file without its ending, each with what is known
-of it (``sdf``: its element; ``alone``: a lone model; ``list``: a generator's list); an object says its own under
-``properties.gazebo.world``. What says none belongs to each of them.
+The part's ``document.gazebo.worlds`` lists them by the path of their file without its ending, each with its data
+(``sdf``: its element; ``alone``: a single model; ``list``: a generator's list); an object names its own world under
+``properties.gazebo.world``. Objects without one belong to each world.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ FAMILY = "gazebo"
 
 
 def rank(name: str, entry: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Worlds before models and lists; ``gazebo.world`` before others; then the shortest name."""
+    """Sort key: worlds before models and lists; ``gazebo.world`` before others; then the shortest name."""
     base = PurePosixPath(name).name
     alone = "sdf" not in entry or bool(entry.get("alone"))
     return (alone, "list" in entry, not base.startswith("gazebo"), name.count("/"), len(base), name)
 
 
 def names(part: Features) -> list[str]:
-    """The worlds of a part, the one that is meant where nobody says so first."""
+    """List the worlds of a part, the default one first."""
     document = part.document.get(FAMILY)
     worlds = document.get("worlds") if isinstance(document, Mapping) else None
     if not isinstance(worlds, Mapping):
@@ -37,16 +37,16 @@ def names(part: Features) -> list[str]:
 
 
 def object_world(properties: Properties) -> str | None:
-    """The world that an object belongs to; None: each."""
+    """Return the world that an object belongs to; None: each."""
     source_properties = properties.get(FAMILY)
     name = source_properties.get("world") if isinstance(source_properties, Mapping) else None
     return None if name is None else str(name)
 
 
 def select_world(part: Features, world: str | None) -> tuple[Features, list[str]]:
-    """The objects of one world, by its path or its file's name, else of the first; and the other worlds.
+    """Return the objects of one world, by its path or its file's name, default the first; and the other worlds.
 
-    NotFound tells the known ones.
+    Raises NotFound with the existing ones.
     """
     worlds = names(part)
     if world is not None and worlds:

@@ -1,4 +1,4 @@
-"""What may stand before the root element of an XML file that nobody trusts: no DOCTYPE and no entities."""
+"""Check of the prolog of untrusted XML files: no DOCTYPE and no entities."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from app.errors import Problem, UnreadableFile
 
 _DOCTYPE = re.compile(rb"<!\s*(DOCTYPE|ENTITY)", re.IGNORECASE)
 _PROLOG = re.compile(rb"\s+|<\?.*?\?>|<!--.*?-->", re.DOTALL)
-"""What may stand before the root element. A DOCTYPE further inside is a text (HTML in a description)."""
+"""Pattern of the prolog before the root element. A DOCTYPE further inside is a text (HTML in a description)."""
 
 
 def check_prolog(data: bytes) -> None:
-    """Refuse a DOCTYPE or entity declaration before any parser sees it. Raises UnreadableFile with the line.
+    """Reject a DOCTYPE or entity declaration before parsing. Raises UnreadableFile with the line.
 
-    Whoever parses looks again at what the parser found.
+    Callers check the parsed document again.
     """
     head = data
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):

@@ -1,15 +1,15 @@
-"""The area of an environment on earth: where a robot with a GNSS fix is taken to be in it.
+"""Area of an environment on earth: a robot with a GNSS fix inside it counts as being in the environment.
 
-The area is, in this order:
+The area is the first of these that exists:
 
 1. ``fence``: the polygons of the location layer (those of kind ``fence`` if there are any), on all levels, with holes;
-2. ``floor``: what is mapped as floor within ``NEIGHBOURHOOD_METRES`` of the datum, wider by ``MARGIN_METRES``: of each
-   occupancy grid that is no filter mask the rectangle around its free cells, of each network its convex hull, and all
+2. ``floor``: mapped floor within ``NEIGHBOURHOOD_METRES`` of the datum, buffered by ``MARGIN_METRES``: the rectangle
+   around the free cells of each occupancy grid that is no filter mask, the convex hull of each network, and all
    objects of kind ``floor``;
 3. ``datum``: the circle of ``DATUM_METRES`` around the datum.
 
-A datum at exactly 0, 0 is a position that nobody has set: it gives no area. What stands in the local frame of such a
-datum, or of none, has no place on earth.
+A datum at exactly 0, 0 counts as not set: it gives no area. Items in the local frame of such a datum, or without a
+datum, have no position on earth.
 """
 
 from __future__ import annotations
@@ -38,27 +38,27 @@ from app.store.tree import ChunkStage
 from app.store.values import NO_AREA, Area, Box, PartEntry
 
 NEIGHBOURHOOD_METRES: Final = 2000.0
-"""Radius around the datum in which floor counts, in metres."""
+"""Radius around the datum within which floor counts, in metres."""
 
 DATUM_METRES: Final = 200.0
-"""Radius around a datum without fence and floor, in metres."""
+"""Radius of the area around a datum without fence and floor, in metres."""
 
 MARGIN_METRES: Final = 10.0
-"""Added around floor, in metres: what a GNSS fix may be off, and lines that have no width."""
+"""Buffer around floor, in metres: covers the error of a GNSS fix, and lines without width."""
 
 AREA_LAYERS: Final[frozenset[Layer]] = frozenset({"location", "occupancy", "topology", "objects"})
-"""The layers that an area depends on."""
+"""Layers that an area depends on."""
 
 MAX_FEATURES: Final = 2000
 MAX_CELLS: Final = 2**22
-"""Up to so many features and cells of one part the area is computed with the commit, beyond by the next query."""
+"""Maximum features and cells of one part for an area computed with the commit; else the next query computes it."""
 
 Array = NDArray[np.float64]
 
 FENCE: Final = "fence"
 FLOOR: Final = "floor"
 CIRCLE_SEGMENTS: Final = 16
-"""Straight pieces of a quarter of a circle."""
+"""Number of straight segments of a quarter circle."""
 
 
 def area_after(
@@ -70,7 +70,7 @@ def area_after(
 ) -> Area | Literal[Keep.KEEP] | None:
     """Compute the area after a change.
 
-    Returns KEEP if it is the one before, None if it takes longer than a commit should.
+    Returns KEEP if it equals the previous one, None if computing it takes too long for a commit.
     """
     changed = {key.layer for key, _ in _hashes(before) ^ _hashes(after)}
     if old_datum == datum and not changed & AREA_LAYERS:
@@ -84,7 +84,7 @@ def area_after(
 
 
 def compute_area(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
-    """Compute the area of a version's content, whatever it takes."""
+    """Compute the area of a version's content, without a limit of time."""
     fence = _fence(draft, entries, datum)
     return _estimate_extent(draft, entries, datum) if fence is None else area_in_degrees(FENCE, fence)
 
@@ -106,13 +106,16 @@ def _load(draft: ChunkStage, entries: Iterable[PartEntry]) -> list[Features]:
 
 
 def _fence(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Any:
-    """The fence as a valid (Multi)Polygon in degrees, beyond ±180 across the antimeridian; None if it has no area."""
+    """Return the fence as a valid (Multi)Polygon in degrees, None if it has no area.
+
+    Longitudes continue beyond ±180 across the antimeridian.
+    """
     sites = _load(draft, (e for e in entries if e.key.layer == "location" and e.count))
     return fence_polygon(sites, _frame(datum))
 
 
 def fence_polygon(sites: Sequence[Features], frame: LocalFrame | None) -> Any:
-    """The polygons of location parts as one, see ``_fence``; local ones only with a frame."""
+    """Join the polygons of location parts, see ``_fence``; local ones only with a frame."""
     polygons: list[Any] = []
     fences: list[Any] = []
     for site in sites:
@@ -129,7 +132,10 @@ def fence_polygon(sites: Sequence[Features], frame: LocalFrame | None) -> Any:
 
 
 def _unwrap(polygon: Any) -> Any:
-    """A polygon in degrees as a valid one; wider than half the globe it crosses the antimeridian, and goes on there."""
+    """Make a polygon in degrees valid.
+
+    A polygon wider than half the globe crosses the antimeridian; its longitudes then continue beyond ±180.
+    """
     if not np.isfinite(shapely.get_coordinates(polygon)).all():
         return None
     west, _, east, _ = polygon.bounds
@@ -139,7 +145,7 @@ def _unwrap(polygon: Any) -> Any:
 
 
 def _polygonal(shape: Any) -> Any:
-    """The polygons of a shape as one; None if they have no area."""
+    """Join the polygons of a shape; None if they have no area."""
     pieces = [p for p in shapely.get_parts(shapely.get_parts(shape)) if p.geom_type == "Polygon" and p.area > 0]
     return shapely.union_all(pieces) if pieces else None
 
@@ -148,7 +154,7 @@ def _polygonal(shape: Any) -> Any:
 
 
 def _floors(entries: Iterable[PartEntry], datum: Datum | None) -> list[PartEntry]:
-    """The parts that may hold floor."""
+    """Return the parts that can contain floor."""
     if _frame(datum) is None:
         return []
     floor_entries = [e for e in entries if e.count and e.key.layer in AREA_LAYERS - {"location"}]
@@ -156,7 +162,7 @@ def _floors(entries: Iterable[PartEntry], datum: Datum | None) -> list[PartEntry
 
 
 def _estimate_extent(draft: ChunkStage, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
-    """The area of an environment without a fence."""
+    """Compute the area of an environment without a fence."""
     frame = _frame(datum)
     if frame is None:
         return NO_AREA
@@ -181,7 +187,7 @@ def _estimate_extent(draft: ChunkStage, entries: Sequence[PartEntry], datum: Dat
 
 
 def _geometries_in_metres(part: Features, frame: LocalFrame) -> NDArray[np.object_]:
-    """A part's geometries in metres, without those that are too far away for the local frame."""
+    """Return a part's geometries in metres, without those that are too far away for the local frame."""
     out = np.asarray(shapely.force_2d(part.geometry), object).copy()
     distant = ~part.local
     if distant.any():
@@ -191,7 +197,7 @@ def _geometries_in_metres(part: Features, frame: LocalFrame) -> NDArray[np.objec
 
 
 def _hull(network: Features, frame: LocalFrame, near: Any) -> Any:
-    """The convex hull, in metres, of what a network has in the neighbourhood; None if that is nothing."""
+    """Compute the convex hull, in metres, of a network's items in the neighbourhood; None if there are none."""
     shapes = _geometries_in_metres(network, frame)
     inside = np.abs(shapely.bounds(shapes)).max(axis=1, initial=0.0) <= NEIGHBOURHOOD_METRES
     shapes[~inside] = shapely.intersection(shapely.make_valid(shapes[~inside]), near)
@@ -206,7 +212,7 @@ def _floor_objects(part: Features, frame: LocalFrame) -> list[Any]:
 
 
 def free_rectangle(draft: ChunkStage, grid: PartRoot) -> Any:
-    """The rectangle in metres around a stored grid's free cells, turned as the grid is; None if no cell is free.
+    """Compute the rectangle in metres around a stored grid's free cells, in the grid's orientation; None without any.
 
     Reads the grid tile by tile, equal tiles once.
     """
@@ -236,7 +242,7 @@ def free_rectangle(draft: ChunkStage, grid: PartRoot) -> Any:
 
 
 def _free_boxes(header: Mapping[str, Any], free: NDArray[np.bool_], codes: Sequence[int]) -> list[Any]:
-    """(first column, first row, end column, end row) of the free cells of equal tiles, each where it lies."""
+    """Return (first column, first row, end column, end row) of the free cells of each of these equal tiles."""
     out: list[Any] = []
     if not free.any():
         return out
@@ -249,7 +255,7 @@ def _free_boxes(header: Mapping[str, Any], free: NDArray[np.bool_], codes: Seque
 
 
 def _shape_in_degrees(shape: Any, frame: LocalFrame) -> Any:
-    """A shape in metres as one in degrees that goes on beyond ±180 across the antimeridian."""
+    """Convert a shape from metres to degrees; longitudes continue beyond ±180 across the antimeridian."""
     around = frame.datum.longitude
 
     def change(xy: Array) -> Array:
@@ -261,8 +267,9 @@ def _shape_in_degrees(shape: Any, frame: LocalFrame) -> Any:
 
 
 def area_in_degrees(by: Literal["fence", "floor", "datum"], shape: Any, size: float | None = None) -> Area:
-    """An area from a (Multi)Polygon in degrees that goes on beyond ±180, cut there and, if that leaves pieces on both
-    sides of the globe, into its eastern and western half.
+    """Build an area from a (Multi)Polygon in degrees whose longitudes may continue beyond ±180.
+
+    It is cut at ±180 and, if that leaves pieces on both sides of the globe, into its eastern and western half.
     """
     pieces = []
     for turn in (-360.0, 0.0, 360.0):
@@ -295,7 +302,7 @@ def _box(shape: Any) -> Box:
 
 
 def write_area(connection: Connection, environment_id: str, area: Area) -> None:
-    """Write an environment's area in place of what was there. The caller holds the environment's row."""
+    """Replace an environment's stored area. The caller has locked the environment's row."""
     table = tables.area
     connection.execute(delete(table).where(table.c.environment_id == environment_id))
     rows = [

@@ -1,4 +1,4 @@
-"""The audit log: who changed what, from where. A row belongs to the transaction of the change that it is about."""
+"""Audit log: each change with its token, address and request. A row is written in the transaction of its change."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from app.store import tables
 from app.store.database import Database
 
 MAX_PATH = 1000
-"""Characters of an address that are kept."""
+"""Maximum length of a stored address, in characters."""
 
 
 @dataclass(slots=True)
 class Caller:
-    """A request that changes something, and who sent it. target: what it makes, where the path does not name it.
-    recorded: whether its row is committed."""
+    """A request that changes something, with its sender.
+
+    target: the object that it creates, if the path does not name it. recorded: whether its row is committed.
+    """
 
     token_id: str
     token: str
@@ -36,12 +38,12 @@ class Caller:
 
 
 CALLER: ContextVar[Caller | None] = ContextVar("caller", default=None)
-"""Set for the time of a request; work of the server itself has none."""
+"""Request that is being handled; None for work that the server starts itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class AuditEntry:
-    """One change: by which token, from which address, by which request."""
+    """One change, with its token, address and request."""
 
     id: int
     time: datetime
@@ -57,7 +59,7 @@ class AuditEntry:
 
 
 def set_audit_target(*, environment: str | None = None, target: str | None = None) -> None:
-    """Say what the current request changes, where its path does not."""
+    """Set the object that the current request changes, if the path does not name it."""
     caller = CALLER.get()
     if caller is not None:
         caller.environment = environment or caller.environment
@@ -65,14 +67,14 @@ def set_audit_target(*, environment: str | None = None, target: str | None = Non
 
 
 def skip_audit() -> None:
-    """Say that the current request is an earlier one that was sent again: it gets no entry of its own."""
+    """Mark the current request as a repetition of an earlier one: it gets no entry of its own."""
     caller = CALLER.get()
     if caller is not None:
         caller.recorded = True
 
 
 def record(connection: Connection, now: datetime) -> Caller | None:
-    """Write the current request's row into its transaction, unless an earlier one has it; the caller, where it did."""
+    """Write the current request's row in the caller's transaction, unless it exists; returns the request, or None."""
     caller = CALLER.get()
     if caller is None or caller.recorded:
         return None
@@ -93,19 +95,19 @@ def record(connection: Connection, now: datetime) -> Caller | None:
 
 
 class Audit:
-    """Reading the audit log."""
+    """Read access to the audit log."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def record_change(self) -> None:
-        """Record the current request, which gives somebody access and changes nothing that is stored."""
+        """Record the current request, which grants access and changes nothing that is stored."""
         with self._database.write():
             pass
 
     @contextmanager
     def changing(self) -> Iterator[None]:
-        """Record the current request's change of something that is not in the database (the server's key)."""
+        """Record the current request's change of something outside the database (the server's key)."""
         with self._database.write():
             yield
 
@@ -117,7 +119,7 @@ class Audit:
         before: int | None = None,
         limit: int = 100,
     ) -> list[AuditEntry]:
-        """The newest changes first. before: only entries with a smaller id."""
+        """List the newest changes first. before: only entries with a smaller id."""
         table = tables.audit
         query = select(table).order_by(table.c.id.desc()).limit(limit)
         if environment is not None:

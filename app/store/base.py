@@ -1,4 +1,4 @@
-"""What all services of the store share: rows as values, names, texts that both databases take."""
+"""Shared helpers of the store's services: rows as values, names, texts that both databases accept."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ MAX_TEXT: Final = 64 * 2**10
 
 
 def utcnow() -> datetime:
-    """The present, in UTC."""
+    """Return the current time, in UTC."""
     return datetime.now(UTC)
 
 
 def checked_text(value: str, label: str, longest: int = MAX_TEXT) -> str:
-    """A text that both databases can keep: no NUL, no lone surrogate, not too long; else Invalid."""
+    """Check a text that both databases can store: no NUL, no lone surrogate, not too long. Raises Invalid."""
     if len(value) > longest or "\x00" in value or any("\ud800" <= c <= "\udfff" for c in value):
         raise Invalid(f"{label} must have at most {longest} characters, none of them NUL or half of a surrogate pair")
     return value
 
 
 def storable_text(value: str) -> str:
-    """A text from a file's content, with what databases refuse replaced by U+FFFD."""
+    """Replace characters in a file's text that databases reject by U+FFFD."""
     return value.replace("\x00", "\ufffd").encode("utf-8", "replace").decode()
 
 
 def clean_problem(problem: Problem) -> Problem:
-    """A problem whose texts can be kept."""
+    """Return a problem with texts that databases can store."""
     return Problem(
         storable_text(problem.problem),
         None if problem.file is None else storable_text(problem.file),
@@ -51,47 +51,50 @@ def clean_problem(problem: Problem) -> Problem:
 
 
 def check_environment_name(name: str) -> str:
-    """Raise Invalid for a name that is not allowed."""
+    """Raise Invalid if a name is not allowed for an environment."""
     if not ENVIRONMENT_NAME.fullmatch(name) or name in RESERVED:
         raise Invalid(
-            f"an environment cannot be called {name[:80]!r}: use 1 to 63 of a-z, 0-9, _ and -, starting with a "
+            f"invalid environment name {name[:80]!r}: use 1 to 63 of a-z, 0-9, _ and -, starting with a "
             "letter or digit; 'robots' and 'server' are taken"
         )
     return name
 
 
 def upsert(connection: Connection, table: Table, keys: Mapping[str, Any], values: Mapping[str, Any]) -> None:
-    """Insert a row, or give these values to the row that has the keys."""
+    """Insert a row, or update the row with these keys."""
     make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
     statement = make(table).values(**keys, **values)
     connection.execute(statement.on_conflict_do_update(index_elements=list(keys), set_=dict(values)))
 
 
 def environment_row(connection: Connection, name: str, *, lock: bool = False, deleted: bool = False) -> Row[Any]:
-    """The environment's row, locked until the transaction ends if asked; Gone where deleted, NotFound where unknown."""
+    """Read an environment's row, with ``lock`` locked until the transaction ends.
+
+    Raises Gone if it is deleted, NotFound if it is unknown.
+    """
     query = select(tables.environment).where(tables.environment.c.name == name)
     row = connection.execute(query.with_for_update() if lock else query).one_or_none()
     if row is None:
         raise NotFound(f"there is no environment {name[:80]!r}")
     if row.deleted is not None and not deleted:
-        raise Gone(f"the environment {name!r} is deleted; POST /api/v1/environments/{name}/restore brings it back")
+        raise Gone(f"the environment {name!r} is deleted: restore it with POST /api/v1/environments/{name}/restore")
     return row
 
 
 def nearest_channel(connection: Connection, environment: Row[Any], name: str) -> str:
-    """Return ` (did you mean NAME?)` for an unknown channel, or an empty text if no other is near."""
+    """Return ` (did you mean NAME?)` for an unknown channel, or an empty text if no other name is similar."""
     table = tables.channel
     names = connection.execute(select(table.c.name).where(table.c.environment_id == environment.id)).scalars()
     return did_you_mean(name, [LATEST, *names])
 
 
 def datum_from_row(members: dict[str, float] | None) -> Datum | None:
-    """A stored datum."""
+    """Convert a stored datum."""
     return None if members is None else Datum(**members)
 
 
 def as_environment(row: Row[Any]) -> Environment:
-    """A row as a value."""
+    """Convert a row into a value."""
     return Environment(
         id=row.id,
         name=row.name,
@@ -110,5 +113,5 @@ def as_environment(row: Row[Any]) -> Environment:
 
 
 def check_tags(tags: Sequence[str]) -> list[str]:
-    """Tags as they are kept: no repeats, in the order given."""
+    """Return tags in the form in which they are stored: without duplicates, in the given order."""
     return [checked_text(tag, "a tag", 256) for tag in dict.fromkeys(tags)]

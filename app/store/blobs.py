@@ -1,10 +1,10 @@
 """Content-addressed files: uploads byte for byte, and the files that maps consist of.
 
-A blob lies in ``ab/abcdef…`` (its SHA-256), or with many other small ones in ``packs/<SHA-256 of the pack>``; the table
-``blob`` says which. What is written gets a temporary name, is synced, renamed, and its folder synced, before anything
-refers to it. Temporary names lie in ``tmp``, in a folder of each upload, which its process locks while it lives: so the
-next start can tell what a killed one left. The table's row comes first when a blob is used again, so that a collection
-in progress leaves it alone.
+A blob is stored as ``ab/abcdef…`` (its SHA-256), or with other small ones in ``packs/<SHA-256 of the pack>``, as its
+row in the table ``blob`` states. Files are written under a temporary name, synced, renamed, and their folder synced,
+before any row refers to them. Temporary names are in a folder of each upload below ``tmp``, which its process locks, so
+that the next start can recognise the remains of a killed process. If a blob is used again, its row is updated first, so
+that a running garbage collection skips it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from app.store.tables import blob
 REPAIR: Final = "run `fleetmap verify --repair`, upload the same file again, or restore it from a backup"
 
 PACKED_BELOW: Final = 64 * 2**10
-"""Smaller files of one upload share a pack."""
+"""Size in bytes below which files of one upload share a pack."""
 
 LOCK: Final = ".lock"
 PACK_BYTES: Final = 64 * 2**20
@@ -60,7 +60,10 @@ class _BlobRow:
 
 
 class Blobs:
-    """Bytes by their SHA-256 (hex). Thread-safe, and safe beside other processes on the same folder and database."""
+    """Store of bytes by their SHA-256 (hex).
+
+    Thread-safe, and safe beside other processes on the same folder and database.
+    """
 
     def __init__(self, database: Database, folder: Path, *, readonly: bool = False) -> None:
         self._database = database
@@ -68,7 +71,7 @@ class Blobs:
         self._readonly = readonly
 
     def prepare(self) -> None:
-        """Make the folders."""
+        """Create the folders."""
         for path in (self.folder, self._packs, self._temporary):
             path.mkdir(parents=True, exist_ok=True)
 
@@ -85,7 +88,7 @@ class Blobs:
 
     @contextmanager
     def _workspace(self) -> Iterator[Path]:
-        """A folder for temporary names, locked as long as this process works in it."""
+        """Create a folder for temporary names, locked while this process uses it."""
         folder = self._temporary / secrets.token_hex(16)
         with self._workspaces_lock(shared=True):
             folder.mkdir()
@@ -99,7 +102,7 @@ class Blobs:
 
     @contextmanager
     def _workspaces_lock(self, *, shared: bool) -> Iterator[None]:
-        """Keeps the search for abandoned workspaces away from one that is just being made."""
+        """Keep the search for abandoned workspaces from removing one that is being created."""
         lock = os.open(self._temporary / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
         try:
             fcntl.flock(lock, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
@@ -110,14 +113,14 @@ class Blobs:
     # --- writing ---
 
     def put(self, data: bytes | Path) -> str:
-        """Store bytes or a file's content durably; the SHA-256."""
+        """Store bytes or a file's content durably; returns the SHA-256."""
         return self.put_many([data])[0]
 
     def put_many(self, files: Sequence[bytes | Path]) -> list[str]:
-        """Store several files with one set of fsyncs; their SHA-256s in the same order.
+        """Store several files with one set of fsyncs; returns their SHA-256s in the same order.
 
-        Small ones (below 64 KiB) go into one pack. Nothing is written twice; what is stored already is hashed again,
-        and replaced where it is damaged or lost. Unavailable where the disk refuses.
+        Small ones (below 64 KiB) share a pack. Nothing is written twice; stored content is hashed again, and replaced
+        if it is damaged or lost. Raises Unavailable if the disk cannot be written.
         """
         if self._readonly:
             raise Invalid("this store was opened for reading only")
@@ -151,7 +154,7 @@ class Blobs:
             rows += [{"sha256": n, "size": sizes[n], "pack": None, "start": 0} for n in large if n in lost]
             with self._database.write(upkeep=True) as connection:
                 _upsert(connection, [r for r in rows if r["sha256"] not in stored_rows])
-                # A row whose file was lost: the content is back, at a new place.
+                # a row whose file was lost: the content is stored again, in another file
                 _relocate(
                     connection,
                     [
@@ -163,7 +166,7 @@ class Blobs:
         return names
 
     def _touch(self, sizes: Mapping[str, int]) -> dict[str, _BlobRow]:
-        """Rows that exist, marked as used now: from here on a collection leaves them alone."""
+        """Mark existing rows as used now, so that garbage collection skips them."""
         names = sorted(sizes)
         out: dict[str, _BlobRow] = {}
         with self._database.read() as connection:
@@ -177,7 +180,7 @@ class Blobs:
         return out
 
     def _problem(self, name: str, row: _BlobRow) -> str | None:
-        """What is wrong with a stored file, None where it has its hash: ``lost``, ``damaged``."""
+        """Return the problem of a stored file (``lost`` or ``damaged``), None if it matches its hash."""
         digest = hashlib.sha256()
         try:
             with (self._path(name) if row.pack is None else self._packs / row.pack).open("rb") as file:
@@ -220,7 +223,7 @@ class Blobs:
             _sync_folder(folder)
 
     def _write_packs(self, workspace: Path, files: Mapping[str, bytes]) -> list[dict[str, object]]:
-        """Packs of at most 64 MiB; the rows that say where each file is in them."""
+        """Write packs of at most 64 MiB; returns the rows that locate each file in them."""
         rows: list[dict[str, object]] = []
         group: list[str] = []
         size = 0
@@ -236,7 +239,7 @@ class Blobs:
 
     def _write_pack(self, workspace: Path, files: Mapping[str, bytes]) -> list[dict[str, object]]:
         content = b"".join(files.values())
-        # Two packs with the same content in another order of names are two files: no row ever changes its meaning.
+        # random suffix: packs of equal content in another order are different files, so a row never changes its meaning
         pack = hashlib.sha256(content + secrets.token_bytes(16)).hexdigest()
         temporary = workspace / pack
         with temporary.open("wb") as out:
@@ -255,11 +258,14 @@ class Blobs:
     # --- reading ---
 
     def get(self, sha256: str) -> bytes:
-        """The content, hashed again; Damaged where it does not match or is lost, NotFound where it never was."""
+        """Read the content, hashed again.
+
+        Raises Damaged if it is lost or does not match, NotFound if it never existed.
+        """
         return self.get_many([sha256])[sha256]
 
     def get_many(self, hashes: Sequence[str]) -> dict[str, bytes]:
-        """SHA-256 -> content, all hashed again."""
+        """Read several contents by SHA-256, all hashed again."""
         names = list(dict.fromkeys(hashes))
         with self._database.read() as connection:
             rows = self._rows(connection, names)
@@ -290,7 +296,7 @@ class Blobs:
             raise _read_error(name, error) from error
 
     def open(self, sha256: str) -> BinaryIO:
-        """The content as a seekable file, hashed again before it is handed out; for big ones that are read in parts."""
+        """Open the content as a seekable file, hashed first; for large ones that are read in parts."""
         row = self._row(sha256)
         if row.pack is not None:
             return io.BytesIO(self.get(sha256))
@@ -309,17 +315,17 @@ class Blobs:
         return file
 
     def path(self, sha256: str) -> Path | None:
-        """The file with exactly this content, None where it is packed with others. Its bytes are not checked here."""
+        """Return the path of the file with exactly this content, None if it is in a pack. Its bytes are not checked."""
         return None if self._row(sha256).pack is not None else self._path(sha256)
 
     def has(self, sha256: str) -> bool:
-        """Whether it is stored with the right content."""
+        """Return whether a blob is stored with the right content."""
         with self._database.read() as connection:
             row = self._rows(connection, [sha256]).get(sha256)
         return row is not None and self._problem(sha256, row) is None
 
     def size(self, sha256: str) -> int:
-        """Bytes of the content."""
+        """Return the size of the content in bytes."""
         return self._row(sha256).size
 
     def _row(self, name: str) -> _BlobRow:
@@ -341,7 +347,7 @@ class Blobs:
     # --- upkeep ---
 
     def check(self) -> None:
-        """Unavailable unless the folder can be written (where it is to be)."""
+        """Raise Unavailable unless the folder can be written (a read-only store: read)."""
         try:
             if self._readonly:
                 next(self.folder.iterdir(), None)
@@ -353,7 +359,7 @@ class Blobs:
             raise _unavailable_error(error) from error
 
     def recover(self, older_than: float) -> int:
-        """Remove workspaces of processes that are gone, and packs that no row knows if older (seconds); how many."""
+        """Remove workspaces of ended processes, and packs without a row that are older (seconds); returns how many."""
         self.prepare()
         limit = time.time() - older_than
         count = 0
@@ -368,10 +374,10 @@ class Blobs:
         return count
 
     def collect(self, referenced: set[str], before: int) -> tuple[int, int]:
-        """Remove blobs that nobody refers to and that were last used before this second: (how many, bytes).
+        """Remove unreferenced blobs that were last used before this second; returns (count, bytes).
 
-        Files go while the transaction still holds their rows, so that an upload that uses one again waits, and then
-        finds it gone and writes it.
+        Files are removed while the transaction still holds their rows. An upload that uses one again waits, then finds
+        it missing and writes it.
         """
         with self._database.read() as connection:
             query = select(blob.c.sha256, blob.c.size).where(blob.c.used < before)
@@ -400,7 +406,7 @@ class Blobs:
         return count, freed
 
     def _repack(self, pack: str) -> None:
-        """Write what is still used of a pack into a new one."""
+        """Write the used blobs of a pack into a new one."""
         with self._database.read() as connection:
             names = list(connection.execute(select(blob.c.sha256).where(blob.c.pack == pack)).scalars())
         if names:
@@ -416,7 +422,7 @@ class Blobs:
                 (self._packs / pack).unlink(missing_ok=True)
 
     def _remove_strays(self, before: int) -> None:
-        """Files that no row knows: what a crash between the file and its row left."""
+        """List files without a row, which remain after a crash between the file and its row."""
         for folder in self.folder.iterdir():
             if len(folder.name) != 2 or not folder.is_dir():
                 continue
@@ -428,15 +434,15 @@ class Blobs:
                     _unlink_if_older(path, before)
 
     def verify(self) -> list[str]:
-        """Hash everything; the names of what is damaged or lost."""
+        """Hash everything; returns the names of damaged and lost blobs."""
         return [name for name, _, problem in self.iterate_checks() if problem is not None]
 
     def iterate_checks(
         self, after: str = "", skip: Callable[[str, Unavailable], None] | None = None
     ) -> Iterator[tuple[str, int, str | None]]:
-        """Hash one file after the other, by their names: (name, bytes, ``lost``, ``damaged`` or None).
+        """Hash one file after the other, in order of their names: (name, bytes, ``lost``, ``damaged`` or None).
 
-        skip: called for one that cannot be read at the moment; without it, that raises Unavailable.
+        skip: called for a file that is temporarily unreadable; without it, that raises Unavailable.
         """
         while True:
             query = select(blob.c.sha256).where(blob.c.sha256 > after).order_by(blob.c.sha256).limit(BATCH)
@@ -445,7 +451,7 @@ class Blobs:
             for name, row in sorted(rows.items()):
                 try:
                     problem = self._problem(name, row)
-                    if problem is not None:  # it may have moved to another pack, or gone, since the query
+                    if problem is not None:  # it may have been moved to another pack, or removed, since the query
                         with self._database.read() as connection:
                             moved = self._rows(connection, [name]).get(name)
                         problem = None if moved is None else self._problem(name, moved)
@@ -461,14 +467,14 @@ class Blobs:
 
 
 def _read_error(sha256: str, error: OSError) -> FleetMapError:
-    """Damaged for broken storage; Unavailable for what may work later, like too many open files."""
+    """Convert an OS error: Damaged for broken storage, Unavailable for temporary errors such as too many open files."""
     if error.errno in BROKEN_STORAGE_ERRNOS:
         return Damaged(f"the stored file {sha256} cannot be read ({system_reason(error)}): {REPAIR}")
     return _unreadable_error(error)
 
 
 class _Unreadable(Unavailable):
-    """A file that cannot be read at the moment, in contrast to a database that does not answer."""
+    """Temporarily unreadable file, as opposed to an unavailable database."""
 
 
 def _unreadable_error(error: OSError) -> _Unreadable:
@@ -478,14 +484,14 @@ def _unreadable_error(error: OSError) -> _Unreadable:
 def _unavailable_error(error: OSError) -> Unavailable:
     if error.errno in DISK_FULL_ERRNOS:
         return NoRoom(
-            f"the server has no room left for files ({system_reason(error)}); nothing was stored. Try again after its "
-            "operator has freed space"
+            f"the server has no disk space left for files ({system_reason(error)}); nothing was stored. Try again "
+            "after its operator has freed space"
         )
     return Unavailable(f"the blob folder cannot be written: {system_reason(error)}. Try again later")
 
 
 def _upsert(connection: Connection, rows: Sequence[Mapping[str, object]]) -> None:
-    """Rows for new blobs; where another upload was quicker its row stays and counts as used now."""
+    """Insert rows for new blobs; a row that another upload inserted first stays and counts as used now."""
     if not rows:
         return
     now = int(time.time())
@@ -521,7 +527,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _remove_workspace(folder: Path) -> bool:
-    """Remove a workspace unless a living process has it locked."""
+    """Remove a workspace unless a running process has locked it."""
     try:
         lock = os.open(folder / LOCK, os.O_RDWR)
     except FileNotFoundError:

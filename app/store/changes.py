@@ -1,4 +1,4 @@
-"""What a new version shall change, and what came out of preparing it."""
+"""Change sets: the operations that make a version, and the prepared version that results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 
 
 class Keep(enum.Enum):
-    """The sentinel for "leave it as it is"."""
+    """Sentinel for "leave unchanged"."""
 
     KEEP = "keep"
 
@@ -38,12 +38,12 @@ class Keep(enum.Enum):
 KEEP: Final = Keep.KEEP
 
 RAW: Final = Provenance()
-"""It stands in a source."""
+"""Provenance of content from a source."""
 
 
 @dataclass(frozen=True, slots=True)
 class Replace:
-    """The part becomes this; what was under the key is gone."""
+    """Replace the part under the key."""
 
     key: PartKey
     part: Part
@@ -52,7 +52,7 @@ class Replace:
 
 @dataclass(frozen=True, slots=True)
 class Put:
-    """Features are added or, where their id is known, replaced; members of the document are joined by key."""
+    """Add features, or replace those with the same id; members of the document are joined by key."""
 
     key: PartKey
     features: Features
@@ -61,7 +61,7 @@ class Put:
 
 @dataclass(frozen=True, slots=True)
 class Delete:
-    """Features go; NotFound where the part or an id is unknown."""
+    """Delete features. Raises NotFound if the part or an id is unknown."""
 
     key: PartKey
     ids: tuple[str, ...]
@@ -69,7 +69,7 @@ class Delete:
 
 @dataclass(frozen=True, slots=True)
 class Drop:
-    """The whole part goes; NotFound where there is none."""
+    """Delete the whole part. Raises NotFound if there is none."""
 
     key: PartKey
 
@@ -79,7 +79,7 @@ Operation = Replace | Put | Delete | Drop
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """Operations in order, and the datum, levels and templates where they are to change."""
+    """Operations in order, with the new datum, levels and templates if they change."""
 
     operations: tuple[Operation, ...] = ()
     datum: Datum | Literal[Keep.KEEP] | None = KEEP
@@ -98,13 +98,12 @@ class IndexRows:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A version ready to be committed on top of version ``base``; plain data, so it can cross processes.
+    """A version ready to be committed on top of version ``base``; plain data, so that it can cross processes.
 
-    chunks: hash (hex) -> stored bytes of all chunks that the base does not have, or has damaged. blobs: SHA-256 ->
-    content of files that belong to the content (resources). changes: counts by layer. changed: whether the root differs
-    from the base's, or what says where the content comes from is renewed. index: the index' changes where they are few,
-    else None (it is brought up to date when it is asked). area: KEEP if it is the base's, None if the next query
-    computes it.
+    chunks: hash (hex) -> stored bytes of all chunks that are missing or damaged in the base. blobs: SHA-256 -> content
+    of files that belong to the content (resources). changes: counts by layer. changed: whether the root differs from
+    the base's, or the provenance of derived parts is renewed. index: the changes to the index if they are few, else
+    None (the next query updates it). area: KEEP if it is the base's, None if the next query computes it.
     """
 
     base: int

@@ -32,17 +32,17 @@ from app.store.values import LATEST, Version, rfc3339
 _NO_PLAN: Final[Mapping[str, None]] = {"planned_version": None, "planned_at": None, "planned_author": None}
 
 MAX_MOVES: Final = 1000
-"""So many moves of a channel are looked back on."""
+"""Maximum number of past moves of a channel that are read."""
 
 
 class Channels:
-    """The channels of environments."""
+    """Service for the channels of environments."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def all(self, environment: str) -> list[Channel]:
-        """``latest`` first, then the others by name."""
+        """List channels: ``latest`` first, then the others by name."""
         table, version = tables.channel, tables.version
         with self._database.read() as connection:
             row = environment_row(connection, environment)
@@ -73,11 +73,11 @@ class Channels:
         return [replace(latest, closures=closures, closures_sequence=row.closures_sequence), *others]
 
     def target(self, environment: str, ref: str | int, closures: ClosureMode | None = None) -> tuple[Version, int]:
-        """Read a version by number or channel as maps of it are made, and the sequence of what it shows.
+        """Read a version by number or channel as maps show it, with its sequence.
 
-        closures: how its maps show the closures in force; default: applied for a channel, ignored for a number, which
-        is history. The sequence is that of the event that brought the channel (or the version) there or, if that is
-        later, that changed which closures are in force.
+        closures: how maps show the closures in force; default: applied for a channel, ignored for a number (history).
+        The sequence is that of the event that moved the channel to the version (or created the version) or, if later,
+        of the event that last changed the closures in force.
         """
         mode = closures or ("ignore" if isinstance(ref, int) else "apply")
         table, version = tables.channel, tables.version
@@ -113,11 +113,14 @@ class Channels:
         activate_at: datetime | None = None,
         rollout: Rollout | None = None,
     ) -> Channel:
-        """Move a channel to a version, or plan to (``activate_at``, an aware time); the plan of before is dropped.
+        """Move a channel to a version at once, or plan the move; replaces an earlier plan.
 
-        The event tells ``rollback: true`` where the version is lower than the channel's. Moving it to where it is
-        changes nothing but that a plan is dropped, which is told. ``latest`` cannot be moved. rollout: in two stages;
-        its version and root are set here. Whatever roll-out was under way ends.
+        Args:
+            activate_at: time of the planned move, aware.
+            rollout: makes it a two-stage rollout; its version and root are set here. Any open rollout ends.
+
+        The event has ``rollback: true`` if the version is lower than the channel's. Moving a channel to its current
+        version changes nothing except that a plan is cancelled, with its event. ``latest`` cannot be moved.
         """
         _check_name(channel)
         if activate_at is not None and activate_at.tzinfo is None:
@@ -136,9 +139,9 @@ class Channels:
             return write.read()
 
     def moves(self, environment: str, channel: str) -> list[ChannelMove]:
-        """The newest events that brought a channel somewhere, oldest first; of ``latest`` each new version.
+        """List the newest events that moved a channel, oldest first; for ``latest`` each new version.
 
-        Events that changed which closures are in force are among them, with an empty root: they move no channel.
+        Events that changed the closures in force are included, with an empty root: they move no channel.
         """
         table = tables.event
         kind = table.c.body["type"].as_string()
@@ -157,7 +160,7 @@ class Channels:
         ]
 
     def cancel_planned(self, environment: str, channel: str, author: str) -> Channel:
-        """Forget a planned move; NotFound where there is none."""
+        """Cancel a planned move. Raises NotFound if there is none."""
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
             write = _ChannelWrite(connection, row, channel, self._database.now())
@@ -173,7 +176,7 @@ class Channels:
             return write.read()
 
     def apply_due_moves(self, now: datetime) -> list[tuple[str, Channel]]:
-        """Carry out the planned moves whose time has come: (environment, channel), in the order of their times."""
+        """Carry out the planned moves that are due; returns (environment, channel) in the order of their times."""
         table, owner = tables.channel, tables.environment
         query = (
             select(owner.c.name.label("environment"), table.c.name)
@@ -198,10 +201,10 @@ class Channels:
         return out
 
     def advance_rollouts(self, now: datetime, decide: Decide) -> list[tuple[str, Channel]]:
-        """Let every open roll-out take its next step, each in its own transaction: (environment, channel) that did.
+        """Advance every open rollout by one step, each in its own transaction; returns (environment, channel) of those.
 
-        decide: what to do with a roll-out, given the robots of its channel. It is asked again inside of the
-        transaction, so that what it decides on is what holds at that moment.
+        decide: chooses the step of a rollout, given the robots of its channel. It is called again inside the
+        transaction, so that it decides on the current state.
         """
         table, owner = tables.channel, tables.environment
         query = (
@@ -278,14 +281,14 @@ def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Deci
 
 
 def _with_prior_failures(write: _ChannelWrite, rollout: Rollout) -> Rollout:
-    """The roll-out at the beginning of a stage: which robots said before it that they failed with this version."""
+    """Note the robots that had reported a failure of this version before the rollout's stage began."""
     robots = channel_robots(write.connection, write.environment.id, write.name)
     failed_robots = (r for r in robots if r.has_failed_with(rollout.root))
     return replace(rollout, said_before={r.robot: rfc3339(r.time) for r in failed_robots})
 
 
 def _apply_step(write: _ChannelWrite, channel: Row[Any], step: RolloutStep) -> None:
-    """One step of a roll-out: the move or the way back with its event, or the end."""
+    """Apply one step of a rollout: move or move back with an event, or end."""
     rollout = Rollout.from_row(channel.rollout)
     ended = replace(rollout, state=step.state, detail=step.detail)
     if step.do == "move":
@@ -297,7 +300,7 @@ def _apply_step(write: _ChannelWrite, channel: Row[Any], step: RolloutStep) -> N
 
 
 def _end_rollout(write: _ChannelWrite, channel: Row[Any], state: RolloutState, detail: str, author: str) -> None:
-    """A roll-out is over; a move that still waits for it is dropped, which is told."""
+    """End a rollout; a planned move that still waits for it is cancelled, with its event."""
     rollout = replace(Rollout.from_row(channel.rollout), state=state, detail=detail)
     values: dict[str, Any] = {"rollout": rollout.as_row(), "rollout_state": state}
     dropped = channel.rollout_state == "waiting" and channel.planned_version is not None
@@ -308,10 +311,10 @@ def _end_rollout(write: _ChannelWrite, channel: Row[Any], state: RolloutState, d
 
 def _check_name(channel: str) -> None:
     if channel == LATEST:
-        raise Invalid("the channel latest moves by itself: it is always the newest version")
+        raise Invalid("channel latest cannot be moved: it always points to the newest version")
     if not CHANNEL_NAME.fullmatch(channel):
         raise Invalid(
-            f"a channel cannot be called {channel[:80]!r}: use at most 63 of a-z, 0-9, _ and -, starting with a letter"
+            f"invalid channel name {channel[:80]!r}: use at most 63 of a-z, 0-9, _ and -, starting with a letter"
         )
 
 
@@ -335,7 +338,10 @@ def _move(
     reason: str = "",
     rollback: bool = False,
 ) -> None:
-    """Move a channel. rollout: what it belongs to; with a share of failures to look out for it is watched from now."""
+    """Move a channel.
+
+    rollout: the rollout that the move belongs to; if it has a limit of failures, it is watched from now on.
+    """
     target = write.read_version(number)
     channel_row = write.read_row()
     nothing: dict[str, Any] = {**_NO_PLAN}
@@ -353,7 +359,7 @@ def _move(
     if before is not None and before.number == number:
         write.store(channel_row, **nothing)
         if channel_row is not None and channel_row.planned_version not in (None, number):
-            _append_cancelled_event(write, channel_row, "the channel stays where it is", author)
+            _append_cancelled_event(write, channel_row, "the channel stays at its version", author)
         return
     sequence = write.environment.sequence + 1
     write.store(channel_row, version=number, sequence=sequence, author=author, time=write.now, **nothing)
@@ -387,7 +393,7 @@ def _plan(write: _ChannelWrite, number: int, author: str, at: datetime | None, r
 
 
 def _append_cancelled_event(write: _ChannelWrite, channel: Row[Any], reason: str, author: str) -> None:
-    """A plan that no longer holds, and that no move replaces: whoever heard of it is told. channel: with the plan."""
+    """Append the event of a plan that was cancelled without a move. channel: the row that still has the plan."""
     before = None if channel.version is None else write.read_version(channel.version)
     target = write.read_version(channel.planned_version)
     _append_event(write, "channel.cancelled", before, target, author, reason=reason)
@@ -403,7 +409,7 @@ def _append_event(
     rollback: bool = False,
     **about: Any,
 ) -> None:
-    """The event of a channel that goes, is planned to go, or does not go after all, from one version to another."""
+    """Append the event of a channel that was moved, planned, or whose plan was cancelled."""
     environment, sequence = write.environment, write.environment.sequence + 1
     table = tables.environment
     write.connection.execute(update(table).where(table.c.id == environment.id).values(sequence=sequence))

@@ -1,4 +1,4 @@
-"""Chunks in the database: read in batches, hashed again, kept in a bounded memory; written in one statement."""
+"""Chunks in the database: read in batches, hashed again, cached in bounded memory; written in one statement."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_CACHED_CHUNK_BYTES = 2**20
 
 
 class Chunks:
-    """Reads chunks by hash. Thread-safe. reads: how many came from the database so far."""
+    """Reader of chunks by hash, with a cache. Thread-safe. reads: number of chunks read from the database so far."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -32,7 +32,7 @@ class Chunks:
         self.reads = 0
 
     def read_many(self, hashes: Sequence[bytes]) -> dict[bytes, bytes]:
-        """Hash -> canonical bytes; Damaged where one is missing or does not match its hash."""
+        """Read chunks: hash -> canonical bytes. Raises Damaged if one is missing or does not match its hash."""
         out: dict[bytes, bytes] = {}
         with self._lock:
             for h in hashes:
@@ -48,31 +48,31 @@ class Chunks:
         return out
 
     def read(self, sha256: str) -> bytes:
-        """A chunk's canonical bytes by its hash in hex, hashed again; Damaged where it is lost or damaged."""
+        """Read a chunk's canonical bytes by its hash in hex, hashed again. Raises Damaged if it is lost or damaged."""
         name = bytes.fromhex(sha256)
         return self.read_many([name])[name]
 
     def stage(self) -> ChunkStage:
-        """Chunks in the making over the stored ones."""
+        """Create a stage for new chunks on top of the stored ones."""
         return ChunkStage(self)
 
     def heal(self, chunks: Mapping[str, bytes]) -> None:
-        """Store chunks (hash in hex -> canonical bytes) in place of damaged or lost ones. Damaged for a wrong hash."""
+        """Replace damaged or lost chunks (hash in hex -> canonical bytes). Raises Damaged for a wrong hash."""
         for name, raw in chunks.items():
             if digest(raw).hex() != name:
-                raise Damaged(f"these are not the bytes of chunk {name}")
+                raise Damaged(f"the replacement does not match the hash of chunk {name}")
         with self._database.write() as connection:
             insert(connection, {name: compress(raw) for name, raw in chunks.items()})
 
     def remove_damaged(self, hashes: Iterable[str], before: float) -> set[str]:
-        """Remove those of the chunks (hashes in hex) that are damaged and were last used before this second; which."""
+        """Remove damaged chunks (hashes in hex) that were last used before this second; returns the removed ones."""
         names = [bytes.fromhex(name) for name in hashes]
         with self._database.write() as connection:
             damaged = [name for name, data in select_rows(connection, names) if problem(name, data) is not None]
             return {name.hex() for name in delete(connection, damaged, int(before))}
 
     def find_damaged(self, hashes: Sequence[bytes]) -> dict[bytes, str]:
-        """Those that the database has not whole, whatever is in memory: hash -> ``lost`` or ``damaged``."""
+        """Check chunks in the database, bypassing the cache; of the bad ones: hash -> ``lost`` or ``damaged``."""
         out = dict.fromkeys(hashes, "lost")
         for start in range(0, len(hashes), BATCH):
             for name, data in self._rows(hashes[start : start + BATCH]):
@@ -83,7 +83,7 @@ class Chunks:
         return out
 
     def iterate_checks(self, after: bytes = b"") -> Iterator[tuple[bytes, int, str | None]]:
-        """Hash one stored chunk after the other, by their hashes: (hash, bytes, ``damaged`` or None)."""
+        """Hash one stored chunk after the other, in order of their hashes: (hash, bytes, ``damaged`` or None)."""
         table = tables.chunk
         while True:
             query = select(table.c.hash, table.c.data).where(table.c.hash > after).order_by(table.c.hash).limit(BATCH)
@@ -125,14 +125,14 @@ class Chunks:
                 self._bytes -= len(raw)
 
     def forget(self) -> None:
-        """Empty the memory."""
+        """Empty the cache."""
         with self._lock:
             self._cache.clear()
             self._bytes = 0
 
 
 def problem(name: bytes, data: bytes) -> str | None:
-    """``damaged`` where stored bytes do not have the chunk's hash, else None."""
+    """Return ``damaged`` if stored bytes do not match the chunk's hash, else None."""
     try:
         return None if digest(decompress(data)) == name else "damaged"
     except Damaged:
@@ -140,11 +140,10 @@ def problem(name: bytes, data: bytes) -> str | None:
 
 
 def insert(connection: Connection, chunks: Mapping[str, bytes], now: float | None = None) -> None:
-    """Write chunks (hash in hex -> stored bytes); one that is there counts as used now.
+    """Write chunks (hash in hex -> stored bytes); an existing one counts as used now.
 
-    It gets these bytes too, which heals it where it was damaged.
-
-    Sorted by hash, so that two uploads with common chunks wait for each other instead of deadlocking.
+    An existing row gets these bytes too, which repairs a damaged one. Chunks are written in the order of their hashes,
+    so that two uploads with common chunks wait for each other instead of deadlocking.
     """
     used = int(time.time() if now is None else now)
     rows = [(bytes.fromhex(h), chunks[h], used) for h in sorted(chunks)]
@@ -159,7 +158,7 @@ def insert(connection: Connection, chunks: Mapping[str, bytes], now: float | Non
 
 
 def select_rows(connection: Connection, hashes: Sequence[bytes]) -> Iterator[tuple[bytes, bytes]]:
-    """Hash and stored bytes of those of the chunks that are there."""
+    """Read hash and stored bytes of the chunks that exist."""
     columns = "SELECT hash, data FROM chunk WHERE hash"
     for batch in _batches(hashes):
         if connection.dialect.name == "sqlite":
@@ -171,7 +170,7 @@ def select_rows(connection: Connection, hashes: Sequence[bytes]) -> Iterator[tup
 
 
 def delete(connection: Connection, hashes: Iterable[bytes], before: int) -> list[bytes]:
-    """Remove those of the chunks that were last used before this second; which."""
+    """Remove the chunks that were last used before this second; returns the removed ones."""
     out: list[bytes] = []
     for batch in _batches(sorted(hashes)):
         if connection.dialect.name == "sqlite":

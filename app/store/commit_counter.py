@@ -1,7 +1,7 @@
-"""A number that changes with every committed write, shared by all processes of a host: what caches in memory ask.
+"""Commit counter in shared memory: in-memory caches compare it to detect writes by any process on this host.
 
-Eight bytes of a file in the blob folder, mapped into memory: reading costs less than a microsecond, where any question
-to the database costs a hundred. Another host's commits are not seen, so a cache may believe it for a second at most.
+Eight bytes of a file in the blob folder, mapped into memory: reading it takes less than a microsecond, a database query
+about a hundred. Commits of other hosts are not counted, so caches expire after one second.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _NUMBER = struct.Struct("<Q")
 
 
 class CommitCounter:
-    """The number, opened when first needed; without a folder it changes in this process alone."""
+    """Commit counter, opened on first use; without a folder it counts commits of this process only."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -26,12 +26,12 @@ class CommitCounter:
         self._lock = threading.Lock()
 
     def __call__(self) -> int:
-        """The number now."""
+        """Return the current number."""
         shared = self._map or self._open()
         return self._changes if shared is None else int(_NUMBER.unpack_from(shared)[0])
 
     def change(self) -> None:
-        """Called after a commit: another number, so that no two processes need to agree on the next one."""
+        """Set another number after a commit. It is random, so that processes need not agree on the next one."""
         shared = self._map or self._open()
         if shared is None:
             self._changes += 1
@@ -39,7 +39,7 @@ class CommitCounter:
             _NUMBER.pack_into(shared, 0, int.from_bytes(os.urandom(8), "little"))
 
     def close(self) -> None:
-        """Give back the mapping."""
+        """Close the mapping."""
         with self._lock:
             if self._map is not None:
                 self._map.close()
@@ -50,11 +50,11 @@ class CommitCounter:
             if self._map is None and self._folder.is_dir():
                 try:
                     descriptor = os.open(self._folder / NAME, os.O_RDWR | os.O_CREAT, 0o600)
-                except OSError:  # a disk that is read-only: nobody on this host commits
+                except OSError:  # read-only disk: no process on this host commits
                     return None
                 try:
                     if os.fstat(descriptor).st_size < _NUMBER.size:
-                        # Real bytes, not a hole: a disk without room for them would kill whoever touches the mapping.
+                        # not a sparse file: on a full disk, access to its mapping would kill the process
                         os.pwrite(descriptor, bytes(_NUMBER.size), 0)
                     self._map = mmap.mmap(descriptor, _NUMBER.size)
                 except OSError:

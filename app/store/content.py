@@ -1,4 +1,4 @@
-"""Content of versions: whole, by box, by id, and what differs between two."""
+"""Content of versions: complete, by box, by id, and the differences of two versions."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from app.store.values import Box, Delta, FeatureDelta, GridDelta, Version
 
 
 class ContentReader:
-    """Reading layers. Any version costs the same."""
+    """Read access to layers. The cost does not depend on the age of the version."""
 
     def __init__(self, chunks: Chunks, blobs: Blobs) -> None:
         self._chunks, self._blobs = chunks, blobs
 
     def load(self, version: Version, keys: Collection[PartKey] | None = None) -> Layers:
-        """A version's content, or some parts of it; NotFound where a key is not there.
+        """Read a version's content, or some parts of it. Raises NotFound if the version has no part with a given key.
 
-        Features come in the order of their ids, whatever order they were uploaded in: a part is a set.
+        Features come in the order of their ids, not in the order of the upload: a part is a set.
         """
         entries = {e.key: e for e in version.parts}
         chosen = list(entries) if keys is None else sorted(set(keys))
@@ -50,12 +50,14 @@ class ContentReader:
         crs: Anchor = "local",
         ids: Collection[str] | None = None,
     ) -> Features:
-        """Features of a vector part, as they are anchored, by id: all; those whose box meets ``bbox``; those with
-        these ids, of which only the leaves they are in are read; or those with both.
+        """Read features of a vector part by id, as they are anchored: all, or filtered by ``bbox``, by ids, or by both.
 
-        bbox: (minimum x, minimum y, maximum x, maximum y) in metres (crs ``local``) or degrees (``wgs84``, where west >
-        east crosses the antimeridian); features without coordinates are in no box. MissingDatum where the part has
-        items anchored otherwise than ``crs`` and the version has no datum.
+        Args:
+            bbox: (minimum x, minimum y, maximum x, maximum y) in metres (crs ``local``) or degrees (``wgs84``; west >
+                east crosses the antimeridian); features without coordinates are in no box.
+            ids: only the leaves that contain them are read.
+
+        Raises MissingDatum if the part has items with another anchor than ``crs`` and the version has no datum.
         """
         draft = self._chunks.stage()
         root = self._root(draft, version, key)
@@ -74,7 +76,7 @@ class ContentReader:
         return features_from_items(items, read_document(draft, root))
 
     def has_ids(self, version: Version, key: PartKey, ids: Collection[str]) -> set[str]:
-        """Those of the ids that the part has; none where there is no such part."""
+        """Return the given ids that the part has; none if there is no such part."""
         if version.part(key) is None:
             return set()
         draft = self._chunks.stage()
@@ -82,19 +84,19 @@ class ContentReader:
 
     def _root(self, draft: ChunkStage, version: Version, key: PartKey) -> PartRoot:
         if key.layer not in VECTOR_LAYERS:
-            raise Invalid(f"{key.layer} has no features; there are {', '.join(sorted(VECTOR_LAYERS))}")
+            raise Invalid(f"layer {key.layer} has no features: use one of {', '.join(sorted(VECTOR_LAYERS))}")
         root = read_roots(draft, key, {e.key: e for e in version.parts})
         if root is None:
             raise NotFound(_missing(version, key))
         return root
 
     def diff(self, a: Version, b: Version) -> dict[str, Any]:
-        """What differs from version a to version b, by layer; reads only what the two do not share.
+        """Compare version a with version b, by layer; reads only what the two do not share.
 
         Vector layers: ``{added: [ids], changed: [{id, fields}], deleted: [ids]}``, ids of all parts of the layer
         together. occupancy: ``{grid: {freed, blocked, unknown, other, bbox, fields?}}``, metres. voxels, imagery and
         resources: ``{name: {added, changed, deleted, fields?}}``, counts of voxels, tiles or files. ``datum`` and
-        ``levels``: ``{from, to}``; ``templates`` as ``template_changes`` says them.
+        ``levels``: ``{from, to}``; ``templates`` as returned by ``template_changes``.
         """
         draft = self._chunks.stage()
         before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
@@ -117,7 +119,7 @@ class ContentReader:
         return out | template_changes(a.templates, b.templates)
 
     def delta_parts(self, a: Version, b: Version) -> Delta:
-        """What turns version a into version b: features put and deleted, changed rectangles of grids."""
+        """Compute the changes that turn version a into version b: features put and deleted, rectangles of grids."""
         draft = self._chunks.stage()
         before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
         features, grids, other = [], [], []

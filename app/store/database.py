@@ -1,4 +1,4 @@
-"""One engine for SQLite and PostgreSQL: pragmas, transactions, and database errors as ours."""
+"""One engine for SQLite and PostgreSQL: pragmas, transactions, and conversion of database errors."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ log = logging.getLogger(__name__)
 BUSY_MILLISECONDS = 5000
 TURN_SECONDS = 30.0
 RECHECK_SECONDS = 60.0
-"""How often a database that was found damaged is checked again."""
+"""Seconds between two checks of a database that was found damaged."""
 
 ROOM_BYTES = 2**20
-"""Free space below which a folder is not writable, and an I/O error of SQLite means a full disk."""
+"""Free space in bytes below which a folder is not writable, and an I/O error of SQLite means a full disk."""
 
 REPAIR = "stop the server, run `fleetmap verify`, and restore a backup of the database"
 _CORRUPT = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 _CORRUPT_STATES = frozenset({"XX001", "XX002"})
-"""PostgreSQL: data_corrupted, index_corrupted."""
+"""PostgreSQL's SQLSTATE codes data_corrupted and index_corrupted."""
 
 _NO_FILE_STATE = "58P01"
 _RELATION_FILE = re.compile(r"\b(?:base|global|pg_tblspc)/")
-"""PostgreSQL's undefined_file means damage only for a file of its data, not for a missing library."""
+"""Pattern of damage in PostgreSQL's undefined_file: a missing data file, not a missing library."""
 
 _DISK_FULL_STATE = "53100"
 
@@ -49,17 +49,15 @@ def _from_json(text: str | bytes) -> Any:
     try:
         return orjson.loads(text)
     except orjson.JSONDecodeError as error:
-        raise DatabaseDamaged(f"a value in the database is not JSON any more: {REPAIR}") from error
+        raise DatabaseDamaged(f"invalid JSON value in the database: {REPAIR}") from error
 
 
 def engine(url: str, *, readonly: bool) -> Engine:
-    """An engine that keeps what it acknowledges: SQLite in WAL mode with full syncs, or PostgreSQL by psycopg."""
+    """Create a durable engine: SQLite in WAL mode with full syncs, or PostgreSQL by psycopg."""
     try:
         parsed = make_url(url)
     except exc.ArgumentError as error:
-        raise Invalid(
-            f"the database URL cannot be read: use sqlite:///PATH or postgresql+psycopg://… ({error})"
-        ) from error
+        raise Invalid(f"invalid database URL ({error}): use sqlite:///PATH or postgresql+psycopg://…") from error
     options: dict[str, Any] = {
         "json_serializer": lambda value: orjson.dumps(value).decode(),
         "json_deserializer": _from_json,
@@ -80,15 +78,13 @@ def engine(url: str, *, readonly: bool) -> Engine:
         return create_engine(
             parsed.set(drivername="postgresql+psycopg"), connect_args=connect, pool_pre_ping=True, **options
         )
-    raise Invalid(
-        f"{parsed.get_backend_name()} is no database that can be used: use sqlite:///… or postgresql+psycopg://…"
-    )
+    raise Invalid(f"unsupported database {parsed.get_backend_name()!r}: use sqlite:///PATH or postgresql+psycopg://…")
 
 
 def _sqlite_on_connect(readonly: bool) -> Any:
     def connected(connection: sqlite3.Connection, record: object) -> None:
         del record
-        # The driver would begin transactions by itself, too late for BEGIN IMMEDIATE.
+        # The driver would begin transactions itself, too late for BEGIN IMMEDIATE.
         connection.isolation_level = None
         for pragma in (
             f"busy_timeout={BUSY_MILLISECONDS}",
@@ -109,20 +105,20 @@ def _sqlite_on_begin(connection: Connection) -> None:
 
 
 class _FileGone(DatabaseDamaged):
-    """SQLite's file is not the one that was opened. It may come back at any moment."""
+    """Error for a replaced SQLite file. The original may be restored at any moment."""
 
 
 class AuditMark(Protocol):
-    """Whether a request's row in the audit log is committed."""
+    """Handle of a request's row in the audit log. recorded: whether the row is committed."""
 
     recorded: bool
 
 
 class Database:
-    """Transactions on an engine. Every database error that another try may not have becomes Unavailable.
+    """Transactions on an engine. Database errors that a retry may avoid become Unavailable.
 
-    written: called after each commit, so that caches in memory can tell. record: adds who makes the change to its
-    transaction. clock: the present as an aware time, for what is stored. file: SQLite's; None on PostgreSQL.
+    written: called after each commit, so that caches in memory notice it. record: adds the audit row to a transaction.
+    clock: returns the present as an aware time. file: SQLite's; None on PostgreSQL.
     """
 
     def __init__(
@@ -144,7 +140,7 @@ class Database:
         self._checking = threading.Lock()
         self._gone = ""
         self.readonly = readonly
-        # SQLite lets whoever happens to look at the right moment write: among many, one may never come to it.
+        # SQLite does not queue writers: among many, one may never get its turn
         self._turn = threading.Lock()
         if self.file is not None:
             event.listen(self.engine, "do_connect", self._before_connect)
@@ -152,13 +148,13 @@ class Database:
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
-        """A transaction that only reads."""
+        """Begin a transaction that only reads."""
         with self.connection() as connection:
             yield connection
 
     @contextmanager
     def snapshot(self) -> Iterator[Connection]:
-        """A transaction that only reads, all of it from one state."""
+        """Begin a transaction that only reads, from one snapshot."""
         with self.connection() as connection:
             if not self.sqlite:
                 connection.execution_options(isolation_level="REPEATABLE READ")
@@ -166,8 +162,9 @@ class Database:
 
     @contextmanager
     def write(self, *, notify: bool = True, upkeep: bool = False) -> Iterator[Connection]:
-        """A transaction that writes: all or nothing, and on disk when it ends. notify: whether caches are to know.
-        upkeep: it is no change that anybody asked for, so that the audit log has nothing of it.
+        """Begin a transaction that writes: all or nothing, durable when it ends.
+
+        notify: whether caches are notified. upkeep: no change by a user, so that it gets no row in the audit log.
         """
         with self._write_turn(), self.connection() as connection:
             connection.execution_options(write=True)
@@ -181,8 +178,9 @@ class Database:
 
     @contextmanager
     def connection(self) -> Iterator[Connection]:
-        """A connection whose errors are ours: Unavailable, NoRoom, DatabaseDamaged; Invalid for a NUL that somebody
-        requests, which PostgreSQL has no text with.
+        """Convert the errors of a connection: Unavailable, NoRoom, DatabaseDamaged; Invalid for a NUL in a query.
+
+        PostgreSQL cannot store a NUL in a text.
         """
         try:
             self._check_file()
@@ -204,17 +202,17 @@ class Database:
             raise
 
     def check(self) -> None:
-        """DatabaseDamaged where damage was found and is still there; a damaged SQLite file is checked now and then."""
+        """Raise DatabaseDamaged while found damage persists; a damaged SQLite file is checked again periodically."""
         self._check_file()
         if self._damage is None:
             return
         since, detail = self._damage
         if time.monotonic() - since > RECHECK_SECONDS and self._checking.acquire(blocking=False):
-            try:  # one check at a time; all others report what is known
+            try:  # one check at a time; all others report the last result
                 problem = self.integrity(1) if self.sqlite else None
                 if problem is None:
                     self._damage = None
-                    log.warning("database: no damage is found any more")
+                    log.warning("database: intact again, no damage found")
                     return
                 self._damage = time.monotonic(), detail
             finally:
@@ -222,7 +220,7 @@ class Database:
         raise DatabaseDamaged(detail)
 
     def check_room(self) -> None:
-        """NoRoom or Unavailable unless the folder of SQLite's file can be written."""
+        """Raise NoRoom or Unavailable unless the folder of SQLite's file can be written."""
         if self.file is None:
             return
         try:
@@ -232,7 +230,7 @@ class Database:
             raise kind(f"the folder of the database cannot be written: {error.strerror}") from error
 
     def tables(self) -> tuple[list[str], int]:
-        """SQLite's tables by name, and the bytes of its pages; none on PostgreSQL."""
+        """Return the names of SQLite's tables, and the bytes of its pages; none on PostgreSQL."""
         if not self.sqlite:
             return [], 0
         with self.connection() as connection:
@@ -241,9 +239,9 @@ class Database:
             return sorted(["sqlite_master", *names]), sizes[0] * sizes[1]
 
     def integrity(self, limit: int, *, quick: bool = True, table: str | None = None) -> str | None:
-        """What SQLite's own check of its pages finds wrong, up to ``limit`` lines; None for nothing, or PostgreSQL.
+        """Run SQLite's own check of its pages; returns up to ``limit`` problems, None if intact or on PostgreSQL.
 
-        table: the only one to check, with its indexes.
+        table: check only this one, with its indexes.
         """
         if not self.sqlite:
             return None
@@ -257,28 +255,28 @@ class Database:
         return None if lines == ["ok"] else "; ".join(map(str, lines))
 
     def note_damage_from(self, error: DatabaseDamaged) -> None:
-        """Report damage that another process met. A file that is missing is checked anew for each request."""
+        """Note damage that another process found. A missing file is checked for each request instead."""
         if not isinstance(error, _FileGone):
             self.note_damage(error.detail)
 
     def note_damage(self, detail: str) -> None:
-        """Report damage that was found: from now on ``check`` fails."""
+        """Note damage: from now on ``check`` fails."""
         first = self._damage is None
         self._damage = time.monotonic(), detail
         if first:  # once, not for each request
             log.critical("database: %s (database=%s)", detail, self.file or self._name)
 
     def report_damage(self, problem: str) -> None:
-        """The same, of what a check of the pages found."""
+        """Note damage that a check of the pages found."""
         self.note_damage(f"the database {self._name} is damaged ({problem[:200]}): {REPAIR}")
 
     @property
     def _name(self) -> str:
-        """What clients may read: no path, no password."""
+        """Return the database's name for clients: no path, no password."""
         return f"file {self.file.name}" if self.file is not None else str(self.engine.url.database)
 
     def _check_file(self) -> None:
-        """DatabaseDamaged where SQLite's file is no longer the one that was opened: writes to it would be lost."""
+        """Raise DatabaseDamaged if SQLite's file is not the one that was opened: writes to it would be lost."""
         if self.file is None or self._inode is None:
             return
         try:
@@ -296,7 +294,7 @@ class Database:
             raise _FileGone(problem)
 
     def _before_connect(self, *_: object) -> None:
-        """SQLite would make an empty file where there is none any more."""
+        """Keep SQLite from creating an empty file if its file is missing."""
         self._check_file()
         if self.readonly and self.file is not None and not self.file.exists():
             raise _FileGone(f"the database {self._name} is missing: restore a backup")
@@ -306,7 +304,7 @@ class Database:
             self._inode = self.file.stat().st_ino
 
     def _error(self, error: exc.SQLAlchemyError) -> FleetMapError | None:
-        """A database error as ours; None where it is none of the database's making."""
+        """Convert a database error; None if the error is in the request."""
         original = getattr(error, "orig", None)
         code = getattr(original, "sqlite_errorcode", 0) & 0xFF
         state = getattr(original, "sqlstate", None)
@@ -317,21 +315,21 @@ class Database:
         full = code == sqlite3.SQLITE_FULL or state == _DISK_FULL_STATE
         if full or (code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and self._is_full()):
             return NoRoom(
-                f"the server has no room left for its database ({_short(error)}); nothing was stored. Try again after "
-                "its operator has freed space"
+                f"the server has no disk space left for its database ({_short(error)}); nothing was stored. Try again "
+                "after its operator has freed space"
             )
         if code == sqlite3.SQLITE_READONLY:
             return Unavailable(
-                f"the database {self._name} cannot be written ({_short(error)}); nothing was stored. Its operator has "
-                "to make the file and its folder writable"
+                f"the database {self._name} cannot be written ({_short(error)}); nothing was stored. Its operator "
+                "must make the file and its folder writable"
             )
         if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
             return Unavailable(
-                f"the database {self._name} cannot be read or written ({_short(error)}): its operator has to check the "
+                f"the database {self._name} cannot be read or written ({_short(error)}): its operator must check the "
                 "file, its folder and its disk"
             )
         if isinstance(error, exc.OperationalError | exc.InterfaceError | exc.TimeoutError | exc.InternalError):
-            return Unavailable(f"the database does not answer as it should: {_short(error)}. Try again later")
+            return Unavailable(f"the database is unavailable ({_short(error)}): try again later")
         return None
 
     def _is_full(self) -> bool:
@@ -342,30 +340,30 @@ class Database:
 
     @contextmanager
     def _write_turn(self) -> Iterator[None]:
-        """One writer of this process after the other, where the database lets only one write."""
+        """Queue the writers of this process for a database that allows one writer at a time."""
         if not self.sqlite:
             yield
             return
         if not self._turn.acquire(timeout=TURN_SECONDS):
-            raise Unavailable("too much is being written: try again in a few seconds")
+            raise Unavailable("too many concurrent writes: try again in a few seconds")
         try:
             yield
         finally:
             self._turn.release()
 
     def close(self) -> None:
-        """Give back all connections."""
+        """Close all connections."""
         self.engine.dispose()
 
 
 def _short(error: exc.SQLAlchemyError) -> str:
-    """The driver's first line, without the statement and without what might be a secret in a URL."""
+    """Return the first line of the driver's message, without the statement and without URLs (secrets)."""
     original = getattr(error, "orig", None)
-    return (str(original or error).splitlines() or ["no reason told"])[0][:200]
+    return (str(original or error).splitlines() or ["no reason given"])[0][:200]
 
 
 def check_room(folder: Path) -> None:
-    """OSError unless a file of 1 MiB can be written to a folder."""
+    """Raise OSError unless a file of 1 MiB can be written to a folder."""
     probe = folder / f".room-{secrets.token_hex(8)}"
     try:
         with probe.open("wb") as file:

@@ -1,4 +1,4 @@
-"""What differs between two versions of a part: reads only what their trees do not share."""
+"""Differences between two versions of a part: reads only what their trees do not share."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from app.store.values import Box, ChangedCells
 
 @dataclass(slots=True)
 class FeatureChanges:
-    """Ids that came, changed and went, sorted, with the items on both sides. document: whether it differs."""
+    """Ids that were added, changed and deleted, sorted, with both items. document: whether it differs."""
 
     added: list[str] = field(default_factory=list)
     changed: list[str] = field(default_factory=list)
@@ -36,11 +36,11 @@ class FeatureChanges:
     document: bool = False
 
     def counts(self) -> dict[str, int]:
-        """How many of each."""
+        """Count each kind of change."""
         return {"added": len(self.added), "changed": len(self.changed), "deleted": len(self.deleted)}
 
     def as_dict(self) -> dict[str, Any]:
-        """The difference as JSON."""
+        """Return the difference as JSON."""
         return {
             "added": self.added,
             "changed": [{"id": i, "fields": fields(self.before[i], self.after[i])} for i in self.changed],
@@ -49,12 +49,12 @@ class FeatureChanges:
 
 
 def fields(a: Item, b: Item) -> list[str]:
-    """Names of the properties that differ, ``geometry`` and ``anchor`` among them, sorted."""
+    """Return the sorted names of differing properties, including ``geometry`` and ``anchor``."""
     old, new = a.properties, b.properties
     out = {
         key
         for key in old.keys() | new.keys()
-        # Packed, since 1 == 1.0 == True to Python.
+        # compared as packed bytes, since 1 == 1.0 == True in Python
         if key not in old or key not in new or old[key] != new[key] or pack(old[key]) != pack(new[key])
     }
     if a.wkb != b.wkb:
@@ -65,7 +65,7 @@ def fields(a: Item, b: Item) -> list[str]:
 
 
 def features(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> FeatureChanges:
-    """Changes between two collections; None is one without items."""
+    """Compare two collections; None is one without items."""
     before: dict[str, Item] = {}
     after: dict[str, Item] = {}
     with gc_paused():
@@ -90,7 +90,7 @@ FRAME: Final = ("height", "width", "resolution", "origin")
 
 @dataclass(frozen=True, slots=True)
 class TileChange:
-    """A tile that differs: its place in cells of the new grid, and both contents (uint8 [height, width])."""
+    """A tile that differs: its position in cells of the new grid, and both contents (uint8 [height, width])."""
 
     row: int
     column: int
@@ -99,12 +99,12 @@ class TileChange:
 
 
 def same_frame(a: PartRoot, b: PartRoot) -> bool:
-    """Whether two grids have their cells at the same places."""
+    """Return whether the cells of two grids cover the same positions."""
     return all(a.header[name] == b.header[name] for name in FRAME)
 
 
 def diff_tiles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> Iterator[TileChange]:
-    """The tiles that differ between two grids of the same frame."""
+    """Return the tiles that differ between two grids of the same frame."""
     left, right = tree.differing(draft, a.trees["tiles"], b.trees["tiles"])
     raws = draft.read_many([*left, *right])
     before = {code: name for leaf in left for code, name in tile_leaf(raws[leaf])}
@@ -125,7 +125,7 @@ def diff_tiles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> Iterator[TileChan
 
 @dataclass(slots=True)
 class CellChanges:
-    """Counts of changed cells by what they became, and the box around them in metres."""
+    """Counts of changed cells by their new value, and the box around them in metres."""
 
     freed: int = 0
     blocked: int = 0
@@ -135,7 +135,7 @@ class CellChanges:
     fields: list[str] = field(default_factory=list)
 
     def add(self, before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Count the cells that differ; the mask of them."""
+        """Count the cells that differ; returns their mask."""
         differs: NDArray[np.bool_] = before != after
         now = after[differs]
         freed, blocked, unknown = (int((now == value).sum()) for value in (FREE, OCCUPIED, UNKNOWN))
@@ -146,7 +146,7 @@ class CellChanges:
         return differs
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-like: all counts, the box, and the names of header members that differ, if any."""
+        """Return all counts, the box, and the names of differing header members, if any, as JSON."""
         out: dict[str, Any] = {
             "freed": self.freed,
             "blocked": self.blocked,
@@ -160,10 +160,10 @@ class CellChanges:
 
 
 def cells(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> CellChanges:
-    """Changes between two grids. Outside of a grid cells count as unknown.
+    """Compare two grids. Cells outside a grid count as unknown.
 
-    Grids whose cells fall on the same raster (equal resolution and yaw, origins whole cells apart) are laid on each
-    other; of others only the header's differences and the box of the new one (or of the old one) are told.
+    Grids on the same raster (equal resolution and yaw, origins whole cells apart) are compared cell by cell; for others
+    only the differences of the header and the box of the new grid (or of the old one) are returned.
     """
     out = CellChanges()
     if a is None and b is None:
@@ -188,7 +188,7 @@ def cells(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> CellChan
 
 
 def _diff_aligned(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None, out: CellChanges) -> CellChanges:
-    """Compare grids of one raster on the rectangle around both, in blocks of rows."""
+    """Compare two grids on one raster on the rectangle around both, in blocks of rows."""
     header = b.header if b else a.header if a else {}
     place = (0, 0) if a is None or b is None else (_offset(a.header, b.header) or (0, 0))
     old = _read_all_cells(draft, a)
@@ -219,7 +219,7 @@ def _diff_aligned(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None, out
 def _window(
     grid: NDArray[np.uint8], row: int, column: int, start: int, end: int, left: int, right: int
 ) -> NDArray[np.uint8]:
-    """Rows [start, end) and columns [left, right) of a grid whose first cell is (row, column); unknown outside."""
+    """Read rows [start, end), columns [left, right) of a grid whose first cell is (row, column); unknown outside."""
     out = np.full((end - start, right - left), UNKNOWN, np.uint8)
     r0, r1 = max(start, row), min(end, row + grid.shape[0])
     if r0 < r1:
@@ -232,7 +232,7 @@ def _read_all_cells(draft: ChunkStage, root: PartRoot | None) -> NDArray[np.uint
 
 
 def _offset(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[int, int] | None:
-    """(row, column) of a's first cell in cells of b, where both lie on one raster; else None."""
+    """Return (row, column) of a's first cell in cells of b if both are on one raster; else None."""
     ax, ay, ayaw = a["origin"]
     bx, by, byaw = b["origin"]
     if a["resolution"] != b["resolution"] or ayaw != byaw:
@@ -247,7 +247,7 @@ def _offset(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[int, int] | Non
 
 
 def cell_box(header: Mapping[str, Any], x0: float, y0: float, x1: float, y1: float) -> Box:
-    """The box in metres around cells [x0, x1) × [y0, y1) of a grid."""
+    """Return the box in metres around cells [x0, x1) × [y0, y1) of a grid."""
     x, y, yaw = header["origin"]
     r = header["resolution"]
     c, s = math.cos(yaw), math.sin(yaw)
@@ -258,7 +258,7 @@ def cell_box(header: Mapping[str, Any], x0: float, y0: float, x1: float, y1: flo
 
 
 def rectangles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> tuple[ChangedCells, ...]:
-    """The changed cells between two grids of one frame: the smallest rectangle in each tile that differs."""
+    """Return the changed cells between two grids of one frame: the smallest rectangle in each tile that differs."""
     out = []
     for change in diff_tiles(draft, a, b):
         rows, columns = np.nonzero(change.before != change.after)
@@ -272,7 +272,7 @@ def rectangles(draft: ChunkStage, a: PartRoot, b: PartRoot) -> tuple[ChangedCell
 
 
 def diff_other_parts(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> dict[str, Any]:
-    """Voxels, tiles of a picture, or files that came, changed and went, and the header members that differ."""
+    """Count voxels, image tiles or files that were added, changed and deleted; list differing header members."""
     if a is not None and b is not None and a.type != b.type:
         a = None
     kind = b.type if b else a.type if a else "resources"
@@ -312,7 +312,7 @@ def _rows(draft: ChunkStage, names: Sequence[bytes], kind: str) -> dict[Any, Any
 
 
 class _Voxels(NamedTuple):
-    """Leaves in ascending order. key: uint64 [n], place and depth. content: [n], comparable as a whole."""
+    """Octree leaves in ascending order. key: uint64 [n], position and depth. content: [n], comparable as a whole."""
 
     key: NDArray[np.uint64]
     content: NDArray[np.void]
@@ -338,7 +338,7 @@ def _voxels(draft: ChunkStage, names: Sequence[bytes], root: PartRoot | None) ->
 
 
 def _voxel_changes(before: _Voxels, after: _Voxels) -> dict[str, Any]:
-    """How many came, changed and went; millions of them take no object each."""
+    """Count added, changed and deleted leaves, without an object for each of possibly millions."""
     at = np.searchsorted(before.key, after.key)
     common = at < len(before.key)
     common[common] = before.key[at[common]] == after.key[common]

@@ -4,18 +4,18 @@ A **chunk** is one MessagePack array. Its name is the SHA-256 of these bytes; th
 so another compressor or level changes no name. The first member is the encoding's version (1), the second its kind:
 
 ``[1, "features", tail, ids, cells, geometry, sizes, properties]``
-    a leaf of vector items in ascending order of (cell, id). ids: array of texts. cells: binary, 8 bytes big-endian an
+    a leaf of vector items in ascending order of (cell, id). ids: array of texts. cells: binary, 8 bytes big-endian per
     item, the z-order cell (below). geometry: array of binaries, ISO WKB, little endian, XY or XYZ, no SRID, no M, no
     negative zero. properties: array of maps with keys in ascending order; integers stay integers and floats stay
-    floats (64 bit), no NaN, no infinity, no negative zero. sizes: binary, 4 bytes little endian an item, bytes of its
+    floats (64 bit), no NaN, no infinity, no negative zero. sizes: binary, 4 bytes little endian per item, bytes of its
     properties; tail: binary, 4 bytes little endian, bytes of the member ``properties``: with these two an item is
     found, compared and moved to another leaf without unpacking it.
 ``[1, "ids", ids, places]``
-    a leaf of the table id -> place, ascending by the ids' UTF-8. places: binary, 9 bytes an item: 0 for local or 1 for
+    a leaf of the table id -> place, ascending by the ids' UTF-8. places: binary, 9 bytes per item: 0 for local or 1 for
     wgs84, then the cell.
 ``[1, "tiles", codes, hashes]``
-    a leaf of a raster, ascending. codes: binary, 8 bytes big-endian a tile, Morton code of (column, row) of the tile,
-    column in the lowest bit. hashes: binary, 32 bytes a tile, each the name of a ``tile``.
+    a leaf of a raster, ascending. codes: binary, 8 bytes big-endian per tile, Morton code of (column, row) of the tile,
+    column in the lowest bit. hashes: binary, 32 bytes per tile, each the name of a ``tile``.
 ``[1, "tile", cells]``
     the values of one tile, row by row, row 0 first, bands interleaved, little endian; its size follows from the
     raster's header (256 × 256, less at the upper edges).
@@ -28,19 +28,19 @@ so another compressor or level changes no name. The first member is the encoding
     each; the contents are blobs.
 ``[1, "inner", level, keys, hashes, counts, leaves, boxes]``
     children in ascending order. keys: each one's last key. counts: items below. leaves: leaves below. boxes: binary, 4
-    float64 little endian a child: x and y of the minimum and of the maximum, (inf, inf, -inf, -inf) where nothing below
-    has a place.
+    float64 little endian per child: x and y of the minimum and of the maximum, (inf, inf, -inf, -inf) if no item below
+    has coordinates.
 ``[1, "document", value]``
     one long member of a collection's document.
 ``[1, "part", type, header, trees]``
     the root of a part; its hash is the part's hash. type: ``features``, ``grid``, ``voxels``, ``picture`` or
-    ``resources``. header: map of what the part says as a whole. trees: map of name -> ``[hash, level, count, leaves,
+    ``resources``. header: map of the data about the whole part. trees: map of name -> ``[hash, level, count, leaves,
     box]`` or nil.
 
-A part's **tree** is a function of its items alone, whatever edits led to them: items are sorted by key, and an item
-ends its node where a public hash of its key says so (``tree.py``). Keys: ``features`` cell (8 bytes big-endian), then
-the id's UTF-8; ``ids`` and ``files`` UTF-8; ``tiles`` the code; ``voxels`` place (8 bytes big-endian), depth. Local and
-wgs84 features have a tree each.
+A part's **tree** is a function of its items alone, independent of the edits that led to them: items are sorted by key,
+and an item ends its node if a public hash of its key has low zero bits (``tree.py``). Keys: ``features`` cell (8 bytes
+big-endian), then the id's UTF-8; ``ids`` and ``files`` UTF-8; ``tiles`` the code; ``voxels`` place (8 bytes
+big-endian), depth. Local and wgs84 features have a tree each.
 
 The **z-order cell** of a feature interleaves the bits of column and row (column lowest) of the middle of its box: local
 metres floor(x + 2^24), floor(y + 2^24); wgs84 floor((longitude + 180) · 2^17), floor((latitude + 90) · 2^17): about one
@@ -48,9 +48,9 @@ metre each. Without coordinates it is 0.
 
 The **root** of a version is the SHA-256 of ``[1, "version", parts, datum, levels]``: parts = ``[layer, level, name,
 hash]`` ascending, datum = ``[latitude, longitude, altitude, heading]`` or nil, levels = ``[name, elevation]``
-ascending.
+ascending. A version with templates has them as a sixth member, a map.
 
-A later encoding gets a new number; what has number 1 is read for ever.
+A later encoding gets a new number; encoding 1 stays readable in all later releases.
 """
 
 from __future__ import annotations
@@ -84,20 +84,20 @@ OPTIONS: Final = (
 )
 
 _SUSPECT: Final = re.compile(rb"\xcb(?:[\x7f\xff][\xf0-\xff]|\x80\x00{7})", re.DOTALL)
-"""The bytes of a NaN, an infinity or a negative zero, or by chance of something else: then the values are looked at."""
+"""Pattern of a NaN, an infinity or a negative zero, or by chance of other bytes: then the values are checked."""
 
 _BINARY: Final = re.compile(rb"[\xc4-\xc6]")
-"""The first byte of a MessagePack binary, or by chance of something else (letters such as č): then JSON decides."""
+"""Pattern of the first byte of a MessagePack binary, or by chance of text (such as č): then JSON decides."""
 
 LEVEL: Final = 1
 MAX_CHUNK: Final = 2**31 - 1
 
 EMPTY_BOX: Final = (np.inf, np.inf, -np.inf, -np.inf)
-"""The box of nothing: any box joined with it stays what it is."""
+"""Box without content: joined with any box it gives that box."""
 
 
 class _Codecs(threading.local):
-    """One compressor a thread: sharing one between threads crashes the interpreter."""
+    """One compressor per thread: sharing one between threads crashes the interpreter."""
 
     def __init__(self) -> None:
         self.compressor = zstandard.ZstdCompressor(level=LEVEL, write_checksum=False, write_content_size=True)
@@ -108,12 +108,12 @@ _codecs = _Codecs()
 
 
 def compress(raw: bytes) -> bytes:
-    """A chunk's stored form."""
+    """Compress a chunk into its stored form."""
     return _codecs.compressor.compress(raw)
 
 
 def decompress(stored: bytes) -> bytes:
-    """A chunk's canonical bytes; Damaged where they are not what was stored."""
+    """Decompress a chunk into its canonical bytes. Raises Damaged if the stored bytes are invalid."""
     try:
         return _codecs.decompressor.decompress(stored)
     except zstandard.ZstdError as error:
@@ -121,28 +121,28 @@ def decompress(stored: bytes) -> bytes:
 
 
 def digest(raw: bytes) -> bytes:
-    """A chunk's name: 32 bytes."""
+    """Return a chunk's name: 32 bytes."""
     return hashlib.sha256(raw).digest()
 
 
 def pack(value: Any) -> bytes:
-    """MessagePack with sorted keys, of values that are known to be canonical."""
+    """Pack values that are already canonical as MessagePack with sorted keys."""
     return ormsgpack.packb(value, option=OPTIONS)
 
 
 def unpack(raw: bytes) -> list[Any]:
-    """A chunk's members; Damaged where it is none or of an encoding that this release does not know."""
+    """Decode a chunk into its members. Raises Damaged if it is invalid or of an encoding that is unsupported."""
     try:
         members = ormsgpack.unpackb(raw)
     except ValueError as error:
-        raise Damaged(f"a stored chunk is no MessagePack: {error}") from error
+        raise Damaged(f"a stored chunk is not valid MessagePack: {error}") from error
     if not isinstance(members, list) or len(members) < 2 or members[0] != ENCODING:
-        raise Damaged("a stored chunk has an encoding that this release does not know: was it written by a newer one?")
+        raise Damaged("a stored chunk has an unsupported encoding: it may have been written by a newer release")
     return members
 
 
 def array_header(n: int) -> bytes:
-    """MessagePack's shortest header of an array."""
+    """Return MessagePack's shortest header of an array."""
     if n < 16:
         return bytes((0x90 | n,))
     if n < 65536:
@@ -151,7 +151,7 @@ def array_header(n: int) -> bytes:
 
 
 def pack_value(value: Any, location: str) -> bytes:
-    """Canonical bytes of a JSON-like value; Invalid tells where something cannot be stored."""
+    """Return the canonical bytes of a JSON-like value. Raises Invalid with the location if it cannot be stored."""
     try:
         packed = ormsgpack.packb(value, default=_plain, option=OPTIONS)
     except (TypeError, ValueError, RecursionError) as error:
@@ -169,7 +169,7 @@ def pack_value(value: Any, location: str) -> bytes:
 
 
 def pack_properties(ids: Sequence[str], properties: Sequence[Properties]) -> list[bytes]:
-    """Each item's properties as canonical bytes; Invalid names the item that cannot be stored."""
+    """Return each item's properties as canonical bytes. Raises Invalid with the item that cannot be stored."""
     packb = ormsgpack.packb
     try:
         packed = [packb(p, default=_plain, option=OPTIONS) for p in properties]
@@ -187,12 +187,12 @@ def pack_properties(ids: Sequence[str], properties: Sequence[Properties]) -> lis
 
 
 def _plain(value: Any) -> Any:
-    """What MessagePack has no word for but is JSON-like all the same: NumPy's scalars and mappings of any kind."""
+    """Convert JSON-like values that MessagePack does not support: NumPy's scalars and other mappings."""
     if isinstance(value, (np.bool_, np.integer, np.floating)):
         return value.item()
     if isinstance(value, Mapping):
         return dict(value)
-    raise TypeError(f"{type(value).__name__} is no JSON value")
+    raise TypeError(f"{type(value).__name__} is not a JSON value")
 
 
 def _normalise(value: Any, location: str) -> Any:
@@ -212,7 +212,7 @@ def _normalise(value: Any, location: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Canonical vector items, in the order they came. boxes: float64 [n, 4]; cells: uint64 [n]; local: bool [n]."""
+    """Canonical vector items in their original order. boxes: float64 [n, 4]; cells: uint64 [n]; local: bool [n]."""
 
     ids: Sequence[str]
     wkb: NDArray[np.object_]
@@ -222,7 +222,7 @@ class Columns:
     cells: NDArray[np.uint64]
 
     def digest(self, document: bytes) -> str:
-        """One hash over everything as it came: equal only where the same items come again in the same order."""
+        """Hash everything in order: equal only for the same items in the same order."""
         h = hashlib.sha256(document)
         h.update(pack(list(self.ids)))
         h.update(np.packbits(self.local).tobytes())
@@ -233,7 +233,7 @@ class Columns:
 
 
 def columns(features: Features) -> Columns:
-    """Features -> canonical columns."""
+    """Convert features into canonical columns."""
     geometry = _without_negative_zero(features.geometry)
     boxes = bounds(geometry)
     return Columns(
@@ -247,7 +247,7 @@ def columns(features: Features) -> Columns:
 
 
 def to_wkb(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
-    """ISO WKB, little endian, XY or XYZ, whatever the machine and the version of GEOS."""
+    """Write ISO WKB, little endian, XY or XYZ, independent of the machine and the version of GEOS."""
     if not len(geometry):
         return np.empty(0, object)
     return np.asarray(
@@ -256,14 +256,14 @@ def to_wkb(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
 
 
 def from_wkb(wkb: Sequence[bytes] | NDArray[np.object_]) -> NDArray[np.object_]:
-    """The reverse; all at once."""
+    """Read geometries from WKB, all at once."""
     column = np.empty(len(wkb), object)
     column[:] = wkb
     return np.asarray(shapely.from_wkb(column), object) if len(column) else column
 
 
 def wkb_bounds(wkb: Sequence[bytes]) -> NDArray[np.float64]:
-    """The boxes of geometries in our own WKB, as ``bounds`` gives them; most shapes need no GEOS for it."""
+    """Return the boxes of geometries in canonical WKB, as ``bounds`` does; most shapes need no GEOS for it."""
     out = np.empty((len(wkb), 4))
     lengths = np.fromiter(map(len, wkb), np.intp, len(wkb))
     rest = np.ones(len(wkb), bool)
@@ -288,7 +288,7 @@ def wkb_bounds(wkb: Sequence[bytes]) -> NDArray[np.float64]:
 
 
 def bounds(geometry: NDArray[np.object_]) -> NDArray[np.float64]:
-    """float64 [n, 4]; NOWHERE for what has no coordinates."""
+    """Return boxes, float64 [n, 4]; NOWHERE for geometries without coordinates."""
     out = np.asarray(shapely.bounds(geometry), np.float64).reshape(len(geometry), 4)
     nowhere = np.isnan(out).any(axis=1)
     if nowhere.any():
@@ -310,7 +310,7 @@ def _without_negative_zero(geometry: NDArray[np.object_]) -> NDArray[np.object_]
 
 
 def z_cells(boxes: NDArray[np.float64], local: NDArray[np.bool_]) -> NDArray[np.uint64]:
-    """The z-order cell of each box: uint64 [n]."""
+    """Return the z-order cell of each box: uint64 [n]."""
     placed = np.isfinite(boxes).all(axis=1)
     middle = np.zeros((len(boxes), 2))
     middle[placed] = (boxes[placed, :2] + boxes[placed, 2:]) / 2.0
@@ -323,12 +323,12 @@ def z_cells(boxes: NDArray[np.float64], local: NDArray[np.bool_]) -> NDArray[np.
 
 
 def interleave(x: NDArray[np.uint64], y: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Morton code of two numbers below 2^32, x in the lowest bit."""
+    """Return the Morton code of two numbers below 2^32, x in the lowest bit."""
     return _spread(x) | (_spread(y) << np.uint64(1))
 
 
 def deinterleave(code: NDArray[np.uint64]) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
-    """The reverse: (x, y)."""
+    """Split Morton codes into (x, y)."""
     return _gather(code), _gather(code >> np.uint64(1))
 
 
@@ -362,10 +362,9 @@ def root_hash(
     levels: Iterable[Level],
     templates: Mapping[str, Any] | None = None,
 ) -> str:
-    """A version's root (hex) from (layer, level, name, hash in hex) of its parts, its datum and its levels.
+    """Compute a version's root (hex) from (layer, level, name, hash in hex) of its parts, its datum and its levels.
 
-    templates: what is filled in where no layer tells it, as ``Templates.as_dict`` says it; where there is none it has
-    no part in the hash.
+    templates: result of ``Templates.as_dict``; if empty, it is not part of the hash.
     """
     place = None if datum is None else [datum.latitude, datum.longitude, datum.altitude, datum.heading]
     storeys = sorted([level.name, level.elevation] for level in levels)

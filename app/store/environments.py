@@ -39,7 +39,7 @@ PAGE: Final = 500
 
 
 class Environments:
-    """The mapped places."""
+    """Service for environments."""
 
     def __init__(self, database: Database, chunks: Chunks) -> None:
         self._database, self._chunks = database, chunks
@@ -55,10 +55,10 @@ class Environments:
         datum: Datum | None = None,
         clone: Version | None = None,
     ) -> Environment:
-        """A new environment with version 0 (empty) and, with a datum or a clone, version 1.
+        """Create an environment with version 0 (empty) and, with a datum or a clone, version 1.
 
-        clone: a version of any environment whose content becomes version 1; a datum given beside it replaces the
-        clone's. Conflict where the name is taken or not yet purged.
+        clone: a version of any environment whose content becomes version 1; a datum given as well replaces the clone's.
+        Raises Conflict if the name is taken or not yet purged.
         """
         check_environment_name(name)
         empty = version_root((), None, (Level(),))
@@ -107,7 +107,7 @@ class Environments:
         return changes | frame_changes(None, place, (Level(),), clone.levels if clone else (Level(),))
 
     def get(self, name: str, *, deleted: bool = False) -> Environment:
-        """The environment; Gone where it is deleted (unless asked for), NotFound where it never was."""
+        """Read an environment. Raises Gone if it is deleted (unless ``deleted``), NotFound if it never existed."""
         with self._database.read() as connection:
             return as_environment(environment_row(connection, name, deleted=deleted))
 
@@ -121,11 +121,11 @@ class Environments:
         allowed: str | None = None,
         deleted: bool = False,
     ) -> tuple[list[Environment], str | None]:
-        """A page of environments by name, and the cursor of the next page.
+        """List a page of environments by name, with the cursor of the next page.
 
-        q: in name, title, description or a tag, whatever its case. bbox: (west, south, east, north) in degrees that the
-        extent meets, west > east across the antimeridian. allowed: a name pattern (fnmatch). deleted: those that wait
-        for being purged instead of the others.
+        q: in name, title, description or a tag, case-insensitive. bbox: (west, south, east, north) in degrees that the
+        extent must intersect, west > east across the antimeridian. allowed: a name pattern (fnmatch). deleted: list
+        those that can be restored or purged instead of the others.
         """
         if limit < 1:
             raise Invalid(f"limit must be at least 1, got {limit}")
@@ -154,7 +154,10 @@ class Environments:
         tags: Sequence[str] | None = None,
         author: str = "",
     ) -> Environment:
-        """Rename or describe. The history stays; listeners are told the end of the old name and the new one's start."""
+        """Rename or describe an environment. The history stays.
+
+        A new name produces two events: the end of the old name and the start of the new one.
+        """
         now = self._database.now()
         with self._database.write() as connection:
             row = environment_row(connection, name, lock=True)
@@ -183,16 +186,16 @@ class Environments:
         except IntegrityError as error:
             raise Conflict(f"the name {new_name!r} is taken") from error
         head = (row.head, row.root)
-        # To which name is not for everybody who may see one of them.
+        # without the other name: a client may be allowed to see only one of them
         _append_event(connection, row, "environment.deleted", ended, row.name, author, now, "renamed", previous=head)
         _append_event(connection, row, "environment.created", begun, new_name, author, now, "renamed", previous=head)
 
     def delete(self, name: str, author: str = "") -> Environment:
-        """Recoverable until purged; the name stays taken."""
+        """Delete an environment; it can be restored until it is purged, and its name stays taken."""
         return self._mark(name, author, deleted=True)
 
     def restore(self, name: str, author: str = "") -> Environment:
-        """Undo a deletion; Conflict where it is not deleted."""
+        """Restore a deleted environment. Raises Conflict if it is not deleted."""
         return self._mark(name, author, deleted=False)
 
     def _mark(self, name: str, author: str, *, deleted: bool) -> Environment:
@@ -215,8 +218,9 @@ class Environments:
             return as_environment(environment_row(connection, name, deleted=True))
 
     def purge(self, name: str) -> None:
-        """Remove a deleted environment for good; Conflict where it is not deleted. Its chunks and files go with the
-        next collection, its events stay in the log until they were surely read.
+        """Remove a deleted environment permanently. Raises Conflict if it is not deleted.
+
+        Garbage collection removes its chunks and files; its events stay in the log for 30 days, for late readers.
         """
         table = tables.environment
         with self._database.write() as connection:
@@ -241,7 +245,7 @@ def _insert_environment(connection: Connection, name: str, values: dict[str, Any
 
 
 def _last_sequence(connection: Connection, name: str) -> int:
-    """The last sequence told under a name that an environment had before; 0 where it is new."""
+    """Return the last sequence published under a name of an earlier environment; 0 for a new name."""
     table = tables.retired
     return int(connection.execute(select(table.c.sequence).where(table.c.name == name)).scalar_one_or_none() or 0)
 
@@ -265,7 +269,7 @@ def _empty_version(environment: str, root: str, author: str, time: datetime) -> 
 
 
 def _first_version(connection: Connection, start: Version, datum: Datum | None, clone: Version | None) -> Version:
-    """What version 1 holds. A clone is read again in this transaction, so that its chunks are surely still there."""
+    """Return the content of version 1. A clone is read again in this transaction, so that its chunks still exist."""
     base, message = start, "datum set"
     if clone is not None:
         origin = environment_row(connection, clone.environment, lock=True)
@@ -315,12 +319,12 @@ def _append_event(
 
 
 def _retire(connection: Connection, name: str, sequence: int) -> None:
-    """Remember the last sequence told under a name."""
+    """Store the last sequence published under a name."""
     upsert(connection, tables.retired, {"name": name}, {"sequence": sequence})
 
 
 def filters(*, q: str | None, bbox: Box | None, deleted: bool, dialect: str) -> list[ColumnElement[bool]]:
-    """The conditions on an environment's row that ``Environments.page`` describes."""
+    """Return the conditions on an environment's row that ``Environments.page`` describes."""
     table = tables.environment
     out: list[ColumnElement[bool]] = [table.c.deleted.is_not(None) if deleted else table.c.deleted.is_(None)]
     if q:
@@ -334,7 +338,7 @@ def filters(*, q: str | None, bbox: Box | None, deleted: bool, dialect: str) -> 
 
 
 def reaches(allowed: str | None, name: str) -> bool:
-    """Whether a name pattern (None: every name) allows an environment."""
+    """Return whether a name pattern (None: every name) allows an environment."""
     return allowed is None or fnmatchcase(name, allowed)
 
 
@@ -342,7 +346,7 @@ def _check_bounds(box: Box) -> Box:
     west, south, east, north = box
     if not (-180.0 <= west <= 180.0 and -180.0 <= east <= 180.0 and -90.0 <= south <= north <= 90.0):
         raise Invalid(
-            "a place must be degrees: longitudes within ±180, latitudes within ±90, south not above north; got "
+            "bbox must be degrees: longitudes within ±180, latitudes within ±90, south not above north; got "
             f"{', '.join(f'{v:g}' for v in box)}"
         )
     return box

@@ -1,4 +1,4 @@
-"""Where an environment is on earth: the box around all parts, also across the antimeridian."""
+"""Extent of an environment on earth: the box around all parts, also across the antimeridian."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.store.values import Box, PartEntry
 
 
 def extent(entries: Iterable[PartEntry], datum: Datum | None) -> Box | None:
-    """(west, south, east, north) in degrees around all parts; the datum where nothing else is known."""
+    """Return (west, south, east, north) in degrees around all parts; without any, the datum."""
     boxes: list[Box] = []
     for entry in entries:
         wgs84, local = entry.bounds.get("wgs84"), entry.bounds.get("local")
@@ -28,7 +28,7 @@ def extent(entries: Iterable[PartEntry], datum: Datum | None) -> Box | None:
 
 
 def join(boxes: Sequence[Box], around: float | None = None) -> Box | None:
-    """The box around boxes in degrees. Each is shifted by whole turns to lie near ``around`` (else near the first)."""
+    """Join boxes in degrees, each shifted by whole turns to be near ``around`` (else near the first)."""
     if not boxes:
         return None
     near = boxes[0][0] if around is None else around
@@ -46,7 +46,7 @@ def join(boxes: Sequence[Box], around: float | None = None) -> Box | None:
 
 
 def geometry(box: Box | None) -> bytes | None:
-    """The box as WKB in degrees: a polygon (a line or a point where it has no area), two across the antimeridian."""
+    """Convert the box to WKB in degrees: a polygon (or line or point without area), two across the antimeridian."""
     if box is None:
         return None
     shapes = [_shape(one) for one in split_box(box)]

@@ -1,4 +1,4 @@
-"""What the store hands out about a fleet: channels and their roll-outs, robots and their reports, overlays."""
+"""Values of the store about a fleet: channels and rollouts, robots and their reports, overlays."""
 
 from __future__ import annotations
 
@@ -17,13 +17,17 @@ OPEN_ROLLOUTS: tuple[RolloutState, ...] = ("waiting", "watching")
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """A move in two stages: robots fetch the version first, and are watched after it.
+    """A two-stage move: robots fetch the version before the channel moves, and are watched after it.
 
-    ready: the channel moves when this share of its online robots has the version (None: at its time alone). failed: it
-    moves back, or does not move at all, when this share says that it failed. deadline: the move is given up then.
-    window: seconds of watching. before: the version that it moves back to. state: ``waiting`` until it moves,
-    ``watching`` after it, then how it ended. said_before: robots that said already that they failed with this version
-    when its present stage began, and when the server received it: this orders later reports, not the robots' clocks.
+    Attributes:
+        ready: share of the channel's online robots that must have the version before the move (None: at its time only).
+        failed: share of robots that must report a failure to move the channel back, or to cancel the move.
+        deadline: time at which a waiting move is cancelled.
+        window: seconds of watching after the move.
+        before: version to move back to.
+        state: ``waiting`` until the move, ``watching`` after it, then the outcome.
+        said_before: robots that had reported a failure of this version before the present stage began, with the time of
+            receipt by the server: later reports are ordered by it, not by the robots' clocks.
     """
 
     version: int
@@ -41,7 +45,7 @@ class Rollout:
     said_before: Mapping[str, str] = field(default_factory=dict)
 
     def as_row(self) -> dict[str, Any]:
-        """JSON-like, with all members, as it is stored."""
+        """Return all members in the stored form, as JSON."""
         out: dict[str, Any] = {}
         for item in fields(self):
             value = getattr(self, item.name)
@@ -49,12 +53,12 @@ class Rollout:
         return out
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-like, what clients see of it."""
+        """Return the members that clients see, as JSON."""
         return {name: value for name, value in self.as_row().items() if name != "said_before"}
 
     @classmethod
     def from_row(cls, members: Mapping[str, Any]) -> Rollout:
-        """The reverse of ``as_row``; rows of earlier releases have no ``said_before``."""
+        """Read the result of ``as_row``; rows of earlier releases have no ``said_before``."""
         values = dict(members)
         for name in ("started", "activate_at", "deadline", "moved"):
             values[name] = None if values[name] is None else datetime.fromisoformat(values[name])
@@ -63,7 +67,7 @@ class Rollout:
 
 @dataclass(frozen=True, slots=True)
 class RolloutStep:
-    """What a roll-out does next: move, move back, or end as ``state`` says; and why."""
+    """The next step of a rollout: move, move back, or end with ``state``; and the reason."""
 
     do: Literal["move", "move_back", "end"]
     state: RolloutState
@@ -72,7 +76,7 @@ class RolloutStep:
 
 @dataclass(frozen=True, slots=True)
 class PlannedMove:
-    """A channel's next move. activate_at: None where it waits for robots alone."""
+    """A channel's next move. activate_at: None if it waits for robots only."""
 
     version: int
     activate_at: datetime | None
@@ -82,9 +86,9 @@ class PlannedMove:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A movable name for a version. version and root are None where the first move is still planned.
+    """A movable name for a version. version and root are None before its first move.
 
-    sequence: of the event that moved it last (``latest``: of the event that made the head). rollout: the last one.
+    sequence: of the event that moved it last (``latest``: of the event that created the head). rollout: the last one.
     closures: those in force, and closures_sequence: of the last event that changed them.
     """
 
@@ -102,11 +106,11 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class RobotReport:
-    """What a robot says of itself. reported_at: when, by its own clock. sequence: of the last event that it has
-    processed.
+    """A robot's status report.
 
-    holds: version and root that it has loaded, ``NO_ROOT`` for none; None where it does not say. It is not part of the
-    history. overlays: digest of the closures in the map that it has loaded; None from robots that know of none.
+    reported_at: by the robot's clock. sequence: of the last event that it has processed. holds: version and root that
+    it has loaded, ``NO_ROOT`` for none; None if not reported; not part of the history. overlays: digest of the closures
+    in the loaded map; None from robots without support for closures.
     """
 
     channel: str
@@ -122,9 +126,9 @@ class RobotReport:
 
 @dataclass(frozen=True, slots=True)
 class ReceivedReport:
-    """A report, of whom, and when it was received by the server's clock.
+    """A report with its robot, and the time of receipt by the server's clock.
 
-    vouched: whether it came with authority: with a token that may report for the robot, or over a router with users.
+    vouched: whether it was authenticated: by a token that may report for the robot, or by a router with users.
     """
 
     environment: str
@@ -136,8 +140,9 @@ class ReceivedReport:
 
 @dataclass(frozen=True, slots=True)
 class ActiveMap:
-    """What a robot drives on. sequence: of the event that it acted on, where it says so. since: server's clock.
-    overlays: digest of the closures in it.
+    """A robot's active map. sequence: of the event that led to it, if reported. since: server's clock.
+
+    overlays: digest of the closures in the map.
     """
 
     version: int
@@ -147,18 +152,17 @@ class ActiveMap:
     overlays: str | None = None
 
     def shows(self, root: str | None, overlays: str) -> bool:
-        """Whether this is the map of a root and of closures, given by their digest."""
+        """Return whether this is the map with a root and closures, given by their digest."""
         return self.root == root and (self.overlays or NO_CLOSURES.digest) == overlays
 
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot in one environment, as it is now.
+    """Current state of a robot in one environment.
 
-    time: of its last report. since: when it first said the same. on_bus: its liveliness on the bus, as of
-        ``presence_at``;
-    None where it never was on the bus. vouched: whether any of its reports came with authority, so that it counts in
-    roll-outs.
+    time: of its last report. since: when it first reported the same. on_bus: its liveliness on the bus, as of
+        ``presence_at``; None if it never was on the bus.
+    vouched: whether any of its reports was authenticated, so that it counts in rollouts.
     """
 
     robot: str
@@ -172,13 +176,13 @@ class Robot:
     vouched: bool = True
 
     def has_failed_with(self, root: str) -> bool:
-        """Whether it says that it failed with a version."""
+        """Return whether it reports a failure of a version."""
         return self.report.state == "failed" and self.report.root == root
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelMove:
-    """An event that brought a channel to a version."""
+    """Event that moved a channel to a version."""
 
     sequence: int
     version: int
@@ -187,16 +191,16 @@ class ChannelMove:
 
 
 NO_ROOT: Final = "0" * 64
-"""Root that a robot without a map reports."""
+"""Root in reports of a robot without a map."""
 
 OverlayState = Literal["pending", "accepted", "rejected", "expired", "ended"]
 
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Something that is blocked until ``expires``: a GeoJSON polygon in ``crs``, or an edge by its id.
+    """A temporary obstruction until ``expires``: a GeoJSON polygon in ``crs``, or an edge by its id.
 
-    state: ``pending`` until an editor accepts or rejects it or its time is over (``expired``). An accepted one is in
+    state: ``pending`` until an editor accepts or rejects it or it expires (``expired``). An accepted overlay is in
     force on every channel until it has ``ended``. version: the one that made it permanent, or into which a release
     before closures put it.
     """
@@ -218,7 +222,7 @@ class Overlay:
     version: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """The overlay as clients see it, without its empty members."""
+        """Return the overlay as clients see it, without its empty members."""
         out: dict[str, Any] = {"id": self.id, "environment": self.environment, "kind": self.kind}
         out |= {"state": self.state, "level": self.level, "reporter": self.reporter}
         out |= {"created": rfc3339(self.created), "expires": rfc3339(self.expires)}
@@ -235,6 +239,6 @@ class Overlay:
 
     @property
     def closure(self) -> Closure:
-        """What it closes while it is in force."""
+        """Return the closure for manifests and maps."""
         end = rfc3339(self.expires)
         return Closure(self.id, self.kind, self.level, end, self.edge, self.polygon, self.crs, self.detail)

@@ -1,8 +1,8 @@
-"""Garbage collection: mark what any version refers to, sweep what nothing used within the grace period.
+"""Garbage collection: mark everything that a version refers to, sweep what was not used in the grace period.
 
-It never races an upload. What a version in progress relies on is either part of its base version, which exists while it
-is marked (else the commit fails), or it was written or used again within the grace period; rows are removed under a
-condition on that time, in the same statement that finds them.
+It never races an upload. The chunks that a version in progress relies on are part of its base version, which exists
+while it is marked (else the commit fails), or were written or used again within the grace period. Rows are removed with
+a condition on that time, in the statement that finds them.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ EVENT_DAYS: Final = 30
 JOB_DAYS: Final = 7
 OVERLAY_DAYS: Final = 30
 ROBOT_DAYS: Final = 90
-"""After so long in silence a robot is no longer part of the fleet."""
+"""Days without a report after which a robot is removed."""
 PAGE: Final = 500
 
 
 class GarbageCollector:
-    """Upkeep."""
+    """Garbage collector of one store."""
 
     def __init__(self, database: Database, chunks: Chunks, blobs: Blobs) -> None:
         self._database, self._chunks, self._blobs = database, chunks, blobs
@@ -37,11 +37,12 @@ class GarbageCollector:
     def collect(self, grace: timedelta) -> dict[str, int]:
         """Remove chunks and blobs that no version refers to and that were not written or used within ``grace``.
 
-        ``{chunks, blobs, bytes, temporary}``: how many went, bytes of the blobs. Old idempotency keys (7 days),
-        finished jobs (7 days), robots that are silent (90 days), overlays that are
-        settled and events of purged environments (30 days) go too.
-        ``grace`` must be longer than any upload takes. Damaged where a version's chunk is: nothing is removed then. One
-        process at a time should collect.
+        Returns ``{chunks, blobs, bytes, temporary}``: numbers of removed objects, bytes of the blobs. Also removes old
+        idempotency keys (7 days), finished jobs (7 days), silent robots (90 days), settled overlays and events of
+        purged environments (30 days).
+
+        ``grace`` must be longer than any upload takes. Raises Damaged if a chunk of a version is damaged; nothing is
+        removed then. Run it in one process at a time.
         """
         self._chunks.forget()
         before = int(time.time() - grace.total_seconds()) + (1 if not grace else 0)
@@ -53,10 +54,10 @@ class GarbageCollector:
         return {"chunks": removed, "blobs": blobs, "bytes": size, "temporary": temporary}
 
     def _live(self) -> tuple[set[bytes], set[str]]:
-        """Every chunk and blob that a version refers to. Equal parts of several versions are walked once."""
+        """Return every chunk and blob that a version refers to. Equal parts of several versions are walked once."""
         table = tables.version
         hashes: dict[str, None] = {}
-        # One snapshot: a clone made and its origin purged while this runs would else be seen in neither place.
+        # one snapshot: else content could be missed if it is cloned and its origin purged during the walk
         with self._database.snapshot() as connection:
             rows = connection.execution_options(stream_results=True).execute(select(table.c.manifest))
             for some in rows.partitions(PAGE):

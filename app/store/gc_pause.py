@@ -1,4 +1,4 @@
-"""Python's cycle collector, paused for work that makes very many objects."""
+"""Pause of Python's cyclic garbage collector for work that creates very many objects."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _gc_was_on = False
 
 @contextmanager
 def gc_paused() -> Iterator[None]:
-    """Without Python's cycle collector, for work that makes very many objects and no cycles.
+    """Pause Python's cyclic garbage collector, for work that creates very many objects and no cycles.
 
-    It would look at all of them again and again (a whole layer loads two to three times slower with it). At the end
-    they are counted among the old objects, or the next collection of the young ones would take as long as it saved;
-    freezing and unfreezing does that without a look at any of them.
+    It would traverse all of them again and again (a whole layer loads two to three times slower with it). At the end
+    the objects move to the oldest generation by freezing and unfreezing, which traverses none of them; else the next
+    collection of the young generation would take as long as the pause saved.
     """
     global _gc_users, _gc_was_on  # noqa: PLW0603 - one switch for the interpreter
     with _gc_lock:

@@ -1,7 +1,7 @@
-"""The heads' vector items on earth, for questions across environments: "what stands here".
+"""Spatial index of the heads' vector items on earth, for queries across environments.
 
-The index is narrow and can be rebuilt from the trees. A commit that changes few items brings it up to date with itself;
-else ``environment.indexed`` stays behind the head, and the first question catches up by what differs.
+The index is narrow and can be rebuilt from the trees. A commit that changes few items updates it; otherwise
+``environment.indexed`` stays behind the head, and the next query applies the differences.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ BATCH: Final = 500
 
 
 def apply(connection: Connection, environment_id: str, rows: Sequence[IndexRows]) -> None:
-    """Bring the index to what these changes say."""
+    """Apply changes to the index."""
     table = tables.place
     for one in rows:
         condition = and_(
@@ -73,7 +73,7 @@ def apply(connection: Connection, environment_id: str, rows: Sequence[IndexRows]
 
 
 def intersects(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str) -> ColumnElement[bool]:
-    """A condition: the row's box, or on PostgreSQL its geometry's, meets a box in degrees."""
+    """Return a condition: the row's box, or on PostgreSQL its geometry's, intersects a box in degrees."""
     conditions: list[ColumnElement[bool]] = []
     for part in split_box(box):
         if dialect == "postgresql":
@@ -89,14 +89,15 @@ def intersects(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str)
 
 
 class SpatialIndex:
-    """Questions across environments."""
+    """Queries across environments."""
 
     def __init__(self, database: Database, chunks: Chunks) -> None:
         self._database, self._chunks = database, chunks
 
     def find(self, bbox: Box, *, layer: Layer | None = None, limit: int = 1000) -> list[FeatureHit]:
-        """Features of all environments' heads that meet ``bbox`` (west, south, east, north; west > east crosses the
-        antimeridian): by their box on SQLite, by their geometry on PostgreSQL. Sorted by environment, part and id.
+        """List features of all heads that intersect ``bbox`` (west, south, east, north; west > east: antimeridian).
+
+        By their box on SQLite, by their geometry on PostgreSQL. Sorted by environment, part and id.
         """
         if not self._database.readonly:
             self.refresh()
@@ -120,7 +121,7 @@ class SpatialIndex:
         ]
 
     def refresh(self) -> int:
-        """Bring the index of every environment to its head; how many were behind."""
+        """Update the index of every environment to its head; returns how many were behind."""
         table = tables.environment
         with self._database.read() as connection:
             behind = list(connection.execute(select(table.c.id).where(table.c.indexed != table.c.head)).scalars())
@@ -154,7 +155,7 @@ class SpatialIndex:
             apply(connection, row.id, index_rows({key: changed}, head.datum, None) or ())
 
     def rebuild(self) -> None:
-        """Throw the index away and make it anew from the trees."""
+        """Rebuild the index from the trees."""
         with self._database.write(upkeep=True) as connection:
             connection.execute(delete(tables.place))
             connection.execute(update(tables.environment).values(indexed=-1))

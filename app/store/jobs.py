@@ -1,4 +1,4 @@
-"""Jobs: work that takes long, and what became of it."""
+"""Jobs: long-running work and its outcome."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from app.store.values import Job, State
 
 
 class Jobs:
-    """The queue's memory."""
+    """Store of the job queue."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def create(self, owner: str = "", detail: str = "") -> Job:
-        """A queued job."""
+        """Add a queued job."""
         now = self._database.now()
         new = secrets.token_hex(16)
         with self._database.write() as connection:
@@ -50,7 +50,7 @@ class Jobs:
         result: dict[str, Any] | None = None,
         problem: dict[str, Any] | None = None,
     ) -> Job:
-        """Change what is given; a job that is done, failed or cancelled keeps its state. NotFound."""
+        """Update the given fields; a done, failed or cancelled job keeps its state. Raises NotFound."""
         table = tables.job
         given = {
             "state": state,
@@ -69,7 +69,7 @@ class Jobs:
             return _as_job(connection.execute(select(table).where(table.c.id == id)).one())
 
     def get(self, id: str) -> Job:
-        """A job; NotFound."""
+        """Read a job. Raises NotFound."""
         with self._database.read() as connection:
             row = connection.execute(select(tables.job).where(tables.job.c.id == id)).one_or_none()
         if row is None:
@@ -77,7 +77,7 @@ class Jobs:
         return _as_job(row)
 
     def all(self, *, state: State | None = None) -> list[Job]:
-        """Jobs, oldest first."""
+        """List jobs, oldest first."""
         table = tables.job
         query = select(table).order_by(table.c.created, table.c.id)
         if state is not None:
@@ -86,7 +86,7 @@ class Jobs:
             return [_as_job(r) for r in connection.execute(query)]
 
     def delete(self, id: str) -> None:
-        """Forget a job; NotFound."""
+        """Delete a job. Raises NotFound."""
         with self._database.write() as connection:
             if not connection.execute(delete(tables.job).where(tables.job.c.id == id)).rowcount:
                 raise NotFound(f"there is no job {id[:80]!r}")

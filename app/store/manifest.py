@@ -1,4 +1,4 @@
-"""Version rows as values: the manifest says what a version holds, the content itself is in chunks."""
+"""Version rows as values: the part list of a version (its manifest); the content itself is in chunks."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from app.store.encode import compress, decompress, pack
 from app.store.values import Box, PartEntry, Provenance, Source, Version
 
 MANIFEST: Final = 1
-"""The form of a version's manifest: [1, datum, levels, parts]; old forms stay readable by this number."""
+"""Encoding of a version's manifest: [1, datum, levels, parts]. Older encodings stay readable by this number."""
 
 WITH_TEMPLATES: Final = 2
-"""The form of those that have templates: [2, datum, levels, parts, templates]."""
+"""Encoding of manifests with templates: [2, datum, levels, parts, templates]."""
 
 
 def pack_manifest(
     datum: Datum | None, levels: Sequence[Level], parts: Sequence[PartEntry], templates: Templates = NO_TEMPLATES
 ) -> bytes:
-    """What a version holds, without the content itself."""
+    """Decoded manifest of a version, without the content itself."""
     rows = [
         [
             e.key.layer,
@@ -61,7 +61,7 @@ def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple
     """The reverse."""
     form, *members = ormsgpack.unpackb(decompress(data))
     if (form, len(members)) not in ((MANIFEST, 3), (WITH_TEMPLATES, 4)):
-        raise Damaged("a version has a manifest that this release does not know: was it written by a newer one?")
+        raise Damaged("a version has an unsupported manifest: it may have been written by a newer release")
     place, levels, rows, *more = members
     parts = tuple(
         PartEntry(
@@ -79,7 +79,7 @@ def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple
 
 
 def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Version:
-    """A row and its sources as a value."""
+    """Convert a row and its sources into a value."""
     datum, levels, parts, templates = unpack_manifest(bytes(row.manifest))
     return Version(
         environment=environment,
@@ -100,7 +100,7 @@ def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Ve
 
 
 def read_sources(connection: Connection, environment_id: str, numbers: Sequence[int]) -> dict[int, list[Source]]:
-    """The sources of some versions, in the order they came."""
+    """Read the sources of some versions, in the order of their upload."""
     table = tables.source
     query = (
         select(table)
@@ -114,7 +114,7 @@ def read_sources(connection: Connection, environment_id: str, numbers: Sequence[
 
 
 def read_version(connection: Connection, environment: Row[Any], number: int) -> Version:
-    """One version; NotFound."""
+    """Read one version. Raises NotFound."""
     table = tables.version
     query = select(table).where(table.c.environment_id == environment.id, table.c.number == number)
     row = connection.execute(query).one_or_none()

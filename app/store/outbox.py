@@ -1,4 +1,4 @@
-"""The outbox: events in the transaction of the change they tell of. It is also the log that clients resume from."""
+"""Outbox: events stored in the transaction of their change. It is also the log from which clients resume."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from app.store.database import Database
 from app.store.values import Event, PartEntry, rfc3339
 
 LOG_SEARCH_WINDOW = 100_000
-"""So far back in the log the last events of environments, and of names that are gone, are looked for."""
+"""Number of newest log positions that are searched for the last events of environments and of former names."""
 
 
 def layer_changes(before: Sequence[PartEntry], after: Sequence[PartEntry]) -> list[dict[str, Any]]:
-    """``[{layer, level, name, change, hash}]`` for the parts that differ, by key."""
+    """List the parts that differ as ``[{layer, level, name, change, hash}]``, by key."""
     old = {e.key: e.hash for e in before}
     new = {e.key: e.hash for e in after}
     out = []
@@ -48,9 +48,9 @@ def append_event(
     time: datetime,
     **more: Any,
 ) -> None:
-    """Add one event. The caller holds the environment's row and stores ``sequence`` in it.
+    """Add one event. The caller has locked the environment's row and stores ``sequence`` in it.
 
-    Call it last: it takes the lock that puts all environments' events in one order. more: members of this type alone.
+    Call it last: it takes the lock that puts all environments' events in one order. more: members of this type only.
     """
     check_members(kind, more)
     body = {
@@ -85,7 +85,7 @@ def append_event(
 
 
 def _reach(connection: Connection) -> int:
-    """Before this position the log is not searched without an index."""
+    """Return the position before which the log is not searched without an index."""
     return (
         int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one())
         - LOG_SEARCH_WINDOW
@@ -93,16 +93,16 @@ def _reach(connection: Connection) -> int:
 
 
 class Outbox:
-    """Reading the log."""
+    """Read access to the log."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def page(self, environment: str | None, since: int = 0, limit: int = 1000) -> list[Event]:
-        """Events after ``since``, oldest first: a sequence with an environment, else a position of the whole log.
+        """List events after ``since``, oldest first: a sequence with an environment, else a position of the whole log.
 
-        Under a name that an environment had (it was renamed, or purged) what was told until then; NotFound where that
-        is nothing.
+        For a former name (renamed or purged environment) lists the events published under it; raises NotFound if there
+        are none.
         """
         table = tables.event
         with self._database.read() as connection:
@@ -121,18 +121,18 @@ class Outbox:
         return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
 
     def last_sequence(self, environment: str) -> int:
-        """The sequence of an environment's newest event."""
+        """Return the sequence of an environment's newest event."""
         with self._database.read() as connection:
             return int(environment_row(connection, environment, deleted=True).sequence)
 
     def relay_position(self) -> int:
-        """The position up to which events were handed to the bus."""
+        """Return the position up to which events were handed to the bus."""
         with self._database.read() as connection:
             position = connection.execute(select(tables.relay.c.position).where(tables.relay.c.id == 1)).scalar()
         return int(position or 0)
 
     def set_relayed(self, position: int) -> None:
-        """Note that events up to this position were handed over. It never goes back."""
+        """Store the position up to which events were handed over. It never decreases."""
         table = tables.relay
         with self._database.write(notify=False, upkeep=True) as connection:
             stored_position = connection.execute(select(table.c.position).where(table.c.id == 1)).scalar()
@@ -142,10 +142,10 @@ class Outbox:
                 connection.execute(update(table).where(table.c.id == 1).values(position=position))
 
     def last(self, position: int, each: int, limit: int) -> list[Event]:
-        """The last ``each`` events up to a position of all environments, purged ones too, in the order of the log.
+        """List the last ``each`` events up to a position of all environments, also purged ones, in log order.
 
-        Where those are more than ``limit``, each environment has fewer; where not even the last one of each fits, the
-        environments that were silent longest have none.
+        If these are more than ``limit``, each environment has fewer; if even one per environment is too many, those
+        with the oldest events have none.
         """
         table = tables.event
         rank = func.row_number().over(partition_by=table.c.environment_id, order_by=table.c.sequence.desc())
@@ -166,6 +166,6 @@ class Outbox:
         return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
 
     def last_position(self) -> int:
-        """The position of the newest event."""
+        """Return the position of the newest event."""
         with self._database.read() as connection:
             return int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one())

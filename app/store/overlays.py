@@ -1,7 +1,7 @@
-"""Overlays: what is reported as blocked for a time. Accepted ones are closures, in force on every channel.
+"""Overlays: reported temporary obstructions. Accepted ones are closures, in force on every channel.
 
-Each step is an event, written in its transaction. Events that change what is in force are also what a channel's
-manifest is ordered by.
+Each change of state is an event, written in its transaction. Events that change the closures in force also order the
+manifests of channels.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from app.store.database import Database
 from app.store.fleet_values import Overlay, OverlayState
 
 MAX_PENDING: Final = 1000
-"""Maximum number of an environment's overlays that wait for a decision."""
+"""Maximum number of pending overlays of an environment."""
 
 MAX_PENDING_PER_REPORTER: Final = 100
-"""Maximum number of them from one reporter: one that goes wild leaves room for the others."""
+"""Maximum number of pending overlays from one reporter, so that a faulty one leaves room for the others."""
 
 MAX_IN_FORCE: Final = 1000
 """Maximum number of closures of an environment: every manifest lists them."""
 
 MAX_IN_FORCE_BYTES: Final = 2**21
-"""Maximum size of their areas as JSON, together."""
+"""Maximum total size of the closures' areas as JSON, in bytes."""
 
 MAX_LISTED: Final = 10_000
 EVENTS: Final[Mapping[OverlayState, EventType]] = {
@@ -46,7 +46,7 @@ EVENTS: Final[Mapping[OverlayState, EventType]] = {
 """The event of each decision."""
 
 CHANGE_CLOSURES: Final = frozenset({"overlay.accepted", "overlay.ended"})
-"""Events after which other closures are in force."""
+"""Types of events that change the closures in force."""
 
 MAX_ENDED_PER_CALL: Final = 100
 """Maximum number of overlays that are ended in one call."""
@@ -129,13 +129,13 @@ class Overlays:
         author: str,
         now: datetime,
     ) -> Overlay:
-        """Change an overlay's state, with the event of it. Raises Conflict if it is not in the state ``before``."""
+        """Change an overlay's state, with its event. Raises Conflict if its state is not ``before``."""
         table = tables.overlay
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
             stored = _read(connection, row, id)
             if stored.state != before:
-                raise Conflict(f"the overlay {id} is {stored.state}, not {before}")
+                raise Conflict(f"overlay {id} is {stored.state}, not {before}")
             if state == "accepted":
                 _require_room(connection, row, stored)
             values: dict[str, Any] = {"state": state, "decided_by": checked_text(author, "an author"), "decided": now}
@@ -146,7 +146,7 @@ class Overlays:
             return decided
 
     def end_due(self, now: datetime) -> None:
-        """End what is due: pending overlays expire, closures are lifted, each with its event."""
+        """End overlays that are due: pending ones expire, closures are lifted, each with its event."""
         table, owner = tables.overlay, tables.environment
         query = (
             select(table.c.id, table.c.state, owner.c.name.label("environment"))
@@ -162,7 +162,7 @@ class Overlays:
                 row = environment_row(connection, due_row.environment, lock=True)
                 stored = _read(connection, row, due_row.id)
                 if stored.state != due_row.state or stored.expires > now:
-                    continue  # another process was faster, or the end has moved
+                    continue  # another process was faster, or the expiry was updated
                 state: OverlayState = "expired" if stored.state == "pending" else "ended"
                 event: EventType = "overlay.expired" if stored.state == "pending" else "overlay.ended"
                 connection.execute(update(table).where(table.c.id == due_row.id).values(state=state, decided=now))
@@ -185,7 +185,7 @@ MAX_CACHED_CLOSURES: Final = 256
 def read_closures(connection: Connection, environment: Row[Any]) -> Closures:
     """Read the closures in force of an environment, in the caller's transaction.
 
-    They are cached by the sequence of the event that changed them last, which the environment's row has.
+    They are cached by the sequence of the event that last changed them, which is in the environment's row.
     """
     key = (str(environment.id), int(environment.closures_sequence))
     with _closure_cache_lock:
@@ -214,11 +214,13 @@ def _require_room(connection: Connection, environment: Row[Any], overlay: Overla
     size = sum(len(json.dumps(polygon)) for polygon in [*polygons, overlay.polygon])
     if len(polygons) >= MAX_IN_FORCE or size > MAX_IN_FORCE_BYTES:
         reason = f"{MAX_IN_FORCE} overlays" if len(polygons) >= MAX_IN_FORCE else f"{MAX_IN_FORCE_BYTES} bytes of areas"
-        raise Conflict(f"{reason} of {environment.name} are in force: end or keep some first, or send simpler outlines")
+        raise Conflict(
+            f"{reason} of {environment.name} are in force, the maximum: end or keep some first, or simplify the polygon"
+        )
 
 
 def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overlay) -> str | None:
-    """The id of the same reporter's same report that still waits. Raises Conflict if too many wait."""
+    """Return the id of the same reporter's equal pending report, if any. Raises Conflict if too many are pending."""
     table = tables.overlay
     pending = (table.c.environment_id == environment.id, table.c.state == "pending")
     query = select(table).where(*pending, table.c.reporter == overlay.reporter, table.c.expires > overlay.created)
@@ -233,14 +235,17 @@ def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overla
         )
     waiting = select(func.count()).select_from(table).where(*pending)
     if connection.execute(waiting).scalar_one() >= MAX_PENDING:
-        raise Conflict(f"{MAX_PENDING} overlays of {environment.name} wait: accept or reject some")
+        raise Conflict(f"{environment.name} has {MAX_PENDING} pending overlays, the maximum: accept or reject some")
     return None
 
 
 def _append_event(
     connection: Connection, environment: Row[Any], overlay: Overlay, event: EventType, author: str, now: datetime
 ) -> None:
-    """Append the event of one step. version and root are the head's; the caller has locked the environment's row."""
+    """Append the event of a change of state. The caller has locked the environment's row.
+
+    version and root are the head's.
+    """
     sequence = environment.sequence + 1
     owner = tables.environment
     values: dict[str, Any] = {"sequence": sequence}

@@ -1,4 +1,4 @@
-"""Which environments a position is in, by their areas in the database."""
+"""Environments at a position, by their areas in the database."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from app.store.values import Area, Box, Environment, Match
 log = logging.getLogger(__name__)
 
 BATCH: Final = 100
-"""Environments that are read, or whose areas are written, at once."""
+"""Maximum number of environments that are read, or whose areas are written, at once."""
 
 MAX_ATTEMPTS: Final = 5
-"""How often an area is computed again because the head has moved meanwhile."""
+"""Maximum number of times an area is computed again because the head has moved."""
 
 Rank = tuple[int, float, float, str]
 
@@ -65,7 +65,7 @@ class Areas:
             latitude, longitude: degrees.
             q, bbox, allowed, deleted: as for ``Environments.page``.
 
-        Fences come first, then the smallest area, then the nearest datum. Raises Invalid for a position that is none.
+        Fences come first, then the smallest area, then the nearest datum. Raises Invalid for an invalid position.
         """
         if not (-90.0 <= latitude <= 90.0 and -180.0 <= longitude <= 180.0):
             raise Invalid(
@@ -132,7 +132,7 @@ class Areas:
         """Compute the areas that no commit has computed; returns how many environments were behind.
 
         Safe beside other servers: an area is written only if the head is the one it was computed from. An environment
-        whose content is damaged keeps the area it had.
+        with damaged content keeps its last area.
         """
         with self._database.read() as connection:
             stale = _stale(connection)
@@ -145,7 +145,7 @@ class Areas:
         return len(stale)
 
     def _refresh_some(self, ids: list[str]) -> list[str]:
-        """Compute some areas and write them; returns those whose head has moved meanwhile."""
+        """Compute and write some areas; returns the environments whose head has moved meanwhile."""
         table = tables.environment
         computed: dict[str, tuple[int, Area]] = {}
         for environment_id in ids:
@@ -157,7 +157,11 @@ class Areas:
             try:
                 computed[environment_id] = head.number, compute_area(self._chunks.stage(), head.parts, head.datum)
             except Damaged as error:
-                log.critical("area of %s: not computed, its last one stays: %s", head.environment, error.detail)
+                log.critical(
+                    "area: not computed, the last one stays (environment=%s, reason=%s)",
+                    head.environment,
+                    error.detail,
+                )
         moved: list[str] = []
         with self._database.write(notify=False, upkeep=True) as connection:
             for environment_id in sorted(computed):
@@ -175,13 +179,13 @@ class Areas:
 
 
 def _stale(connection: Connection) -> list[str]:
-    """The ids of the environments whose areas have to be computed."""
+    """Return the ids of the environments whose areas have to be computed."""
     table = tables.environment
     return list(connection.execute(select(table.c.id).where(table.c.area_stale)).scalars())
 
 
 def _environments(connection: Connection, ids: list[str]) -> dict[str, Environment]:
-    """Environments by id; those that are purged meanwhile are missing."""
+    """Read environments by id; those that are purged meanwhile are missing."""
     table = tables.environment
     out: dict[str, Environment] = {}
     for start in range(0, len(ids), BATCH):
@@ -195,10 +199,10 @@ def _cursor(rank: Rank) -> str:
 
 
 def _rank(cursor: str) -> Rank:
-    """The reverse of ``_cursor``; Invalid for anything else."""
+    """Read the result of ``_cursor``. Raises Invalid for anything else."""
     try:
         guessed, size, away, name = cursor.split(" ")
         return int(guessed), float(size), float(away), name
     except ValueError:
         problems = [Problem("from the last page's Link header", where="cursor")]
-        raise Invalid("cursor is not one of this list: take it from the last page's Link header", problems) from None
+        raise Invalid("invalid cursor: use the one in the Link header of the last page", problems) from None

@@ -1,4 +1,4 @@
-"""PostGIS' column type. It is imported for PostgreSQL alone: GeoAlchemy2 takes a fifth of a second to load."""
+"""PostGIS' column type. Imported for PostgreSQL only: GeoAlchemy2 takes a fifth of a second to load."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sqlalchemy.sql.elements import BindParameter, ColumnElement
 
 
 class PlainGeometry(Geometry):
-    """PostGIS' column type without GeoAlchemy2's conversions of values: ours are WKB in and out."""
+    """PostGIS' column type without GeoAlchemy2's conversions of values: WKB in and out."""
 
     cache_ok = True
 
@@ -18,14 +18,14 @@ class PlainGeometry(Geometry):
         super().__init__(geometry_type="GEOMETRY", srid=4326, spatial_index=False)
 
     def bind_processor(self, dialect: Dialect) -> None:
-        """Values are bytes already."""
+        """Return None: values are bytes already."""
 
     def result_processor(self, dialect: Dialect, coltype: object) -> None:
-        """Values stay bytes."""
+        """Return None: values stay bytes."""
 
     def bind_expression(self, bindvalue: BindParameter[Any]) -> None:
-        """``app.store.tables.WkbGeometry`` does it, by dialect."""
+        """Return no SQL function: ``app.store.tables.WkbGeometry`` converts, by dialect."""
 
     def column_expression(self, col: ColumnElement[Any]) -> ColumnElement[Any]:
-        """``app.store.tables.WkbGeometry`` does it, by dialect."""
+        """Return the column: ``app.store.tables.WkbGeometry`` converts, by dialect."""
         return col

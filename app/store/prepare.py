@@ -1,4 +1,4 @@
-"""Working out a version: operations on trees, what they change, and the new chunks. Reads and computes only."""
+"""Working out a version: operations on trees, the resulting changes, and the new chunks. Only reads and computes."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from app.store.tree import ChunkStage
 from app.store.values import PartEntry, Provenance, Version
 
 MAX_INDEX_ROWS: Final = 2000
-"""Up to so many changed features the head's index is brought up to date with the commit, beyond when it is asked."""
+"""Maximum number of changed features for an update of the head's index with the commit; else on the next query."""
 
 
 IsIntact = Callable[[str], bool]
-"""Whether all stored chunks of a part (its hash) still have their hashes."""
+"""Predicate: whether all stored chunks of a part (its hash) still match their hashes."""
 
 
 def prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
-    """A version on top of a base. What is damaged of a part that is replaced is stored again."""
+    """Prepare a version on top of a base. Damaged chunks of a part that is replaced are stored again."""
     with gc_paused():
         return _prepare(draft, base, changes, is_intact)
 
@@ -49,7 +49,7 @@ def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIn
     for operation in changes.operations:
         key = operation.key
         if isinstance(operation, Replace) and key in before and not is_intact(before[key].hash):
-            del before[key], entries[key]  # it cannot be compared with, and none of its chunks counts as stored
+            del before[key], entries[key]  # damaged: no comparison is possible, and none of its chunks counts as stored
         encoded_part = compose_operation(draft, entries, operation)
         if encoded_part is not None:
             blobs.update(encoded_part.blobs)
@@ -94,7 +94,7 @@ def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIn
 def version_root(
     entries: Sequence[PartEntry], datum: Datum | None, levels: Sequence[Level], templates: Templates = NO_TEMPLATES
 ) -> str:
-    """The version's root hash."""
+    """Return the version's root hash."""
     named = ((e.key.layer, e.key.level, e.key.name, e.hash) for e in entries)
     return root_hash(named, datum, levels, templates.as_dict())
 
@@ -102,9 +102,9 @@ def version_root(
 def _rederived_parts(
     before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry], replaced: Mapping[PartKey, Replace]
 ) -> list[dict[str, str]]:
-    """The derived parts whose content was given anew and is the same, by another way or from other inputs than before.
+    """Return derived parts that were given again with equal content but by other steps or from other inputs.
 
-    What they say of themselves then needs a version of its own, since it decides on whether they are stale.
+    Their provenance needs a new version, since it decides whether they are stale.
     """
     out = []
     for key in sorted(replaced):
@@ -117,7 +117,7 @@ def _rederived_parts(
             or b.provenance.is_edited
         ):
             continue
-        # Packed, since what is stored has lists where a step just made may have tuples.
+        # compared as packed bytes: stored lists correspond to tuples of new steps
         old, new = (pack([p.information, list(p.steps), list(p.inputs)]) for p in (a.provenance, b.provenance))
         if old != new:
             out.append({"layer": key.layer, "level": key.level, "name": key.name})
@@ -132,7 +132,7 @@ def _check_levels(levels: Sequence[Level]) -> tuple[Level, ...]:
 
 
 def compose_operation(draft: ChunkStage, entries: dict[PartKey, PartEntry], operation: Operation) -> EncodedPart | None:
-    """Carry out an operation on a version's entries: its chunks are in the draft; None where there are none."""
+    """Apply an operation to a version's entries; returns its chunks in the stage, None if there are none."""
     key = operation.key
     entry = entries.get(key)
     label = f"{key.layer} {key.name!r} on level {key.level!r}"
@@ -178,7 +178,7 @@ def compose_operation(draft: ChunkStage, entries: dict[PartKey, PartEntry], oper
 
 
 def merge_provenance(old: Provenance, new: Provenance) -> Provenance:
-    """Of a part to which features were added: raw where anything in it is, and all sources, steps and credits."""
+    """Return the provenance after features were added: raw if any of it is, with all sources, steps and credits."""
     return Provenance(
         information="raw" if "raw" in (old.information, new.information) else new.information,
         format=old.format or new.format,
@@ -190,17 +190,17 @@ def merge_provenance(old: Provenance, new: Provenance) -> Provenance:
     )
 
 
-# --- what changed ---
+# --- changes ---
 
 
 def read_roots(draft: ChunkStage, key: PartKey, entries: Mapping[PartKey, PartEntry]) -> PartRoot | None:
-    """The decoded root of a part, or None."""
+    """Read the decoded root of a part, or None."""
     entry = entries.get(key)
     return read_root(draft, bytes.fromhex(entry.hash)) if entry else None
 
 
 def differing_keys(before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry]) -> list[PartKey]:
-    """The keys of parts that differ, by layer as the layers are listed."""
+    """Return the keys of parts that differ, by layer in the order of ``LAYERS``."""
 
     def differs(key: PartKey) -> bool:
         a, b = before.get(key), after.get(key)
@@ -211,7 +211,7 @@ def differing_keys(before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, 
 
 
 def part_names(keys: Sequence[PartKey]) -> dict[PartKey, str]:
-    """What a part is called among those of its layer: its name, with the level where that alone is not enough."""
+    """Return a part's name among those of its layer, with the level if the name is ambiguous."""
     seen: dict[tuple[str, str], int] = {}
     for key in keys:
         seen[key.layer, key.name] = seen.get((key.layer, key.name), 0) + 1
@@ -224,7 +224,7 @@ def summarise(
     after: Mapping[PartKey, PartEntry],
     replaced: Mapping[PartKey, Replace] | None = None,
 ) -> tuple[dict[str, Any], dict[PartKey, FeatureChanges] | None]:
-    """Counts by layer, and the changed features of each vector part (None where they are too many for the index)."""
+    """Count changes by layer; list the changed features of each vector part (None if too many for the index)."""
     out: dict[str, Any] = {}
     features: dict[PartKey, FeatureChanges] | None = {}
     keys = differing_keys(before, after)
@@ -263,7 +263,7 @@ def summarise(
 
 
 def cells_of_new_grid(grid: OccupancyGrid) -> CellChanges:
-    """The changes that a new grid is: every known cell was unknown before."""
+    """Return the changes of a new grid: every cell with a value was unknown before."""
     out = CellChanges()
     known_cells = grid.cells != UNKNOWN
     total = int(known_cells.sum())
@@ -281,7 +281,7 @@ def cells_of_new_grid(grid: OccupancyGrid) -> CellChanges:
 def frame_changes(
     old: Datum | None, new: Datum | None, old_levels: Sequence[Level], new_levels: Sequence[Level]
 ) -> dict[str, Any]:
-    """``datum`` and ``levels``, where they differ, from and to."""
+    """Return ``datum`` and ``levels`` with from and to, if they differ."""
     out: dict[str, Any] = {}
     if old != new:
         out["datum"] = {"from": old.as_dict() if old else None, "to": new.as_dict() if new else None}
@@ -299,7 +299,7 @@ def frame_changes(
 def index_rows(
     changed: Mapping[PartKey, FeatureChanges] | None, datum: Datum | None, limit: int | None = MAX_INDEX_ROWS
 ) -> tuple[IndexRows, ...] | None:
-    """The changes to the head's index, None where they are more than ``limit``."""
+    """Return the changes to the head's index, None if they are more than ``limit``."""
     if changed is None:
         return None
     count = sum(len(c.added) + len(c.changed) + len(c.deleted) for c in changed.values())
@@ -316,7 +316,7 @@ def index_rows(
 def located_items(
     items: Mapping[str, Item], datum: Datum | None
 ) -> tuple[tuple[str, tuple[float, float, float, float], bytes], ...]:
-    """(id, box in degrees, WKB in degrees) of the items that have a place on earth."""
+    """Return (id, box in degrees, WKB in degrees) of the items with a position on earth."""
     chosen = [i for i, item in items.items() if item.anchor == 1 or datum is not None]
     if not chosen:
         return ()
@@ -325,7 +325,7 @@ def located_items(
     if datum is not None and local.any():
         geometry[local] = local_frame(datum).geometries_to_wgs84(geometry[local])
     boxes = bounds(geometry)
-    wkb = to_wkb(np.asarray(shapely.force_2d(geometry), object))  # the index is a map seen from above
+    wkb = to_wkb(np.asarray(shapely.force_2d(geometry), object))  # the index is two-dimensional
     out = []
     for k in np.flatnonzero(np.isfinite(boxes).all(axis=1)).tolist():
         west, south, east, north = boxes[k].tolist()
@@ -335,13 +335,13 @@ def located_items(
     return tuple(out)
 
 
-# --- chunks that the base does not have ---
+# --- new chunks ---
 
 
 def _new_chunks(
     draft: ChunkStage, before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry]
 ) -> dict[str, bytes]:
-    """Hash (hex) -> stored bytes of the chunks of changed parts that were not read from the store."""
+    """Return hash (hex) -> stored bytes of the chunks of changed parts that were not read from the store."""
     out: dict[bytes, bytes] = {}
     for key in differing_keys(before, after):
         entry = after.get(key)

@@ -1,4 +1,4 @@
-"""Robots: what they said last, what they drive on, the history of both, and which of them are on the bus."""
+"""Robots: their last reports and active maps, the history of both, and their presence on the bus."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from app.store.database import Database
 from app.store.fleet_values import NO_ROOT, ActiveMap, ReceivedReport, Robot, RobotReport
 
 HISTORY: Final = 200
-"""So many reports of each robot in each environment are kept."""
+"""Maximum number of reports stored per robot and environment."""
 
 MAX_ROBOTS: Final = 10_000
-"""So many robots report in one environment; on an open router anybody can make up names."""
+"""Maximum number of robots in an environment: on a router without users anyone can invent names."""
 
 MAX_PRESENT: Final = 100_000
 
 
 class Robots:
-    """The fleet's memory."""
+    """Store of the fleet."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def note_reports(self, reports: Sequence[ReceivedReport]) -> list[FleetMapError | None]:
-        """Take in what robots say, in the order given, in one transaction: for each None, or why it was refused.
+        """Store robot reports in the given order, in one transaction; returns for each None, or the error.
 
-        The same said again, or the same report come by another way, only renews the time. NotFound where there is no
-        such environment, Conflict where it has too many robots already.
+        A repetition of the last report, or of an earlier one received by another transport, only renews the time.
+        Errors: NotFound for an unknown environment, Conflict if it has too many robots.
         """
         out: list[FleetMapError | None] = [None] * len(reports)
         with self._database.write(notify=False, upkeep=True) as connection:
             owners: dict[str, str | FleetMapError] = {}
-            # One order for all writers, so that none waits for another that waits for it; each robot's own order stays.
+            # same order for all writers, which avoids deadlocks; the order of each robot's reports stays
             for k in sorted(range(len(reports)), key=lambda k: (reports[k].environment, reports[k].robot)):
                 name = reports[k].environment
                 if name not in owners:
@@ -52,7 +52,7 @@ class Robots:
         return out
 
     def all(self, environment: str | None = None, robot: str | None = None) -> list[Robot]:
-        """Robots by environment and name, of environments that are not deleted; NotFound for an unknown environment."""
+        """List robots by environment and name, of environments that are not deleted. Raises NotFound."""
         table, owner = tables.robot, tables.environment
         with self._database.read() as connection:
             query = _robots().where(owner.c.deleted.is_(None)).order_by(owner.c.name, table.c.robot)
@@ -71,10 +71,10 @@ class Robots:
         cursor: str | None = None,
         allowed: str | None = None,
     ) -> tuple[list[Robot], str | None]:
-        """A page of the same list, and the cursor of the next one: ``<environment>/<robot>``, the last one on the page.
+        """List a page of robots, with the cursor of the next one: ``<environment>/<robot>``, the last one on the page.
 
-        channel: only those that report on it. allowed: a pattern of environments' names (fnmatch). Invalid for a cursor
-        that is none.
+        channel: only those that report on it. allowed: a pattern of environments' names (fnmatch). Raises Invalid for
+        an invalid cursor.
         """
         table, owner = tables.robot, tables.environment
         query = _robots().where(owner.c.deleted.is_(None)).order_by(owner.c.name, table.c.robot)
@@ -90,7 +90,7 @@ class Robots:
                 if cursor is not None:
                     place, slash, robot = cursor.partition("/")
                     if not slash:
-                        raise Invalid("the cursor is not one that a page's Link header gave")
+                        raise Invalid("invalid cursor: use the one in the Link header of the last page")
                     page = query.where(tuple_(owner.c.name, table.c.robot) > tuple_(place, robot))
                 robots = [_as_robot(row) for row in connection.execute(page.limit(many))]
                 out += [r for r in robots if allowed is None or fnmatchcase(r.environment, allowed)]
@@ -100,7 +100,7 @@ class Robots:
         return out[:limit], _cursor(out[limit - 1]) if len(out) > limit else None
 
     def history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, RobotReport]]:
-        """A robot's changed reports in an environment, each with the time of receipt, newest first."""
+        """List a robot's changed reports in an environment, each with the time of receipt, newest first."""
         table = tables.robot_history
         with self._database.read() as connection:
             row = environment_row(connection, environment)
@@ -113,7 +113,7 @@ class Robots:
             return [(r.time, _as_report(r)) for r in connection.execute(query)]
 
     def forget(self, environment: str, robot: str) -> None:
-        """Remove a robot and its history from an environment; NotFound. It comes back with its next report."""
+        """Remove a robot and its history from an environment. Raises NotFound. Its next report adds it again."""
         with self._database.write(notify=False) as connection:
             row = environment_row(connection, environment)
             for table in (tables.robot_history, tables.robot):
@@ -124,13 +124,13 @@ class Robots:
                 raise NotFound(f"no robot {robot[:80]!r} has reported in {environment}")
 
     def note_presence(self, present_robots: Collection[str], absent_robots: Collection[str], now: datetime) -> None:
-        """Robots that are on the bus at this moment, and robots that have left it."""
+        """Store the robots that are on the bus, and those that have left it."""
         table = tables.presence
         with self._database.write(notify=False, upkeep=True) as connection:
             room = MAX_PRESENT - int(connection.execute(select(func.count()).select_from(table)).scalar_one())
             rows = sorted([(name, True) for name in present_robots] + [(name, False) for name in absent_robots])
             for name, is_present in rows:
-                if room < len(rows):  # full: who is known stays known
+                if room < len(rows):  # table full: update stored robots, add no new ones
                     connection.execute(update(table).where(table.c.robot == name).values(there=is_present, time=now))
                     continue
                 upsert(connection, table, {"robot": name}, {"there": is_present, "time": now})
@@ -165,17 +165,19 @@ def _note(connection: Connection, environment_id: str, received: ReceivedReport)
     else:
         others = select(func.count()).select_from(table).where(table.c.environment_id == environment_id)
         if connection.execute(others).scalar_one() >= MAX_ROBOTS:
-            return Conflict(f"{received.environment} has {MAX_ROBOTS} robots: remove some that are gone")
+            return Conflict(f"{received.environment} has {MAX_ROBOTS} robots: remove robots that no longer exist")
         keys = {"environment_id": environment_id, "robot": received.robot}
-        upsert(connection, table, keys, values)  # in a race the later one wins
+        upsert(connection, table, keys, values)  # the later writer wins
     if not again:
         _remember(connection, environment_id, received, report_columns)
     return None
 
 
 def _held_values(report: RobotReport, row: Row[Any] | None, time: datetime) -> dict[str, Any]:
-    """What a robot runs, from its report: columns that change. Its own statement counts, whatever the report is about:
-    a status may be lost, so that a failure of the next version is the first that is received after a switch.
+    """Return the changed columns of a robot's active map.
+
+    The report's ``holds`` counts in any report: a status may be lost, so that the first report that is received after a
+    switch may be a failure of the next version.
     """
     holds = (report.version, report.root) if report.state == "active" else report.holds
     if holds is None:
@@ -192,7 +194,7 @@ def _held_values(report: RobotReport, row: Row[Any] | None, time: datetime) -> d
 def _is_duplicate_report(
     connection: Connection, environment_id: str, received: ReceivedReport, report_columns: dict[str, Any]
 ) -> bool:
-    """Whether this very report came before, by another way: robots tell over Zenoh and HTTP, and one may be late."""
+    """Return whether an equal report was received before: robots report over Zenoh and HTTP, one may be delayed."""
     table = tables.robot_history
     if received.report.reported_at is None:
         return False
@@ -235,7 +237,7 @@ def _robots() -> Select[Any]:
 
 
 def channel_robots(connection: Connection, environment_id: str, channel: str) -> list[Robot]:
-    """The robots of a channel, within a transaction."""
+    """List the robots of a channel, within a transaction."""
     table = tables.robot
     query = _robots().where(table.c.environment_id == environment_id, table.c.channel == channel)
     return [_as_robot(row) for row in connection.execute(query.order_by(table.c.robot))]

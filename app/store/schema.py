@@ -1,4 +1,4 @@
-"""Migrations: Alembic's, run from code; in a checkout they lie in ``migrations``, in a wheel in ``app/_migrations``."""
+"""Alembic migrations, run from code: ``migrations`` in a checkout, ``app/_migrations`` in a wheel."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
     from alembic.config import Config
 
 LOCK = 4_820_117_001
-"""PostgreSQL's advisory lock: two servers that start together migrate one after the other."""
+"""Key of PostgreSQL's advisory lock: two servers that start together migrate one after the other."""
 
 
 def folder() -> Path:
-    """Where the migrations are."""
+    """Return the folder of the migrations."""
     package = Path(__file__).resolve().parents[1]
     for path in (package / "_migrations", package.parent / "migrations"):
         if (path / "env.py").is_file():
             return path
-    raise Unavailable("the migrations are missing from this installation: install it again")
+    raise Unavailable("the migrations are missing from this installation: reinstall it")
 
 
 def config() -> Config:
-    """Alembic's settings, without a file. (It is imported late: worker processes never need it.)"""
+    """Create Alembic's configuration without a file. (Late import: worker processes never need Alembic.)"""
     from alembic.config import Config
 
     alembic_config = Config()
@@ -38,8 +38,9 @@ def config() -> Config:
 
 
 def comparison(dialect: str) -> dict[str, Any]:
-    """Options for Alembic to compare a database with the models: without PostGIS' own tables, and without the indexes
-    that another dialect has.
+    """Return Alembic's options for comparing a database with the models.
+
+    They exclude PostGIS' own tables, and the indexes of the other dialect.
     """
 
     def ours(thing: Any, name: str | None, kind: str, reflected: bool, compared_to: Any) -> bool:
@@ -52,12 +53,12 @@ def comparison(dialect: str) -> dict[str, Any]:
 
 
 def newest() -> str:
-    """This release's revision: files of migrations start with theirs."""
+    """Return this release's revision: the file name of a migration starts with its revision."""
     return max(path.name.partition("_")[0] for path in (folder() / "versions").glob("[0-9]*_*.py"))
 
 
 def _present(database: Database) -> str | None:
-    """The revision of the database's schema; None where it has none. (Alembic's own look takes ten times as long.)"""
+    """Return the revision of the database's schema, None without one. (Alembic's own query takes ten times as long.)"""
     with database.connection() as connection:
         if not inspect(connection).has_table("alembic_version"):
             return None
@@ -65,7 +66,7 @@ def _present(database: Database) -> str | None:
 
 
 def upgrade(database: Database) -> None:
-    """To the newest schema."""
+    """Migrate the database to the newest schema."""
     if _present(database) == newest():
         return
     from alembic import command
@@ -82,20 +83,20 @@ def upgrade(database: Database) -> None:
                 command.upgrade(settings, "head")
         except CommandError as error:
             raise Unavailable(
-                "the database was made by a newer release of this server: run that release, or restore a backup of "
-                "the database that is as old as this one"
+                "the database was created by a newer release of this server: run that release, or restore a backup of "
+                "the database from this release"
             ) from error
         except exc.ProgrammingError as error:
             raise Unavailable(
                 f"the database cannot be migrated: {str(error.orig).splitlines()[0]}. On PostgreSQL PostGIS must be "
-                "installed, and created in the database by a superuser where ours may not: CREATE EXTENSION postgis"
+                "installed; if the server's user may not create it, run as a superuser: CREATE EXTENSION postgis"
             ) from error
 
 
 def check(database: Database) -> None:
-    """Unavailable unless the schema is the newest."""
+    """Raise Unavailable unless the schema is the newest."""
     present = _present(database)
     if present != newest():
         raise Unavailable(
-            f"the database's schema is {present or 'not there'}, this release needs {newest()}: run fleetmap migrate"
+            f"the database's schema is {present or 'missing'}, this release needs {newest()}: run fleetmap migrate"
         )

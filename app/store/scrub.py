@@ -1,7 +1,7 @@
-"""The background scrub: stored bytes are hashed again, slowly, over and over, by one process of several.
+"""Background scrub: one process hashes stored bytes again, slowly, in repeated passes.
 
-A pass reads SQLite's tables one by one, chunks, versions' roots, files and a sample of the cache. How far it is stands
-in the blob folder, beside the lock that one process holds; a start goes on where the last one ended.
+A pass reads SQLite's tables one by one, chunks, versions' roots, files and a sample of the cache. Its position is
+stored in the blob folder, beside the lock that one process holds; after a restart the pass continues there.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ STATE: Final = ".scrub.json"
 POLL_SECONDS: Final = 60.0
 SAVE_SECONDS: Final = 10.0
 THING_BYTES: Final = 4096
-"""What checking a small thing counts as, since finding it costs more than hashing it."""
+"""Size that checking a small object counts as, in bytes, since finding it costs more than hashing it."""
 
 CheckCache = Callable[[], Iterator[tuple[str, int, bool]]]
-"""(key, bytes, whether it was intact) of the cache's entries, one after the other."""
+"""Iterator over (key, bytes, whether it is intact) of the cache's entries."""
 
 
 @dataclass(slots=True)
 class ScrubState:
-    """How far a pass is. Times: seconds since 1970, 0.0 for never. after: what the step checked last (table, hash).
+    """Position of a pass. Times: seconds since 1970, 0.0 for never. after: last object checked by the step.
 
-    found: damaged things by kind, of the pass under way; findings: of the last complete pass, and at least ``found``.
+    found: damaged objects by kind, of the current pass; findings: of the last complete pass, and at least ``found``.
     """
 
     step: int = 0
@@ -52,7 +52,7 @@ class ScrubState:
 
 
 def read_state(folder: Path) -> ScrubState:
-    """The state that whichever process scrubs has left in a blob folder."""
+    """Read the state that the scrubbing process stored in a blob folder."""
     try:
         members = json.loads((folder / STATE).read_bytes())
         field_names = {f.name for f in fields(ScrubState)}
@@ -62,9 +62,9 @@ def read_state(folder: Path) -> ScrubState:
 
 
 class Scrub:
-    """Passes over a store in a thread of its own. every: seconds from one pass to the next. rate: bytes a second.
+    """Passes over a store in a thread of its own. every: seconds from one pass to the next. rate: bytes per second.
 
-    delay: seconds before the first pass, so that it does not slow down a start.
+    delay: seconds before the first pass, so that it does not slow down the start of the server.
     """
 
     def __init__(
@@ -80,11 +80,11 @@ class Scrub:
         self._thread = threading.Thread(target=self._run, daemon=True, name="fleetmap-scrub")
 
     def start(self) -> None:
-        """Begin, where this process gets the lock."""
+        """Start the thread; it scrubs once this process gets the lock."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop within a moment."""
+        """Stop the thread promptly."""
         self._stopped.set()
         if self._thread.is_alive():
             self._thread.join(5.0)
@@ -100,22 +100,22 @@ class Scrub:
                         self._reason = ""
                         self._stopped.wait(POLL_SECONDS)
             except BlockingIOError:
-                pass  # another process is at it
+                pass  # another process scrubs
             except OSError as error:
                 self._wait_for(system_reason(error))
             except FleetMapError as error:
                 self._wait_for(error.detail)
-            except Exception:  # the thread must outlive a defect: else nothing is checked any more, unnoticed
-                log.exception("scrub: internal error; it goes on")
+            except Exception:  # the thread must outlive a defect: else checks would end unnoticed
+                log.exception("scrub: internal error; it continues")
             self._stopped.wait(POLL_SECONDS)
 
     def _wait_for(self, reason: str) -> None:
         if reason != self._reason:  # once, not every minute
-            log.warning("scrub: waits (reason=%s)", reason)
+            log.warning("scrub: waiting (reason=%s)", reason)
         self._reason = reason
 
     def pass_if_due(self) -> None:
-        """Go on with a pass, or begin one where the last is long enough ago."""
+        """Continue a pass, or begin one if the last is long enough ago."""
         self._state = read_state(self._store.blob_dir)
         if not self._state.started and time.time() - self._state.completed < self._every:
             return
@@ -127,7 +127,7 @@ class Scrub:
         while self._state.step < len(steps):
             step = steps[self._state.step]
             if step in restarting:
-                self._state.found.pop(restarting[step], None)  # what it found before it was stopped is found again
+                self._state.found.pop(restarting[step], None)  # the step restarts and finds it again
             step()
             if self._stopped.is_set():
                 self._save()
@@ -160,16 +160,16 @@ class Scrub:
                 return
 
     def _skip(self, name: str, error: Unavailable) -> None:
-        """Pass over a file that cannot be read at the moment: the next pass checks it."""
+        """Skip a file that is temporarily unreadable: the next pass checks it."""
         log.warning("scrub: a stored file could not be checked (blob=%s, reason=%s)", name, error.detail)
 
     def _cache(self) -> None:
         for key, size, intact in self._check_cache():
-            if not self._note_checked("cache", key, size, None if intact else "damaged; it is made again"):
+            if not self._note_checked("cache", key, size, None if intact else "damaged; it is rebuilt"):
                 return
 
     def _note_checked(self, kind: Kind, name: str, size: int, problem: str | None) -> bool:
-        """Note what was checked and take the time for it; False where the scrub was stopped."""
+        """Count a checked object and wait as long as the rate requires; False if the scrub was stopped."""
         if problem is not None:
             self._note(kind, name, problem)
         self._state.after = name
@@ -177,7 +177,7 @@ class Scrub:
         self._debt += max(size, THING_BYTES) / self._rate
         if time.monotonic() - self._saved > SAVE_SECONDS:
             self._save()
-        if self._debt > 0.05:  # slept in one piece rather than a microsecond at a time
+        if self._debt > 0.05:  # one long sleep instead of many of a microsecond
             self._stopped.wait(self._debt)
             self._debt = 0.0
         return not self._stopped.is_set()
@@ -186,7 +186,7 @@ class Scrub:
         state = self._state
         state.found[kind] = state.found.get(kind, 0) + 1
         state.findings[kind] = max(state.findings.get(kind, 0), state.found[kind])
-        if kind != "cache":  # that one heals by itself
+        if kind != "cache":  # cached maps are rebuilt without an administrator
             log.critical(
                 "scrub: stored data is damaged: run `fleetmap verify --repair` (%s=%s, %s)", kind, name, problem
             )
@@ -195,13 +195,13 @@ class Scrub:
         self._saved = time.monotonic()
         path = self._store.blob_dir / STATE
         temporary = path.with_suffix(f".{os.getpid()}")
-        with contextlib.suppress(OSError):  # a full disk stops no scrub
+        with contextlib.suppress(OSError):  # a full disk must not stop the scrub
             temporary.write_text(json.dumps(asdict(self._state)))
             temporary.replace(path)
 
 
 def figures(state: ScrubState) -> dict[str, Any]:
-    """A state as monitoring reads it. age: seconds since the last complete pass, infinite where there was none."""
+    """Return the figures for monitoring. age: seconds since the last complete pass, infinite if there was none."""
     age = time.time() - state.completed if state.completed else float("inf")
     findings = {kind: state.findings.get(kind, 0) for kind in KINDS}
     return {"age": age, "completed": state.completed, "running": bool(state.started), "findings": findings}

@@ -1,4 +1,4 @@
-"""The store: its services over one database and one blob folder, on SQLite or PostgreSQL."""
+"""The store: all its services over one database and one blob folder, on SQLite or PostgreSQL."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from app.store.verify import Progress, Verifier
 from app.store.versions import Versions
 
 ABANDONED_SECONDS = 24 * 3600.0
-"""A pack of this age that no row knows is no living upload's: the row comes right after it."""
+"""Age in seconds of packs without a row that are removed: a running upload writes the row right after the pack."""
 
 
 class Store:
     """One database and one blob folder. Thread-safe; cheap to open again in a worker process.
 
-    database_url: ``sqlite:///PATH`` or ``postgresql+psycopg://…`` (with PostGIS). readonly: nothing can be written,
-    by the database's own means; ``versions.prepare`` and all reading work. ``generation()`` is a number that changes
-    with every committed write on this host.
+    database_url: ``sqlite:///PATH`` or ``postgresql+psycopg://…`` (with PostGIS). readonly: the database itself rejects
+    writes; ``versions.prepare`` and all reading work. ``generation()`` is a number that changes with every committed
+    write on this host.
     """
 
     def __init__(
@@ -73,37 +73,37 @@ class Store:
         self.garbage = GarbageCollector(database, self.chunks, self.blobs)
 
     def migrate(self) -> None:
-        """Bring the database's schema up to date (creates it where there is none), and make the blob folder.
+        """Create or migrate the database's schema, and create the blob folder.
 
-        Unavailable where the database does not answer, or where PostGIS is missing and may not be created.
+        Raises Unavailable if the database does not answer, or if PostGIS is missing and may not be created.
         """
         schema.upgrade(self._database)
         self.blobs.prepare()
         self.areas.refresh()
 
     def check(self) -> None:
-        """Unavailable unless the database answers, is whole as far as is known, and its schema is this release's."""
+        """Raise Unavailable unless the database answers, has no known damage, and its schema is this release's."""
         schema.check(self._database)
         self._database.check()
 
     def check_writable(self) -> None:
-        """Unavailable (NoRoom: a full disk) unless the blob folder and the database's folder can be written."""
+        """Raise Unavailable (NoRoom: a full disk) unless the blob folder and the database's folder can be written."""
         self.blobs.check()
         self._database.check_room()
 
     def note_damage(self, error: DatabaseDamaged) -> None:
-        """Report that another process found the database damaged: from now on ``check`` fails."""
+        """Note that another process found the database damaged: from now on ``check`` fails."""
         self._database.note_damage_from(error)
 
     def verifier(self, progress: Progress = lambda kind, size: None) -> Verifier:
-        """Checks of everything that is stored."""
+        """Create a verifier of everything that is stored."""
         return Verifier(self._database, self.chunks, self.blobs, progress)
 
     def check_pages(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
-        """(table, bytes, problem) of SQLite's tables after this one, each by a quick check in a query of its own.
+        """Check SQLite's tables after this one, each in a query of its own: (table, bytes, problem).
 
         Between two tables no connection is held. A problem is noted, so that ``check`` fails. bytes: the same share of
-        the file for each, since SQLite does not tell them cheaply.
+        the file for each, since SQLite does not report them cheaply.
         """
         try:
             tables, size = self._database.tables()
@@ -118,16 +118,16 @@ class Store:
                 yield table, size // len(tables), problem
 
     def recover(self) -> None:
-        """At start: remove what a killed upload left behind. Safe beside other processes that are at work."""
+        """Remove the remains of killed uploads, at start. Safe beside other running processes."""
         self.blobs.recover(ABANDONED_SECONDS)
 
     def epoch(self) -> int:
-        """The server's epoch: it rises when the database is restored from a backup. Robots order by it first."""
+        """Return the server's epoch: it rises when the database is restored from a backup; robots order by it first."""
         with self._database.read() as connection:
             return int(connection.execute(select(tables.server.c.epoch)).scalar_one_or_none() or 0)
 
     def close(self) -> None:
-        """Give back connections."""
+        """Close all connections."""
         self._database.close()
         self.generation.close()
 

@@ -1,7 +1,6 @@
-"""The tables, one model for SQLite and PostgreSQL. Migrations make them; a test holds both equal.
+"""Tables, one model for SQLite and PostgreSQL. Migrations create them; a test compares both.
 
-Geometry is PostGIS' ``geometry`` (GiST index) on PostgreSQL and WKB on SQLite, beside four bounding-box columns on
-both.
+Geometry is PostGIS' ``geometry`` (GiST index) on PostgreSQL and WKB on SQLite, with four bounding-box columns on both.
 """
 
 from __future__ import annotations
@@ -34,20 +33,20 @@ from sqlalchemy.types import TypeDecorator, TypeEngine
 
 
 class UtcDateTime(TypeDecorator[datetime]):
-    """An aware time in UTC; SQLite keeps it without the zone."""
+    """An aware time in UTC; SQLite stores it without the zone."""
 
     impl = DateTime(timezone=True)
     cache_ok = True
 
     def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Any zone -> UTC."""
+        """Convert a time of any zone to UTC."""
         if value is None:
             return None
         utc = value.astimezone(UTC)
         return utc.replace(tzinfo=None) if dialect.name == "sqlite" else utc
 
     def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Aware, in UTC."""
+        """Return an aware time in UTC."""
         del dialect
         if value is None:
             return None
@@ -55,13 +54,13 @@ class UtcDateTime(TypeDecorator[datetime]):
 
 
 class from_wkb(FunctionElement[bytes]):  # noqa: N801 - an SQL function
-    """WKB in degrees -> the column's form."""
+    """SQL function from WKB in degrees to the column's form."""
 
     inherit_cache = True
 
 
 class as_wkb(FunctionElement[bytes]):  # noqa: N801 - an SQL function
-    """The column's form -> WKB."""
+    """SQL function from the column's form to WKB."""
 
     inherit_cache = True
 
@@ -89,7 +88,7 @@ class WkbGeometry(TypeDecorator[bytes]):
     cache_ok = True
 
     def load_dialect_impl(self, dialect: Dialect | None) -> TypeEngine[Any]:
-        """PostGIS' type on PostgreSQL alone (SQLAlchemy also asks without a dialect)."""
+        """Return PostGIS' type on PostgreSQL only (SQLAlchemy also calls this without a dialect)."""
         if dialect is not None and dialect.name == "postgresql":
             from app.store.postgis import PlainGeometry
 
@@ -97,21 +96,21 @@ class WkbGeometry(TypeDecorator[bytes]):
         return LargeBinary()
 
     def bind_expression(self, bindparam: BindParameter[Any]) -> ColumnElement[Any]:
-        """WKB -> the column's form."""
+        """Convert WKB into the column's form."""
         return from_wkb(bindparam)
 
     def column_expression(self, column: ColumnElement[Any]) -> ColumnElement[Any]:
-        """The column's form -> WKB."""
+        """Convert the column's form into WKB."""
         return as_wkb(column)
 
 
 def _box() -> list[Column[float]]:
-    """Degrees; west > east crosses the antimeridian."""
+    """Return columns of a box in degrees; west > east crosses the antimeridian."""
     return [Column(name, Float(53), nullable=True) for name in ("west", "south", "east", "north")]
 
 
 POSTGRESQL = {"dialect": "postgresql"}
-"""What only PostgreSQL has says so, for the comparison of models and migrations, which does not look at ddl_if."""
+"""Mark of objects that only PostgreSQL has: the comparison of models and migrations ignores ddl_if."""
 
 metadata = MetaData(
     naming_convention={
@@ -148,9 +147,10 @@ environment = Table(
     Column("extent", WkbGeometry, nullable=True),
     Column("area_stale", Boolean, nullable=False, server_default=true(), index=True),
 )
-"""head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event that changed
-which closures are in force. indexed: the version that ``place`` shows. area_stale: whether ``area`` has to be computed
-from the head before it is read."""
+"""Environments. head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event
+that changed the closures in force. indexed: the version that ``place`` shows. area_stale: whether ``area`` has to be
+computed from the head before it is read.
+"""
 
 Index("ix_environment_extent", environment.c.extent, postgresql_using="gist", info=POSTGRESQL).ddl_if(
     dialect="postgresql"
@@ -167,8 +167,11 @@ area = Table(
     *_box(),
     Column("geometry", WkbGeometry, nullable=False),
 )
-"""The heads' areas on earth, see ``app.store.area``: for "which map am I on". A piece does not cross the antimeridian.
-size: square metres of all pieces. It can be rebuilt from the trees at any time."""
+"""Areas of the heads on earth, see ``app.store.area``: for queries by position.
+
+A piece does not cross the antimeridian.
+size: square metres of all pieces. Can be rebuilt from the trees at any time.
+"""
 
 Index("ix_area_geometry", area.c.geometry, postgresql_using="gist", info=POSTGRESQL).ddl_if(dialect="postgresql")
 Index("ix_area_box", area.c.south, area.c.north, area.c.west, area.c.east)
@@ -188,7 +191,7 @@ version = Table(
     Column("warnings", JSON, nullable=False),
     Column("manifest", LargeBinary, nullable=False),
 )
-"""manifest: datum, levels and parts, as ``versions.py`` packs them. sequence: of the event that told of it."""
+"""Versions. manifest: datum, levels and parts, as packed by ``manifest.py``. sequence: of the version's event."""
 
 source = Table(
     "source",
@@ -202,7 +205,7 @@ source = Table(
     Column("format", Text, nullable=True),
     Column("used", Boolean, nullable=False),
 )
-"""The files of a version, in the order they came."""
+"""Files of a version, in the order of the upload."""
 
 chunk = Table(
     "chunk",
@@ -211,8 +214,11 @@ chunk = Table(
     Column("data", LargeBinary, nullable=False),
     Column("used", BigInteger, nullable=False, index=True),
 )
-"""Chunks by the hash of their canonical bytes; data is compressed. used: when it was last written or written again
-(seconds since 1970), so that collection leaves alone what an upload in progress relies on."""
+"""Chunks by the hash of their canonical bytes; data is compressed.
+
+used: time of the last write or repeated write (seconds
+since 1970): garbage collection skips recent ones, which an upload in progress may rely on.
+"""
 
 blob = Table(
     "blob",
@@ -223,8 +229,11 @@ blob = Table(
     Column("start", BigInteger, nullable=False),
     Column("used", BigInteger, nullable=False, index=True),
 )
-"""Files by the hash of their content. pack: the file that holds it among others, from byte ``start`` on; NULL where it
-is a file of its own."""
+"""Files by the hash of their content.
+
+pack: the pack file that contains it, from byte ``start`` on; NULL if it is a file
+of its own.
+"""
 
 channel = Table(
     "channel",
@@ -241,7 +250,7 @@ channel = Table(
     Column("rollout", JSON(none_as_null=True), nullable=True),
     Column("rollout_state", String(16), nullable=True, index=True),
 )
-"""planned_at is NULL where the move waits for robots alone. rollout: as ``values.Rollout`` says it."""
+"""Channels. planned_at is NULL if the move waits for robots only. rollout: result of ``Rollout.as_row``."""
 
 event = Table(
     "event",
@@ -254,7 +263,7 @@ event = Table(
     Column("time", UtcDateTime, nullable=False),
     Index("uq_event_sequence", "environment_id", "sequence", unique=True),
 )
-"""The outbox, which is the log. Rows outlive their environment, so that its end is still told after a purge."""
+"""The outbox, which is also the log. Rows outlive their environment, so that its end is published after a purge."""
 
 log = Table(
     "log",
@@ -278,8 +287,9 @@ retired = Table(
     Column("name", String(63), primary_key=True),
     Column("sequence", BigInteger, nullable=False),
 )
-"""Names that an environment gave up, with the last sequence told under them: a new one goes on from there, since robots
-refuse a lower sequence."""
+"""Former names of environments, with the last sequence published under them: a new environment of that name continues
+from there, since robots reject a lower sequence.
+"""
 
 idempotency = Table(
     "idempotency",
@@ -321,7 +331,7 @@ job = Table(
 
 
 def _report() -> list[Column[Any]]:
-    """A robot's report. said: when, by the robot's clock; time: when it was received, by the server's."""
+    """Columns of a robot's report. said: time by the robot's clock; time: of receipt, by the server's clock."""
     return [
         Column("channel", String(63), nullable=False),
         Column("version", BigInteger, nullable=False),
@@ -349,8 +359,11 @@ robot = Table(
     Column("held_since", UtcDateTime, nullable=True),
     Column("vouched", Boolean, nullable=False, server_default=true()),
 )
-"""Robots as they are now, for each environment. since: when they first said this. held: what they drive on, which a
-report of a map that is still being fetched does not change. vouched: whether any report came with authority."""
+"""Current state of robots, for each environment. since: when they first reported it.
+
+held: the active map, which a report
+of a map that is still being fetched does not change. vouched: whether any report was authenticated.
+"""
 
 robot_history = Table(
     "robot_history",
@@ -361,7 +374,7 @@ robot_history = Table(
     *_report(),
     Index("ix_robot_history_robot", "environment_id", "robot", "id"),
 )
-"""What robots said, each time that it was something new; the newest of each robot are kept."""
+"""Changed reports of robots; the newest of each robot are retained."""
 
 server = Table(
     "server",
@@ -392,8 +405,11 @@ overlay = Table(
     Index("ix_overlay_environment", "environment_id", "state"),
     Index("ix_overlay_expires", "state", "expires"),
 )
-"""What is reported as blocked. expires: end of the blocking. version: that made it permanent; of rows that releases
-before closures wrote, the version that it was put into."""
+"""Overlays. expires: end of the obstruction.
+
+version: the one that made it permanent; in rows of releases before closures,
+the version that it was put into.
+"""
 
 presence = Table(
     "presence",
@@ -402,7 +418,7 @@ presence = Table(
     Column("there", Boolean, nullable=False),
     Column("time", UtcDateTime, nullable=False),
 )
-"""Robots' liveliness on the bus. time: of the change, and while they are there of the last look."""
+"""Robots' liveliness on the bus. time: of the last change, and while they are present of the last check."""
 
 place = Table(
     "place",
@@ -417,7 +433,7 @@ place = Table(
     Column("geometry", WkbGeometry, nullable=False),
     Index("ix_place_feature", "environment_id", "feature"),
 )
-"""The heads' vector items on earth, for questions across environments. It can be rebuilt from the trees at any time."""
+"""The heads' vector items on earth, for queries across environments. Can be rebuilt from the trees at any time."""
 
 Index("ix_place_geometry", place.c.geometry, postgresql_using="gist", info=POSTGRESQL).ddl_if(dialect="postgresql")
 Index("ix_place_box", place.c.south, place.c.north, place.c.west, place.c.east)
@@ -438,4 +454,4 @@ audit = Table(
     Column("target", Text, nullable=True),
     Index("ix_audit_environment", "environment", "id"),
 )
-"""Who changed what, from where. Rows outlive tokens and environments, so they hold their names."""
+"""Audit log. Rows outlive tokens and environments, so they contain their names."""

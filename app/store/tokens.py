@@ -1,4 +1,4 @@
-"""Access tokens: kept as SHA-256, compared in constant time."""
+"""Access tokens: stored as SHA-256, compared in constant time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SECRET_BYTES: Final = 32
 
 
 class Tokens:
-    """Who may do what."""
+    """Service for access tokens."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -39,13 +39,13 @@ class Tokens:
         expires: datetime | None = None,
         token: str | None = None,
     ) -> tuple[Token, str]:
-        """A token and its secret, which is told only now.
+        """Create a token; returns it with its secret, which is not stored.
 
-        environments: a name pattern (fnmatch). robot: whose status a robot's token may put; required for the role
-        robot. token: a secret chosen by the operator; one that exists already is Conflict.
+        environments: a name pattern (fnmatch). robot: name of the robot whose status the token may report; required for
+        the role robot. token: a secret chosen by the operator. Raises Conflict if it exists already.
         """
         if role not in get_args(Role):
-            raise Invalid(f"a role must be one of {', '.join(get_args(Role))}, got {role!r}")
+            raise Invalid(f"role must be one of {', '.join(get_args(Role))}, got {role!r}")
         if role == "robot" and robot is None:
             raise Invalid("a token with the role robot must name its robot")
         if expires is not None and expires.tzinfo is None:
@@ -71,9 +71,9 @@ class Tokens:
         return Token(**values), secret
 
     def create_administrator(self) -> str | None:
-        """The secret of a first administrator's token; None where there is an administrator already.
+        """Create a first administrator's token; returns its secret, None if there is an administrator already.
 
-        Of servers that start together on one database one creates it.
+        Of several servers that start together on one database only one creates it.
         """
         with self._database.write() as connection:
             if not self._database.sqlite:
@@ -88,20 +88,20 @@ class Tokens:
         return secret
 
     def all(self) -> list[Token]:
-        """All tokens, oldest first."""
+        """List all tokens, oldest first."""
         table = tables.token
         with self._database.read() as connection:
             rows = connection.execute(select(table).order_by(table.c.created, table.c.id)).all()
         return [_as_token(r) for r in rows]
 
     def delete(self, id: str) -> None:
-        """Revoke a token; NotFound."""
+        """Revoke a token. Raises NotFound."""
         with self._database.write() as connection:
             if not connection.execute(delete(tables.token).where(tables.token.c.id == id)).rowcount:
                 raise NotFound(f"there is no token {id[:80]!r}")
 
     def find(self, text: str) -> Token | None:
-        """The token with this secret, unless unknown or expired."""
+        """Find the token with this secret; None if it is unknown or expired."""
         if len(text) > 4096:
             return None
         digest = _hash(text)
@@ -113,13 +113,13 @@ class Tokens:
         if token.ended is None and token.expires is not None and token.expires <= self._database.now():
             try:
                 self.end_expired()
-            except Unavailable as error:  # it is refused all the same, and noted when it is seen again
-                log.warning("tokens: the end of an expired token could not be stored (%s)", error.detail)
+            except Unavailable as error:  # rejected anyway, and stored the next time
+                log.warning("tokens: storing the end of an expired token failed (reason=%s)", error.detail)
             return None
         return None if token.ended is not None else token
 
     def end_expired(self) -> int:
-        """Note which tokens have expired, and return how many: they stay so, also where the clock is set back."""
+        """Mark expired tokens as ended, and return how many: they stay so, even if the clock is set back."""
         table, now = tables.token, self._database.now()
         expired = table.c.ended.is_(None) & (table.c.expires <= now)
         with self._database.read() as connection:

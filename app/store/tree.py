@@ -1,13 +1,13 @@
-"""The chunk tree: a sorted sequence of items cut into content-addressed nodes, independent of its history.
+"""Chunk tree: a sorted sequence of items cut into content-addressed nodes, independent of its history.
 
-Where the sequence is cut depends on the items' keys alone: a key whose hash at its level has ``bits`` low zero bits
-ends its node (2^bits items on average). A node that would hold more than four times as many is cut again where fewer
-bits are zero, and so on. The nodes' last keys are the sequence of the next level, until one node is left: the root. So
-equal items have equal roots, an edit rewrites the few nodes on its path, and two trees share every node that lies
-between their differences. It is the idea of the prolly trees of Noms and Dolt.
+The cuts depend on the items' keys only: a key whose hash at its level has ``bits`` low zero bits ends its node (2^bits
+items on average). A node with more than four times as many items is cut again at keys with fewer zero bits, and so on.
+The nodes' last keys are the sequence of the next level, until one node is left: the root. So equal items have equal
+roots, an edit rewrites the few nodes on its path, and two trees share every node outside their differences. The idea
+is that of the prolly trees of Noms and Dolt.
 
-The key's hash is public (CRC-32, mixed with the level), so whoever chooses ids could make every item a node of its own
-and slow down his own environment: more than 64 + n/8 leaves for n items are refused.
+The key's hash is public (CRC-32, mixed with the level), so a client that chooses ids could make every item a node of
+its own and slow down its own environment: more than 64 + n/8 leaves for n items are rejected.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from app.errors import Damaged, Invalid
 from app.store.encode import EMPTY_BOX, ENCODING, compress, decompress, digest, pack, unpack
 
 FANOUT_BITS: Final = 6
-"""An inner node has 64 children on average."""
+"""Bits of an inner node's cuts: it has 64 children on average."""
 
 OVERSIZE: Final = 4
-"""Nodes with more than this many times the average are cut again."""
+"""Multiple of the average size above which nodes are cut again."""
 
 MAX_LEVEL: Final = 12
-"""A level at which everything goes into one node, so that no choice of keys makes an endless tower."""
+"""Level at which everything goes into one node, so that no choice of keys makes an endless tree."""
 
 Box = tuple[float, float, float, float]
 
 
 class ChunkReader(Protocol):
-    """Where chunks are read."""
+    """Source of stored chunks."""
 
     def read_many(self, hashes: Sequence[bytes]) -> Mapping[bytes, bytes]:
-        """Hash -> canonical bytes; Damaged where one is missing or wrong."""
+        """Read chunks: hash -> canonical bytes. Raises Damaged if one is missing or damaged."""
         ...
 
 
@@ -56,13 +56,13 @@ class Node:
     key: bytes = b""
 
     def as_list(self) -> list[Any]:
-        """For a part's chunk."""
+        """Return the reference as a list for a part's chunk."""
         box = None if self.box == EMPTY_BOX else list(self.box)
         return [self.hash, self.level, self.count, self.leaves, box]
 
     @classmethod
     def from_list(cls, members: Sequence[Any] | None) -> Node | None:
-        """The reverse; None for an empty tree."""
+        """Read the result of ``as_list``; None for an empty tree."""
         if members is None:
             return None
         h, level, count, leaves, box = members
@@ -81,7 +81,7 @@ class Inner:
     boxes: NDArray[np.float64]
 
     def child(self, k: int) -> Node:
-        """A reference to child k."""
+        """Return a reference to child k."""
         x0, y0, x1, y1 = self.boxes[k].tolist()
         return Node(self.hashes[k], self.level - 1, self.counts[k], self.leaves[k], (x0, y0, x1, y1), key=self.keys[k])
 
@@ -91,10 +91,10 @@ class Inner:
 
 
 def decode_inner(raw: bytes) -> Inner:
-    """The canonical bytes of an inner node -> its members."""
+    """Decode the canonical bytes of an inner node."""
     members = unpack(raw)
     if members[1] != "inner":
-        raise Damaged(f"a stored chunk is {members[1]!r} where an inner node belongs")
+        raise Damaged(f"a stored chunk is {members[1]!r} instead of an inner node")
     _, _, level, keys, hashes, counts, leaves, boxes = members
     n = len(keys)
     return Inner(
@@ -125,7 +125,7 @@ def encode_inner(level: int, children: Sequence[Node]) -> bytes:
 
 
 class ChunkStage:
-    """Chunks in the making over the stored ones. What is read is kept, so one operation reads nothing twice."""
+    """New chunks on top of the stored ones. Chunks that are read are cached, so that none is read twice."""
 
     def __init__(self, source: ChunkReader) -> None:
         self._source = source
@@ -135,27 +135,27 @@ class ChunkStage:
         self._inner: dict[bytes, Inner] = {}
 
     def put(self, raw: bytes) -> bytes:
-        """Keep a chunk; its hash."""
+        """Stage a chunk; returns its hash."""
         name = digest(raw)
         self.new[name] = raw
         return name
 
     def put_compressed(self, raw: bytes, existing_names: Container[bytes]) -> bytes:
-        """Keep a chunk compressed, unless its hash is among the known ones; its hash."""
+        """Stage a chunk compressed, unless its hash is in ``existing_names``; returns its hash."""
         name = digest(raw)
         if name not in existing_names and name not in self.stored:
             self.stored[name] = compress(raw)
         return name
 
     def read_many(self, hashes: Sequence[bytes]) -> dict[bytes, bytes]:
-        """Hash -> canonical bytes, one query for all that are not at hand."""
+        """Read chunks: hash -> canonical bytes, one query for all that are not in memory."""
         missing = [h for h in dict.fromkeys(hashes) if h not in self.new and h not in self._read]
         if missing:
             self._read.update(self.stream(missing))
         return {h: self.new[h] if h in self.new else self._read[h] for h in hashes}
 
     def stream(self, hashes: Sequence[bytes]) -> dict[bytes, bytes]:
-        """The same, but nothing is kept."""
+        """Read chunks like ``read_many``, without caching them."""
         out = {h: self.new[h] for h in hashes if h in self.new}
         out.update((h, decompress(self.stored[h])) for h in hashes if h in self.stored)
         missing = [h for h in dict.fromkeys(hashes) if h not in out]
@@ -164,7 +164,7 @@ class ChunkStage:
         return out
 
     def was_read(self, name: bytes) -> bool:
-        """Whether this chunk came from the store."""
+        """Return whether this chunk came from the store."""
         return name in self._read
 
     def read(self, name: bytes) -> bytes:
@@ -172,18 +172,18 @@ class ChunkStage:
         return self.read_many([name])[name]
 
     def inner(self, name: bytes) -> Inner:
-        """One inner node."""
+        """Read one inner node."""
         node = self._inner.get(name)
         if node is None:
             node = self._inner[name] = decode_inner(self.read(name))
         return node
 
 
-# --- where to cut ---
+# --- cuts ---
 
 
 def key_hashes(keys: Iterable[bytes], level: int) -> NDArray[np.uint32]:
-    """The public hash of each key at a level: CRC-32 plus level · 0x9E3779B9, through MurmurHash3's finaliser."""
+    """Hash keys at a level: CRC-32 plus level · 0x9E3779B9, through MurmurHash3's finaliser. The hash is public."""
     crc = np.fromiter(map(zlib.crc32, keys), np.uint32)
     h = crc + np.uint32((level * 0x9E3779B9) & 0xFFFFFFFF)
     h ^= h >> np.uint32(16)
@@ -195,7 +195,7 @@ def key_hashes(keys: Iterable[bytes], level: int) -> NDArray[np.uint32]:
 
 
 def cut(hashes: NDArray[np.uint32], bits: int, limit: int | None = None) -> list[int]:
-    """The ends (exclusive) of the nodes of a sequence of keys with these hashes."""
+    """Return the ends (exclusive) of the nodes of a sequence of keys with these hashes."""
     n = len(hashes)
     if limit is None:
         limit = OVERSIZE << bits
@@ -214,7 +214,7 @@ def cut(hashes: NDArray[np.uint32], bits: int, limit: int | None = None) -> list
 
 
 def ends_node(key: bytes, level: int, bits: int) -> bool:
-    """Whether this key ends its node (by the full number of bits), so that nothing before touches what is after."""
+    """Return whether this key ends its node by the full number of bits, which separates the nodes on both sides."""
     return level < MAX_LEVEL and not int(key_hashes((key,), level)[0]) & ((1 << bits) - 1)
 
 
@@ -228,7 +228,7 @@ def build(
     encode: Callable[[int, int], bytes],
     boxes: NDArray[np.float64] | None = None,
 ) -> Node | None:
-    """A tree of sorted distinct keys. encode(start, end) gives a leaf's bytes; boxes: float64 [n, 4] or None."""
+    """Build a tree of sorted distinct keys. encode(start, end) gives a leaf's bytes; boxes: float64 [n, 4] or None."""
     if not keys:
         return None
     ends = cut(key_hashes(keys, 0), bits)
@@ -244,7 +244,7 @@ def build(
 
 
 def join_boxes(boxes: NDArray[np.float64], starts: Sequence[int]) -> list[Box]:
-    """The box around each run of boxes."""
+    """Return the box around each run of boxes."""
     low = np.minimum.reduceat(boxes[:, :2], starts, axis=0)
     high = np.maximum.reduceat(boxes[:, 2:], starts, axis=0)
     return [(a, b, c, d) for (a, b), (c, d) in zip(low.tolist(), high.tolist(), strict=True)]
@@ -267,7 +267,7 @@ def inner_nodes(draft: ChunkStage, children: Sequence[Node], level: int) -> list
 
 
 def raise_tree(draft: ChunkStage, nodes: list[Node], level: int) -> Node:
-    """Inner levels above these nodes, until one is left."""
+    """Build inner levels above these nodes, until one is left."""
     while len(nodes) > 1:
         nodes = inner_nodes(draft, nodes, level)
         level += 1
@@ -275,7 +275,7 @@ def raise_tree(draft: ChunkStage, nodes: list[Node], level: int) -> Node:
 
 
 def check_leaves(root: Node | None) -> None:
-    """Invalid where keys were chosen so that leaves become tiny."""
+    """Raise Invalid if keys were chosen so that leaves become tiny."""
     if root is not None and root.leaves > 64 + root.count // 8:
         raise Invalid(
             f"{root.count} items would need {root.leaves} leaves of storage: their ids are chosen such that "
@@ -287,7 +287,7 @@ def check_leaves(root: Node | None) -> None:
 
 
 def leaves(draft: ChunkStage, roots: Sequence[Node]) -> list[list[bytes]]:
-    """The hashes of each tree's leaves, in order; one query for each level of the tallest."""
+    """Return the hashes of each tree's leaves, in order; one query for each level of the tallest."""
     frontier: list[list[Node]] = [[root] for root in roots]
     while any(node.level for nodes in frontier for node in nodes):
         draft.read_many([node.hash for nodes in frontier for node in nodes if node.level])
@@ -301,7 +301,7 @@ def leaves(draft: ChunkStage, roots: Sequence[Node]) -> list[list[bytes]]:
 def select(
     draft: ChunkStage, root: Node | None, predicate: Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 ) -> list[bytes]:
-    """The hashes of the leaves whose box passes: wanted(boxes float64 [n, 4]) -> bool [n]."""
+    """Return the hashes of the leaves whose box passes: wanted(boxes float64 [n, 4]) -> bool [n]."""
     if root is None or not bool(predicate(np.array([root.box]))[0]):
         return []
     nodes = [root.hash]
@@ -316,7 +316,7 @@ def select(
 
 
 def paths(draft: ChunkStage, root: Node | None, keys: Sequence[bytes]) -> list[bytes]:
-    """The hashes of the leaves in which these sorted keys are, or would be; all nodes on the way are read."""
+    """Return the hashes of the leaves that contain, or would contain, these sorted keys; reads the path."""
     if root is None or not keys:
         return []
     frontier: list[tuple[bytes, Sequence[bytes]]] = [(root.hash, keys)]
@@ -339,7 +339,7 @@ def paths(draft: ChunkStage, root: Node | None, keys: Sequence[bytes]) -> list[b
 
 
 def differing(draft: ChunkStage, a: Node | None, b: Node | None) -> tuple[list[bytes], list[bytes]]:
-    """Leaves of a that b does not have, and the reverse: reads nothing below equal nodes."""
+    """Return the leaves of a that are not in b, and the reverse; reads nothing below equal nodes."""
     left, right = [a] if a else [], [b] if b else []
     while True:
         common = {n.hash for n in left} & {n.hash for n in right}
@@ -356,7 +356,7 @@ def differing(draft: ChunkStage, a: Node | None, b: Node | None) -> tuple[list[b
 
 
 def names(draft: ChunkStage, root: Node | None, existing_names: Container[bytes] = ()) -> set[bytes]:
-    """The hashes of all nodes of a tree, but of known ones and what is below them. Leaves are not read."""
+    """Return the hashes of all nodes of a tree except ``existing_names`` and the nodes below them. Reads no leaves."""
     out: set[bytes] = set()
     nodes = [root] if root else []
     while nodes:
@@ -372,27 +372,27 @@ def names(draft: ChunkStage, root: Node | None, existing_names: Container[bytes]
 
 
 class LeafCodec(Protocol):
-    """How the leaves of one kind of tree are taken apart and put together."""
+    """Codec of the leaves of one kind of tree."""
 
     bits: int
 
     def decode(self, raw: bytes) -> tuple[list[bytes], list[Any]]:
-        """A leaf's keys and items."""
+        """Decode a leaf into keys and items."""
         ...
 
     def encode(self, keys: Sequence[bytes], items: Sequence[Any]) -> bytes:
-        """A leaf's bytes."""
+        """Encode a leaf."""
         ...
 
     def boxes(self, items: Sequence[Any]) -> NDArray[np.float64] | None:
-        """The items' boxes, float64 [n, 4], or None where they have no place."""
+        """Return the items' boxes, float64 [n, 4], or None if they have no coordinates."""
         ...
 
 
 def edit(
     draft: ChunkStage, codec: LeafCodec, root: Node | None, put: Mapping[bytes, Any], removed: Iterable[bytes]
 ) -> Node | None:
-    """The tree with items put (added or replaced by key) and keys removed: the very tree that building anew gives."""
+    """Put items (add or replace by key) and remove keys; returns the same tree as building it from scratch."""
     deletions = set(removed) - put.keys()
     if not put and not deletions:
         return root
@@ -445,7 +445,7 @@ def edit(
 def _edited_leaves(
     draft: ChunkStage, codec: LeafCodec, old: Sequence[Node], put: Mapping[bytes, Any], touched: Sequence[bytes]
 ) -> list[Node]:
-    """The leaves that stand for old ones after these keys were put, or removed where nothing is put."""
+    """Return the leaves that replace old ones after the touched keys were put, or removed if not in ``put``."""
     merged: dict[bytes, Any] = {}
     for raw in draft.read_many([n.hash for n in old]).values():
         merged.update(zip(*codec.decode(raw), strict=True))
@@ -474,7 +474,7 @@ def _update(merged: dict[bytes, Any], put: Mapping[bytes, Any], touched: Sequenc
 
 
 def _between(keys: Sequence[bytes], lo: bytes | None, hi: bytes | None) -> Sequence[bytes]:
-    """The sorted keys in (lo, hi]; None is no bound."""
+    """Return the sorted keys in (lo, hi]; None is no bound."""
     return keys[0 if lo is None else bisect_right(keys, lo) : len(keys) if hi is None else bisect_right(keys, hi)]
 
 
@@ -489,8 +489,9 @@ def _edit_level(
 ) -> tuple[list[Node], set[bytes], bool]:
     """Regroup the runs of nodes of a level that these sorted keys touch.
 
-    A run starts after a key that ends its node by the full number of bits and ends with one that stays, or with the
-    sequence. Returns the new nodes, the last keys of the nodes they stand for, and whether those were all of the level.
+    A run starts after a key that ends its node by the full number of bits, and ends with such a key that is not
+    deleted, or with the sequence. Returns the new nodes, the last keys of the nodes that they replace, and whether
+    those were the whole level.
     """
     if level == root.level:
         last = draft.inner(root.hash).keys[-1] if root.level else b""
@@ -520,7 +521,7 @@ def _edit_level(
 
 
 def _first_node(draft: ChunkStage, root: Node, level: int, key: bytes, *, strict: bool = False) -> Node | None:
-    """The first node of a level whose last key is not before (strict: is after) this key."""
+    """Return the first node of a level whose last key is not before (strict: is after) this key."""
     node = draft.inner(root.hash)
     while True:
         k = bisect_right(node.keys, key) if strict else bisect_left(node.keys, key)
@@ -539,7 +540,7 @@ def _last_node(draft: ChunkStage, root: Node, level: int) -> Node:
 
 
 def _is_before(draft: ChunkStage, root: Node, level: int, key: bytes) -> Node | None:
-    """The last node of a level whose last key is before this key."""
+    """Return the last node of a level whose last key is before this key."""
 
     def search(node: Inner) -> Node | None:
         k = bisect_left(node.keys, key)

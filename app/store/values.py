@@ -1,4 +1,4 @@
-"""What the store hands out: frozen values, free of SQLAlchemy, picklable, all times aware and in UTC."""
+"""Values of the store: frozen, free of SQLAlchemy, picklable, with aware times in UTC."""
 
 from __future__ import annotations
 
@@ -18,30 +18,32 @@ from app.model.layers import CONTENT_LAYERS, PartKey
 from app.model.templates import NO_TEMPLATES, Templates
 
 EDIT = "edit"
-"""The step that people's changes leave in the provenance of what was derived."""
+"""Name of the provenance step that an edit of derived content adds."""
 
 Information = Literal["raw", "derived", "template", "generated"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 Role = Literal["viewer", "robot", "editor", "admin"]
 
 Box = tuple[float, float, float, float]
-"""(minimum x, minimum y, maximum x, maximum y); in degrees (west, south, east, north), where west > east means that
-the box crosses the antimeridian."""
+"""A box (minimum x, minimum y, maximum x, maximum y), or in degrees (west, south, east, north).
+
+In degrees, west > east means that the box crosses the antimeridian.
+"""
 
 Bounds = Mapping[Literal["local", "wgs84"], Box | None]
-"""The box of a part's local items in metres and of its wgs84 items in degrees; None where it has none of them."""
+"""Boxes of a part's local items in metres and of its wgs84 items in degrees; None without such items."""
 
 LATEST = "latest"
-"""The channel that moves by itself: the head."""
+"""Name of the channel that always points to the head."""
 
 
 @dataclass(frozen=True, slots=True)
 class Environment:
-    """A mapped place, as it is now.
+    """An environment, in its current state.
 
     id: stays when the name changes. head: the newest version's number, root: its root hash (hex). bounds: (west,
-    south, east, north) in degrees around all that it holds, or None where nothing is on earth. sequence: of its last
-    event. deleted: since when it waits for being restored or purged.
+    south, east, north) in degrees around all content, or None if nothing is on earth. sequence: of its last event.
+    deleted: time of deletion, until it is restored or purged.
     """
 
     id: str
@@ -75,12 +77,12 @@ class Area:
 
 
 NO_AREA = Area("datum", 0.0, ())
-"""Of an environment without a place on earth."""
+"""Area of an environment without a position on earth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """The reason why a position is in an environment.
+    """Reason why a position is in an environment.
 
     by: what its area is taken from. area: square metres. distance: metres to the datum, None if there is none.
     """
@@ -90,7 +92,7 @@ class Match:
     distance: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """The match as clients see it."""
+        """Return the match as clients see it."""
         return {"by": self.by, "area_m2": self.area, "distance_m": self.distance}
 
 
@@ -105,7 +107,7 @@ class Source:
     used: bool = True
 
     def as_dict(self) -> dict[str, Any]:
-        """The source as JSON."""
+        """Return the source as JSON."""
         return {
             "name": self.name,
             "size": self.size,
@@ -117,12 +119,12 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where a part's content comes from. It does not count for any hash.
+    """Origin of a part's content. It is not part of any hash.
 
-    information: it stands in a source, was computed from other layers, filled in, or made up. format: of the source.
-    sources: names of the version's sources that gave it. upload: SHA-256 over the uploaded files of this part. steps:
-    how it was computed, with parameters. attribution: licences and credits. inputs: of a derived part, what it was
-    computed from: ``{layer, level, name, hash}``, and ``{datum, levels}`` in a line of their own.
+    information: whether it comes from a source, other layers, defaults or a generator. format: of the source. sources:
+    names of the version's sources it was read from. upload: SHA-256 over the uploaded files of this part. steps: how it
+    was computed, with parameters. attribution: licences and credits. inputs: of a derived part: ``{layer, level, name,
+    hash}`` each, and ``{datum, levels}`` in a line of their own.
     """
 
     information: Information = "raw"
@@ -135,17 +137,17 @@ class Provenance:
 
     @property
     def is_edited(self) -> bool:
-        """Whether people have changed what was derived."""
+        """Return whether derived content was edited."""
         return any(step.get("step") == EDIT for step in self.steps)
 
     def with_edit_step(self) -> Provenance:
-        """After people's changes: what was derived or generated is no longer made anew without a word."""
+        """Add the step for an edit: edited content is not derived or generated again without confirmation."""
         if not (self.inputs or self.information == "generated") or self.is_edited:
             return self
         return replace(self, steps=(*self.steps, {"step": EDIT}))
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-like members, without the empty ones."""
+        """Return the JSON members, without the empty ones."""
         members: dict[str, Any] = {
             "information": self.information,
             "format": self.format,
@@ -159,7 +161,7 @@ class Provenance:
 
     @classmethod
     def from_dict(cls, members: Mapping[str, Any]) -> Provenance:
-        """The reverse of ``as_dict``."""
+        """Read the result of ``as_dict``."""
         return cls(
             information=members.get("information", "raw"),
             format=members.get("format"),
@@ -173,11 +175,11 @@ class Provenance:
 
 @dataclass(frozen=True, slots=True)
 class PartEntry:
-    """A version's line about one part.
+    """A version's record of one part.
 
     hash: of the part's content (hex), the root of its tree. count: features, cells, voxels, pixels or files. bounds:
-    where its items lie. digest: hash of the canonical content in the order it was uploaded, empty after an edit; only
-    a short cut for "the same again".
+    boxes of its items. digest: hash of the canonical content in the order of the upload, empty after an edit; only a
+    shortcut to detect an equal upload.
     """
 
     key: PartKey
@@ -189,7 +191,7 @@ class PartEntry:
 
 
 def datum_information(datum: Datum, parts: Iterable[PartEntry]) -> Information:
-    """Whether people told the datum, or a generator made it up with one of the parts."""
+    """Return whether the datum was set by people, or by the generator of one of the parts."""
     datum_values = datum.as_dict()
     made_up = any(step.get("datum") == datum_values for e in parts for step in e.provenance.steps)
     return "generated" if made_up else "raw"
@@ -199,9 +201,9 @@ def datum_information(datum: Datum, parts: Iterable[PartEntry]) -> Information:
 class Version:
     """An immutable state of an environment.
 
-    environment: its name. changes: counts of what this version changed against its parent, by layer. warnings: what
-    was doubtful in its sources. parts: sorted by key. templates: what is filled in where a format asks for more than
-    the layers have. closures: those that its maps show; None: none (as it is stored).
+    environment: its name. changes: counts of changes against its parent, by layer. warnings: of its sources. parts:
+    sorted by key. templates: values for formats that need more than the layers have. closures: those that its maps
+    show; None: none (as it is stored).
     """
 
     environment: str
@@ -221,12 +223,12 @@ class Version:
     closures: Closures | None = None
 
     def part(self, key: PartKey) -> PartEntry | None:
-        """The entry of a part, or None."""
+        """Return the entry of a part, or None."""
         return next((entry for entry in self.parts if entry.key == key), None)
 
     @property
     def stale(self) -> dict[PartKey, tuple[str, ...]]:
-        """Derived parts whose inputs are no longer what they were computed from, each with what has changed."""
+        """Return derived parts with changed inputs, each with the inputs that have changed."""
         now = {(e.key.layer, e.key.level, e.key.name): e.hash for e in self.parts if e.count}
         out: dict[PartKey, tuple[str, ...]] = {}
         for entry in self.parts:
@@ -243,7 +245,7 @@ class Version:
             steps = entry.provenance.steps
             layers |= {layer for step in steps for layer in step.get("also", ())}
             if any("location" in step.get("from", ()) for step in steps):
-                layers.add("location")  # the one layer that a step may have done without: a datum is location enough
+                layers.add("location")  # the one layer that a step can do without: a datum is sufficient
             identity = (entry.key.layer, entry.key.level, entry.key.name)
             new = (
                 [k for k in now if k[0] in layers and k not in used and k != identity]
@@ -257,7 +259,7 @@ class Version:
 
     @property
     def information(self) -> dict[str, str]:
-        """For each of the seven layers raw, derived, template, generated, or missing; raw beats the others."""
+        """Return for each of the seven layers raw, derived, template, generated, or missing; raw takes precedence."""
         order = ("raw", "derived", "generated", "template")
         out: dict[str, str] = {}
         for layer in CONTENT_LAYERS:
@@ -268,7 +270,7 @@ class Version:
         return out
 
     def as_dict(self) -> dict[str, Any]:
-        """The version as JSON."""
+        """Return the version as JSON."""
         return {
             "environment": self.environment,
             "version": self.number,
@@ -289,7 +291,7 @@ class Version:
 
 
 def frame_input(datum: Datum | None, levels: Sequence[Level]) -> dict[str, Any]:
-    """Datum and levels as a line among a derivation's inputs."""
+    """Return datum and levels as a line among a derivation's inputs."""
     return {
         "datum": datum.as_dict() if datum else None,
         "levels": [[level.name, level.elevation] for level in levels],
@@ -300,7 +302,7 @@ def frame_input(datum: Datum | None, levels: Sequence[Level]) -> dict[str, Any]:
 class Event:
     """One row of the log. sequence: of the environment, without gaps. body: the event as JSON.
 
-    position: of the whole log, growing by one, so that one reader can follow all environments.
+    position: in the whole log, increasing by one, so that one reader can follow all environments.
     """
 
     sequence: int
@@ -314,7 +316,7 @@ class Event:
 class Token:
     """An access token without its secret.
 
-    environments: a name pattern (fnmatch), None for all. ended: when it was seen to have expired; it stays expired.
+    environments: a name pattern (fnmatch), None for all. ended: when it was found to have expired; it stays expired.
     """
 
     id: str
@@ -329,10 +331,7 @@ class Token:
 
 @dataclass(frozen=True, slots=True)
 class Idempotency:
-    """A client's key for one request, and a fingerprint of the request's content.
-
-    Raises Invalid if the key is invalid.
-    """
+    """A client's key for one request, with a fingerprint of its content. Raises Invalid for an invalid key."""
 
     key: str
     fingerprint: str
@@ -344,7 +343,7 @@ class Idempotency:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Work that takes long. progress: 0 to 1. problem: why it failed, as an RFC 9457 object."""
+    """Long-running work. progress: 0 to 1. problem: the reason of a failure, as an RFC 9457 object."""
 
     id: str
     state: State
@@ -359,7 +358,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class FeatureDelta:
-    """What turns a vector part of one version into that of another: a moved feature is one put."""
+    """Changes of a vector part from one version to another; a moved feature is one put."""
 
     key: PartKey
     put: Features
@@ -377,10 +376,10 @@ class ChangedCells:
 
 @dataclass(frozen=True, slots=True)
 class GridDelta:
-    """What turns a grid of one version into that of another.
+    """Changes of a grid from one version to another.
 
-    whole: the grid's frame (size, resolution, origin, mode) changed or the grid is new, so that only loading it helps;
-    rectangles is empty then. deleted: it is gone.
+    whole: the grid's frame (size, resolution, origin, mode) changed or the grid is new, so that the client must load
+    it; rectangles is then empty. deleted: the grid was deleted.
     """
 
     key: PartKey
@@ -391,7 +390,7 @@ class GridDelta:
 
 @dataclass(frozen=True, slots=True)
 class Delta:
-    """What changed in meaning between two versions. other: changed parts that are neither vectors nor grids."""
+    """Changes between two versions. other: changed parts that are neither vectors nor grids."""
 
     features: tuple[FeatureDelta, ...] = ()
     grids: tuple[GridDelta, ...] = ()
@@ -402,7 +401,7 @@ class Delta:
 
 @dataclass(frozen=True, slots=True)
 class FeatureHit:
-    """A feature of some environment's head that stands in a box on earth: box in degrees."""
+    """A feature of some environment's head inside a box on earth: box in degrees."""
 
     environment: str
     key: PartKey
@@ -411,5 +410,5 @@ class FeatureHit:
 
 
 def rfc3339(time: datetime) -> str:
-    """UTC with microseconds and a Z."""
+    """Format a time in UTC with microseconds and a Z."""
     return time.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")

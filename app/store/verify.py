@@ -1,7 +1,7 @@
-"""Verification: stored bytes against their hashes, versions' roots against their chunks. It reads and changes nothing.
+"""Verification of stored bytes against their hashes, and of versions' roots against their chunks. Read-only.
 
-A version's root is the hash of its parts' hashes, a part's hash that of its first chunk, and each chunk names the next:
-where all chunks have their hashes and none is missing, every version is what it was when it was committed.
+A version's root is the hash of its parts' hashes, a part's hash that of its first chunk, and each chunk contains the
+hashes of the next: if all chunks match their hashes and none is missing, every version is unchanged since its commit.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from app.store.values import PartEntry
 Kind = Literal["database", "blob", "chunk", "version", "cache"]
 KINDS: Final[tuple[Kind, ...]] = ("database", "chunk", "version", "blob", "cache")
 VersionName = tuple[str, int]
-"""Environment and number."""
+"""An environment's name and a version's number."""
 
 Progress = Callable[[Kind, int], None]
-"""Called after each checked thing with its kind and its bytes."""
+"""Callback after each checked object, with its kind and its bytes."""
 
 PAGE: Final = 200
 MAX_LINES: Final = 20
@@ -41,7 +41,7 @@ _NOTHING: Final[frozenset[str]] = frozenset()
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One damaged thing. name: a hash (hex), a version, or the database. versions: whose content it is part of."""
+    """One damaged object. name: a hash (hex), a version, or the database. versions: those that contain it."""
 
     kind: Kind
     name: str
@@ -56,7 +56,7 @@ class Finding:
 
 @dataclass(slots=True)
 class VerifyResult:
-    """What was checked (count by kind), and what was found. started: when, in seconds since 1970."""
+    """Number of checked objects by kind, and the findings. started: seconds since 1970."""
 
     checked: dict[Kind, int] = field(default_factory=dict)
     size: int = 0
@@ -65,20 +65,20 @@ class VerifyResult:
 
     @property
     def unused_chunks(self) -> list[str]:
-        """The damaged chunks that no version has, to be removed when all others are healed."""
+        """Return the damaged chunks that no version uses, to be removed when all others are repaired."""
         return [f.name for f in self.findings if f.kind == "chunk" and not f.versions]
 
 
 @dataclass(frozen=True, slots=True)
 class _PartReferences:
-    """What a part refers to: chunks that are lost or damaged (hex), and blobs (hex)."""
+    """References of a part: chunks that are lost or damaged (hex), and blobs (hex)."""
 
     bad: frozenset[str]
     blobs: frozenset[str]
 
 
 class Verifier:
-    """Checks one store. It may run beside servers that write to it."""
+    """Checks of one store. It may run beside servers that write to it."""
 
     def __init__(
         self, database: Database, chunks: Chunks, blobs: Blobs, progress: Progress = lambda kind, size: None
@@ -86,7 +86,7 @@ class Verifier:
         self._database, self._chunks, self._blobs, self._progress = database, chunks, blobs, progress
 
     def run(self) -> VerifyResult:
-        """Check everything. Unavailable where the database cannot be read at all."""
+        """Check everything. Raises Unavailable if the database cannot be read at all."""
         out = VerifyResult()
         problem = self._database.integrity(MAX_LINES, quick=False)
         self._count(out, "database", 0)
@@ -146,12 +146,12 @@ class Verifier:
         self._progress(kind, size)
 
     def chunks(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
-        """Hash one chunk after the other: (hash in hex, bytes, what is wrong with it or None)."""
+        """Hash one chunk after the other: (hash in hex, bytes, problem or None)."""
         for name, size, problem in self._chunks.iterate_checks(bytes.fromhex(after)):
             yield name.hex(), size, problem
 
     def versions(self) -> Iterator[tuple[str, Any]]:
-        """(environment, row) of every version, also of deleted environments."""
+        """Iterate over (environment, row) of every version, also of deleted environments."""
         e, v = tables.environment, tables.version
         columns = (e.c.name, e.c.id, v.c.number, v.c.root, v.c.manifest, e.c.head, e.c.root.label("head_root"))
         query = select(*columns).join(v, v.c.environment_id == e.c.id).order_by(e.c.id, v.c.number).limit(PAGE)
@@ -174,23 +174,23 @@ class Verifier:
 
 
 def check_root(row: Any) -> tuple[str | None, tuple[PartEntry, ...]]:
-    """What is wrong with a version's own row (None: nothing), and its parts."""
+    """Check a version's own row; returns its problem (None if intact), and its parts."""
     try:
         datum, levels, entries, templates = unpack_manifest(bytes(row.manifest))
         root = version_root(entries, datum, levels, templates)
     except Damaged as error:
         return error.detail, ()
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        return f"its manifest cannot be read ({type(error).__name__})", ()
+        return f"invalid manifest ({type(error).__name__})", ()
     if root != row.root:
-        return f"its manifest gives the root {root}, and {row.root} was committed", entries
+        return f"the root of its manifest is {root}, but {row.root} was committed", entries
     if row.number == row.head and row.root != row.head_root:
-        return f"its environment takes {row.head_root} for its root, and {row.root} was committed", entries
+        return f"the root in its environment is {row.head_root}, but {row.root} was committed", entries
     return None, entries
 
 
 class _Walk:
-    """Through parts' trees, past what is damaged; each node once."""
+    """Walk through parts' trees that skips damaged nodes and visits each node once."""
 
     def __init__(self, chunks: Chunks, bad: Mapping[str, str], present: set[bytes]) -> None:
         self._chunks, self._bad, self._present = chunks, bad, present
@@ -198,14 +198,14 @@ class _Walk:
         self._nodes: dict[bytes, _PartReferences] = {}
 
     def below(self, part: bytes) -> _PartReferences:
-        """What a part refers to."""
+        """Return the references of a part."""
         if part not in self._parts:
             self._parts[part] = self._part(part)
         return self._parts[part]
 
     def _is_bad(self, name: bytes) -> bool:
         if name not in self._present and not self._chunks.find_damaged([name]):
-            self._present.add(name)  # it was stored after its turn had come
+            self._present.add(name)  # stored after the iteration over chunks had passed it
         return name not in self._present or name.hex() in self._bad
 
     def _part(self, name: bytes) -> _PartReferences:

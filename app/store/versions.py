@@ -1,4 +1,4 @@
-"""Versions: reading them, committing a prepared one, keeping further sources, reverting."""
+"""Versions: reading them, committing a prepared one, adding further sources, reverting."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MAX_REVERT_ATTEMPTS: Final = 8
 
 
 def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> int:
-    """A version's number from a number, ``latest``, or a channel's name; NotFound."""
+    """Resolve a number, ``latest``, or a channel's name to a version's number. Raises NotFound."""
     if isinstance(ref, int):
         return ref
     if ref == LATEST:
@@ -48,8 +48,8 @@ def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> in
     if number is None:
         near = nearest_channel(connection, environment, ref)
         raise NotFound(
-            f"{environment.name} has no version or channel {ref[:80]!r}{near}: ask for a number, latest, or a channel "
-            "that was set"
+            f"{environment.name} has no version or channel {ref[:80]!r}{near}: use a number, latest, or an existing "
+            "channel"
         )
     return int(number)
 
@@ -63,7 +63,7 @@ def insert_version(
     indexed: int,
     area: Area | Literal[Keep.KEEP] | None,
 ) -> None:
-    """Write a version's rows and make it the head. The caller holds the environment's row.
+    """Write a version's rows and make it the head. The caller has locked the environment's row.
 
     area: of this version; KEEP if it is that of the version before, None if the next query computes it.
     """
@@ -110,7 +110,7 @@ def insert_version(
 def append_version_event(
     connection: Connection, environment: Row[Any], before: Version, version: Version, sequence: int
 ) -> None:
-    """The event of a new version. Call it last, see ``outbox.append_event``."""
+    """Append the event of a new version. Call it last, see ``outbox.append_event``."""
     outbox.append_event(
         connection,
         environment_id=environment.id,
@@ -130,7 +130,7 @@ def append_version_event(
 def insert_sources(
     connection: Connection, environment_id: str, number: int, sources: Sequence[Source], first: int
 ) -> None:
-    """Write source rows; their blobs must be there and are marked as used."""
+    """Write source rows; their blobs must exist and are marked as used."""
     if not sources:
         return
     lock_blobs(connection, {s.sha256 for s in sources})
@@ -153,7 +153,10 @@ def insert_sources(
 
 
 def lock_blobs(connection: Connection, hashes: set[str]) -> None:
-    """Keep a collection in progress away from blobs that this transaction refers to; Unavailable where one is gone."""
+    """Mark blobs of this transaction as used, so that garbage collection skips them.
+
+    Raises Unavailable if one is missing.
+    """
     now = int(time.time())
     names = sorted(hashes)
     for start in range(0, len(names), 500):
@@ -162,24 +165,24 @@ def lock_blobs(connection: Connection, hashes: set[str]) -> None:
         stored_names = set(connection.execute(query.with_for_update()).scalars())
         missing = [n for n in batch if n not in stored_names]
         if missing:
-            raise Unavailable(f"the uploaded file {missing[0]} is not in the store (any more): send it again")
+            raise Unavailable(f"uploaded file {missing[0]} is no longer stored: send it again")
         connection.execute(update(tables.blob).where(tables.blob.c.sha256.in_(batch)).values(used=now))
 
 
 class Versions:
-    """Versions of environments."""
+    """Service for the versions of environments."""
 
     def __init__(self, database: Database, chunks: Chunks, blobs: Blobs) -> None:
         self._database, self._chunks, self._blobs = database, chunks, blobs
 
     def get(self, environment: str, ref: str | int = LATEST) -> Version:
-        """A version by number, channel or ``latest``; NotFound, or Gone where the environment is deleted."""
+        """Read a version by number, channel or ``latest``. Raises NotFound, or Gone if the environment is deleted."""
         with self._database.read() as connection:
             row = environment_row(connection, environment)
             return read_version(connection, row, resolve(connection, row, ref))
 
     def page(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
-        """Newest first; ``before``: only those with a smaller number."""
+        """List versions, newest first; ``before``: only those with a smaller number."""
         table = tables.version
         with self._database.read() as connection:
             row = environment_row(connection, environment)
@@ -191,21 +194,21 @@ class Versions:
         return [as_version(row.name, r, sources[r.number]) for r in rows]
 
     def get_with_base(self, environment: str, number: int) -> tuple[Version, Version | None]:
-        """A version, also of a deleted environment, and the one before it."""
+        """Read a version, also of a deleted environment, and its predecessor."""
         with self._database.read() as connection:
             row = environment_row(connection, environment, deleted=True)
             base = read_version(connection, row, number - 1) if number else None
             return read_version(connection, row, number), base
 
     def prepare(self, base: Version, changes: Changes) -> Prepared:
-        """Work out a version on top of a base. Reads and computes only, so it may run in another process.
+        """Prepare a version on top of a base. Only reads and computes, so that it may run in another process.
 
-        Raises Invalid where something cannot be stored, NotFound where something to delete is not there.
+        Raises Invalid if content cannot be stored, NotFound if content to delete does not exist.
         """
         return prepare(self._chunks.stage(), base, changes, self._is_intact)
 
     def _is_intact(self, part: str) -> bool:
-        """Whether the database has all chunks of a part, whatever is in memory."""
+        """Return whether the database has all chunks of a part intact, bypassing the cache."""
         try:
             names, _ = parts.all_chunks(self._chunks.stage(), bytes.fromhex(part), ())
         except Damaged:
@@ -225,9 +228,9 @@ class Versions:
     ) -> Version:
         """Make the prepared version the head, in one transaction with its event.
 
-        StaleParent where the head has moved since ``prepared.base``. A key that was used before gives the version of
-        then, or Conflict with another fingerprint. A prepared version that changes nothing adds the sources to the
-        head and returns it.
+        A key that was used before returns the version of that request. A prepared version without changes adds the
+        sources to the head and returns it. Raises StaleParent if the head has moved since ``prepared.base``, Conflict
+        if the key was used with another fingerprint.
         """
         checked_text(author, "an author")
         checked_text(message, "a message")
@@ -240,7 +243,7 @@ class Versions:
                 return read_version(connection, row, previous)
             _check_head(row, prepared.base)
             now = self._database.now()
-            chunks.insert(connection, prepared.chunks)  # where nothing changed, what was found damaged
+            chunks.insert(connection, prepared.chunks)  # without changes: the repaired chunks
             if not prepared.changed:
                 _append_sources(connection, row.id, row.head, sources)
                 _remember(connection, row.id, idempotency, row.head, now)
@@ -274,7 +277,7 @@ class Versions:
         return stored
 
     def add_sources(self, environment: str, version: int, sources: Sequence[Source]) -> Version:
-        """Keep further files with a version: what was uploaded but changed nothing. The version with all of them."""
+        """Add files of an upload without changes to a version; returns the version with all of its files."""
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
             read_version(connection, row, version)
@@ -291,9 +294,9 @@ class Versions:
         expected: int | None = None,
         idempotency: Idempotency | None = None,
     ) -> Version:
-        """A new version with the content of an old one; the head itself where that is the same content.
+        """Create a version with the content of an old one; returns the head itself if its content is equal.
 
-        expected: StaleParent where the head is another one; without it the head may move meanwhile.
+        expected: raise StaleParent if the head is another one; without it the head may move meanwhile.
         """
         for attempt in range(MAX_REVERT_ATTEMPTS):
             target = self.get(environment, to)
@@ -329,7 +332,7 @@ class Versions:
         return Prepared(head.number, target.root, {}, *contents, changes, changed=changed, area=area)
 
     def idempotent(self, environment: str, key: str) -> tuple[str, int] | None:
-        """(fingerprint, version number) of the request that used this key, or None."""
+        """Return (fingerprint, version number) of the request that used this key, or None."""
         table = tables.idempotency
         with self._database.read() as connection:
             row = environment_row(connection, environment)
@@ -343,8 +346,8 @@ class Versions:
 def _check_head(row: Row[Any], base: int) -> None:
     if row.head != base:
         raise StaleParent(
-            f"the head of {row.name} is version {row.head}, the change was made for version {base}: look at what "
-            "changed and send it again"
+            f"the head of {row.name} is version {row.head}, the change was made for version {base}: review "
+            "the changes in between and send it again"
         )
 
 
@@ -357,7 +360,7 @@ def _previous_version(connection: Connection, row: Row[Any], idempotency: Idempo
     if record is None:
         return None
     if record.fingerprint != idempotency.fingerprint:
-        raise Conflict(f"the Idempotency-Key {idempotency.key!r} was used for another request: choose a new one")
+        raise Conflict(f"the Idempotency-Key {idempotency.key!r} was used for another request: use a new key")
     return int(record.version)
 
 

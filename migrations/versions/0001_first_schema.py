@@ -218,7 +218,7 @@ def upgrade() -> None:
     if postgresql:
         op.create_index("ix_environment_extent", "environment", ["extent"], postgresql_using="gist")
         op.create_index("ix_place_geometry", "place", ["geometry"], postgresql_using="gist")
-        # Chunks are compressed already: no second try at it, and parts of them need not be read.
+        # chunks are compressed already: no second compression, and no access to parts of them
         op.execute("ALTER TABLE chunk ALTER COLUMN data SET STORAGE EXTERNAL")
 
 

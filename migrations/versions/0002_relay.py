@@ -1,4 +1,4 @@
-"""Up to where events were handed to the bus.
+"""Position up to which events were handed to the bus.
 
 Revision ID: 0002
 Revises: 0001

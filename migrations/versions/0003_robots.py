@@ -1,4 +1,4 @@
-"""What robots say of themselves, and which of them are there.
+"""Robots' reports, and their presence on the bus.
 
 Revision ID: 0003
 Revises: 0002

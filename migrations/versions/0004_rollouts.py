@@ -1,4 +1,4 @@
-"""Roll-outs in two stages: channels that wait for robots, or are watched after a move.
+"""Two-stage rollouts: channels that wait for robots, or are watched after a move.
 
 Revision ID: 0004
 Revises: 0003

@@ -1,4 +1,4 @@
-"""What robots report as blocked, until somebody decides on it or its time is over.
+"""Overlays: obstructions reported by robots, until an editor decides or they expire.
 
 Revision ID: 0005
 Revises: 0004

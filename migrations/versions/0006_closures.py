@@ -17,7 +17,7 @@ depends_on = None
 
 def upgrade() -> None:
     op.add_column("environment", sa.Column("closures_sequence", sa.BigInteger, nullable=False, server_default="0"))
-    # Overlays that were accepted before are in force on every channel from now on: robots fetch them as a change.
+    # earlier accepted overlays are in force on every channel from now on: robots fetch them as a change
     op.execute(
         "UPDATE environment SET closures_sequence = sequence "
         "WHERE id IN (SELECT environment_id FROM overlay WHERE state = 'accepted')"

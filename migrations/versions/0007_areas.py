@@ -1,6 +1,6 @@
-"""Areas of environments on earth: their GNSS fence, else what is mapped as floor, else the datum's neighbourhood.
+"""Areas of environments on earth: their GNSS fence, else their floor, else the datum's neighbourhood.
 
-The rows are computed from the trees when the store is opened for the first time after this migration.
+The rows are computed from the trees when the store is first opened after this migration.
 
 Revision ID: 0007
 Revises: 0006

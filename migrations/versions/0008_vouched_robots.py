@@ -1,4 +1,4 @@
-"""Which robots count in a roll-out: those of which a report came with authority. All that reported before do.
+"""Robots that count in a rollout: those with an authenticated report. All existing robots count.
 
 Revision ID: 0008
 Revises: 0007

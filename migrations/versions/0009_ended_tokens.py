@@ -1,4 +1,4 @@
-"""When a token was seen to have expired: it stays so, also where the clock is set back.
+"""Time at which a token was found to have expired: it stays so, even if the clock is set back.
 
 Revision ID: 0009
 Revises: 0008

@@ -1,4 +1,4 @@
-"""The audit log: who changed what, from where.
+"""Audit log: each change with its token, address and request.
 
 Revision ID: 0010
 Revises: 0009

@@ -125,8 +125,8 @@ def test_server_and_offline_conversion_give_equal_cells(api: Api) -> None:
         api.upload("ruin", lost)
         if not extra:
             problem: Any = api.problem("GET", "environments/ruin/versions/latest/maps/occupancy_grid", 422)
-            assert "walls.stl is not there: upload it" in problem["detail"]
-            with pytest.raises(MissingLayer, match=r"walls\.stl is not there: upload it"):
+            assert "walls.stl is missing: upload it" in problem["detail"]
+            with pytest.raises(MissingLayer, match=r"walls\.stl is missing: upload it"):
                 direct.offline(lost, "occupancy_grid")
             rows = {r["format"]: r for r in api.get("environments/ruin/versions/latest/maps").json()}
             assert rows["occupancy_grid"]["state"] == "missing"
@@ -153,7 +153,7 @@ def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
         assert [s["step"] for s in line["steps"]] == ["topology_to_occupancy"]
         (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].startswith("made another way")]
         assert "objects_to_occupancy failed" in warning
-        assert "walls.stl is not there" in warning
+        assert "walls.stl is missing" in warning
 
 
 def test_a_drawing_of_regions_is_no_obstacle_and_says_so(api: Api) -> None:

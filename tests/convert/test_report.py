@@ -49,6 +49,6 @@ def test_notes_become_warnings_of_a_version() -> None:
     notes.fill("width", 1.5, "none is given")
     assert notes.as_warnings() == (
         Problem("turned", where="L2"),
-        Problem("left out: 2 zones: no place"),
+        Problem("dropped: 2 zones: no place"),
         Problem("filled in: width = 1.5: none is given"),
     )

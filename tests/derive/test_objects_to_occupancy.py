@@ -179,7 +179,7 @@ def test_a_fence_on_earth_without_a_datum_is_told_and_left() -> None:
         objects((shapely.box(1, 1, 2, 2), {"kind": "wall"})), fence=shapely.box(9, 51, 10, 52), anchor="wgs84"
     )
     assert grid(content, notes).width == 60
-    assert "the fence is not used" in notes.warnings[0].problem
+    assert "the fence is ignored" in notes.warnings[0].problem
 
 
 def test_places_on_earth_need_a_datum() -> None:
@@ -304,7 +304,7 @@ def test_a_town_gets_coarser_cells_and_absurd_wishes_are_refused() -> None:
     with pytest.raises(CannotConvert, match=r"the limit is 536870912 cells .* resolution of at least 0\.13"):
         grid(town, resolution=0.01)
     world = layers(objects(house, (shapely.box(9e6, 9e6, 9e6 + 1, 9e6 + 1), {"kind": "wall"})))
-    with pytest.raises(CannotConvert, match="ask for a resolution"):
+    with pytest.raises(CannotConvert, match="set a resolution"):
         grid(world)
 
 
@@ -390,7 +390,7 @@ def test_solids_that_cannot_be_read_refuse_a_grid_of_guesses() -> None:
         ([(None, lost)], {"fence": shapely.box(-9, -9, 9, 9)}),
         ([(None, lost), (None, {"kind": "model", "shapes": [BOX]})], {}),
     ):
-        with pytest.raises(MissingLayer, match=r"model://house/walls\.dae is not there: upload it") as caught:
+        with pytest.raises(MissingLayer, match=r"model://house/walls\.dae is missing: upload it") as caught:
             grid(layers(objects(*rows), **dict(more)), outside_free=False)
         assert "model://house/walls.dae" in caught.value.problems[0].problem
     with pytest.raises(MissingLayer, match=r"known to have a body.*walls\.dae"):
@@ -520,7 +520,7 @@ def test_what_keeps_a_world_from_being_a_grid_is_told() -> None:
         (shapely.Point(0, 0), {"kind": "include"}),
         (None, {"kind": "model", "shapes": [{"type": "mesh", "file": "a.dae"}]}),
     ]
-    with pytest.raises(MissingLayer, match=r"cannot be read: the file a\.dae is not there: upload it"):
+    with pytest.raises(MissingLayer, match=r"cannot be read: the file a\.dae is missing: upload it"):
         grid(layers(objects(*rows)))
 
 

@@ -317,7 +317,7 @@ def test_which_grid_and_levels() -> None:
     parts[PartKey("occupancy", "L2", "second")] = g
     with pytest.raises(Ambiguous, match="only, second"):
         occupancy_to_objects(Layers(dict(parts), levels=layers.levels), Parameters(), DerivationNotes())
-    with pytest.raises(MissingLayer, match="masks alone tell no obstacles"):
+    with pytest.raises(MissingLayer, match="masks contain no obstacles"):
         occupancy_to_objects(Layers({PartKey("occupancy", "ground", "keepout"): g}), Parameters(), DerivationNotes())
 
 

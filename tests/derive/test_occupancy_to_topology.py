@@ -586,7 +586,7 @@ def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
         .items()
     )
     assert back.counts()["free"] == free
-    assert "taken as unknown" in notes.warnings[0].problem
+    assert "count as unknown" in notes.warnings[0].problem
 
     (picture,) = occupancy_to_imagery.occupancy_to_imagery(
         layers, occupancy_to_imagery.Parameters(), notes

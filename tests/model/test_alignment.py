@@ -1,4 +1,4 @@
-"""Maps laid onto others: known motions are found again."""
+"""Alignment of maps: known motions are found again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 
 
 def hall(resolution: float = 0.05, noise: float = 0.0) -> OccupancyGrid:
-    """A room 12 × 8 m with inner walls and pillars, no two sides alike."""
+    """Return a room of 12 × 8 m with inner walls and pillars, without symmetry."""
     cells = np.full((round(8 / resolution), round(12 / resolution)), FREE, np.uint8)
 
     def wall(x0: float, y0: float, x1: float, y1: float) -> None:
@@ -34,7 +34,7 @@ def hall(resolution: float = 0.05, noise: float = 0.0) -> OccupancyGrid:
 
 
 def away(fit: Fit, x: float, y: float, yaw: float) -> tuple[float, float]:
-    """(metres at the hall's middle, degrees) between a fit and a known motion."""
+    """Return (metres at the hall's middle, degrees) between a fit and a known motion."""
     middle = np.array([[3.0, 6.0]])
     computed, expected = fit.apply_to(middle), Fit(x, y, yaw, 0, 1).apply_to(middle)
     return float(np.linalg.norm(computed - expected)), abs(math.degrees(math.remainder(fit.yaw - yaw, 2 * math.pi)))
@@ -43,9 +43,9 @@ def away(fit: Fit, x: float, y: float, yaw: float) -> tuple[float, float]:
 @pytest.mark.parametrize(
     ("x", "y", "degrees"), [(0.0, 0.0, 0.0), (1.3, -2.7, 11.3), (-20.0, 4.0, -97.0), (3.0, 3.0, 179.0)]
 )
-def test_a_known_motion_is_found_again(x: float, y: float, degrees: float) -> None:
+def test_align_grids_finds_known_motion(x: float, y: float, degrees: float) -> None:
     onto = hall()
-    # What is moved is a coarser, damaged map of the hall, brought out of its place.
+    # the moved map is a coarser, damaged map of the hall
     out = Fit(x, y, math.radians(degrees), 0.0, 1.0)
     moving = out.move_grid(hall(0.1, noise=0.2))
     fit = alignment.align_grids(moving, onto)[0]
@@ -58,7 +58,7 @@ def test_a_known_motion_is_found_again(x: float, y: float, degrees: float) -> No
     assert np.array_equal(back.cells, moving.cells)
 
 
-def test_the_search_keeps_to_what_is_asked() -> None:
+def test_align_grids_keeps_to_angle_and_reach() -> None:
     onto = hall()
     moving = Fit(0.5, 0.0, math.radians(90), 0.0, 1.0).move_grid(hall())
     for fit in alignment.align_grids(moving, onto, angle=math.radians(20)):
@@ -73,7 +73,7 @@ def test_the_search_keeps_to_what_is_asked() -> None:
     assert all(f.score < 0.7 for f in fits)
 
 
-def test_of_equal_places_the_nearest_is_taken() -> None:
+def test_align_grids_prefers_nearest_of_equal_fits() -> None:
     cells = np.zeros((100, 100), np.uint8)
     cells[0:2], cells[-2:], cells[:, 0:2], cells[:, -2:] = (OCCUPIED,) * 4
     square = OccupancyGrid(cells, 0.1)
@@ -83,10 +83,10 @@ def test_of_equal_places_the_nearest_is_taken() -> None:
     assert len([f for f in fits if f.score > 0.95]) >= 4, "a square fits four ways"
 
 
-def test_grids_that_show_nothing_are_refused() -> None:
+def test_align_grids_rejects_grids_without_outline() -> None:
     nothing = OccupancyGrid(np.zeros((10, 10), np.uint8), 0.1)
     for a, b in ((nothing, hall()), (hall(), nothing)):
-        with pytest.raises(CannotConvert, match="0 occupied cells"):
+        with pytest.raises(CannotConvert, match="0 occupied border cells"):
             alignment.align_grids(a, b)
     solid = OccupancyGrid(np.full((40, 40), OCCUPIED, np.uint8), 0.1)
     assert alignment.align_grids(solid, solid)[0].score > 0.9
@@ -96,7 +96,7 @@ POINTS = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 5.0], [3.0, 8.0], [-4.0, 2.0]
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
-def test_points_by_least_squares(count: int) -> None:
+def test_align_points_minimises_squares(count: int) -> None:
     truth = Fit(5.0, -1.0, math.radians(33.0), 0, 1)
     fit, bad, scale = alignment.fit_pairs(np.stack([POINTS[:count], truth.apply_to(POINTS[:count])], axis=1))
     assert away(fit, truth.x, truth.y, truth.yaw) == pytest.approx((0, 0), abs=1e-9)
@@ -104,7 +104,7 @@ def test_points_by_least_squares(count: int) -> None:
     assert scale == pytest.approx(1.0)
 
 
-def test_wrong_pairs_are_left_out_and_told() -> None:
+def test_align_points_reports_wrong_pairs() -> None:
     truth = Fit(5.0, -1.0, math.radians(-120.0), 0, 1)
     targets = truth.apply_to(POINTS)
     targets[2] += (6.0, -3.0)
@@ -130,7 +130,7 @@ def test_wrong_pairs_are_left_out_and_told() -> None:
         np.full((2, 2, 2), 1e9), np.zeros((2, 3)), np.stack([POINTS, 3 * POINTS], axis=1),
     ],
 )  # fmt: skip
-def test_points_that_say_nothing(pairs: Any) -> None:
+def test_align_points_rejects_undetermined_pairs(pairs: Any) -> None:
     with pytest.raises(Invalid) as refused:
         alignment.fit_pairs(pairs)
     assert refused.value.problems[0].where == "pairs"

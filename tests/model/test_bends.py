@@ -1,4 +1,4 @@
-"""Bent edges become straight ones with nodes at the bends, and bent edges again."""
+"""Splitting bent edges into straight ones with nodes at the bends, and joining them again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KEY = PartKey("topology", GROUND, NETWORK)
 AT = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (10.0, 8.0)}
 DETOUR = [(2.0, 0.0), (2.0, 6.0), (7.0, 6.0), (10.0, 0.0)]
 HOUSE = shapely.box(3, -2, 6, 5)
-STRAIGHT = sorted(name for name, known in formats.all_formats().items() if known.traits.keeps_bends != "shape")
+STRAIGHT = sorted(name for name, fmt in formats.all_formats().items() if fmt.traits.keeps_bends != "shape")
 
 
 def network(*edges: tuple[str, str, str, list[tuple[float, float]]], **properties: Any) -> Layers:
@@ -38,7 +38,7 @@ def part_of(layers: Layers) -> Features:
 
 
 def edges(layers: Layers) -> dict[str, tuple[str, str, str]]:
-    """id -> source, target, shape."""
+    """Return id -> source, target, shape."""
     part = part_of(layers)
     rows = zip(part.ids, part.properties, part.geometry, strict=True)
     return {i: (p["source"], p["target"], g.wkt) for i, p, g in rows if p["kind"] == "edge"}
@@ -65,7 +65,7 @@ def test_both_directions_share_nodes_at_their_bends() -> None:
     assert edges(bends.join(straight)) == edges(both())
 
 
-def test_straight_networks_are_returned_unchanged() -> None:
+def test_split_returns_straight_networks_unchanged() -> None:
     plain = network(("a_b", "a", "b", []), ("b_c", "b", "c", []))
     assert bends.split(plain)[0] is plain
     assert bends.join(plain) is plain
@@ -83,8 +83,8 @@ def test_pieces_keep_properties_but_not_their_identity() -> None:
     )
 
 
-def test_names_stay_when_other_edges_are_closed() -> None:
-    """A robot that stands at a bend finds it again in a map without the other direction."""
+def test_bend_names_stay_when_other_edges_are_closed() -> None:
+    """A robot at a bend finds its node in a map without the other direction."""
     one_way = network(("b_a", "b", "a", DETOUR[2::-1]))
     nodes = {i for i, p in zip(part_of(one_way).ids, part_of(one_way).properties, strict=True) if p["kind"] == "node"}
     split = part_of(bends.split(one_way)[0])
@@ -104,14 +104,14 @@ def test_parallel_edges_get_nodes_of_their_own() -> None:
     assert edges(bends.join(straight)) == edges(layers)
 
 
-def test_an_edge_between_networks_and_one_to_nowhere_stay_whole() -> None:
+def test_edges_without_both_nodes_in_network_stay_unsplit() -> None:
     lost = network(("a_b", "a", "b", [(5.0, 5.0)]))
     part = part_of(lost)
     incomplete = Layers({KEY: part.select([k for k, i in enumerate(part.ids) if i != "b"])})
     assert bends.split(incomplete)[0] is incomplete
 
 
-def test_places_on_earth_bend_by_metres() -> None:
+def test_bends_on_earth_are_measured_in_metres() -> None:
     datum = Datum(53.2, -0.5)
     frame = Layers({}, datum).frame
     assert frame is not None
@@ -144,15 +144,15 @@ def test_edited_pieces_stay_pieces() -> None:
     assert bends.join(Layers({KEY: joined})).parts[KEY] is joined
 
 
-def test_formats_without_shapes_of_edges() -> None:
+def test_formats_with_straight_edges_are_listed() -> None:
     expected = ["ffr_network", "nav2_route", "navgraph", "openrmf", "prm", "rmf_nav_graph", "rmf_site"]
     expected += ["tmap", "tmap2"]
     assert expected == STRAIGHT
 
 
 @pytest.mark.parametrize("name", STRAIGHT)
-def test_no_written_edge_leads_through_a_house(name: str) -> None:
-    """Whoever drives straight from node to node goes around the house, and an upload gives the same way back."""
+def test_written_edges_avoid_house(name: str) -> None:
+    """Straight edges from node to node lead around the house, and an upload restores the bent edge."""
     fmt = formats.get_format(name)
     context = WriteContext()
     files = formats.write(fmt, both(), context)
@@ -172,11 +172,11 @@ def test_no_written_edge_leads_through_a_house(name: str) -> None:
 
 
 NAMED = [name for name in STRAIGHT if name != "prm" and formats.get_format(name).traits.keeps_bends == "nodes"]
-"""Formats with names of nodes, which bends have; prm has none."""
+"""Formats with node names, by which bends are recognised; prm has none."""
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_an_upload_of_what_was_written_has_its_bends(name: str) -> None:
+def test_upload_of_written_map_restores_bends(name: str) -> None:
     fmt = formats.get_format(name)
     files = formats.write(fmt, both(), WriteContext())
     again = part_of(formats.read(FileGroup(fmt, next(iter(files)), files), ReadContext()))

@@ -1,4 +1,4 @@
-"""The local frame: equal to PROJ's own tmerc, to geodesics near the datum, and back again, everywhere on earth."""
+"""Local frame: equal to PROJ's own tmerc and to geodesics near the datum, and reversible everywhere on earth."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def test_distance_and_surface_are_geodesic() -> None:
 
 
 def around(latitude: float, longitude: float, metres: list[float]) -> np.ndarray:
-    """Places in 24 directions at these distances, by geodesics: (longitude, latitude) float64 [n, 2]."""
+    """Return points in 24 directions at these distances, by geodesics: (longitude, latitude) float64 [n, 2]."""
     azimuth, distance = (a.ravel() for a in np.meshgrid(np.arange(0.0, 360.0, 15.0), metres))
     lon, lat, _ = WGS84.fwd(np.full(azimuth.shape, longitude), np.full(azimuth.shape, latitude), azimuth, distance)
     return np.stack([lon, lat], 1)
 
 
 def turned(xy: np.ndarray, heading: float) -> np.ndarray:
-    """East and north seen from axes whose y points ``heading`` degrees clockwise from north."""
+    """Rotate east and north to axes whose y points ``heading`` degrees clockwise from north."""
     h = math.radians(heading)
     ahead, right = np.array([math.sin(h), math.cos(h)]), np.array([math.cos(h), -math.sin(h)])
     return np.stack([xy @ right, xy @ ahead], 1)
@@ -64,7 +64,9 @@ def turned(xy: np.ndarray, heading: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("latitude", "longitude"), PLACES)
 @pytest.mark.parametrize("heading", [0.0, 30.0, -30.0, 90.0, 180.0, -277.7, 360.0])
-def test_equals_proj_and_comes_back_within_ten_kilometres(latitude: float, longitude: float, heading: float) -> None:
+def test_local_frame_equals_proj_and_round_trips_within_ten_kilometres(
+    latitude: float, longitude: float, heading: float
+) -> None:
     places = around(latitude, longitude, [0.0, 0.01, 1.0, 100.0, 1000.0, 10_000.0])
     frame = LocalFrame(Datum(latitude, longitude, 0.0, heading))
     crs = CRS.from_proj4(f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +x_0=0 +y_0=0 +datum=WGS84")
@@ -80,8 +82,8 @@ def test_equals_proj_and_comes_back_within_ten_kilometres(latitude: float, longi
 
 
 @pytest.mark.parametrize(("latitude", "longitude"), PLACES)
-def test_metres_are_those_on_the_ellipsoid(latitude: float, longitude: float) -> None:
-    """Independent of any projection: distance and direction from the datum as geodesics have them."""
+def test_local_metres_equal_geodesic_metres(latitude: float, longitude: float) -> None:
+    """Distance and direction from the datum equal those of geodesics, independent of any projection."""
     frame = LocalFrame(Datum(latitude, longitude))
     for metres, tolerance in ((1.0, 1e-8), (100.0, 1e-6), (1000.0, 1e-4), (10_000.0, 0.05)):
         azimuth = np.radians(np.arange(0.0, 360.0, 15.0))
@@ -91,7 +93,7 @@ def test_metres_are_those_on_the_ellipsoid(latitude: float, longitude: float) ->
         assert np.abs(local - expected).max() < tolerance
 
 
-def test_the_axes_point_where_they_should() -> None:
+def test_local_axes_follow_heading() -> None:
     north, east = np.array([[0.1, 53.001]]), np.array([[0.1015, 53.0]])
     plain = LocalFrame(Datum(53.0, 0.1))
     assert plain.to_local(north)[0, 1] > 100
@@ -103,7 +105,7 @@ def test_the_axes_point_where_they_should() -> None:
 
 @pytest.mark.parametrize("heading", [0.0, 45.0, -90.0, 213.0])
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5, math.pi])
-def test_a_yaw_is_a_heading_on_earth(heading: float, yaw: float) -> None:
+def test_yaw_converts_to_heading(heading: float, yaw: float) -> None:
     frame = LocalFrame(Datum(53.0, 0.1, 0.0, heading))
     (start, end) = frame.to_wgs84(np.array([[0.0, 0.0], [math.cos(yaw), math.sin(yaw)]]))
     azimuth, _, _ = WGS84.inv(*start, *end)
@@ -111,7 +113,7 @@ def test_a_yaw_is_a_heading_on_earth(heading: float, yaw: float) -> None:
     assert 0 <= frame.yaw_to_heading(yaw) < 360
 
 
-def test_across_the_antimeridian_places_stay_neighbours() -> None:
+def test_points_across_antimeridian_stay_neighbours() -> None:
     for longitude, other in ((179.9999, -179.9999), (-179.9999, 179.9999), (180.0, -179.9998), (-180.0, 179.9998)):
         frame = LocalFrame(Datum(-16.8, longitude))
         x, y = frame.to_local(np.array([[other, -16.8]]))[0]
@@ -124,13 +126,13 @@ def test_across_the_antimeridian_places_stay_neighbours() -> None:
 
 @given(DATUMS, st.floats(-10_000, 10_000), st.floats(-10_000, 10_000))
 @settings(max_examples=300, deadline=None)
-def test_any_local_place_comes_back(datum: Datum, x: float, y: float) -> None:
+def test_any_local_point_round_trips(datum: Datum, x: float, y: float) -> None:
     frame = local_frame(datum)
     lonlat = frame.to_wgs84(np.array([[x, y]]))
     assert np.abs(frame.to_local(lonlat) - [x, y]).max() < 1e-6
 
 
-def test_heights_pass_through_and_inputs_stay() -> None:
+def test_heights_pass_through_and_inputs_stay_unchanged() -> None:
     frame = LocalFrame(Datum(53.0, 0.1, 40.0, 10.0))
     given_places = np.array([[0.1, 53.0, 7.5], [0.2, 53.1, -3.0]])
     original = given_places.copy()
@@ -142,18 +144,18 @@ def test_heights_pass_through_and_inputs_stay() -> None:
 
 
 @pytest.mark.parametrize("far", [(100.0, 10.0), (90.0, 0.0), (-179.9, -53.0), (0.0, -90.0)])
-def test_a_place_round_the_globe_is_refused_and_named(far: tuple[float, float]) -> None:
+def test_geometry_too_far_from_datum_is_rejected_by_name(far: tuple[float, float]) -> None:
     frame = LocalFrame(Datum(53.0, 0.0))
     near = shapely.Point(0.0, 53.0)
     with pytest.raises(Invalid, match=f"{far[1]:g}, {far[0]:g}"):
         features([("a", near, {}), ("b", shapely.LineString([near, far]), {})], "wgs84").in_local(frame)
 
 
-def test_places_alone_may_come_out_infinite() -> None:
+def test_to_local_returns_infinite_points_without_error() -> None:
     assert np.isinf(LocalFrame(Datum(53.0, 0.0)).to_local(np.array([[90.0, 0.0]]))).all()
 
 
-def test_frames_are_kept() -> None:
+def test_local_frames_are_cached() -> None:
     assert local_frame(Datum(1.0, 2.0)) is local_frame(Datum(1.0, 2.0))
     assert local_frame(Datum(1.0, 2.0)) is not local_frame(Datum(1.0, 2.0, 0.0, 1.0))
 
@@ -176,7 +178,7 @@ def mixed() -> list[shapely.Geometry]:
     ]
 
 
-def test_geometries_of_all_kinds_at_once() -> None:
+def test_geometries_of_all_types_are_converted_together() -> None:
     frame = LocalFrame(Datum(53.0, 0.1, 0.0, 25.0))
     drawn = mixed()
     earth = features([(str(k), g, {}) for k, g in enumerate(drawn)], "wgs84")
@@ -196,7 +198,7 @@ def test_geometries_of_all_kinds_at_once() -> None:
     assert [g.wkb for g in earth.geometry] == [g.wkb for g in drawn]
 
 
-def test_only_what_is_anchored_otherwise_moves() -> None:
+def test_only_items_with_other_anchor_are_converted() -> None:
     frame = LocalFrame(Datum(53.0, 0.1))
     local_items = features([("a", shapely.Point(3.0, 4.0), {})], "local")
     earth = features([("b", shapely.Point(0.1, 53.0), {}), ("c", shapely.Point(0.1, 53.001, 9.0), {})], "wgs84")
@@ -213,6 +215,6 @@ def test_only_what_is_anchored_otherwise_moves() -> None:
     assert both.needs_datum
     assert not local_items.needs_datum
     assert local_items.in_local(None)[0] is local_items.geometry[0]
-    for ask in (both.in_local, both.in_wgs84, local_items.in_wgs84, earth.in_local):
+    for convert in (both.in_local, both.in_wgs84, local_items.in_wgs84, earth.in_local):
         with pytest.raises(MissingDatum, match="datum"):
-            ask(None)
+            convert(None)

@@ -1,4 +1,4 @@
-"""Pictures: what screens show of them, and the same place on another grid, against PROJ pixel by pixel."""
+"""Images: display, and resampling to another grid, compared with PROJ pixel by pixel."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from app.model.imagery import GeoImage, display_pixels, pixel_positions
 from app.model.resampling import resample, to_wgs84
 
 UTM = "EPSG:32630"
-HERE = Datum(53.2686, -0.5245)
+DATUM = Datum(53.2686, -0.5245)
 EAST, NORTH = 665050.0, 5904950.0
-"""A place near the datum in UTM zone 30."""
+"""A point near the datum in UTM zone 30."""
 
 
 def numbered(shape: tuple[int, int] = (60, 80), crs: str = UTM, transform: Any = None, **properties: Any) -> GeoImage:
-    """Every pixel another number."""
+    """Return an image in which every pixel has another number."""
     values = np.arange(shape[0] * shape[1], dtype=np.int32).reshape(*shape, 1) + 1
     return GeoImage(values, transform or (0.5, 0.0, EAST, 0.0, -0.5, NORTH), crs, properties)
 
 
 def truth(image: GeoImage, source: GeoImage, to_source: Any) -> tuple[np.ndarray, np.ndarray]:
-    """For every pixel of the result: the value that stands there by PROJ alone, and how near to a pixel's edge."""
+    """Return each result pixel's value at its position by PROJ alone, and its distance to a pixel's edge."""
     height, width = image.pixels.shape[:2]
     rows, columns = (v.ravel() + 0.5 for v in np.mgrid[0:height, 0:width])
     places = to_source(pixel_positions(image.transform, columns, rows))
@@ -45,18 +45,18 @@ def truth(image: GeoImage, source: GeoImage, to_source: Any) -> tuple[np.ndarray
 
 @pytest.mark.parametrize("heading", [0.0, 33.0, -120.0])
 @pytest.mark.parametrize("transform", [None, (0.4, 0.3, EAST, 0.3, -0.4, NORTH)], ids=["upright", "turned"])
-def test_every_pixel_stands_where_proj_says(heading: float, transform: Any) -> None:
+def test_resampled_pixels_are_where_proj_puts_them(heading: float, transform: Any) -> None:
     source = numbered(transform=transform, nodata=0)
-    frame = local_frame(Datum(HERE.latitude, HERE.longitude, heading=heading))
+    frame = local_frame(Datum(DATUM.latitude, DATUM.longitude, heading=heading))
     image = resample(source, frame, method="nearest")
     earth = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
     tmerc = Transformer.from_crs(
-        f"+proj=tmerc +lat_0={HERE.latitude} +lon_0={HERE.longitude} +k=1 +ellps=WGS84", "EPSG:4326", always_xy=True
+        f"+proj=tmerc +lat_0={DATUM.latitude} +lon_0={DATUM.longitude} +k=1 +ellps=WGS84", "EPSG:4326", always_xy=True
     )
     turn = math.radians(heading)
 
     def to_source(xy: np.ndarray) -> np.ndarray:
-        # Written out again: local y points to the heading, clockwise from north.
+        # computed independently: local y points to the heading, clockwise from north
         east = xy[:, 0] * math.cos(turn) + xy[:, 1] * math.sin(turn)
         north = xy[:, 1] * math.cos(turn) - xy[:, 0] * math.sin(turn)
         return np.column_stack(earth.transform(*tmerc.transform(east, north)))
@@ -66,7 +66,7 @@ def test_every_pixel_stands_where_proj_says(heading: float, transform: Any) -> N
     assert sure.mean() > 0.9
     assert np.array_equal(image.pixels[..., 0][sure], expected[sure])
     assert image.crs == "local"
-    # The corners to the millimetre: the result's outline holds the source's corners, and no more than a pixel beyond.
+    # corners to the millimetre: the outline contains the source's corners, and no more than a pixel beyond
     corners = local_frame(frame.datum).to_local(
         np.column_stack(earth.transform(*source.outline().T, direction="INVERSE"))
     )
@@ -81,7 +81,7 @@ def test_every_pixel_stands_where_proj_says(heading: float, transform: Any) -> N
     assert abs(f / a - round(f / a)) < 1e-6
 
 
-def test_degrees_and_back() -> None:
+def test_resample_to_degrees_round_trips() -> None:
     source = numbered(nodata=0)
     image = to_wgs84(source, method="nearest", resolution=2e-6)
     forth = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
@@ -91,12 +91,12 @@ def test_degrees_and_back() -> None:
     assert set(np.unique(image.pixels)) >= set(range(1, 4801)), "at this resolution no pixel is missed"
 
 
-def test_a_plane_stays_a_plane() -> None:
-    """Heights that rise evenly: between pixels they are what the plane says, to a millimetre."""
+def test_resampled_plane_stays_plane() -> None:
+    """On a plane of heights, values between pixels equal the plane to a millimetre."""
     rows, columns = np.mgrid[0:60, 0:80] + 0.5
     heights = (0.25 * columns - 0.125 * rows)[..., None]
     source = GeoImage(heights, (0.5, 0.0, EAST, 0.0, -0.5, NORTH), UTM)
-    frame = local_frame(HERE)
+    frame = local_frame(DATUM)
     image = resample(source, frame)
     assert image.properties["nodata"] == "nan"
     v, u = np.nonzero(np.isfinite(image.pixels[..., 0]))
@@ -110,9 +110,9 @@ def test_a_plane_stays_a_plane() -> None:
 
 
 @pytest.mark.parametrize(("kind", "band"), [(np.uint8, "alpha"), (np.uint16, "mask"), (np.int8, "mask")])
-def test_outside_is_said_by_a_further_band(kind: Any, band: str) -> None:
+def test_resampled_image_marks_outside_by_extra_band(kind: Any, band: str) -> None:
     source = GeoImage(np.full((40, 40, 3), 100, kind), (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM)
-    image = resample(source, local_frame(HERE))
+    image = resample(source, local_frame(DATUM))
     assert image.colours == ("red", "green", "blue", band)
     opaque = image.pixels[..., 3] != 0
     assert 0.4 < opaque.mean() < 0.6, "half of the box around a turned square"
@@ -120,13 +120,13 @@ def test_outside_is_said_by_a_further_band(kind: Any, band: str) -> None:
     assert display_pixels(image)[..., 3].tolist() == np.where(opaque, 255, 0).tolist() or band == "alpha"
 
 
-def test_what_lies_right_is_left_alone() -> None:
+def test_resample_returns_image_on_target_grid_unchanged() -> None:
     plan = numbered(crs="local")
     assert resample(plan) is plan
     assert resample(numbered(), crs=UTM).crs == UTM
 
 
-def test_a_turned_plan_is_set_upright_without_a_datum() -> None:
+def test_rotated_plan_is_resampled_without_datum() -> None:
     plan = numbered((40, 40), "local", (0.0, 0.5, 0.0, 0.5, 0.0, 0.0), nodata=0)
     image = resample(plan, method="nearest")
     # x runs along the rows, y along the columns: transposed, and upside down since rows run down.
@@ -134,24 +134,24 @@ def test_a_turned_plan_is_set_upright_without_a_datum() -> None:
     assert np.array_equal(image.pixels[..., 0], plan.pixels[..., 0].T[::-1])
 
 
-def test_palettes_are_never_mixed() -> None:
+def test_resample_never_mixes_palette_values() -> None:
     values = (np.arange(1600).reshape(40, 40, 1) % 2 * 200).astype(np.uint8)
     properties = {"bands": [{"colour": "palette"}], "palette": [[k, 0, 0, 255] for k in range(256)], "nodata": 7}
-    image = resample(GeoImage(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(HERE))
+    image = resample(GeoImage(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(DATUM))
     assert set(np.unique(image.pixels)) == {0, 7, 200}
 
 
-def test_what_cannot_be_is_said() -> None:
+def test_resample_rejects_impossible_targets() -> None:
     with pytest.raises(MissingDatum, match="datum"):
         resample(numbered())
     with pytest.raises(MissingDatum, match="datum"):
         to_wgs84(numbered(crs="local"))
     with pytest.raises(Invalid, match="coarser"):
-        resample(numbered(), local_frame(HERE), resolution=1e-4)
-    with pytest.raises(Invalid, match="cannot say"):
+        resample(numbered(), local_frame(DATUM), resolution=1e-4)
+    with pytest.raises(Invalid, match="beyond the target"):
         resample(numbered(), local_frame(Datum(-53.0, 179.0)))
-    with pytest.raises(Invalid, match="no way"):
-        resample(numbered(crs="EPSG:99999"), local_frame(HERE))
+    with pytest.raises(Invalid, match="cannot convert"):
+        resample(numbered(crs="EPSG:99999"), local_frame(DATUM))
 
 
 # --- displayed ----------------------------------------------------------------------------------------------------
@@ -163,13 +163,13 @@ def shown(values: Any, kind: Any = np.uint8, **properties: Any) -> list[Any]:
     return display_pixels(GeoImage(pixels, SQUARE, "local", properties)).tolist()
 
 
-def test_bytes_are_shown_as_they_are() -> None:
+def test_displayed_bytes_are_unchanged() -> None:
     for bands in (1, 2, 3, 4):
         pixels = np.random.default_rng(bands).integers(0, 255, (700, 900, bands), dtype=np.uint8)
         assert np.array_equal(display_pixels(GeoImage(pixels, SQUARE)), pixels)
 
 
-def test_other_types_are_stretched() -> None:
+def test_displayed_values_of_other_types_are_stretched() -> None:
     assert shown([[[100], [300]], [[200], [300]]], np.uint16) == [[[0], [255]], [[128], [255]]]
     assert shown([[[-1.0], [1.0]]], np.float32) == [[[0, 255], [255, 255]]]
     assert shown([[[5.0], [np.nan]]], np.float64) == [[[0, 255], [0, 0]]]
@@ -178,14 +178,14 @@ def test_other_types_are_stretched() -> None:
     assert shown([[[True], [False]]], bool) == [[[255], [0]]]
 
 
-def test_no_data_and_masks_are_transparent() -> None:
+def test_displayed_no_data_and_masks_are_transparent() -> None:
     assert shown([[[7, 7, 7], [7, 7, 8]]], nodata=7) == [[[7, 7, 7, 0], [7, 7, 8, 255]]]
     bands = [{"colour": "gray"}, {"colour": "mask"}]
     assert shown([[[9, 1], [8, 0]]], bands=bands) == [[[9, 255], [8, 0]]]
     assert shown([[[9, 65535], [9, 0]]], np.uint16) == [[[0, 255], [0, 0]]]
 
 
-def test_of_many_bands_the_colours_are_shown() -> None:
+def test_displayed_image_uses_colour_bands() -> None:
     bands = [{"colour": c} for c in ("undefined", "blue", "green", "red", "undefined")]
     assert shown([[[1, 2, 3, 4, 5]]], bands=bands) == [[[4, 3, 2]]]
     assert shown([[[1, 2, 3, 4, 5]]]) == [[[1]]]

@@ -1,4 +1,4 @@
-"""The canonical values refuse what no map may hold, and cannot be changed once made."""
+"""Canonical values: invalid ones are rejected, and they are immutable."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def at(*coordinates: float) -> Features:
         ("heading", [NAN, INF, 361.0, -361.0]),
     ],
 )
-def test_a_datum_is_a_place_on_earth(name: str, values: list[Any]) -> None:
+def test_datum_must_be_on_earth(name: str, values: list[Any]) -> None:
     good = {"latitude": 53.0, "longitude": 0.1, "altitude": 0.0, "heading": 0.0}
     for value in values:
         with pytest.raises(Invalid, match=name):
@@ -71,12 +71,12 @@ def test_equal_datums_are_equal() -> None:
 @pytest.mark.parametrize(
     ("name", "elevation"), [("", 0), ("a\nb", 0), ("x" * 257, 0), ("a", NAN), ("a", INF), ("a", 1e8)]
 )
-def test_a_level_has_a_name_and_a_height(name: str, elevation: float) -> None:
+def test_level_requires_name_and_elevation(name: str, elevation: float) -> None:
     with pytest.raises(Invalid):
         Level(name, elevation)
 
 
-def test_levels_are_joined_by_name() -> None:
+def test_levels_are_merged_by_name() -> None:
     joined = join_levels([Level(), Level("L2", 3.0)], [Level("L1", -2.5), Level("L2", 4.0)])
     assert [(level.name, level.elevation) for level in joined] == [("L1", -2.5), ("ground", 0.0), ("L2", 4.0)]
 
@@ -86,25 +86,25 @@ def test_levels_are_joined_by_name() -> None:
     "coordinates",
     [(NAN, 1), (1, NAN), (INF, 1), (181, 1), (-180.001, 1), (1, 90.001), (1, -91), (1, 1, INF), (1, 1, 1e8)],
 )
-def test_places_on_earth_are_in_range(coordinates: tuple[float, ...]) -> None:
+def test_degrees_must_be_in_range(coordinates: tuple[float, ...]) -> None:
     with pytest.raises(Invalid) as error:
         at(*coordinates)
     assert error.value.problems[0].where == "a"
 
 
 @pytest.mark.parametrize("coordinates", [(180, 90), (-180, -90), (0, 0), (1, 1, -MAX_METRES)])
-def test_the_edges_of_the_earth_are_places(coordinates: tuple[float, ...]) -> None:
+def test_extreme_degrees_are_accepted(coordinates: tuple[float, ...]) -> None:
     assert len(at(*coordinates)) == 1
 
 
 @pytest.mark.parametrize("coordinates", [(NAN, 0), (0, INF), (1.0001e7, 0), (0, -1.0001e7), (0, 0, INF)])
-def test_metres_are_in_range(coordinates: tuple[float, ...]) -> None:
+def test_metres_must_be_in_range(coordinates: tuple[float, ...]) -> None:
     with pytest.raises(Invalid, match="metres"):
         features([("a", shapely.Point(*coordinates), {})], "local")
     features([("a", shapely.Point(500, 300), {})], "local")
 
 
-def test_the_bad_one_of_many_is_named() -> None:
+def test_invalid_feature_of_many_is_named() -> None:
     line = shapely.LineString([(0, 0), (1, 1)])
     bad = shapely.LineString([(0, 0), (1, INF)])
     with pytest.raises(Invalid, match="'third'"):
@@ -114,14 +114,14 @@ def test_the_bad_one_of_many_is_named() -> None:
         features([("a", line, {}), ("b", nested, {})], "wgs84")
 
 
-def test_the_bad_one_of_very_many_is_named() -> None:
+def test_invalid_feature_of_very_many_is_named() -> None:
     at = np.zeros((70_000, 2))
     at[66_000] = (2e7, 0)
     with pytest.raises(Invalid, match="'i66000' has the coordinates"):
         from_columns([f"i{k}" for k in range(len(at))], points(at), [{}] * len(at), "local")
 
 
-def test_copies_of_a_pattern_are_usual_mappings_that_take_less_memory() -> None:
+def test_shared_key_dicts_are_ordinary_dicts_with_less_memory() -> None:
     pattern = shared_key_dict("kind", "source", "target")
     one, two = pattern.copy(), pattern.copy()
     one["kind"], one["source"], one["target"] = "edge", "a", "b"
@@ -134,13 +134,13 @@ def test_copies_of_a_pattern_are_usual_mappings_that_take_less_memory() -> None:
     assert "more" not in pattern.copy()
 
 
-def test_flat_and_high_geometries_may_be_mixed() -> None:
+def test_2d_and_3d_geometries_may_be_mixed() -> None:
     both = features([("a", shapely.Point(1, 1), {}), ("b", shapely.Point(1, 1, 5), {}), ("c", None, {})], "wgs84")
     assert [g.has_z for g in both.geometry] == [False, True, False]
 
 
 @pytest.mark.parametrize("name", ["", "x" * (MAX_ID + 1), "a\nb", "a\x00", "\x85", "\u2028", "\ud800"])
-def test_an_id_fits_one_line(name: str) -> None:
+def test_id_must_fit_one_line(name: str) -> None:
     with pytest.raises(Invalid):
         features([(name, shapely.Point(0, 0), {})], "local")
     with pytest.raises(Invalid):
@@ -150,13 +150,13 @@ def test_an_id_fits_one_line(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["a b", "n-12", "größe", "北門", "全角\u3000空白", "nb\xa0sp", "zero\u200bwidth", "👩\u200d🌾", "\u202eabc"]
 )
-def test_real_names_are_ids(name: str) -> None:
+def test_real_names_are_valid_ids(name: str) -> None:
     assert features([(name, shapely.Point(0, 0), {})], "local").ids == (name,)
     assert PartKey("objects", name, name).name == name
     assert is_writable(name)
 
 
-def test_ids_are_distinct() -> None:
+def test_ids_must_be_distinct() -> None:
     with pytest.raises(Invalid, match="'a'"):
         features([("a", None, {}), ("b", None, {}), ("a", None, {})], "local")
     one = features([("a", None, {})], "local")
@@ -165,7 +165,7 @@ def test_ids_are_distinct() -> None:
     assert unique_ids(["a", "b", "a", "a", "a#2", "c"], {"c"}) == ["a", "b", "a#2", "a#3", "a#2#2", "c#2"]
 
 
-def test_columns_have_one_length_and_type() -> None:
+def test_feature_columns_must_have_equal_length_and_type() -> None:
     geometry = points(np.zeros((2, 2)))
     local = np.ones(2, bool)
     with pytest.raises(ValueError, match="columns differ"):
@@ -176,7 +176,7 @@ def test_columns_have_one_length_and_type() -> None:
         Features(("a", "b"), np.array([geometry[0], None], object), ({}, {}), local)
 
 
-def test_features_cannot_be_changed() -> None:
+def test_features_are_immutable() -> None:
     one = from_columns(["a", "b"], points(np.zeros((2, 2))), [{"kind": "node"}, {}], "local")
     with pytest.raises(ValueError, match="read-only"):
         one.geometry[0] = NO_GEOMETRY
@@ -186,7 +186,7 @@ def test_features_cannot_be_changed() -> None:
         one.ids = ()  # type: ignore[misc]
 
 
-def test_parts_of_a_collection() -> None:
+def test_features_select_and_concatenate() -> None:
     rows = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", None, {"kind": "edge"}), ("c", None, {})]
     collection = features(rows, "local", {"x": {"name": "n"}})
     assert collection.select_kinds("node", "edge").ids == ("a", "b")
@@ -216,13 +216,13 @@ def test_parts_of_a_collection() -> None:
         np.zeros((2, 0), np.uint8),
     ],
 )
-def test_cells_are_bytes_in_rows(cells: Any) -> None:
+def test_grid_cells_must_be_rows_of_bytes(cells: Any) -> None:
     with pytest.raises(Invalid, match="uint8"):
         OccupancyGrid(cells, 0.05)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (2000, 700)])
-def test_cells_are_0_to_100_or_unknown(shape: tuple[int, int]) -> None:
+def test_grid_cells_must_be_0_to_100_or_unknown(shape: tuple[int, int]) -> None:
     for value in range(256):
         cells = np.zeros(shape, np.uint8)
         cells[-1, -1] = value
@@ -244,12 +244,12 @@ def test_cells_are_0_to_100_or_unknown(shape: tuple[int, int]) -> None:
         {"mode": ""},
     ],
 )
-def test_a_grid_lies_somewhere(bad: dict[str, Any]) -> None:
+def test_grid_requires_valid_origin_and_resolution(bad: dict[str, Any]) -> None:
     with pytest.raises(Invalid):
         OccupancyGrid(**{"cells": CELLS.copy(), "resolution": 0.05, **bad})
 
 
-def test_a_grid_counts_and_lies() -> None:
+def test_grid_counts_cells_and_returns_corners() -> None:
     cells = np.array([[0, 100, 255], [50, 100, 255]], np.uint8)
     grid = OccupancyGrid(cells, 0.5, (1.0, 2.0, math.pi / 2))
     assert grid.counts() == {"occupied": 2, "free": 1, "unknown": 2, "other": 1}
@@ -296,12 +296,12 @@ def voxels(**other: Any) -> VoxelMap:
         {"colour": np.zeros((2, 3), np.float32)},
     ],
 )
-def test_voxels_lie_in_the_tree(bad: dict[str, Any]) -> None:
+def test_voxels_must_be_inside_tree(bad: dict[str, Any]) -> None:
     with pytest.raises((Invalid, ValueError)):
         voxels(**bad)
 
 
-def test_where_voxels_lie() -> None:
+def test_voxel_positions_and_bounds() -> None:
     axes = [np.array([-32768, -1, 0, 1, 12345, 32767])] * 3
     x, y, z = axes[0], axes[1][::-1], axes[2] * 0 + 7
     code = morton(x, y, z)
@@ -320,7 +320,7 @@ def test_where_voxels_lie() -> None:
     assert big.place.tolist() == [0, 7 * 8**15]
 
 
-def test_voxels_cannot_be_changed() -> None:
+def test_voxels_are_immutable() -> None:
     voxel_map = voxels(colour=np.zeros((2, 3), np.uint8))
     assert voxel_map.colour is not None
     for column in (voxel_map.depth, voxel_map.code, voxel_map.log_odds, voxel_map.colour):
@@ -344,7 +344,7 @@ def test_voxels_cannot_be_changed() -> None:
         {"crs": ""},
     ],
 )
-def test_a_picture_lies_somewhere(bad: dict[str, Any]) -> None:
+def test_image_requires_valid_transform_and_crs(bad: dict[str, Any]) -> None:
     good: dict[str, Any] = {"pixels": np.zeros((2, 3, 1), np.uint8), "transform": (1, 0, 0, 0, -1, 0)}
     GeoImage(**good)
     with pytest.raises(Invalid):
@@ -352,8 +352,8 @@ def test_a_picture_lies_somewhere(bad: dict[str, Any]) -> None:
 
 
 # --- all together -------------------------------------------------------------------------------------------------
-def test_part_keys() -> None:
-    with pytest.raises(Invalid, match="no layer"):
+def test_part_keys_are_checked() -> None:
+    with pytest.raises(Invalid, match="unknown layer"):
         PartKey("roads")  # type: ignore[arg-type]
     for level, name in (("", "a"), ("a", ""), ("x" * 257, "a"), ("a\tb", "a"), ("a", "b\x7f")):
         with pytest.raises(Invalid):
@@ -363,7 +363,7 @@ def test_part_keys() -> None:
     assert set(PART_TYPES) == set(LAYERS)
 
 
-def test_layers_hold_what_their_keys_say() -> None:
+def test_layers_require_part_types_of_their_keys() -> None:
     grid, network = OccupancyGrid(CELLS.copy(), 0.1), features([("n", shapely.Point(0, 0), {})], "local")
     with pytest.raises(ValueError, match="Features"):
         Layers({PartKey("topology"): grid})

@@ -1,4 +1,4 @@
-"""Lines become a network: where they join, which way they go, what nodes and edges are called."""
+"""Networks from lines: joins, directions, and names of nodes and edges."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def both(*pairs: tuple[str, str]) -> set[tuple[str, str]]:
     return {*pairs, *((b, a) for a, b in pairs)}
 
 
-def test_a_segment_is_two_edges_and_each_end_a_node() -> None:
+def test_segment_becomes_two_edges_and_two_nodes() -> None:
     network = from_drawing(drawing(a=line((0, 0), (3, 4), (6, 4))))
     assert nodes(network) == {"a/0": (0, 0), "a/1": (3, 4), "a/2": (6, 4)}
     assert edges(network) == both(("a/0", "a/1"), ("a/1", "a/2"))
@@ -54,7 +54,7 @@ def test_a_segment_is_two_edges_and_each_end_a_node() -> None:
 
 
 @pytest.mark.parametrize(
-    ("says", "expected"),
+    ("value", "expected"),
     [
         ("yes", "forward"),
         ("TRUE", "forward"),
@@ -68,20 +68,20 @@ def test_a_segment_is_two_edges_and_each_end_a_node() -> None:
         (None, "both"),
     ],
 )
-def test_oneway_wherever_a_format_keeps_it(says: Any, expected: str) -> None:
-    assert direction({"oneway": says}) == expected
-    assert direction({"kml": {"data": {"oneway": says}}}) == expected
-    assert direction({"kml": {"data": [{"name": "oneway", "value": says}]}}) == expected
+def test_oneway_is_found_at_any_depth(value: Any, expected: str) -> None:
+    assert direction({"oneway": value}) == expected
+    assert direction({"kml": {"data": {"oneway": value}}}) == expected
+    assert direction({"kml": {"data": [{"name": "oneway", "value": value}]}}) == expected
 
 
-def test_oneway_binds_the_edges() -> None:
+def test_oneway_line_has_edges_in_one_direction() -> None:
     network = from_drawing(
         drawing(a=(line((0, 0), (1, 0)), {"oneway": "yes"}), b=(line((5, 0), (6, 0)), {"oneway": "-1"}))
     )
     assert edges(network) == {("a/0", "a/1"), ("b/1", "b/0")}
 
 
-def test_near_vertices_are_one_node_at_the_first_place() -> None:
+def test_near_vertices_join_at_first_position() -> None:
     network = from_drawing(
         drawing(a=line((0, 0), (10, 0)), b=line((10.06, 0.05), (20, 0)), c=line((10.2, 0), (10.2, 5)))
     )
@@ -89,7 +89,7 @@ def test_near_vertices_are_one_node_at_the_first_place() -> None:
     assert ("a/1", "c/0") in edges(network), "c starts on b's segment"
 
 
-def test_a_dense_line_does_not_shrink_to_a_node() -> None:
+def test_dense_line_does_not_shrink_to_node() -> None:
     x = np.arange(0, 10, 0.01)
     network = from_drawing(drawing(a=shapely.linestrings(np.column_stack([x, 0 * x]))))
     at = sorted(p[0] for p in nodes(network).values())
@@ -98,17 +98,17 @@ def test_a_dense_line_does_not_shrink_to_a_node() -> None:
     assert shapely.union_all([f.geometry for f in network]).length == pytest.approx(9.99, abs=0.11)
 
 
-def test_crossing_lines_do_not_join_but_an_end_on_a_line_does() -> None:
+def test_lines_join_at_end_on_line_but_not_at_crossing() -> None:
     network = from_drawing(drawing(a=line((0, 0), (10, 0)), bridge=line((5, -5), (5, 5)), t=line((2, 0.05), (2, 9))))
     assert edges(network) == both(("a/0", "t/0"), ("t/0", "a/1"), ("bridge/0", "bridge/1"), ("t/0", "t/1"))
 
 
-def test_a_ring_closes() -> None:
+def test_ring_becomes_closed_path() -> None:
     network = from_drawing(drawing(r=line((0, 0), (1, 0), (1, 1), (0, 0))))
     assert edges(network) == both(("r/0", "r/1"), ("r/1", "r/2"), ("r/2", "r/0"))
 
 
-def test_collections_and_outlines() -> None:
+def test_collections_and_outlines_become_edges() -> None:
     square = shapely.Polygon([(0, 0), (4, 0), (4, 4), (0, 4)], [[(1, 1), (2, 1), (2, 2)]])
     mixed = shapely.GeometryCollection([shapely.MultiLineString([line((9, 9), (9, 8)), line((9, 8), (7, 7))]), square])
     assert len(edges(from_drawing(drawing(m=mixed)))) == 4
@@ -118,12 +118,12 @@ def test_collections_and_outlines() -> None:
     assert not len(from_drawing(drawing(p=square)))
 
 
-def test_points_of_interest_are_nodes_and_keep_what_they_say() -> None:
-    says = {"name": "Dock", "orientation": [0, 0, 0, 1], "tmap2": {"verts": []}}
+def test_points_of_interest_become_nodes_with_their_properties() -> None:
+    properties = {"name": "Dock", "orientation": [0, 0, 0, 1], "tmap2": {"verts": []}}
     network = from_drawing(
         drawing(
             a=line((0, 0), (10, 0), (20, 0)),
-            dock=(shapely.Point(10.04, 0), says),
+            dock=(shapely.Point(10.04, 0), properties),
             gate=shapely.Point(15, 0.02),
             far=shapely.Point(99, 99),
         )
@@ -131,15 +131,15 @@ def test_points_of_interest_are_nodes_and_keep_what_they_say() -> None:
     assert nodes(network) == {"dock": (10.04, 0), "gate": (15, 0.02), "far": (99, 99), "a/0": (0, 0), "a/2": (20, 0)}
     assert edges(network) == both(("a/0", "dock"), ("dock", "gate"), ("gate", "a/2"))
     dock = next(f for f in network if f.id == "dock")
-    assert dock.properties == {**says, "kind": "node", "drawn_from": "dock"}
+    assert dock.properties == {**properties, "kind": "node", "drawn_from": "dock"}
 
 
-def test_two_points_of_interest_never_melt_into_one() -> None:
+def test_points_of_interest_never_join() -> None:
     network = from_drawing(drawing(p=shapely.Point(0, 0), q=shapely.Point(0.01, 0), a=line((0.02, 0), (5, 0))))
     assert set(nodes(network)) == {"p", "q", "a/1"}
 
 
-def test_edges_take_over_what_robots_need() -> None:
+def test_edges_inherit_properties_for_robots() -> None:
     network = from_drawing(drawing(a=(line((0, 0), (1, 0)), {"speed_limit": 0.5, "action": "row", "colour": "red"})))
     edge = next(f for f in network if f.properties["kind"] == "edge")
     assert edge.properties["speed_limit"] == 0.5
@@ -147,7 +147,7 @@ def test_edges_take_over_what_robots_need() -> None:
     assert "colour" not in edge.properties
 
 
-def test_ids_stay_unique_and_short() -> None:
+def test_network_ids_stay_unique_and_short() -> None:
     long = "ä" * 512
     rows = [("a", line((0, 0), (1, 0)), {}), (long, line((5, 0), (6, 0)), {}), ("a/0", line((8, 8), (9, 9)), {})]
     poi = ("a/0_a/1", shapely.Point(50, 50), {"kind": "poi"})
@@ -157,14 +157,14 @@ def test_ids_stay_unique_and_short() -> None:
     assert edges(network) <= {(a, b) for a in nodes(network) for b in nodes(network)}
 
 
-def test_altitudes_are_kept() -> None:
+def test_network_keeps_altitudes() -> None:
     network = from_drawing(drawing(a=line((0, 0, 3), (1, 0, 4)), b=line((5, 5), (6, 6))))
     assert nodes(network) == {"a/0": (0, 0, 3), "a/1": (1, 0, 4), "b/0": (5, 5), "b/1": (6, 6)}
     assert next(f for f in network if f.id == "a/0_a/1").geometry.has_z
 
 
 @pytest.mark.parametrize("longitude", [5.0, 179.99999, -180.0])
-def test_on_earth_without_a_datum_metres_are_metres(longitude: float) -> None:
+def test_join_distance_is_in_metres_on_earth_without_datum(longitude: float) -> None:
     lat, lon = 53.0, longitude
     metre = 1 / 67_138.0  # degrees of longitude at 53° N
 
@@ -183,7 +183,7 @@ def test_on_earth_without_a_datum_metres_are_metres(longitude: float) -> None:
     assert nodes(network)["a/0"] == at(0)
 
 
-def test_the_datums_frame_and_mixed_anchors() -> None:
+def test_network_of_mixed_anchors_uses_datum() -> None:
     earth = features([("w", line((5.0, 52.0), (5.001, 52.0)), {})], "wgs84")
     both_kinds = concatenate([drawing(a=line((500, 500), (510, 500))), earth])
     with pytest.raises(MissingDatum):
@@ -192,25 +192,25 @@ def test_the_datums_frame_and_mixed_anchors() -> None:
     assert network.local.tolist() == [True, True, False, False] * 2
 
 
-def test_a_drawing_of_the_whole_earth_is_refused() -> None:
+def test_drawing_of_whole_earth_is_rejected() -> None:
     rows = [("a", line((-170, 0), (0, 0)), {}), ("b", line((90, 80), (150, -80)), {})]
     with pytest.raises(Invalid, match="too much of the earth"):
         from_drawing(features(rows, "wgs84"))
 
 
-def test_lines_heaped_on_each_other_end_in_time() -> None:
+def test_overlapping_lines_are_rejected_in_time() -> None:
     n = 20_000
     rng = np.random.default_rng(5)
     heap = shapely.linestrings(np.stack([rng.random((n, 2)) * [100, 1e-3], rng.random((n, 2)) * [100, 1e-3]], axis=1))
     started = time.process_time()
-    with pytest.raises(Invalid, match="lie on each other"):
+    with pytest.raises(Invalid, match="overlapping lines"):
         from_drawing(features([(str(k), g, {}) for k, g in enumerate(heap)], "local"))
     assert time.process_time() - started < 20
     dense = rng.random((20_000, 2)) * 0.05
     assert len(nodes(from_drawing(features([("d", shapely.linestrings(dense), {})], "local")))) == 1
 
 
-def test_nothing_drawn_is_an_empty_network() -> None:
+def test_network_of_empty_drawing_is_empty() -> None:
     assert not len(from_drawing(features([], "local")))
     assert not len(from_drawing(features([("n", None, {"kind": "note"})], "wgs84")))
 
@@ -221,8 +221,8 @@ lines = st.lists(st.lists(st.tuples(coordinate, coordinate), min_size=2, max_siz
 
 @given(lines)
 @settings(max_examples=80, deadline=None)
-def test_laws(drawn: list[list[tuple[float, float]]]) -> None:
-    """Every vertex is within ``join`` of a node, nodes are apart, edges join nodes at their places, twice the same."""
+def test_network_invariants_hold_for_any_drawing(drawn: list[list[tuple[float, float]]]) -> None:
+    """Every vertex is within ``join`` of a node, nodes are apart, edges join nodes, and the result is reproducible."""
     objects = features([(str(k), shapely.LineString(c), {"kind": "path"}) for k, c in enumerate(drawn)], "local")
     network = from_drawing(objects, join=0.25)
     positions = nodes(network)

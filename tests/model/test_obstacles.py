@@ -1,4 +1,4 @@
-"""What is solid, by kind: roles, bodies, heights and the walls of lifts."""
+"""Obstacles by kind: roles, bodies, heights and the walls of lifts."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def test_role_follows_kind_shapes_and_tags(properties: dict[str, Any], role: str
     assert obstacles.object_role(properties) == role
 
 
-def test_door_is_an_outline_where_doors_are_closed() -> None:
+def test_door_is_outline_when_doors_are_closed() -> None:
     assert obstacles.object_role({"kind": "door"}, doors_closed=True) == "outline"
 
 
-def test_height_is_the_top_above_the_floor() -> None:
+def test_height_is_top_above_floor() -> None:
     assert obstacles.object_heights({"kind": "wall", "base": 1.0, "height": 4.0}, LINE) == (1.0, 4.0)
     assert obstacles.object_heights({"kind": "crate", "size": [1, 1, 2], "pose": [0, 0, 1.5]}, POINT) == (1.5, 3.5)
     assert obstacles.object_heights({"kind": "wall"}, LINE) == (0.0, math.inf)
@@ -57,7 +57,7 @@ def test_height_is_the_top_above_the_floor() -> None:
     assert obstacles.object_heights({"kind": "building", "osm": {"tags": tags}}, AREA) == (3.0, 9.0)
 
 
-def test_lines_of_walls_close_corners_and_others_end_where_they_end() -> None:
+def test_wall_lines_close_corners_and_others_keep_their_ends() -> None:
     wall, fence = (obstacles.object_body({"kind": kind, "width": 0.2}, LINE) for kind in ("wall", "fence"))
     assert wall is not None
     assert fence is not None
@@ -65,8 +65,8 @@ def test_lines_of_walls_close_corners_and_others_end_where_they_end() -> None:
     assert fence.area.bounds == pytest.approx((0.0, -0.1, 4.0, 0.1))
 
 
-def test_walls_of_a_lift_are_open_at_its_doors() -> None:
-    """A cabin of 2 × 2 m turned by 90 degrees: the door on its lower side is on the right."""
+def test_lift_walls_are_open_at_doors() -> None:
+    """For a cabin of 2 × 2 m turned by 90 degrees, the door on its lower side is on the right."""
     body = obstacles.object_body(lift(front=DOOR), POINT)
     assert body is not None
     assert (body.base, body.top) == (0.0, 2.5)
@@ -81,12 +81,12 @@ def test_walls_of_a_lift_are_open_at_its_doors() -> None:
 @pytest.mark.parametrize(
     "doors", [{}, {"front": None}, {"front": {**DOOR, "x": "left"}}, {"front": {**DOOR, "width": math.nan}}]
 )
-def test_lift_without_a_known_door_has_no_walls(doors: dict[str, Any]) -> None:
+def test_lift_without_known_door_has_no_walls(doors: dict[str, Any]) -> None:
     """Walls without a way in would lock the cabin."""
     assert obstacles.object_body(lift(**doors), POINT) is None
 
 
-def test_flood_reaches_what_is_joined_to_the_border() -> None:
+def test_flood_fills_cells_connected_to_border() -> None:
     cells = np.zeros((9, 12), np.uint8)
     cells[2:7, 2:7], cells[3:6, 3:6] = OCCUPIED, FREE
     cells[2:7, 8], cells[4, 8] = OCCUPIED, FREE

@@ -1,4 +1,4 @@
-"""OpenStreetMap's values, as its wiki writes them."""
+"""OpenStreetMap's values, as written in its wiki."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from app.model import osm_tags
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("value", "expected"),
     [
         *[("3", 3.0), ("3.5 m", 3.5), ("3,5", 3.5), ("2m", 2.0), ("50 cm", 0.5), ("10 ft", 3.048), ("10'", 3.048)],
         *[("7'6\"", 2.286), ("6' 3\"", 1.905), ("0", 0.0), ("0.5 km", 500.0), ("1 mi", 1609.344)],
@@ -18,12 +18,12 @@ from app.model import osm_tags
         *[("999999999 km", None), ("٣", None), ("3 m m", None)],
     ],
 )
-def test_lengths(said: Any, expected: float | None) -> None:
-    assert osm_tags.metres(said) == pytest.approx(expected) if expected is not None else osm_tags.metres(said) is None
+def test_osm_lengths_are_parsed_to_metres(value: Any, expected: float | None) -> None:
+    assert osm_tags.metres(value) == pytest.approx(expected) if expected is not None else osm_tags.metres(value) is None
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("value", "expected"),
     [
         *[("50", 13.888888889), ("30 mph", 13.4112), ("5 knots", 2.572222222), ("30 km/h", 8.333333333)],
         *[("walk", 1.666666667), ("50;30", 8.333333333), ("none;70", 19.444444444)],
@@ -31,11 +31,11 @@ def test_lengths(said: Any, expected: float | None) -> None:
         *[("30 @ (22:00-06:00)", None), ("1" * 90, None)],
     ],
 )
-def test_speeds(said: Any, expected: float | None) -> None:
-    assert osm_tags.speed(said) == expected
+def test_osm_speeds_are_parsed_to_metres_per_second(value: Any, expected: float | None) -> None:
+    assert osm_tags.speed(value) == expected
 
 
-def test_measures() -> None:
+def test_osm_measures_follow_tags() -> None:
     assert osm_tags.height({"height": "12.5", "building:levels": "9"}) == 12.5
     assert osm_tags.height({"building:levels": "2.5"}) == 7.5
     assert osm_tags.height({"height": "high", "building:levels": "2"}) == 6.0

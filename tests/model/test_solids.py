@@ -1,4 +1,4 @@
-"""Solids against truths worked out by hand: volumes, boxes, poses, and what cannot be used."""
+"""Solids compared with values computed by hand: volumes, boxes and poses; rejection of invalid shapes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BOX = {"type": "box", "size": [2, 4, 6]}
 
 
 def volume(corners: Any) -> float:
-    """Of closed, outward triangles (divergence theorem): negative or wrong where any is turned."""
+    """Return the volume of closed, outward triangles (divergence theorem): wrong if any is inverted."""
     return float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
 
@@ -61,8 +61,8 @@ def test_volume_and_extent_of_primitives(shape: dict[str, Any], expected: float,
     assert all((*e[3:], *e[:3]) in edge_set for e in edge_set), "closed: each edge is met by its reverse"
 
 
-def test_a_round_solid_is_true_to_millimetres() -> None:
-    """The widest gap between a circle and a chord lies at the chord's middle."""
+def test_round_solid_is_accurate_to_millimetres() -> None:
+    """The widest gap between a circle and a chord is at the chord's middle."""
     for radius in (0.05, 0.5, 3.0):
         ring = one({"type": "cylinder", "radius": radius, "length": 1})
         at = ring.reshape(-1, 3)[:, :2]
@@ -70,7 +70,7 @@ def test_a_round_solid_is_true_to_millimetres() -> None:
         assert radius - shapely.boundary(hull).distance(shapely.Point(0, 0)) <= 0.0021
 
 
-def test_polyline_rings_count_by_even_and_odd() -> None:
+def test_polyline_rings_follow_even_odd_rule() -> None:
     rings = [[[0, 0], [4, 0], [4, 4], [0, 4]], [[1, 1], [1, 3], [3, 3], [3, 1]], [[10, 0], [11, 0], [11, 1], [10, 1]]]
     shape = {"type": "polyline", "points": rings, "height": 2.5}
     triangles = one(shape)
@@ -81,12 +81,12 @@ def test_polyline_rings_count_by_even_and_odd() -> None:
     assert ground.is_valid
 
 
-def test_a_crossed_ring_is_still_a_solid() -> None:
+def test_self_crossing_ring_is_solid() -> None:
     triangles = one({"type": "polyline", "points": [[[0, 0], [2, 2], [2, 0], [0, 2]]], "height": 1})
     assert volume(triangles) == pytest.approx(2)
 
 
-def test_rotation_is_about_fixed_axes() -> None:
+def test_pose_rotates_about_fixed_axes() -> None:
     """Roll first, about the fixed x, then pitch about the fixed y, then yaw about the fixed z."""
     at = rotation(math.pi / 2, 0, math.pi / 2) @ [0, 0, 1]  # roll: z -> -y; yaw: -y -> x
     assert at == pytest.approx([1, 0, 0])
@@ -96,26 +96,26 @@ def test_rotation_is_about_fixed_axes() -> None:
 
 @given(st.tuples(*[st.floats(-4, 4)] * 3))
 @settings(max_examples=50, deadline=None)
-def test_rotation_agrees_with_scipy(angles: tuple[float, float, float]) -> None:
+def test_pose_rotation_agrees_with_scipy(angles: tuple[float, float, float]) -> None:
     from scipy.spatial.transform import Rotation
 
     assert rotation(*angles) == pytest.approx(Rotation.from_euler("xyz", angles).as_matrix())
 
 
-def test_object_pose_then_shape_pose_then_scale() -> None:
+def test_solids_apply_scale_then_shape_pose_then_object_pose() -> None:
     shape = {"type": "mesh", "file": "m/a.stl", "scale": [10, 1, 1], "pose": [1, 0, 0, 0, 0, math.pi / 2]}
     triangles = one(shape, {"m/a.stl": stl(TRIANGLE)}, pose=[100, 0, 5, 0, 0, math.pi / 2])
     # (2,0,0) -> scale (20,0,0) -> turned (0,20,0) -> shifted (1,20,0) -> turned (-20,1,0) -> (80,1,5)
     assert triangles[0] == pytest.approx(np.array([[100, 1, 5], [80, 1, 5], [100, -2, 6]]))
 
 
-def test_a_mirrored_mesh_keeps_its_outside() -> None:
+def test_mirrored_mesh_keeps_outward_faces() -> None:
     files = {"a.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"}
     assert volume(one({"type": "mesh", "file": "a.obj"}, files)) == pytest.approx(1 / 6)
     assert volume(one({"type": "mesh", "file": "a.obj", "scale": [-2, 1, 1]}, files)) == pytest.approx(2 / 6)
 
 
-def test_a_part_of_a_mesh() -> None:
+def test_submesh_is_selected_and_centred() -> None:
     files = {
         "a.dae": dae(ONE, SHOWN + '<node name="far"><translate>9 9 9</translate><instance_geometry url="#g"/></node>')
     }
@@ -126,7 +126,7 @@ def test_a_part_of_a_mesh() -> None:
     assert middle[0, 0].tolist() == [-1, -1, 0]
 
 
-def test_planes_and_visuals_count_only_where_asked() -> None:
+def test_planes_and_visuals_count_only_when_requested() -> None:
     plane = {"type": "plane", "normal": [0, 0, 1], "size": [10, 20]}
     properties = {"shapes": [plane, {**BOX, "visual": True}]}
     assert len(solids.triangles(properties, {})) == 0
@@ -141,7 +141,7 @@ def test_planes_and_visuals_count_only_where_asked() -> None:
         assert facing / np.linalg.norm(facing) == pytest.approx(normal)
 
 
-def test_a_height_map_is_closed_and_north_is_up() -> None:
+def test_height_map_is_closed_with_north_up() -> None:
     files = {"h.png": picture([[0, 0, 200], [0, 0, 0], [0, 0, 0]])}
     shape = {"type": "heightmap", "file": "h.png", "size": [4, 2, 3], "position": [10, 0, 1]}
     triangles = one(shape, files)
@@ -154,7 +154,7 @@ def test_a_height_map_is_closed_and_north_is_up() -> None:
     assert volume(deep) > 0
 
 
-def test_a_large_height_map_keeps_its_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_height_map_keeps_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solids, "MAX_HEIGHTMAP_SIDE", 4)
     rows = [[0] * 9 for _ in range(6)]
     rows[0][8] = 100
@@ -167,7 +167,7 @@ def test_a_large_height_map_keeps_its_peaks(monkeypatch: pytest.MonkeyPatch) -> 
     assert volume(triangles) > 0
 
 
-def test_footprints() -> None:
+def test_footprint_is_union_of_solids() -> None:
     turned = {"shapes": [BOX], "pose": [10, 0, 0, 0, 0, math.pi / 2]}
     ground = solids.footprint(turned, {})
     assert ground.bounds == pytest.approx((8, -1, 12, 1))
@@ -180,7 +180,7 @@ def test_footprints() -> None:
     assert solids.footprint({}, {}).is_empty
 
 
-def test_a_mesh_that_many_objects_show_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_shared_by_many_objects_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     from app.model import meshes
 
     read: list[str] = []
@@ -200,12 +200,12 @@ def test_a_mesh_that_many_objects_show_is_read_once(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(
-    ("shapes", "says"),
+    ("shapes", "message"),
     [
         ("box", "must be a list"),
         ([1], "must be a list"),
-        ([{}], "has the type 'None'; there are box"),
-        ([{"type": ["box"]}], "has the type"),
+        ([{}], "has the unknown type 'None': use one of box"),
+        ([{"type": ["box"]}], "has the unknown type"),
         ([{"type": "box"}], r"shapes\[0\]\.size must be 3 numbers"),
         ([{"type": "box", "size": [1, 2]}], "must be 3 numbers"),
         ([{"type": "box", "size": [1, -2, 3]}], "at least 0"),
@@ -217,26 +217,26 @@ def test_a_mesh_that_many_objects_show_is_read_once(monkeypatch: pytest.MonkeyPa
         ([{**BOX, "pose": "0 0 0"}], "must be .x, y, z"),
         ([{**BOX, "pose": [1e7, 1e7, 0, 0, 0, 0.5]}], "not finite metres"),
         ([{"type": "mesh"}], "path of a mesh"),
-        ([{"type": "mesh", "file": "absent.dae"}], "absent.dae is not there: upload it together"),
-        ([{"type": "mesh", "file": "../../etc/passwd"}], "not there"),
+        ([{"type": "mesh", "file": "absent.dae"}], "absent.dae is missing: upload it together"),
+        ([{"type": "mesh", "file": "../../etc/passwd"}], "is missing"),
         ([{"type": "plane", "normal": [0, 0, 0]}], "must not be zero"),
         ([{"type": "polyline", "height": 1}], "list of rings"),
         ([{"type": "polyline", "points": [[[0, 0], [1]]], "height": 1}], "list of rings"),
         ([{"type": "polyline", "points": [[[0, 0], [1, 1], [0, "a"]]], "height": 1}], "finite"),
-        ([{"type": "heightmap", "file": "h.svg"}], "not there"),
+        ([{"type": "heightmap", "file": "h.svg"}], "is missing"),
         ([{"type": "heightmap", "file": "bad.png"}], "bad.png cannot be read as a picture"),
         ([{"type": "heightmap", "file": "dot.png"}], "2 × 2"),
         ([BOX] * 10_001, "the limit is 10000"),
     ],
 )
-def test_what_cannot_be_used_is_refused_with_its_place(shapes: Any, says: str) -> None:
+def test_invalid_shapes_are_rejected_with_location(shapes: Any, message: str) -> None:
     files = {"bad.png": b"\x89PNG\r\n\x1a\n1234", "dot.png": picture([[1]])}
-    with pytest.raises(Invalid, match=says) as caught:
+    with pytest.raises(Invalid, match=message) as caught:
         solids.triangles({"shapes": shapes}, files, planes=True)
     assert caught.value.problems
 
 
-def test_degenerate_solids_are_no_error() -> None:
+def test_degenerate_solids_are_accepted() -> None:
     for shape in (
         {"type": "box", "size": [0, 0, 0]},
         {"type": "sphere", "radius": 0},
@@ -248,7 +248,7 @@ def test_degenerate_solids_are_no_error() -> None:
         assert solids.footprint({"shapes": [shape]}, {}).area == 0
 
 
-def test_a_heavy_mesh_has_a_footprint_soon() -> None:
+def test_heavy_mesh_footprint_is_quick() -> None:
     n = 60_000
     corners = np.random.default_rng(1).uniform(-5, 5, (n, 3, 3)).astype("<f4")
     record = np.zeros(n, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")]))

@@ -1,6 +1,6 @@
-"""What versions of 100 000 features cost: ``python -m tests.store.bench_layout [sqlite|postgres] [features]``.
+"""Benchmark of versions of 100 000 features: ``python -m tests.store.bench_layout [sqlite|postgres] [features]``.
 
-Prints milliseconds (the least of several runs, nothing kept in memory between them) and bytes added.
+Prints milliseconds (the minimum of several runs, without caches in memory) and bytes added.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ KEY = PartKey("topology", "ground", "network")
 
 
 def network(n: int) -> Features:
-    """Half nodes, half edges of two points, about 390 bytes of properties and geometry each, on 2 × 2 km."""
+    """Return half nodes, half edges of two points, about 390 bytes of properties and geometry each, on 2 × 2 km."""
     random = np.random.default_rng(1)
     xy = random.random((n, 2)) * 2000
     geometry = points(xy)
@@ -48,7 +48,7 @@ def network(n: int) -> Features:
 
 
 def bench(store: Store, n: int) -> None:
-    """All rows of the table."""
+    """Print all rows of the table."""
     store.migrate()
     store.environments.create("farm", datum=Datum(53.2, -0.5))
     network_part = network(n)
@@ -93,14 +93,14 @@ def bench(store: Store, n: int) -> None:
 
 
 def edited(original: Features, some: Any, metres: float, k: int) -> Features:
-    """These features with another name, moved a little or not."""
+    """Return these features with another name, with or without a small move."""
     part = original.select(some)
     moved = points(shapely.get_coordinates(part.geometry) + np.random.default_rng(k).random((len(part), 2)) * metres)
     return Features(part.ids, moved, tuple({**p, "name": f"v{k}"} for p in part.properties), part.local.copy())
 
 
 def commit(store: Store, name: str, *operations: Operation) -> None:
-    """Prepare and commit; a row where it has a name."""
+    """Prepare and commit; prints a row if it has a name."""
     store.chunks.forget()
     head = store.versions.get("farm")
     start = time.perf_counter()
@@ -115,7 +115,7 @@ def commit(store: Store, name: str, *operations: Operation) -> None:
 
 
 def shortest_time(run: Callable[[], object], times: int, store: Store) -> float:
-    """The least milliseconds of several runs, each with empty memory."""
+    """Return the minimum milliseconds of several runs, each without cached chunks."""
     out = []
     for _ in range(times):
         store.chunks.forget()
@@ -132,7 +132,7 @@ def row(name: str, milliseconds: float, more: str = "") -> None:
 
 
 def main() -> None:
-    """On a database of its own."""
+    """Run on a new database."""
     kind = sys.argv[1] if len(sys.argv) > 1 else "sqlite"
     n = int(sys.argv[2]) if len(sys.argv) > 2 else 100_000
     with tempfile.TemporaryDirectory() as folder:

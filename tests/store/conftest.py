@@ -1,4 +1,4 @@
-"""One conformance suite for both databases: every test that asks for ``database_url`` or ``store`` runs on each."""
+"""Conformance suite for both databases: each test with ``database_url`` or ``store`` runs on both."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DATABASES = ["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)]
 
 @pytest.fixture(params=DATABASES)
 def empty_database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """A database without a schema."""
+    """URL of a database without a schema."""
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'fleetmap.sqlite'}"
     url: str = request.getfixturevalue("postgres_url")
@@ -28,7 +28,7 @@ def empty_database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 @pytest.fixture(scope="session")
 def migrated_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An SQLite database with the schema and nothing in it: a copy takes a hundredth of migrating."""
+    """Empty SQLite database with the schema: copying it takes a hundredth of the time of migrating."""
     folder = tmp_path_factory.mktemp("migrated")
     migrated(f"sqlite:///{folder / 'fleetmap.sqlite'}", folder)
     return folder / "fleetmap.sqlite"
@@ -36,7 +36,7 @@ def migrated_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def migrated_database(postgres_cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The same in PostgreSQL: a database to make others from."""
+    """Template database with the schema in PostgreSQL."""
     name = postgres_cluster.create_database()
     migrated(postgres_cluster.url(name), tmp_path_factory.mktemp("migrated"))
     return name
@@ -50,7 +50,7 @@ def migrated(url: str, folder: Path) -> None:
 
 @pytest.fixture(params=DATABASES)
 def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """A database with the schema and nothing in it."""
+    """URL of an empty database with the schema."""
     if request.param == "sqlite":
         path = tmp_path / "fleetmap.sqlite"
         shutil.copyfile(request.getfixturevalue("migrated_file"), path)
@@ -73,7 +73,7 @@ def store(database_url: str, tmp_path: Path) -> Iterator[Store]:
 
 @pytest.fixture
 def sqlite_store(tmp_path: Path, migrated_file: Path) -> Iterator[Store]:
-    """A store on SQLite, for what does not depend on the database."""
+    """A store on SQLite, for tests that do not depend on the database."""
     shutil.copyfile(migrated_file, tmp_path / "only.sqlite")
     new_store = Store(f"sqlite:///{tmp_path / 'only.sqlite'}", tmp_path / "only-blobs")
     new_store.migrate()

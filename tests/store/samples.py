@@ -1,4 +1,4 @@
-"""Small layers of our own making."""
+"""Small synthetic layers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GRID = PartKey("occupancy", "ground", "map")
 
 
 def network(n: int, seed: int = 0, side: float = 500.0, anchor: Any = "local") -> Features:
-    """n nodes at random places, every third one with nested properties."""
+    """Return n nodes at random positions, every third one with nested properties."""
     random = np.random.default_rng(seed)
     xy = random.random((n, 2)) * side
     if anchor == "wgs84":
@@ -44,7 +44,7 @@ def network(n: int, seed: int = 0, side: float = 500.0, anchor: Any = "local") -
 
 
 def mixed() -> Features:
-    """All kinds of geometry, both anchors, heights, and an item without a place."""
+    """Return all kinds of geometry, both anchors, heights, and an item without coordinates."""
     local = features(
         [
             ("p", shapely.Point(1.5, -2.5), {"kind": "poi"}),
@@ -69,7 +69,7 @@ def mixed() -> Features:
 
 
 def grid(width: int = 600, height: int = 300, seed: int = 0, **options: Any) -> OccupancyGrid:
-    """Unknown with a free room and walls."""
+    """Return an unknown grid with a free room and walls."""
     cells = np.full((height, width), 255, np.uint8)
     cells[20:-20, 20:-20] = 0
     cells[20, 20:-20] = 100
@@ -80,7 +80,7 @@ def grid(width: int = 600, height: int = 300, seed: int = 0, **options: Any) -> 
 
 
 def voxels(n: int = 5000, seed: int = 0) -> VoxelMap:
-    """Leaves of the smallest size."""
+    """Return leaves of the smallest size."""
     code = np.unique(np.random.default_rng(seed).integers(0, 2**40, n, dtype=np.uint64))
     return VoxelMap(
         0.05,
@@ -94,13 +94,13 @@ def voxels(n: int = 5000, seed: int = 0) -> VoxelMap:
 
 
 def picture(seed: int = 0, dtype: Any = np.uint8) -> GeoImage:
-    """Three bands, larger than a tile."""
+    """Return an image of three bands, larger than a tile."""
     pixels = (np.random.default_rng(seed).random((300, 270, 3)) * 200).astype(dtype)
     return GeoImage(pixels, (0.1, 0.0, -5.0, 0.0, -0.1, 20.0), "local", {"png": {"dpi": 72}})
 
 
 def everything() -> dict[PartKey, Part]:
-    """One part of every kind."""
+    """Return one part of every kind."""
     return {
         TOPOLOGY: network(300),
         OBJECTS: mixed(),
@@ -128,14 +128,14 @@ def save(store: Store, environment: str, *operations: Operation, base: Version |
 
 
 def rows(f: Features) -> dict[str, tuple[str, Any, bool]]:
-    """Features as comparable values: id -> (WKB, properties with their types, local)."""
+    """Return features as comparable values: id -> (WKB, properties with their types, local)."""
     return {
         x.id: (shapely.to_wkt(x.geometry, rounding_precision=-1), typed(x.properties), x.anchor == "local") for x in f
     }
 
 
 def typed(value: Any) -> Any:
-    """A value in which 1, 1.0 and True differ."""
+    """Return a comparable value that distinguishes 1, 1.0 and True."""
     if isinstance(value, dict):
         return {k: typed(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Areas without a database: whatever is drawn, they are valid, cut at the antimeridian, and cover what was drawn."""
+"""Areas without a database: for any drawing they are valid, cut at the antimeridian, and cover the drawing."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ def check(area: Area) -> None:
 
 @given(st.lists(st.tuples(st.floats(-180, 180), st.floats(-90, 90)), min_size=3, max_size=9))
 @settings(max_examples=300, deadline=None)
-def test_any_polygon_in_degrees(points: list[tuple[float, float]]) -> None:
+def test_area_of_any_polygon_in_degrees_is_valid(points: list[tuple[float, float]]) -> None:
     check(area_of(shapely.Polygon(points), "wgs84"))
 
 
 @given(st.lists(st.tuples(METRES, METRES), min_size=3, max_size=7), DATUMS)
 @settings(max_examples=200, deadline=None)
-def test_any_polygon_in_metres(points: list[tuple[float, float]], datum: Datum) -> None:
+def test_area_of_any_polygon_in_metres_is_valid(points: list[tuple[float, float]], datum: Datum) -> None:
     check(area_of(shapely.Polygon(points), "local", datum))
 
 
 @given(st.floats(-180, 180), st.floats(-80, 80), st.floats(1e-5, 5), st.floats(1e-5, 5))
 @settings(max_examples=200, deadline=None)
-def test_a_box_anywhere_covers_its_middle_and_nothing_beside(x: float, y: float, width: float, height: float) -> None:
+def test_box_area_covers_its_middle_and_no_point_outside(x: float, y: float, width: float, height: float) -> None:
     corners = np.array(shapely.box(x - width, y - height, x + width, y + height).exterior.coords)
     corners[:, 0] = (corners[:, 0] + 180.0) % 360.0 - 180.0
     area = area_of(shapely.Polygon(corners), "wgs84")

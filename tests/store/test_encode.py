@@ -1,4 +1,4 @@
-"""Canonical bytes: equal everywhere, strict about numbers, refusing what JSON has no word for."""
+"""Canonical bytes: equal on every machine, exact in numbers, and limited to JSON types."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def part_hash(part) -> str:
     return parts.compose(ChunkStage(Nothing()), part, None, "").hash.hex()
 
 
-def test_hashes_of_this_encoding_never_change():
-    """What was stored by an older release must stay readable and comparable: these may only grow."""
+def test_encoding_hashes_never_change():
+    """Hashes of content stored by older releases: it must stay readable and comparable, so these may only grow."""
     assert {
         "mixed": part_hash(mixed()),
         "network": part_hash(network(200)),
@@ -53,18 +53,18 @@ GOLDEN = {
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, np.float64("nan"), {"deep": [1, {"x": math.nan}]}])
-def test_numbers_must_be_finite(bad):
+def test_pack_rejects_infinite_numbers(bad):
     with pytest.raises(Invalid, match="x1"):
         part_hash(features([("x0", None, {}), ("x1", None, {"v": bad})], "local"))
 
 
 @pytest.mark.parametrize("bad", [2**64, {1: 2}, {1, 2}, "\ud800", object(), {"a": b"bytes"}])
-def test_what_json_has_no_word_for_is_refused(bad):
+def test_pack_rejects_values_without_json_type(bad):
     with pytest.raises(Invalid, match="x1"):
         part_hash(features([("x1", None, {"v": bad})], "local"))
 
 
-def test_kinds_of_numbers_stay_apart_and_zero_has_no_sign():
+def test_pack_keeps_integers_and_floats_apart_and_drops_sign_of_zero():
     hashes = {part_hash(features([("a", shapely.Point(0, 0), {"v": v})], "local")) for v in (1, 1.0, True, "1")}
     assert len(hashes) == 4
     origin = shapely.Point(0, 0)
@@ -73,7 +73,7 @@ def test_kinds_of_numbers_stay_apart_and_zero_has_no_sign():
     assert zero == part_hash(features([("a", origin, {"w": (np.float64(0),), "v": np.float32(0)})], "local"))
 
 
-def test_order_of_items_and_keys_does_not_count():
+def test_root_ignores_order_of_items_and_keys():
     rows = [(f"i{k}", shapely.Point(k % 7, k), {"a": k, "b": {"x": 1, "y": 2}}) for k in range(300)]
     turned = [(i, g, {"b": {"y": 2, "x": 1}, "a": p["a"]}) for i, g, p in reversed(rows)]
     assert part_hash(features(rows, "local")) == part_hash(features(turned, "local"))
@@ -92,7 +92,7 @@ json_values = st.recursive(
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.dictionaries(st.text(), json_values, max_size=4), min_size=1, max_size=5))
-def test_properties_come_back_exactly(properties):
+def test_properties_round_trip_exactly(properties):
     ids = [f"i{k}" for k in range(len(properties))]
     packed = encode.pack_properties(ids, properties)
     leaf = encode_leaf(ids, b"\0" * 8 * len(ids), [b""] * len(ids), packed)
@@ -104,7 +104,7 @@ def test_properties_come_back_exactly(properties):
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1)), min_size=1, max_size=20))
-def test_interleaving_is_reversible(pairs):
+def test_interleave_is_reversible(pairs):
     x, y = (np.array(v, np.uint64) for v in zip(*pairs, strict=True))
     code = encode.interleave(x, y)
     back = encode.deinterleave(code)
@@ -113,7 +113,7 @@ def test_interleaving_is_reversible(pairs):
     assert morton(int(encode.interleave(x % 1000, y % 1000)[0])) == (pairs[0][1] % 1000, pairs[0][0] % 1000)
 
 
-def test_boxes_of_wkb_are_those_of_geos():
+def test_wkb_boxes_equal_geos_bounds():
     shapes = [
         shapely.Point(1, 2),
         shapely.Point(3, 4, 5),
@@ -129,12 +129,12 @@ def test_boxes_of_wkb_are_those_of_geos():
     assert np.array_equal(encode.wkb_bounds(list(encode.to_wkb(column))), encode.bounds(column))
 
 
-def test_an_unknown_encoding_is_told(sqlite_store: Store):
+def test_unknown_encoding_raises_damaged(sqlite_store: Store):
     with pytest.raises(Damaged, match="newer"):
         encode.unpack(encode.pack([2, "features", []]))
 
 
-def test_adversarial_ids_are_told(sqlite_store: Store):
+def test_adversarial_ids_are_rejected(sqlite_store: Store):
     from app.store import tree
 
     shape = shapely.Point(1, 2)

@@ -21,7 +21,7 @@ from app.store.values import PartEntry, Provenance
 from tests.store.samples import DATUM, GRID, OBJECTS, TOPOLOGY, everything, grid, network, replaces, rows, save
 
 
-def test_create_describe_find(store: Store):
+def test_environment_create_describe_and_find(store: Store):
     environment = store.environments.create(
         "farm-1", title="The Farm", description="of apples", tags=("uk", "uk", "trial")
     )
@@ -49,7 +49,7 @@ def test_create_describe_find(store: Store):
         store.environments.update("farm-1", description="a\x00")
 
 
-def test_lists_are_paged_filtered_and_scoped(store: Store):
+def test_environment_list_is_paged_filtered_and_scoped(store: Store):
     for k in range(7):
         store.environments.create(f"farm-{k}", title=f"Field {k}", description="100%" if k == 3 else "", tags=[f"T{k}"])
     store.environments.create("city")
@@ -70,7 +70,7 @@ def test_lists_are_paged_filtered_and_scoped(store: Store):
         store.environments.page(limit=0)
 
 
-def test_extents_hold_all_parts(store: Store):
+def test_extent_contains_all_parts(store: Store):
     store.environments.create("farm", datum=Datum(53.2, -0.5))
     store.environments.create("nowhere")
     assert store.environments.get("farm").bounds == (-0.5, 53.2, -0.5, 53.2)
@@ -88,7 +88,7 @@ def test_extents_hold_all_parts(store: Store):
 
 
 @pytest.mark.parametrize("anchor", ["wgs84", "local"])
-def test_extents_cross_the_antimeridian(store: Store, anchor: str):
+def test_extent_crosses_antimeridian(store: Store, anchor: str):
     store.environments.create("fiji", datum=Datum(-17.0, 179.999))
     if anchor == "wgs84":
         rows_ = [("a", shapely.Point(179.99, -17.01), {}), ("b", shapely.Point(-179.98, -16.9), {})]
@@ -117,7 +117,7 @@ def test_extents_cross_the_antimeridian(store: Store, anchor: str):
     assert {"a", "b"} <= set(inside.ids)
 
 
-def test_boxes_are_joined_around_the_globe():
+def test_boxes_are_joined_across_antimeridian():
     assert join([]) is None
     assert join([(10, 0, 20, 5), (15, -1, 30, 3)]) == (10, -1, 30, 5)
     assert join([(170, 0, -170, 1), (-175, 2, -165, 3)]) == (170, 0, -165, 3)
@@ -131,7 +131,7 @@ def test_boxes_are_joined_around_the_globe():
     assert geometry(None) is None
 
 
-def test_the_index_follows_every_head(store: Store):
+def test_index_follows_every_head(store: Store):
     store.environments.create("farm", datum=Datum(53.2, -0.5))
     save(store, "farm", *replaces(everything()))
     everywhere = (-180.0, -90.0, 180.0, 90.0)
@@ -172,7 +172,7 @@ def test_the_index_follows_every_head(store: Store):
     assert indexed_items() == set()
 
 
-def test_delete_restore_purge(store: Store):
+def test_environment_delete_restore_and_purge(store: Store):
     store.environments.create("farm", datum=DATUM)
     save(store, "farm", Replace(GRID, grid()))
     environment = store.environments.delete("farm", "ann")
@@ -202,11 +202,11 @@ def test_delete_restore_purge(store: Store):
     assert new.head == 0
     assert new.id != back.id
     events = store.events.page("farm")
-    assert events[0].sequence == 7  # five events of the first farm were told under this name, and its second end
+    assert events[0].sequence == 7  # five events of the first farm were published under this name, and its second end
     assert [e.body["type"] for e in store.events.page(None)].count("environment.deleted") == 2
 
 
-def test_a_clone_shares_content_and_keeps_its_own_history(store: Store):
+def test_clone_shares_content_and_has_separate_history(store: Store):
     store.environments.create("farm", datum=DATUM)
     digest = store.blobs.put(b"orig")
     from app.store.values import Source
@@ -230,7 +230,7 @@ def test_a_clone_shares_content_and_keeps_its_own_history(store: Store):
     ]
 
 
-def test_a_renamed_environment_keeps_its_history(store: Store):
+def test_renamed_environment_keeps_its_history(store: Store):
     store.environments.create("farm", datum=DATUM)
     save(store, "farm", Replace(GRID, grid()))
     store.channels.move("farm", "production", 1, author="a")
@@ -249,7 +249,7 @@ def test_a_renamed_environment_keeps_its_history(store: Store):
         store.environments.update("farm", new_name="NO")
 
 
-def test_the_last_events_of_all_environments(store: Store):
+def test_outbox_lists_last_events_of_all_environments(store: Store):
     for name, moves in (("busy", 5), ("calm", 1), ("gone", 1), ("moved", 2)):
         store.environments.create(name)
         for k in range(moves):
@@ -268,14 +268,14 @@ def test_the_last_events_of_all_environments(store: Store):
     ended = [("gone", 3), ("moved", 4), ("here", 5)]
     assert last(9, 99) == [*begun, ("moved", 1), ("moved", 2), ("moved", 3), *ended]
     assert last(1, 99) == [("busy", 6), ("calm", 2), ("gone", 3), ("here", 5)]
-    assert last(9, 7) == [("busy", 6), ("calm", 1), ("calm", 2), ("gone", 2), *ended], "each has its last ones"
-    assert last(9, 2) == [("gone", 3), ("here", 5)], "the ones that were silent longest have none"
+    assert last(9, 7) == [("busy", 6), ("calm", 1), ("calm", 2), ("gone", 2), *ended], "each has its last events"
+    assert last(9, 2) == [("gone", 3), ("here", 5)], "those with the oldest events have none"
     assert last(9, 99, position=2) == [("busy", 1), ("busy", 2)]
 
 
 def test_events_have_the_documented_members(store: Store):
     store.environments.create("farm", author="ann", datum=DATUM)
-    made = save(store, "farm", Replace(GRID, grid()), Replace(TOPOLOGY, network(5)))
+    version = save(store, "farm", Replace(GRID, grid()), Replace(TOPOLOGY, network(5)))
     then = datetime(2031, 5, 1, 4, tzinfo=UTC)
     store.channels.move("farm", "production", 2, author="ann", activate_at=then)
     store.channels.move("farm", "production", 1, author="bob")
@@ -298,11 +298,11 @@ def test_events_have_the_documented_members(store: Store):
         "type": "version.created",
         "environment": "farm",
         "version": 2,
-        "root": made.root,
+        "root": version.root,
         "previous": {"version": 1, "root": store.versions.get("farm", 1).root},
         "layers": [
             {"layer": e.key.layer, "level": "ground", "name": e.key.name, "change": "added", "hash": e.hash}
-            for e in made.parts
+            for e in version.parts
         ],
         "message": "edit",
         "author": "ann",
@@ -325,7 +325,7 @@ def test_events_have_the_documented_members(store: Store):
     assert [e.environment for e in store.events.page(None, since=7)] == ["other"]
 
 
-def test_the_log_has_one_order_with_many_writers(store: Store):
+def test_log_has_one_order_with_many_writers(store: Store):
     def work(k: int) -> None:
         name = f"e{k}"
         store.environments.create(name)
@@ -340,7 +340,7 @@ def test_the_log_has_one_order_with_many_writers(store: Store):
         assert [e.sequence for e in log if e.environment == f"e{k}"] == list(range(1, 7))
 
 
-def test_channels_are_moved_planned_cancelled(store: Store):
+def test_channels_are_moved_planned_and_cancelled(store: Store):
     store.environments.create("farm", datum=DATUM)
     save(store, "farm", Replace(GRID, grid()))
     assert [(c.name, c.version) for c in store.channels.all("farm")] == [("latest", 2)]
@@ -378,8 +378,8 @@ def test_channels_are_moved_planned_cancelled(store: Store):
         store.channels.move("farm", "production", 1, author="ann", activate_at=datetime(2031, 1, 1))
 
 
-def test_a_plan_that_is_dropped_is_told(store: Store):
-    """Events carry ``activate_at``: who goes by them would switch all the same."""
+def test_dropped_plan_appends_cancelled_event(store: Store):
+    """Events carry ``activate_at``: clients that rely on them would switch anyway."""
     store.environments.create("farm", datum=DATUM)
     save(store, "farm", Replace(GRID, grid()))
     soon = datetime.now(UTC) + timedelta(hours=1)
@@ -431,7 +431,7 @@ def test_expired_token_stays_expired_when_the_clock_is_set_back(store: Store):
     other.close()
 
 
-def test_tokens_are_kept_hashed(store: Store):
+def test_tokens_are_stored_hashed(store: Store):
     token, secret = store.tokens.create("ci", "editor", environments="farm-*")
     assert token.ended is None
     assert len(secret) >= 32
@@ -462,7 +462,7 @@ def test_tokens_are_kept_hashed(store: Store):
     assert all(len(h) == 64 and text not in h for h in stored)
 
 
-def test_jobs(store: Store):
+def test_jobs_are_stored_updated_and_deleted(store: Store):
     job = store.jobs.create(owner="ann", detail="waiting")
     assert (job.state, job.progress, job.owner, job.detail) == ("queued", 0.0, "ann", "waiting")
     job = store.jobs.update(job.id, state="running", progress=0.5, detail="half")
@@ -478,7 +478,7 @@ def test_jobs(store: Store):
             call(job.id)
 
 
-def test_parts_of_several_levels_are_told_apart(store: Store):
+def test_version_changes_name_level_of_parts_with_equal_names(store: Store):
     store.environments.create("farm")
     first, second = PartKey("occupancy", "ground", "map"), PartKey("occupancy", "first", "map")
     version = save(store, "farm", Replace(first, grid()), Replace(second, grid(seed=1)))

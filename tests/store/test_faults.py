@@ -1,4 +1,4 @@
-"""What bad luck must not achieve: a killed process, damaged bytes, a full disk, a database that does not answer."""
+"""Faults: a killed process, damaged bytes, a full disk, a database that does not answer."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ for n in range(1000):
     operations = (Replace(TOPOLOGY, network(400, seed=head.number)), Replace(GRID, grid(seed=head.number)))
     prepared = store.versions.prepare(head, Changes(operations))
     sources = [Source(f"f{k}", 1, sha) for k, sha in enumerate(files)]
-    made = store.versions.commit("farm", prepared, author="child", message=str(head.number), sources=sources)
-    print("committed", made.number, made.root, flush=True)
+    version = store.versions.commit("farm", prepared, author="child", message=str(head.number), sources=sources)
+    print("committed", version.number, version.root, flush=True)
 """
 
 
-def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
+def test_kill_9_leaves_old_or_new_state(store: Store):
     store.environments.create("farm", datum=DATUM)
     random.seed(1)
     acknowledged: dict[int, str] = {}
@@ -73,7 +73,7 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
         )
         assert child.stdout is not None
         assert child.stdout.readline() == "ready\n"
-        # On a busy machine none may have committed before it was killed: then the last one is left to commit once.
+        # on a busy machine every process may be killed before its commit: then the last one may commit once
         lines = [child.stdout.readline()] if not left and not acknowledged else []
         time.sleep(random.uniform(0.05, 0.6))
         child.send_signal(signal.SIGKILL)
@@ -112,18 +112,18 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
 
 
 def temporary(store: Store) -> list[Path]:
-    """The workspaces of uploads."""
+    """Return the workspaces of uploads."""
     return [p for p in (store.blob_dir / "tmp").iterdir() if p.name != ".lock"]
 
 
 def files_in(store: Store) -> list[tuple[Path, int]]:
-    """All stored files with their times."""
+    """Return all stored files with their times."""
     files = sorted(p for p in store.blob_dir.rglob("*") if p.is_file() and not p.name.startswith("."))
     return [(p, p.stat().st_mtime_ns) for p in files]
 
 
 def read_all(store: Store, version: Version) -> None:
-    """Read every chunk of a version; loading alone leaves out the tables of ids."""
+    """Read every chunk of a version; loading alone skips the tables of ids."""
     store.content.load(version)
     for entry in version.parts:
         if entry.key.layer in VECTOR_LAYERS:
@@ -132,7 +132,7 @@ def read_all(store: Store, version: Version) -> None:
             store.content.has_ids(version, entry.key, part.ids)
 
 
-def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
+def test_damaged_chunk_raises_damaged(store: Store):
     store.environments.create("farm", datum=DATUM)
     version = save(store, "farm", *replaces(everything()))
     with store._database.read() as connection:
@@ -161,7 +161,7 @@ def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
         assert_same_layers(store.content.load(version), Layers(everything(), DATUM))
 
 
-def test_collecting_stops_at_damage(sqlite_store: Store):
+def test_garbage_collection_stops_at_damage(sqlite_store: Store):
     sqlite_store.environments.create("farm")
     version = save(sqlite_store, "farm", Replace(GRID, grid()))
     root = bytes.fromhex(version.parts[0].hash)
@@ -174,7 +174,7 @@ def test_collecting_stops_at_damage(sqlite_store: Store):
         assert connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one() == before
 
 
-def test_damaged_and_lost_blobs_are_alarms(store: Store):
+def test_damaged_and_lost_blobs_raise_damaged(store: Store):
     big, small, other = b"b" * 100_000, b"small", b"other"
     names = store.blobs.put_many([big, small, other])
     assert [hashlib.sha256(d).hexdigest() for d in (big, small, other)] == names
@@ -204,7 +204,7 @@ def test_damaged_and_lost_blobs_are_alarms(store: Store):
         store.blobs.get("0" * 64)
 
 
-def test_blobs_come_from_bytes_and_files_and_are_written_once(store: Store, tmp_path: Path):
+def test_blobs_from_bytes_and_files_are_written_once(store: Store, tmp_path: Path):
     spooled = tmp_path / "upload"
     spooled.write_bytes(b"x" * 3_000_000)
     (tmp_path / "tiny").write_bytes(b"t")
@@ -225,7 +225,7 @@ def test_blobs_come_from_bytes_and_files_and_are_written_once(store: Store, tmp_
     assert temporary(store) == []
 
 
-def test_what_a_killed_upload_left_is_removed_at_the_start(store: Store):
+def test_recover_removes_remains_of_killed_upload(store: Store):
     old = time.time() - 3 * 24 * 3600
     stray = store.blob_dir / "packs" / ("1" * 64)
     stray.write_bytes(b"half")
@@ -251,7 +251,7 @@ def test_what_a_killed_upload_left_is_removed_at_the_start(store: Store):
     assert store.blobs.get(name) == b"z" * 70_000
 
 
-def test_a_disk_that_refuses_is_unavailable_and_leaves_nothing(store: Store, monkeypatch: pytest.MonkeyPatch):
+def test_unwritable_disk_raises_unavailable_and_leaves_no_files(store: Store, monkeypatch: pytest.MonkeyPatch):
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -266,7 +266,7 @@ def test_a_disk_that_refuses_is_unavailable_and_leaves_nothing(store: Store, mon
         assert connection.exec_driver_sql("SELECT count(*) FROM blob").scalar_one() == 0
 
 
-def test_a_failing_commit_stores_nothing(store: Store, monkeypatch: pytest.MonkeyPatch):
+def test_failed_commit_stores_nothing(store: Store, monkeypatch: pytest.MonkeyPatch):
     store.environments.create("farm", datum=DATUM)
     head = store.versions.get("farm")
     prepared = store.versions.prepare(head, Changes((Replace(GRID, grid()),)))
@@ -288,7 +288,7 @@ def test_a_failing_commit_stores_nothing(store: Store, monkeypatch: pytest.Monke
     assert store.versions.get("farm") == head
 
 
-def test_a_locked_sqlite_is_unavailable_not_a_crash(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch):
+def test_locked_sqlite_raises_unavailable(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch):
     import app.store.database as database
 
     monkeypatch.setattr(database, "BUSY_MILLISECONDS", 50)
@@ -299,13 +299,13 @@ def test_a_locked_sqlite_is_unavailable_not_a_crash(sqlite_store: Store, monkeyp
     other.close()
 
 
-def test_other_urls_are_refused(tmp_path: Path):
+def test_unsupported_database_urls_are_rejected(tmp_path: Path):
     for url in ("mysql://x/y", "nonsense"):
         with pytest.raises(Invalid, match="postgresql"):
             Store(url, tmp_path)
 
 
-def test_chunks_are_named_by_their_canonical_bytes(store: Store):
+def test_chunk_names_are_hashes_of_canonical_bytes(store: Store):
     store.environments.create("farm")
     save(store, "farm", *replaces(everything()))
     from app.store.encode import decompress
@@ -317,7 +317,7 @@ def test_chunks_are_named_by_their_canonical_bytes(store: Store):
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.EBADMSG, errno.EUCLEAN, errno.EMFILE, errno.EACCES])
-def test_only_broken_storage_makes_a_blob_damaged(
+def test_blob_is_damaged_only_with_broken_storage(
     sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     name = sqlite_store.blobs.put(b"large" * 20_000)

@@ -1,4 +1,4 @@
-"""Overlays, kept on both databases."""
+"""Overlays and closures, on both databases."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def farm(store: Store) -> Store:
     return store
 
 
-def test_an_overlay_waits_and_expires(farm: Store):
+def test_pending_overlay_expires(farm: Store):
     first, new = farm.overlays.add(blocked())
     assert new
     assert first == blocked(id=first.id)
@@ -55,7 +55,7 @@ def test_an_overlay_waits_and_expires(farm: Store):
         farm.overlays.get("yard", first.id)
 
 
-def test_acceptance_is_in_force_until_the_end_with_an_event_each(farm: Store):
+def test_accepted_overlay_is_in_force_until_end_with_events(farm: Store):
     one, _ = farm.overlays.add(blocked())
     assert farm.overlays.closures("farm").items == ()
     before = farm.events.last_sequence("farm")
@@ -101,10 +101,10 @@ def test_kept_overlay_names_its_version_and_stays_in_force(farm: Store):
     assert farm.overlays.get("farm", one.id).state == "ended"
 
 
-def test_areas_in_force_are_bounded_in_size(farm: Store, monkeypatch: pytest.MonkeyPatch):
+def test_closures_in_force_are_bounded_in_bytes(farm: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(overlays, "MAX_IN_FORCE_BYTES", 100)
     farm.overlays.add(blocked(state="accepted"))
-    with pytest.raises(Conflict, match="simpler outlines"):
+    with pytest.raises(Conflict, match="simplify the polygon"):
         farm.overlays.add(blocked(state="accepted"))
 
 
@@ -112,7 +112,7 @@ def test_overlays_are_bounded_and_tidied(farm: Store, monkeypatch: pytest.Monkey
     monkeypatch.setattr(overlays, "MAX_PENDING", 2)
     one, _ = farm.overlays.add(blocked(edge="1"))
     two, _ = farm.overlays.add(blocked(edge="2"))
-    with pytest.raises(Conflict, match="2 overlays"):
+    with pytest.raises(Conflict, match="2 pending"):
         farm.overlays.add(blocked(edge="3"))
     assert farm.overlays.add(blocked(edge="2"))[0].id == two.id
     farm.overlays.decide("farm", one.id, "pending", "rejected", "ann", NOW - timedelta(days=31))
@@ -125,7 +125,7 @@ def test_overlays_are_bounded_and_tidied(farm: Store, monkeypatch: pytest.Monkey
     assert farm.overlays.all("farm") == []
 
 
-def test_of_very_many_the_newest_are_listed(farm: Store, monkeypatch: pytest.MonkeyPatch):
+def test_overlay_list_is_limited_to_newest(farm: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(overlays, "MAX_LISTED", 2)
     overlay_list = [farm.overlays.add(blocked(edge=f"e{k}", created=NOW + timedelta(seconds=k)))[0] for k in range(3)]
     assert [o.edge for o in farm.overlays.all("farm")] == ["e1", "e2"]

@@ -1,4 +1,4 @@
-"""Which environments a position is in: fences, floor and datums, on both databases."""
+"""Environments at a position: fences, floor and datums, on both databases."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.store.samples import DATUM, OBJECTS, TOPOLOGY, network, save
 
 SITE = PartKey("location", "ground", "site")
 MAP = PartKey("occupancy", "ground", "map")
-HERE = Datum(53.268, -0.5245)
+FARM_DATUM = Datum(53.268, -0.5245)
 FARM = shapely.box(-0.54, 53.254, -0.521, 53.276)
 
 
@@ -40,7 +40,7 @@ def fence(shape: Any, kind: str = "fence", anchor: Any = "wgs84") -> Features:
 
 
 def grid(free: tuple[int, int, int, int] | None, origin: tuple[float, float, float] = (0.0, 0.0, 0.0), **more: Any):
-    """400 × 300 m of a metre each: unknown but for free cells from (column, row) to (column, row)."""
+    """Return a grid of 400 × 300 m, 1 m per cell: unknown except for free cells from (column, row) to (column, row)."""
     cells = np.full((300, 400), 255, np.uint8)
     if free is not None:
         u0, v0, u1, v1 = free
@@ -50,7 +50,7 @@ def grid(free: tuple[int, int, int, int] | None, origin: tuple[float, float, flo
 
 
 def at(datum: Datum, x: float, y: float) -> tuple[float, float]:
-    """Latitude and longitude of local metres."""
+    """Convert local metres to latitude and longitude."""
     longitude, latitude = local_frame(datum).to_wgs84(np.array([[x, y]]))[0].tolist()
     return latitude, longitude
 
@@ -70,7 +70,7 @@ def stale(store: Store) -> list[str]:
         return list(connection.execute(select(table.c.name).where(table.c.area_stale)).scalars())
 
 
-def test_two_fields_of_one_farm_answer_for_their_own(store: Store):
+def test_positions_find_the_field_that_contains_them(store: Store):
     fields = {"north": shapely.box(-0.53, 53.27, -0.529, 53.271), "south": shapely.box(-0.53, 53.268, -0.529, 53.269)}
     for name, field in fields.items():
         store.environments.create(name, datum=Datum(field.bounds[1], field.bounds[0]))
@@ -91,7 +91,7 @@ def test_two_fields_of_one_farm_answer_for_their_own(store: Store):
 
 
 def test_fences_have_holes_and_several_pieces(store: Store):
-    store.environments.create("yard", datum=HERE)
+    store.environments.create("yard", datum=FARM_DATUM)
     ring = shapely.Polygon(
         shapely.box(-0.53, 53.26, -0.52, 53.27).exterior, [shapely.box(-0.526, 53.264, -0.524, 53.266).exterior]
     )
@@ -108,7 +108,7 @@ def test_fences_have_holes_and_several_pieces(store: Store):
     assert position_match.area == pytest.approx(surface(ring) + surface(island), abs=0.1)
 
 
-def test_both_databases_agree_with_geometry(store: Store):
+def test_position_query_agrees_with_geometry_on_both_databases(store: Store):
     random = np.random.default_rng(3)
     drawn: dict[str, Any] = {}
     for k in range(6):
@@ -123,7 +123,7 @@ def test_both_databases_agree_with_geometry(store: Store):
 
 
 @pytest.mark.parametrize("form", ["crossing", "cut", "local", "touching", "circle"])
-def test_fences_across_the_antimeridian(store: Store, form: str):
+def test_fence_across_antimeridian_covers_positions(store: Store, form: str):
     datum = Datum(-17.0, 179.999)
     store.environments.create("fiji", datum=datum)
     shape: Any = shapely.Polygon([(179.99, -17.01), (-179.99, -17.01), (-179.99, -16.99), (179.99, -16.99)])
@@ -150,7 +150,7 @@ def test_fences_across_the_antimeridian(store: Store, form: str):
     assert position_match.distance == pytest.approx(106.5, rel=0.01)
 
 
-def test_a_fence_without_area_is_none(store: Store):
+def test_fence_without_area_is_ignored(store: Store):
     line = shapely.Polygon([(-0.53, 53.26), (-0.52, 53.27), (-0.525, 53.265)])
     bow = shapely.Polygon([(-0.53, 53.26), (-0.52, 53.27), (-0.52, 53.26), (-0.53, 53.27)])
     drawn = {
@@ -169,8 +169,8 @@ def test_a_fence_without_area_is_none(store: Store):
     assert {(e.name, m.by) for e, m in environments} == {(name, "datum") for name in ("line", "path", "empty")}
 
 
-def test_what_is_called_a_fence_wins_over_other_polygons(store: Store):
-    store.environments.create("farm", datum=HERE)
+def test_polygons_of_kind_fence_win_over_other_polygons(store: Store):
+    store.environments.create("farm", datum=FARM_DATUM)
     boundary = shapely.box(-0.525, 53.268, -0.524, 53.269)
     save(store, "farm", Replace(SITE, features([("farm", FARM, {}), ("own", boundary, {"kind": "fence"})], "wgs84")))
     assert names(store, 53.2685, -0.5245) == ["farm"]
@@ -179,7 +179,7 @@ def test_what_is_called_a_fence_wins_over_other_polygons(store: Store):
     assert names(store, 53.26, -0.53) == ["farm"]
 
 
-def test_floor_is_what_grids_networks_and_floors_show(store: Store):
+def test_floor_area_joins_grids_networks_and_floors(store: Store):
     turned = Datum(53.2, -0.5, heading=30.0)
     for name in ("grid", "network", "hall", "mask", "unknown"):
         store.environments.create(name, datum=turned)
@@ -199,7 +199,7 @@ def test_floor_is_what_grids_networks_and_floors_show(store: Store):
     def hits(x: float, y: float) -> dict[str, str]:
         return {e.name: m.by for e, m in store.areas.locate(*at(turned, x, y))[0]}
 
-    # The grid is turned by 90°: x = 500 - v, y = u; the lowest row of its free room is a wall.
+    # the grid is turned by 90°: x = 500 - v, y = u; the lowest row of its free room is a wall
     assert hits(350, 200) == {"grid": "floor"}
     assert hits(450 + 8, 200) == {"grid": "floor"}, "10 m around it"
     assert hits(500, 200) == {}
@@ -217,7 +217,7 @@ def test_floor_is_what_grids_networks_and_floors_show(store: Store):
 
 
 @pytest.mark.parametrize("anchor", ["local", "wgs84"])
-def test_floor_counts_near_the_datum_alone(store: Store, anchor: Any):
+def test_floor_counts_only_near_datum(store: Store, anchor: Any):
     datum = Datum(53.2, -0.5)
     store.environments.create("long", datum=datum)
     store.environments.create("far", datum=datum)
@@ -235,49 +235,56 @@ def test_floor_counts_near_the_datum_alone(store: Store, anchor: Any):
     assert {(e.name, m.by) for e, m in store.areas.locate(*at(datum, 0, 0))[0]} == {("long", "floor"), ("far", "datum")}
 
 
-def test_a_datum_has_a_neighbourhood_but_null_island_has_none(store: Store):
-    store.environments.create("bare", datum=HERE)
+def test_datum_has_neighbourhood_except_null_island(store: Store):
+    store.environments.create("bare", datum=FARM_DATUM)
     store.environments.create("nowhere")
     store.environments.create("unset", datum=Datum(0.0, 0.0))
     store.environments.create("gulf", datum=Datum(0.0, 0.0))
     square = fence(shapely.box(-9, -9, 9, 9), anchor="local")
     save(store, "unset", Replace(TOPOLOGY, network(20)), Replace(SITE, square))
     save(store, "nowhere", Replace(TOPOLOGY, network(20)), Replace(SITE, fence(FARM)))
-    assert match(store, "bare", *at(HERE, 199, 0)) == Match("datum", pytest.approx(math.pi * 200**2, rel=0.01), 199.0)
-    assert names(store, *at(HERE, 199, 0)) == ["nowhere", "bare"], "a fence on earth needs no datum"
-    assert match(store, "nowhere", *at(HERE, 199, 0)) == Match("fence", pytest.approx(3.1e6, rel=0.1), None)
-    assert names(store, *at(HERE, 0, 1500)) == []
+    assert match(store, "bare", *at(FARM_DATUM, 199, 0)) == Match(
+        "datum", pytest.approx(math.pi * 200**2, rel=0.01), 199.0
+    )
+    assert names(store, *at(FARM_DATUM, 199, 0)) == ["nowhere", "bare"], "a fence on earth needs no datum"
+    assert match(store, "nowhere", *at(FARM_DATUM, 199, 0)) == Match("fence", pytest.approx(3.1e6, rel=0.1), None)
+    assert names(store, *at(FARM_DATUM, 0, 1500)) == []
     assert names(store, 0.0, 0.0) == []
     assert names(store, 0.0, 1e-5) == []
     save(store, "gulf", Replace(SITE, fence(shapely.box(-1, -1, 1, 1))))
-    assert names(store, 0.0, 0.0) == ["gulf"], "a fence that somebody drew there counts"
+    assert names(store, 0.0, 0.0) == ["gulf"], "a drawn fence counts"
 
 
-def test_fences_first_then_the_smallest_then_the_nearest_datum(store: Store):
+def test_matches_are_ordered_by_fence_size_and_distance(store: Store):
     for name, half in (("large", 0.02), ("small", 0.01)):
-        store.environments.create(name, datum=HERE)
+        store.environments.create(name, datum=FARM_DATUM)
         box = shapely.box(*(c + s * half for c, s in zip((-0.5245, 53.268) * 2, (-1, -1, 1, 1), strict=True)))
         save(store, name, Replace(SITE, fence(box)))
-    store.environments.create("a-far", datum=Datum(*at(HERE, 150, 0)))
-    store.environments.create("b-near", datum=Datum(*at(HERE, 50, 0)))
-    store.environments.create("room", datum=HERE)
+    store.environments.create("a-far", datum=Datum(*at(FARM_DATUM, 150, 0)))
+    store.environments.create("b-near", datum=Datum(*at(FARM_DATUM, 50, 0)))
+    store.environments.create("room", datum=FARM_DATUM)
     save(store, "room", Replace(MAP, grid((0, 0, 10, 10), origin=(-5.0, -5.0, 0.0))))
     expected = ["small", "large", "room", "b-near", "a-far"]
-    assert names(store, HERE.latitude, HERE.longitude) == expected
+    assert names(store, FARM_DATUM.latitude, FARM_DATUM.longitude) == expected
     seen: list[str] = []
     cursor: str | None = None
     pages = 0
     while pages == 0 or cursor is not None:
-        environments, cursor = store.areas.locate(HERE.latitude, HERE.longitude, limit=2, cursor=cursor)
+        environments, cursor = store.areas.locate(FARM_DATUM.latitude, FARM_DATUM.longitude, limit=2, cursor=cursor)
         seen += [e.name for e, _ in environments]
         pages += 1
     assert (seen, pages) == (expected, 3)
-    assert names(store, HERE.latitude, HERE.longitude, allowed="*r*") == ["large", "room", "b-near", "a-far"]
-    assert names(store, HERE.latitude, HERE.longitude, q="ROOM") == ["room"]
-    assert names(store, HERE.latitude, HERE.longitude, bbox=(-0.51, 53.26, -0.50, 53.27)) == ["large"]
+    assert names(store, FARM_DATUM.latitude, FARM_DATUM.longitude, allowed="*r*") == [
+        "large",
+        "room",
+        "b-near",
+        "a-far",
+    ]
+    assert names(store, FARM_DATUM.latitude, FARM_DATUM.longitude, q="ROOM") == ["room"]
+    assert names(store, FARM_DATUM.latitude, FARM_DATUM.longitude, bbox=(-0.51, 53.26, -0.50, 53.27)) == ["large"]
     for bad in ("", "farm", "1 2 3", "a 1 2 farm"):
         with pytest.raises(Invalid, match="Link"):
-            store.areas.locate(HERE.latitude, HERE.longitude, cursor=bad)
+            store.areas.locate(FARM_DATUM.latitude, FARM_DATUM.longitude, cursor=bad)
     for wrong in ((91.0, 0.0), (0.0, 181.0), (math.nan, 0.0), (0.0, math.inf)):
         with pytest.raises(Invalid, match="degrees"):
             store.areas.locate(*wrong)
@@ -285,7 +292,7 @@ def test_fences_first_then_the_smallest_then_the_nearest_datum(store: Store):
         store.areas.locate(0.0, 0.0, limit=0)
 
 
-def test_areas_follow_every_change_in_its_transaction(store: Store):
+def test_area_follows_every_change_in_its_transaction(store: Store):
     west, east = (53.265, -0.529), (53.265, -0.521)
     one, other = shapely.box(-0.53, 53.26, -0.525, 53.27), shapely.box(-0.525, 53.26, -0.52, 53.27)
 
@@ -293,7 +300,7 @@ def test_areas_follow_every_change_in_its_transaction(store: Store):
         assert stale(store) == []
         return names(store, *west), names(store, *east)
 
-    store.environments.create("farm", datum=HERE)
+    store.environments.create("farm", datum=FARM_DATUM)
     save(store, "farm", Replace(SITE, fence(one)))
     assert matching_names() == (["farm"], [])
     save(store, "farm", Put(SITE, fence(other)))
@@ -313,13 +320,13 @@ def test_areas_follow_every_change_in_its_transaction(store: Store):
     assert matching_names() == (["farm"], ["second"])
     save(store, "second", Drop(SITE))
     assert matching_names() == (["farm"], [])
-    position_match = match(store, "second", *at(HERE, 150, 150))
+    position_match = match(store, "second", *at(FARM_DATUM, 150, 150))
     assert (position_match.by if position_match else "none") == "floor"
     moved = Datum(53.3, -0.6)
     base = store.versions.get("second")
     store.versions.commit("second", store.versions.prepare(base, Changes(datum=moved)), author="me", message="moved")
     assert stale(store) == []
-    assert names(store, *at(HERE, 150, 150)) == []
+    assert names(store, *at(FARM_DATUM, 150, 150)) == []
     assert names(store, *at(moved, 150, 150)) == ["second"]
     store.environments.delete("second")
     store.environments.purge("second")
@@ -327,30 +334,30 @@ def test_areas_follow_every_change_in_its_transaction(store: Store):
         assert len(connection.execute(select(tables.area)).all()) == 1
 
 
-def test_large_content_is_left_to_the_next_query(store: Store, monkeypatch: pytest.MonkeyPatch):
+def test_area_of_large_content_is_computed_by_next_query(store: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(area, "MAX_FEATURES", 10)
     monkeypatch.setattr(area, "MAX_CELLS", 1000)
-    store.environments.create("farm", datum=HERE)
+    store.environments.create("farm", datum=FARM_DATUM)
     save(store, "farm", Replace(TOPOLOGY, network(50, side=300)))
     assert stale(store) == ["farm"]
     expected = Match("floor", pytest.approx(9e4, rel=0.2), pytest.approx(212.1, abs=0.1))
-    assert match(store, "farm", *at(HERE, 150, 150)) == expected
+    assert match(store, "farm", *at(FARM_DATUM, 150, 150)) == expected
     assert stale(store) == []
     save(store, "farm", Replace(MAP, grid((0, 0, 400, 300), origin=(-400.0, -300.0, 0.0))))
     assert stale(store) == ["farm"]
     save(store, "farm", Replace(SITE, fence(FARM)))
-    assert stale(store) == [], "a fence needs no look at the floor"
+    assert stale(store) == [], "a fence needs no floor"
     save(store, "farm", Drop(SITE))
     assert stale(store) == ["farm"]
     save(store, "farm", Replace(PartKey("zones", "ground", "zones"), features([], "local", {"a": 1})))
-    assert stale(store) == ["farm"], "what does not touch the area does not make it good"
-    assert names(store, *at(HERE, -200, -200)) == ["farm"]
+    assert stale(store) == ["farm"], "a change outside the area does not mark it as current"
+    assert names(store, *at(FARM_DATUM, -200, -200)) == ["farm"]
     assert stale(store) == []
 
 
-def test_several_servers_catch_up_together(store: Store, database_url: str, monkeypatch: pytest.MonkeyPatch):
+def test_several_servers_compute_areas_concurrently(store: Store, database_url: str, monkeypatch: pytest.MonkeyPatch):
     for k in range(8):
-        store.environments.create(f"farm-{k}", datum=HERE)
+        store.environments.create(f"farm-{k}", datum=FARM_DATUM)
         save(store, f"farm-{k}", Replace(SITE, fence(FARM)))
     table = tables.environment
     with store._database.write() as connection:
@@ -361,7 +368,7 @@ def test_several_servers_catch_up_together(store: Store, database_url: str, monk
 
     def slow(*arguments: Any) -> Any:
         result = compute(*arguments)
-        if not moved.is_set():  # a commit comes between the computing and the writing
+        if not moved.is_set():  # a commit between the computation and the write
             moved.set()
             save(store, "farm-0", Replace(SITE, fence(shapely.box(-0.5, 53.0, -0.4, 53.1))))
             with store._database.write() as connection:
@@ -384,11 +391,11 @@ def test_several_servers_catch_up_together(store: Store, database_url: str, monk
         assert len(connection.execute(select(tables.area)).all()) == 8
 
 
-def test_damaged_content_of_one_environment_keeps_no_other_away(
+def test_damaged_environment_does_not_hide_others(
     store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     for name in ("good", "rotten"):
-        store.environments.create(name, datum=HERE)
+        store.environments.create(name, datum=FARM_DATUM)
     with store._database.write() as connection:
         connection.execute(tables.area.delete())
         connection.execute(update(tables.environment).values(area_stale=True))
@@ -402,16 +409,16 @@ def test_damaged_content_of_one_environment_keeps_no_other_away(
 
     calls: list[int] = []
     monkeypatch.setattr(position, "compute_area", fail)
-    environment_names = names(store, HERE.latitude, HERE.longitude)
+    environment_names = names(store, FARM_DATUM.latitude, FARM_DATUM.longitude)
     assert len(environment_names) == 1
     assert len(stale(store)) == 1
     assert "chunk 4711" in caplog.text
     assert stale(store)[0] in caplog.text
-    assert names(store, HERE.latitude, HERE.longitude) == ["good", "rotten"]
+    assert names(store, FARM_DATUM.latitude, FARM_DATUM.longitude) == ["good", "rotten"]
 
 
-def test_environments_of_an_older_release_are_found_after_the_migration(store: Store):
-    store.environments.create("old", datum=HERE)
+def test_environments_of_older_release_are_found_after_migration(store: Store):
+    store.environments.create("old", datum=FARM_DATUM)
     save(store, "old", Replace(SITE, fence(FARM)))
     revision = ScriptDirectory.from_config(schema.config()).get_revision("0007")
     settings = schema.config()
@@ -432,7 +439,7 @@ MANY = 10_000
 
 @contextmanager
 def statements(store: Store) -> Iterator[list[tuple[str, Any]]]:
-    """The statements on areas that are executed."""
+    """Record the executed statements on areas."""
     seen: list[tuple[str, Any]] = []
 
     def note(connection: Any, cursor: Any, statement: str, parameters: Any, *_: Any) -> None:
@@ -447,7 +454,7 @@ def statements(store: Store) -> Iterator[list[tuple[str, Any]]]:
 
 
 def crowd(store: Store, corners: Sequence[tuple[float, float]], size: float) -> None:
-    """Environments with a square fence each, written as they are stored."""
+    """Insert environments with a square fence each, in their stored form."""
     store.environments.create("model", datum=DATUM)
     with store._database.write() as connection:
         row = dict(connection.execute(select(tables.environment)).mappings().one())
@@ -473,7 +480,7 @@ def crowd(store: Store, corners: Sequence[tuple[float, float]], size: float) -> 
         )
 
 
-def test_ten_thousand_environments_cost_an_index_search(store: Store):
+def test_position_query_of_ten_thousand_environments_uses_index(store: Store):
     random = np.random.default_rng(0)
     corners = (random.random((MANY, 2)) * np.array([300.0, 100.0]) - np.array([150.0, 50.0])).tolist()
     crowd(store, corners, 0.05)
@@ -503,7 +510,7 @@ def test_ten_thousand_environments_cost_an_index_search(store: Store):
             driver.set_progress_handler(count, 1)
             row_count = len(connection.exec_driver_sql(statement, parameters).all())
             driver.set_progress_handler(None, 0)
-            assert row_count < 5, "what shapely looks at"
+            assert row_count < 5, "number of polygons that shapely tests"
             assert steps[0] < 10 * MANY, "instructions of SQLite's machine: a few for each entry of the index"
         else:
             plan_ = connection.exec_driver_sql(f"EXPLAIN (ANALYZE, FORMAT JSON) {statement}", parameters).scalar_one()
@@ -515,14 +522,14 @@ def test_ten_thousand_environments_cost_an_index_search(store: Store):
 
 
 def flat(plan: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """A plan's nodes."""
+    """Return the nodes of a plan."""
     yield plan
     for inner in plan.get("Plans", ()):
         yield from flat(inner)
 
 
-def test_nothing_is_read_of_environments_that_are_not_behind(sqlite_store: Store):
-    sqlite_store.environments.create("farm", datum=HERE)
+def test_stale_areas_are_found_by_index(sqlite_store: Store):
+    sqlite_store.environments.create("farm", datum=FARM_DATUM)
     with sqlite_store._database.engine.connect() as connection:
         query = select(tables.environment.c.id).where(tables.environment.c.area_stale)
         text = str(query.compile(sqlite_store._database.engine))

@@ -1,4 +1,4 @@
-"""What robots said, kept on both databases."""
+"""Robot reports and presence, on both databases."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ NOW = datetime(2031, 5, 1, 14, 0, tzinfo=UTC)
 A, B = "a" * 64, "b" * 64
 
 
-def heard(robot: str, minute: float, root: str = A, state: Any = "active", **more: Any) -> ReceivedReport:
-    """A report, so many minutes after NOW."""
+def received_report(robot: str, minute: float, root: str = A, state: Any = "active", **more: Any) -> ReceivedReport:
+    """Return a report received the given minutes after NOW."""
     version = more.pop("version", 1)
     channel = more.pop("channel", "production")
     environment = more.pop("environment", "farm")
@@ -36,63 +36,74 @@ def farm(store: Store) -> Store:
     return store
 
 
-def test_held_version_follows_the_statement_of_the_robot(farm: Store):
+def test_active_map_follows_robot_reports(farm: Store):
     def active_map() -> ActiveMap | None:
         return farm.robots.all("farm", "r1")[0].active_map
 
-    def say(minute: float, root: str, state: Any, holds: tuple[int, str] | None, **more: Any) -> None:
-        assert farm.robots.note_reports([heard("r1", minute, root, state, holds=holds, **more)]) == [None]
+    def report_status(minute: float, root: str, state: Any, holds: tuple[int, str] | None, **more: Any) -> None:
+        assert farm.robots.note_reports([received_report("r1", minute, root, state, holds=holds, **more)]) == [None]
 
-    say(0, A, "active", None, sequence=3)
-    say(1, "c" * 64, "failed", (2, B), version=3, sequence=5)
+    report_status(0, A, "active", None, sequence=3)
+    report_status(1, "c" * 64, "failed", (2, B), version=3, sequence=5)
     assert active_map() == ActiveMap(2, B, 5, NOW + timedelta(minutes=1)), "the status active of B was lost"
-    say(2, "c" * 64, "failed", (2, B), version=3, sequence=5)
+    report_status(2, "c" * 64, "failed", (2, B), version=3, sequence=5)
     assert active_map() == ActiveMap(2, B, 5, NOW + timedelta(minutes=1))
     assert len(farm.robots.history("farm", "r1")) == 2
-    say(3, "c" * 64, "failed", (1, A), version=3, sequence=5)
-    assert active_map() == ActiveMap(1, A, 5, NOW + timedelta(minutes=3)), "the same failure, and it went back"
-    say(4, "c" * 64, "downloading", None, version=3)
-    assert active_map() == ActiveMap(1, A, 5, NOW + timedelta(minutes=3)), "it does not say"
-    say(5, "c" * 64, "active", (1, A), version=3)
-    assert active_map() == ActiveMap(3, "c" * 64, None, NOW + timedelta(minutes=5)), "active is what it runs"
-    say(6, A, "downloading", (0, NO_ROOT), version=1)
+    report_status(3, "c" * 64, "failed", (1, A), version=3, sequence=5)
+    assert active_map() == ActiveMap(1, A, 5, NOW + timedelta(minutes=3)), "the same failure, and it moved back"
+    report_status(4, "c" * 64, "downloading", None, version=3)
+    assert active_map() == ActiveMap(1, A, 5, NOW + timedelta(minutes=3)), "not reported"
+    report_status(5, "c" * 64, "active", (1, A), version=3)
+    assert active_map() == ActiveMap(3, "c" * 64, None, NOW + timedelta(minutes=5)), (
+        "active means that it runs the version"
+    )
+    report_status(6, A, "downloading", (0, NO_ROOT), version=1)
     assert active_map() is None, "its disk is empty"
 
 
-def test_authority_of_one_report_lasts(farm: Store):
+def test_vouched_robot_stays_vouched(farm: Store):
     def vouched() -> list[bool]:
         return [r.vouched for r in farm.robots.all("farm")]
 
     open_bus = {"vouched": False}
     reported_at = NOW
-    first, second = heard("r1", 0, A, reported_at=reported_at), heard("r1", 1, B, "ready", reported_at=reported_at)
+    first, second = (
+        received_report("r1", 0, A, reported_at=reported_at),
+        received_report("r1", 1, B, "ready", reported_at=reported_at),
+    )
     farm.robots.note_reports(
-        [replace(first, **open_bus), replace(second, **open_bus), replace(heard("r2", 0), **open_bus)]
+        [replace(first, **open_bus), replace(second, **open_bus), replace(received_report("r2", 0), **open_bus)]
     )
     assert vouched() == [False, False]
     farm.robots.note_reports([replace(first, time=NOW + timedelta(minutes=2))])
-    assert vouched() == [True, False], "the same report came late, over HTTP"
+    assert vouched() == [True, False], "the same report arrived late, over HTTP"
     assert farm.robots.all("farm", "r1")[0].report.state == "ready"
-    farm.robots.note_reports([replace(heard("r1", 3, A, "failed"), **open_bus), heard("r2", 3)])
+    farm.robots.note_reports([replace(received_report("r1", 3, A, "failed"), **open_bus), received_report("r2", 3)])
     assert vouched() == [True, True]
     farm.robots.forget("farm", "r2")
-    farm.robots.note_reports([replace(heard("r2", 4), **open_bus)])
+    farm.robots.note_reports([replace(received_report("r2", 4), **open_bus)])
     assert vouched() == [True, False]
 
 
-def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
+def test_active_map_stays_while_robot_fetches(farm: Store):
     reported_at = NOW - timedelta(hours=5)
-    assert farm.robots.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, reported_at=reported_at)]) == [None]
+    assert farm.robots.note_reports(
+        [received_report("r1", 0, A, detail="ok\x00", sequence=4, reported_at=reported_at)]
+    ) == [None]
     (robot,) = farm.robots.all("farm")
     assert robot.report == RobotReport("production", 1, A, "active", "ok\ufffd", 4, reported_at)
     assert (robot.environment, robot.robot, robot.time, robot.since) == ("farm", "r1", NOW, NOW)
     assert robot.active_map == ActiveMap(1, A, 4, NOW)
     assert (robot.on_bus, robot.presence_at) == (None, None)
-    farm.robots.note_reports([heard("r1", 1, B, "downloading", version=2), heard("r1", 2, B, "failed", version=2)])
+    farm.robots.note_reports(
+        [received_report("r1", 1, B, "downloading", version=2), received_report("r1", 2, B, "failed", version=2)]
+    )
     (robot,) = farm.robots.all("farm", "r1")
     assert (robot.report.state, robot.report.version) == ("failed", 2)
     assert robot.active_map == ActiveMap(1, A, 4, NOW)
-    farm.robots.note_reports([heard("r1", 3, B, version=2, sequence=9), heard("r1", 4, B, version=2, sequence=9)])
+    farm.robots.note_reports(
+        [received_report("r1", 3, B, version=2, sequence=9), received_report("r1", 4, B, version=2, sequence=9)]
+    )
     (robot,) = farm.robots.all("farm", "r1")
     assert robot.active_map == ActiveMap(2, B, 9, NOW + timedelta(minutes=3))
     assert (robot.since, robot.time) == (NOW + timedelta(minutes=3), NOW + timedelta(minutes=4))
@@ -104,9 +115,9 @@ def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
     assert len(farm.robots.history("farm", "r1", limit=2)) == 2
 
 
-def test_a_report_that_comes_twice_counts_once(farm: Store):
-    first = heard("r1", 0, B, "downloading", reported_at=NOW)
-    second = heard("r1", 0, B, "ready", reported_at=NOW + timedelta(seconds=1), detail="x")
+def test_duplicate_report_counts_once(farm: Store):
+    first = received_report("r1", 0, B, "downloading", reported_at=NOW)
+    second = received_report("r1", 0, B, "ready", reported_at=NOW + timedelta(seconds=1), detail="x")
     farm.robots.note_reports([first, second, replace(first, time=NOW + timedelta(minutes=1)), second])
     assert [r.state for _, r in farm.robots.history("farm", "r1")] == ["ready", "downloading"]
     (robot,) = farm.robots.all("farm")
@@ -114,16 +125,21 @@ def test_a_report_that_comes_twice_counts_once(farm: Store):
     farm.robots.note_reports([replace(first, time=NOW + timedelta(minutes=1))])
     (robot,) = farm.robots.all("farm")
     assert (robot.report.state, robot.time) == ("ready", NOW + timedelta(minutes=1))
-    farm.robots.note_reports([heard("r1", 2, B, "downloading", reported_at=NOW + timedelta(seconds=2))])
+    farm.robots.note_reports([received_report("r1", 2, B, "downloading", reported_at=NOW + timedelta(seconds=2))])
     assert farm.robots.all("farm")[0].report.state == "downloading"
 
 
-def test_robots_of_several_environments(farm: Store):
+def test_robots_are_listed_per_environment(farm: Store):
     farm.environments.create("yard")
-    refused = farm.robots.note_reports(
-        [heard("r2", 0), heard("r1", 0), heard("r1", 0, environment="nowhere"), heard("r1", 1, environment="yard")]
+    errors = farm.robots.note_reports(
+        [
+            received_report("r2", 0),
+            received_report("r1", 0),
+            received_report("r1", 0, environment="nowhere"),
+            received_report("r1", 1, environment="yard"),
+        ]
     )
-    assert [type(r) for r in refused] == [type(None), type(None), NotFound, type(None)]
+    assert [type(e) for e in errors] == [type(None), type(None), NotFound, type(None)]
     assert [(r.environment, r.robot) for r in farm.robots.all()] == [("farm", "r1"), ("farm", "r2"), ("yard", "r1")]
     assert [r.environment for r in farm.robots.all(robot="r1")] == ["farm", "yard"]
     farm.environments.delete("yard")
@@ -141,28 +157,30 @@ def test_robots_of_several_environments(farm: Store):
 def test_history_and_fleet_are_bounded(farm: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(robots, "HISTORY", 5)
     monkeypatch.setattr(robots, "MAX_ROBOTS", 2)
-    farm.robots.note_reports([heard("r1", k, version=k) for k in range(12)] + [heard("r2", 0)])
+    farm.robots.note_reports([received_report("r1", k, version=k) for k in range(12)] + [received_report("r2", 0)])
     assert [r.version for _, r in farm.robots.history("farm", "r1")] == [11, 10, 9, 8, 7]
     assert len(farm.robots.history("farm", "r2")) == 1
-    (refused,) = farm.robots.note_reports([heard("r3", 0)])
-    assert isinstance(refused, Conflict)
-    assert farm.robots.note_reports([heard("r2", 1)]) == [None]
+    (error,) = farm.robots.note_reports([received_report("r3", 0)])
+    assert isinstance(error, Conflict)
+    assert farm.robots.note_reports([received_report("r2", 1)]) == [None]
     assert [r.robot for r in farm.robots.all()] == ["r1", "r2"]
 
 
-def test_many_writers_of_the_same_robots(farm: Store):
+def test_concurrent_reports_of_same_robots_are_stored(farm: Store):
     def write(k: int) -> None:
         names = [f"r{n}" for n in range(6)]
         for name in names if k % 2 else reversed(names):
-            assert farm.robots.note_reports([heard(name, k, version=k), heard("r0", k, version=k)]) == [None, None]
+            assert farm.robots.note_reports(
+                [received_report(name, k, version=k), received_report("r0", k, version=k)]
+            ) == [None, None]
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(write, range(8)))
     assert [r.robot for r in farm.robots.all("farm")] == [f"r{n}" for n in range(6)]
 
 
-def test_presence(farm: Store, monkeypatch: pytest.MonkeyPatch):
-    farm.robots.note_reports([heard("r1", 0), heard("r2", 0)])
+def test_presence_is_stored_and_bounded(farm: Store, monkeypatch: pytest.MonkeyPatch):
+    farm.robots.note_reports([received_report("r1", 0), received_report("r2", 0)])
     farm.robots.note_presence({"r1", "r2", "r9"}, set(), NOW)
     later = NOW + timedelta(minutes=9)
     farm.robots.note_presence({"r1"}, {"r2"}, later)
@@ -171,12 +189,12 @@ def test_presence(farm: Store, monkeypatch: pytest.MonkeyPatch):
         ("r2", False, later),
     ]
     monkeypatch.setattr(robots, "MAX_PRESENT", 3)
-    farm.robots.note_reports([heard("r3", 0)])
+    farm.robots.note_reports([received_report("r3", 0)])
     farm.robots.note_presence({"r2", "r3"}, {"r1"}, later)
     assert [(r.robot, r.on_bus) for r in farm.robots.all()] == [("r1", False), ("r2", True), ("r3", None)]
 
 
-def test_silent_robots_are_tidied_away(farm: Store):
+def test_silent_robots_are_removed(farm: Store):
     old = datetime.now(UTC) - timedelta(days=91)
     farm.robots.note_reports([ReceivedReport("farm", "old", RobotReport("latest", 0, A, "active"), old)])
     farm.robots.note_reports([ReceivedReport("farm", "new", RobotReport("latest", 0, A, "active"), datetime.now(UTC))])
@@ -186,7 +204,7 @@ def test_silent_robots_are_tidied_away(farm: Store):
     assert farm.robots.history("farm", "old") == []
 
 
-def test_moves_of_channels(farm: Store):
+def test_channel_moves_are_listed_oldest_first(farm: Store):
     first = save(farm, "farm", Replace(GRID, grid()))
     second = save(farm, "farm", Replace(GRID, grid(seed=1)))
     farm.channels.move("farm", "production", 2, author="ann")
@@ -200,51 +218,51 @@ def test_moves_of_channels(farm: Store):
     assert farm.channels.moves("farm", "none") == []
 
 
-def test_convergence_is_proved(farm: Store):
+def test_convergence_requires_reports_of_root(farm: Store):
     old, new = (save(farm, "farm", Replace(GRID, grid(seed=k))).root for k in range(2))
     channel = farm.channels.move("farm", "production", 2, author="ann")
     base = channel.time
 
-    def say(robot: str, seconds: float, root: str, state: Any = "active", **more: Any) -> None:
+    def report_status(robot: str, seconds: float, root: str, state: Any = "active", **more: Any) -> None:
         report = RobotReport(more.pop("channel", "production"), 0, root, state, **more)
         farm.robots.note_reports([ReceivedReport("farm", robot, report, base + timedelta(seconds=seconds))])
 
-    def stand(seconds: float = 60) -> Any:
+    def convergence(seconds: float = 60) -> Any:
         return channel_convergence(farm.robots.all("farm"), channel, base + timedelta(seconds=seconds))
 
-    assert stand().as_dict() == {
+    assert convergence().as_dict() == {
         "total": 0, "online": 0, "holding": 0, "lagging": 0, "failed": 0, "ready": 0, "since": None,
     }  # fmt: skip
-    say("a", -100, new)
-    say("b", 3, old, sequence=1)
-    say("c", 4, new, "failed")
-    say("d", 4, old, channel="staging")
-    now = stand()
+    report_status("a", -100, new)
+    report_status("b", 3, old, sequence=1)
+    report_status("c", 4, new, "failed")
+    report_status("d", 4, old, channel="staging")
+    now = convergence()
     assert (now.total, now.online, now.holding, now.lagging, now.failed, now.since) == (3, 3, 1, 1, 1, None)
-    assert stand(1000).online == 0
-    say("b", 5, new)
-    say("b", 9, new)
-    say("c", 7, new)
-    now = stand()
+    assert convergence(1000).online == 0
+    report_status("b", 5, new)
+    report_status("b", 9, new)
+    report_status("c", 7, new)
+    now = convergence()
     assert (now.total, now.holding, now.lagging, now.failed) == (3, 3, 0, 0)
     assert now.since == base + timedelta(seconds=7)
     farm.robots.forget("farm", "b")
     farm.robots.forget("farm", "c")
-    assert stand().since == base, "before the channel came there, nobody held the channel's root"
-    # What comes next is fetched, while the present is held.
+    assert convergence().since == base, "before the move no robot ran the root"
+    # the next version is fetched while the robot runs the present one
     planned = farm.channels.move("farm", "production", 1, author="ann", activate_at=base + timedelta(hours=1))
     assert planned.planned is not None
     assert planned.planned.root == old
-    say("a", 20, old, "ready")
+    report_status("a", 20, old, "ready")
     ready = channel_convergence(farm.robots.all("farm"), planned, base, old)
     assert (ready.holding, ready.ready) == (1, 1)
     report = RobotReport("production", 1, old, "ready")
-    farm.robots.note_reports([ReceivedReport("farm", "made-up", report, base + timedelta(seconds=21), vouched=False)])
+    farm.robots.note_reports([ReceivedReport("farm", "unvouched", report, base + timedelta(seconds=21), vouched=False)])
     ready = channel_convergence(farm.robots.all("farm"), planned, base, old)
-    assert (ready.total, ready.ready) == (2, 1), "it is listed, and does not count in the roll-out"
+    assert (ready.total, ready.ready) == (2, 1), "it is listed, and does not count in the rollout"
 
 
-def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
+def test_lag_counts_unapplied_events(sqlite_store: Store):
     farm = sqlite_store
     farm.environments.create("farm", datum=DATUM)
     channel = next(c for c in farm.channels.all("farm"))
@@ -257,27 +275,29 @@ def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
         lag = robot_lag(robot, channel, moves)
         return lag.events, lag.differs, lag.since and (lag.since - NOW) / timedelta(minutes=1)
 
-    assert lag(heard("in-step", 0, moves[2].root)) == (0, False, None)
-    assert lag(heard("told", 0, moves[1].root, sequence=5)) == (1, True, 7)
-    assert lag(heard("untold", 0, moves[0].root)) == (2, True, 5)
-    assert lag(heard("foreign", 0, A)) == (3, True, 2)
-    assert lag(heard("empty", 0, moves[2].root, "downloading")) == (3, True, 2)
-    assert lag(heard("ahead", 4, A, sequence=9)) == (0, True, 4)
+    assert lag(received_report("in-step", 0, moves[2].root)) == (0, False, None)
+    assert lag(received_report("applied", 0, moves[1].root, sequence=5)) == (1, True, 7)
+    assert lag(received_report("behind", 0, moves[0].root)) == (2, True, 5)
+    assert lag(received_report("foreign", 0, A)) == (3, True, 2)
+    assert lag(received_report("empty", 0, moves[2].root, "downloading")) == (3, True, 2)
+    assert lag(received_report("ahead", 4, A, sequence=9)) == (0, True, 4)
 
 
 @pytest.mark.parametrize(
-    ("report", "there", "seen", "online"),
+    ("report", "present", "seen", "online"),
     [
         (-1, None, None, True), (-4, None, None, False),
         (-4, True, -0.5, True), (-4, True, -2, False), (-1, True, -2, True),
         (-1, False, -0.5, False), (-1, False, -2, True), (-1, False, -1, False),
     ],
 )  # fmt: skip
-def test_who_is_online(sqlite_store: Store, report: float, there: bool | None, seen: float | None, online: bool):
+def test_robot_is_online_by_presence_or_recent_report(
+    sqlite_store: Store, report: float, present: bool | None, seen: float | None, online: bool
+):
     sqlite_store.environments.create("farm")
-    sqlite_store.robots.note_reports([heard("r", report)])
+    sqlite_store.robots.note_reports([received_report("r", report)])
     if seen is not None:
         at = NOW + timedelta(minutes=seen)
-        sqlite_store.robots.note_presence({"r"} if there else set(), set() if there else {"r"}, at)
+        sqlite_store.robots.note_presence({"r"} if present else set(), set() if present else {"r"}, at)
     (robot,) = sqlite_store.robots.all()
     assert is_online(robot, NOW) is online

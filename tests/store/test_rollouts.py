@@ -1,4 +1,4 @@
-"""Moves in two stages, on both databases."""
+"""Two-stage rollouts, on both databases."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.store.samples import GRID, grid, save
 
 
 class Fleet:
-    """Robots of the channel production, which stands on version 1; version 2 is to come."""
+    """Robots of the channel production, which points to version 1 and is to move to version 2."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
@@ -27,7 +27,7 @@ class Fleet:
     def at(self, seconds: float) -> datetime:
         return self.start + timedelta(seconds=seconds)
 
-    def say(self, robots: str, version: int, state: Any, seconds: float = 1, *, vouched: bool = True) -> None:
+    def report(self, robots: str, version: int, state: Any, seconds: float = 1, *, vouched: bool = True) -> None:
         report = RobotReport("production", version, self.roots[version], state)
         assert not any(
             self.store.robots.note_reports(
@@ -42,7 +42,7 @@ class Fleet:
         )
 
     def tick(self, seconds: float) -> tuple[int | None, str]:
-        """(version, state of the roll-out) after it."""
+        """Advance the rollout; returns (version, state of the rollout)."""
         self.store.channels.apply_due_moves(self.at(seconds))
         self.store.channels.advance_rollouts(self.at(seconds), next_step)
         now = self.channel()
@@ -51,7 +51,7 @@ class Fleet:
     def channel(self) -> Channel:
         return next(c for c in self.store.channels.all("farm") if c.name == "production")
 
-    def told(self) -> list[dict[str, Any]]:
+    def events(self) -> list[dict[str, Any]]:
         return [dict(e.body) for e in self.store.events.page("farm", since=5)]
 
 
@@ -60,52 +60,52 @@ def fleet(store: Store) -> Fleet:
     return Fleet(store)
 
 
-def test_robots_without_authority_neither_move_nor_stop_a_rollout(fleet: Fleet):
-    fleet.say("ab", 1, "active")
-    fleet.say("wxyz", 1, "active", vouched=False)
+def test_unvouched_robots_neither_move_nor_stop_rollout(fleet: Fleet):
+    fleet.report("ab", 1, "active")
+    fleet.report("wxyz", 1, "active", vouched=False)
     fleet.roll(ready=1, failed=0.4)
-    fleet.say("wxyz", 2, "ready", 2, vouched=False)
+    fleet.report("wxyz", 2, "ready", 2, vouched=False)
     assert fleet.tick(3) == (1, "waiting")
-    fleet.say("wxy", 2, "failed", 4, vouched=False)
-    fleet.say("a", 2, "ready", 4)
+    fleet.report("wxy", 2, "failed", 4, vouched=False)
+    fleet.report("a", 2, "ready", 4)
     assert fleet.tick(5) == (1, "waiting"), "one of two is ready, and none of the two failed"
-    fleet.say("b", 2, "ready", 6, vouched=False)
-    assert fleet.tick(7) == (2, "watching"), "b has reported with authority before"
-    fleet.say("wxyz", 2, "failed", 8, vouched=False)
+    fleet.report("b", 2, "ready", 6, vouched=False)
+    assert fleet.tick(7) == (2, "watching"), "b has sent a vouched report before"
+    fleet.report("wxyz", 2, "failed", 8, vouched=False)
     assert fleet.tick(9) == (2, "watching")
-    fleet.say("w", 2, "failed", 10)
+    fleet.report("w", 2, "failed", 10)
     assert fleet.tick(11) == (2, "watching"), "w counts from now on, and is one of three"
-    fleet.say("x", 2, "failed", 12)
+    fleet.report("x", 2, "failed", 12)
     assert fleet.tick(13) == (1, "rolled_back")
 
 
-def test_it_moves_when_enough_are_ready(fleet: Fleet):
-    fleet.say("abcd", 1, "active")
+def test_rollout_moves_when_enough_robots_are_ready(fleet: Fleet):
+    fleet.report("abcd", 1, "active")
     planned = fleet.roll(ready=0.75)
     assert planned.planned is not None
     assert (planned.version, planned.planned.version, planned.planned.activate_at) == (1, 2, None)
     assert planned.planned.root == fleet.roots[2]
-    (event,) = fleet.told()
+    (event,) = fleet.events()
     assert (event["type"], event["version"]) == ("channel.planned", 2)
     assert event["rollout"] == {"ready": 0.75, "failed": None, "deadline": None}
     assert "activate_at" not in event
-    fleet.say("ab", 2, "ready", 2)
-    fleet.say("c", 2, "downloading", 2)
+    fleet.report("ab", 2, "ready", 2)
+    fleet.report("c", 2, "downloading", 2)
     assert fleet.tick(3) == (1, "waiting")
-    fleet.say("c", 2, "ready", 4)
+    fleet.report("c", 2, "ready", 4)
     assert fleet.tick(5) == (2, "done")
-    event = fleet.told()[-1]
+    event = fleet.events()[-1]
     assert (event["type"], event["version"], event["previous"]["version"]) == ("channel.moved", 2, 1)
     assert (event["rollback"], event["reason"], event["author"]) == (False, "3 of 4 robots are ready", "bob")
-    count = len(fleet.told())
+    count = len(fleet.events())
     assert fleet.tick(6) == (2, "done")
-    assert len(fleet.told()) == count
+    assert len(fleet.events()) == count
     assert fleet.channel().planned is None
 
 
 @pytest.mark.parametrize(("count", "share", "enough"), [(25, 0.28, 7), (25, 0.56, 14), (1, 1.0, 1), (3, 0.001, 1)])
-def test_exactly_the_share_is_enough(count: int, share: float, enough: int):
-    """In binary, 0.28 of 25 is a little more than 7."""
+def test_rollout_moves_at_exact_ready_share(count: int, share: float, enough: int):
+    """In binary, 0.28 of 25 is slightly more than 7."""
     now = datetime.now(UTC)
 
     def step(state: Any, version: str, those: int) -> Any:
@@ -123,14 +123,14 @@ def test_exactly_the_share_is_enough(count: int, share: float, enough: int):
 
 
 @pytest.mark.parametrize("shift", [-60, 60])
-def test_a_clock_that_is_set_hides_no_failure(fleet: Fleet, shift: float):
-    fleet.say("abc", 1, "active")
-    fleet.say("a", 2, "failed")  # an attempt of before: it does not count
+def test_changed_robot_clock_hides_no_failure(fleet: Fleet, shift: float):
+    fleet.report("abc", 1, "active")
+    fleet.report("a", 2, "failed")  # an earlier attempt: it does not count
     fleet.roll(failed=0.5, window=600.0)
     assert fleet.tick(1) == (2, "watching")
-    fleet.say("b", 2, "failed", 2 + shift)
+    fleet.report("b", 2, "failed", 2 + shift)
     assert fleet.tick(3 + shift) == (2, "watching")
-    fleet.say("c", 2, "failed", 4 + shift)
+    fleet.report("c", 2, "failed", 4 + shift)
     assert fleet.tick(5 + shift) == (1, "rolled_back")
     ended = fleet.channel().rollout
     assert ended is not None
@@ -138,16 +138,16 @@ def test_a_clock_that_is_set_hides_no_failure(fleet: Fleet, shift: float):
     assert "said_before" not in ended.as_dict()
 
 
-def test_robots_that_are_away_are_not_waited_for(fleet: Fleet):
-    fleet.say("abcd", 1, "active", -1000)
-    fleet.say("a", 1, "active")
+def test_rollout_does_not_wait_for_offline_robots(fleet: Fleet):
+    fleet.report("abcd", 1, "active", -1000)
+    fleet.report("a", 1, "active")
     fleet.roll(ready=1.0)
     assert fleet.tick(2) == (1, "waiting")
-    fleet.say("a", 2, "ready", 3)
+    fleet.report("a", 2, "ready", 3)
     assert fleet.tick(4) == (2, "done")
 
 
-def test_nobody_is_no_fleet(fleet: Fleet):
+def test_rollout_without_robots_does_not_move(fleet: Fleet):
     fleet.roll(ready=0.1, deadline=fleet.at(100))
     assert fleet.tick(99) == (1, "waiting")
     assert fleet.tick(100) == (1, "expired")
@@ -156,35 +156,35 @@ def test_nobody_is_no_fleet(fleet: Fleet):
     assert now.rollout is not None
     assert now.rollout.detail == "only 0 of 0 robots are ready: the channel stays"
     assert fleet.tick(101) == (1, "expired")
-    assert [e["type"] for e in fleet.told()] == ["channel.planned", "channel.cancelled"]
+    assert [e["type"] for e in fleet.events()] == ["channel.planned", "channel.cancelled"]
 
 
-def test_not_before_its_time(fleet: Fleet):
-    fleet.say("a", 2, "ready")
+def test_rollout_waits_for_its_time(fleet: Fleet):
+    fleet.report("a", 2, "ready")
     fleet.roll(ready=1.0, activate_at=fleet.at(60))
-    assert fleet.told()[0]["activate_at"]
+    assert fleet.events()[0]["activate_at"]
     assert fleet.tick(59) == (1, "waiting")
     assert fleet.tick(60) == (2, "done")
-    fleet.say("a", 2, "active", 61)
+    fleet.report("a", 2, "active", 61)
     fleet.roll(3, ready=1.0, activate_at=fleet.at(70))
-    assert fleet.tick(71) == (2, "waiting"), "its time has come, its robots have not"
-    fleet.say("a", 3, "ready", 80)
+    assert fleet.tick(71) == (2, "waiting"), "due, but its robots are not ready"
+    fleet.report("a", 3, "ready", 80)
     assert fleet.tick(81) == (3, "done")
 
 
-def test_it_moves_back_when_too_many_fail(fleet: Fleet):
-    fleet.say("abcde", 1, "active")
+def test_rollout_moves_back_when_too_many_robots_fail(fleet: Fleet):
+    fleet.report("abcde", 1, "active")
     fleet.roll(ready=0.6, failed=0.4, window=100.0)
-    fleet.say("abc", 2, "ready", 2)
-    fleet.say("d", 2, "failed", 2)
+    fleet.report("abc", 2, "ready", 2)
+    fleet.report("d", 2, "failed", 2)
     assert fleet.tick(3) == (2, "watching")
-    fleet.say("ab", 2, "active", 4)
-    assert fleet.tick(5) == (2, "watching"), "what failed before the move does not count after it"
-    fleet.say("c", 2, "failed", 6)
+    fleet.report("ab", 2, "active", 4)
+    assert fleet.tick(5) == (2, "watching"), "failures before the move do not count after it"
+    fleet.report("c", 2, "failed", 6)
     assert fleet.tick(7) == (2, "watching")
-    fleet.say("d", 2, "failed", 8)
+    fleet.report("d", 2, "failed", 8)
     assert fleet.tick(9) == (1, "rolled_back")
-    moved, back = (e for e in fleet.told() if e["type"] == "channel.moved")
+    moved, back = (e for e in fleet.events() if e["type"] == "channel.moved")
     assert back["sequence"] == moved["sequence"] + 1
     assert (back["version"], back["root"], back["rollback"]) == (1, fleet.roots[1], True)
     assert (back["previous"]["version"], back["reason"]) == (2, "2 of 5 robots failed")
@@ -192,52 +192,52 @@ def test_it_moves_back_when_too_many_fail(fleet: Fleet):
     assert fleet.tick(10) == (1, "rolled_back")
 
 
-def test_back_to_a_newer_version_is_a_rollback_too(fleet: Fleet):
+def test_move_back_to_newer_version_is_rollback(fleet: Fleet):
     fleet.store.channels.move("farm", "production", 3, author="ann")
     fleet.roll(2, failed=0.5)
-    assert fleet.tick(0) == (2, "watching"), "without a share to wait for it moves at once"
-    fleet.say("a", 2, "failed", 10)
+    assert fleet.tick(0) == (2, "watching"), "without a ready share it moves at once"
+    fleet.report("a", 2, "failed", 10)
     assert fleet.tick(11) == (3, "rolled_back")
-    assert fleet.told()[-1]["rollback"] is True
+    assert fleet.events()[-1]["rollback"] is True
 
 
-def test_robots_that_fail_and_vanish_count(fleet: Fleet):
-    fleet.say("abc", 1, "active")
+def test_failed_robots_count_when_offline(fleet: Fleet):
+    fleet.report("abc", 1, "active")
     fleet.roll(failed=0.5, window=10_000.0)
-    fleet.say("ab", 2, "failed", 2)
+    fleet.report("ab", 2, "failed", 2)
     assert fleet.tick(1000) == (1, "rolled_back")
 
 
-def test_watching_ends(fleet: Fleet):
-    fleet.say("abc", 1, "active")
+def test_rollout_ends_after_window(fleet: Fleet):
+    fleet.report("abc", 1, "active")
     fleet.roll(failed=0.5, window=60.0)
     assert fleet.tick(59) == (2, "watching")
     assert fleet.tick(61) == (2, "done")
-    fleet.say("abc", 2, "failed", 62)
+    fleet.report("abc", 2, "failed", 62)
     assert fleet.tick(63) == (2, "done")
 
 
-def test_what_cannot_be_fetched_is_not_activated(fleet: Fleet):
-    fleet.say("abc", 1, "active")
+def test_rollout_is_cancelled_when_robots_fail_to_fetch(fleet: Fleet):
+    fleet.report("abc", 1, "active")
     fleet.roll(ready=0.3, failed=0.5)
-    fleet.say("ab", 2, "failed", 2)
+    fleet.report("ab", 2, "failed", 2)
     assert fleet.tick(3) == (1, "failed")
     assert fleet.channel().planned is None
-    planned, dropped = fleet.told()
+    planned, dropped = fleet.events()
     assert (planned["type"], dropped["type"]) == ("channel.planned", "channel.cancelled")
     assert (dropped["version"], dropped["previous"]["version"], dropped["author"]) == (2, 1, "bob")
     assert "2 of 3 robots failed to fetch it" in dropped["reason"]
 
 
-def test_another_move_ends_a_rollout(fleet: Fleet):
-    fleet.say("a", 1, "active")
+def test_another_move_ends_rollout(fleet: Fleet):
+    fleet.report("a", 1, "active")
     fleet.roll(failed=0.1)
     fleet.store.channels.move("farm", "production", 3, author="ann")
-    fleet.say("a", 2, "failed", 2)
+    fleet.report("a", 2, "failed", 2)
     assert fleet.tick(3) == (3, "")
     fleet.roll(ready=1.0)
     fleet.store.channels.cancel_planned("farm", "production", "ann")
-    fleet.say("a", 2, "ready", 4)
+    fleet.report("a", 2, "ready", 4)
     assert fleet.tick(5) == (3, "cancelled")
     fleet.roll(ready=1.0)
     fleet.store.channels.move("farm", "production", 1, author="ann", activate_at=fleet.at(10))
@@ -245,7 +245,7 @@ def test_another_move_ends_a_rollout(fleet: Fleet):
     assert fleet.tick(10) == (1, "")
 
 
-def test_a_first_move_has_nothing_to_go_back_to(fleet: Fleet):
+def test_first_move_has_no_version_to_move_back_to(fleet: Fleet):
     rollout = Rollout(0, "", fleet.start, failed=0.1)
     moved = fleet.store.channels.move("farm", "staging", 2, author="ann", rollout=rollout)
     assert moved.rollout is not None
@@ -254,8 +254,8 @@ def test_a_first_move_has_nothing_to_go_back_to(fleet: Fleet):
     assert same.sequence == moved.sequence
 
 
-def test_a_decision_is_taken_again_where_it_is_carried_out(fleet: Fleet):
-    fleet.say("a", 2, "ready")
+def test_rollout_decision_is_repeated_in_transaction(fleet: Fleet):
+    fleet.report("a", 2, "ready")
     fleet.roll(ready=1.0)
     calls = []
 

@@ -1,4 +1,4 @@
-"""Migrations make exactly what the models say, on both databases."""
+"""Migrations create exactly the tables of the models, on both databases."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from app.store.store import Store
 from app.store.tables import metadata
 
 
-def test_models_and_migrations_do_not_differ(store: Store, database_url: str):
+def test_models_and_migrations_are_equal(store: Store, database_url: str):
     database = Database(database_url, readonly=False)
     with database.engine.connect() as connection:
         context = MigrationContext.configure(connection, opts=comparison(connection.dialect.name))
@@ -30,7 +30,7 @@ def test_models_and_migrations_do_not_differ(store: Store, database_url: str):
     database.close()
 
 
-def test_the_comparison_sees_a_missing_column(store: Store, database_url: str):
+def test_schema_comparison_finds_missing_column(store: Store, database_url: str):
     database = Database(database_url, readonly=False)
     with database.write() as connection:
         connection.exec_driver_sql("ALTER TABLE job DROP COLUMN detail")
@@ -40,12 +40,12 @@ def test_the_comparison_sees_a_missing_column(store: Store, database_url: str):
     assert any(d[0] == "add_column" and d[3].name == "detail" for d in differences if isinstance(d, tuple))
 
 
-def test_migrating_again_changes_nothing_and_check_passes(store: Store):
+def test_repeated_migration_changes_nothing(store: Store):
     store.migrate()
     store.check()
 
 
-def test_robots_of_before_are_vouched_for(store: Store, database_url: str):
+def test_migration_vouches_for_existing_robots(store: Store, database_url: str):
     store.environments.create("farm")
     report = RobotReport("latest", 0, "a" * 64, "active")
     store.robots.note_reports([ReceivedReport("farm", "old", report, datetime.now(UTC), vouched=False)])
@@ -62,14 +62,14 @@ def test_robots_of_before_are_vouched_for(store: Store, database_url: str):
     assert [r.vouched for r in store.robots.all("farm")] == [True]
 
 
-def test_check_fails_before_migration(empty_database_url: str, tmp_path: Path):
+def test_schema_check_fails_before_migration(empty_database_url: str, tmp_path: Path):
     store = Store(empty_database_url, tmp_path / "b")
     with pytest.raises(Unavailable, match="fleetmap migrate"):
         store.check()
     store.close()
 
 
-def test_no_database_is_unavailable(tmp_path: Path):
+def test_missing_database_raises_unavailable(tmp_path: Path):
     store = Store("postgresql+psycopg://nobody@127.0.0.1:1/none", tmp_path / "b")
     with pytest.raises(Unavailable):
         store.check()
@@ -78,7 +78,7 @@ def test_no_database_is_unavailable(tmp_path: Path):
     store.close()
 
 
-def test_sqlite_keeps_what_it_acknowledges(sqlite_store: Store):
+def test_sqlite_commits_are_durable(sqlite_store: Store):
     with sqlite_store._database.engine.connect() as connection:
         pragma = {
             name: connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()
@@ -106,11 +106,11 @@ def test_postgres_has_gist_indexes_and_uncompressed_chunks(postgres_url: str, tm
     store.close()
 
 
-def test_files_of_migrations_tell_the_newest_revision() -> None:
+def test_newest_revision_follows_from_migration_files() -> None:
     assert newest() == ScriptDirectory.from_config(config()).get_current_head()
 
 
-def test_of_servers_that_start_together_one_makes_the_administrator(empty_database_url: str, tmp_path: Path) -> None:
+def test_concurrent_servers_create_one_administrator(empty_database_url: str, tmp_path: Path) -> None:
     def start(number: int) -> str | None:
         store = Store(empty_database_url, tmp_path / "blobs")
         try:

@@ -1,4 +1,4 @@
-"""The chunk tree is a function of its items alone, whatever edits led to them."""
+"""The chunk tree is a function of its items only, independent of its edits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from app.store.encode import ENCODING, pack, unpack
 
 
 class Memory:
-    """Chunks of earlier drafts; counts what is read."""
+    """Chunks of earlier stages; counts reads."""
 
     def __init__(self) -> None:
         self.chunks: dict[bytes, bytes] = {}
@@ -28,7 +28,7 @@ class Memory:
 
 
 class Numbers:
-    """Items are numbers, and their boxes points."""
+    """Codec of items that are numbers, with points as boxes."""
 
     def __init__(self, bits: int) -> None:
         self.bits = bits
@@ -56,14 +56,14 @@ edits = st.lists(
 
 @pytest.fixture(autouse=True)
 def small_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four children a node, and no limit on tiny leaves: high trees of few items."""
+    """Use four children per node, and no limit on tiny leaves: high trees of few items."""
     monkeypatch.setattr(tree, "FANOUT_BITS", 2)
     monkeypatch.setattr(tree, "check_leaves", lambda root: None)
 
 
 @settings(max_examples=150, deadline=None)
 @given(edits)
-def test_an_edited_tree_is_the_one_built_anew(rounds: list[tuple[dict[bytes, int], set[bytes]]]):
+def test_edited_tree_equals_rebuilt_tree(rounds: list[tuple[dict[bytes, int], set[bytes]]]):
     tree.FANOUT_BITS = 2
     tree.check_leaves = lambda root: None
     codec, memory = Numbers(2), Memory()
@@ -82,7 +82,7 @@ def test_an_edited_tree_is_the_one_built_anew(rounds: list[tuple[dict[bytes, int
         )
 
 
-def test_one_edit_in_a_large_tree_touches_one_path():
+def test_edit_of_large_tree_rewrites_one_path():
     codec, memory = Numbers(4), Memory()
     items = {b"%06d" % i: i for i in range(20_000)}
     draft = tree.ChunkStage(memory)
@@ -101,7 +101,7 @@ def test_one_edit_in_a_large_tree_touches_one_path():
     assert memory.reads <= 2 * root.level
 
 
-def test_paths_reach_every_key_and_select_every_box():
+def test_tree_paths_reach_every_key_and_select_every_box():
     codec, memory = Numbers(2), Memory()
     items = {b"%05d" % i: i for i in range(3000)}
     draft = tree.ChunkStage(memory)
@@ -115,7 +115,7 @@ def test_paths_reach_every_key_and_select_every_box():
     assert len(chosen) < 100
 
 
-def test_chosen_keys_cannot_make_endless_towers_or_tiny_leaves(monkeypatch: pytest.MonkeyPatch):
+def test_adversarial_keys_are_limited_in_levels_and_leaves(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.undo()
     some = (b"%d" % i for i in range(10**7))
     chosen = [k for k in (next(some) for _ in range(80_000)) if tree.ends_node(k, 0, 6)]

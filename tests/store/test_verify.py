@@ -1,4 +1,4 @@
-"""What verification finds, and the background scrub, on both databases."""
+"""Verification and the background scrub, on both databases."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.store.samples import GRID, everything, grid, replaces, save
 
 
 def filled(store: Store) -> None:
-    """Two versions of everything, with sources: a large file and two packed ones."""
+    """A store with two versions of every kind of part, with sources: a large file and two packed ones."""
     store.environments.create("farm")
     names = store.blobs.put_many([b"b" * 100_000, b"small", b"other"])
     sources = [Source(f"f{k}", 1, name) for k, name in enumerate(names)]
@@ -47,7 +47,7 @@ def spoil_chunk(store: Store, name: str, *, lose: bool = False) -> None:
     store.chunks.forget()
 
 
-def test_verification_names_what_is_damaged_and_the_versions_it_hits(store: Store) -> None:
+def test_verification_names_damage_and_affected_versions(store: Store) -> None:
     filled(store)
     verification = store.verifier().run()
     assert verification.findings == []
@@ -80,7 +80,7 @@ def test_verification_names_what_is_damaged_and_the_versions_it_hits(store: Stor
     assert [f for f in store.verifier().run().findings if f.kind == "blob"] == [], "uploaded again: healed"
 
 
-def test_every_node_of_a_tree_counts(sqlite_store: Store) -> None:
+def test_verification_covers_every_node_of_tree(sqlite_store: Store) -> None:
     filled(sqlite_store)
     version = sqlite_store.versions.get("farm", 2)
     names = [name for name, _, _ in sqlite_store.verifier().chunks()][::7]
@@ -99,7 +99,7 @@ def test_every_node_of_a_tree_counts(sqlite_store: Store) -> None:
         sqlite_store.chunks.heal({names[0]: b"other bytes"})
 
 
-def test_a_changed_version_row_is_found(store: Store) -> None:
+def test_verification_finds_changed_version_row(store: Store) -> None:
     filled(store)
     with store._database.write() as connection:
         connection.exec_driver_sql("UPDATE version SET root = 'f' || substr(root, 2) WHERE number = 1")
@@ -108,7 +108,7 @@ def test_a_changed_version_row_is_found(store: Store) -> None:
     assert "was committed" in finding.problem
 
 
-def test_the_scrub_finds_damage_goes_on_after_a_stop_and_tells_its_age(store: Store) -> None:
+def test_scrub_finds_damage_resumes_and_reports_age(store: Store) -> None:
     filled(store)
     entry = store.versions.get("farm", 1).part(GRID)
     assert entry is not None
@@ -116,7 +116,7 @@ def test_the_scrub_finds_damage_goes_on_after_a_stop_and_tells_its_age(store: St
     assert figures(read_state(store.blob_dir))["age"] == float("inf")
     cache = [("00", 10, True), ("01", 0, False)]
     scrub = Scrub(store, lambda: iter(cache), every=3600, rate=10**9)
-    scrub._stopped.set()  # it is stopped within the first step
+    scrub._stopped.set()  # stopped within the first step
     scrub.pass_if_due()
     begun = read_state(store.blob_dir)
     assert begun.started
@@ -131,9 +131,7 @@ def test_the_scrub_finds_damage_goes_on_after_a_stop_and_tells_its_age(store: St
     assert read_state(store.blob_dir) == state, "the next pass is not due yet"
 
 
-def test_the_scrub_checks_sqlite_table_by_table_with_pauses(
-    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scrub_checks_sqlite_by_table_with_pauses(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pauses hold no connection; a stop between two tables loses nothing, and damage counts once."""
     real, checked = sqlite_store._database.integrity, list[str]()
 
@@ -145,7 +143,7 @@ def test_the_scrub_checks_sqlite_table_by_table_with_pauses(
     tables, size = sqlite_store._database.tables()
     assert {"sqlite_master", "blob", "chunk"} <= set(tables)
     assert sqlite_store._database.file is not None
-    assert size <= sqlite_store._database.file.stat().st_size + 2**22  # what the write-ahead log has yet to add
+    assert size <= sqlite_store._database.file.stat().st_size + 2**22  # pages still in the write-ahead log
     waited: list[float] = []
 
     def wait(seconds: float | None = None) -> bool:
@@ -168,7 +166,7 @@ def test_the_scrub_checks_sqlite_table_by_table_with_pauses(
         sqlite_store._database.check()
 
 
-def test_a_scrub_passes_over_what_cannot_be_read(
+def test_scrub_skips_unreadable_files(
     sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     names = sorted(sqlite_store.blobs.put(bytes([k]) * 100) for k in range(3))
@@ -186,7 +184,7 @@ def test_a_scrub_passes_over_what_cannot_be_read(
     assert "/srv" not in caplog.text
 
 
-def test_a_scrub_survives_a_defect(
+def test_scrub_continues_after_unexpected_error(
     sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.store.scrub.POLL_SECONDS", 0.01)
@@ -210,7 +208,7 @@ def test_a_scrub_survives_a_defect(
     assert "/srv" not in caplog.text
 
 
-def test_one_process_scrubs(sqlite_store: Store) -> None:
+def test_scrub_runs_in_one_process(sqlite_store: Store) -> None:
     scrubs = [Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9, delay=0.0) for _ in range(2)]
     for scrub in scrubs:
         scrub.start()
@@ -223,7 +221,7 @@ def test_one_process_scrubs(sqlite_store: Store) -> None:
     assert (sqlite_store.blob_dir / LOCK).exists()
 
 
-def test_a_rate_bounds_the_scrub(sqlite_store: Store) -> None:
+def test_scrub_keeps_to_its_rate(sqlite_store: Store) -> None:
     sqlite_store.blobs.put(b"x" * 40_000)
     waited: list[float] = []
     scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=100_000)
@@ -232,7 +230,7 @@ def test_a_rate_bounds_the_scrub(sqlite_store: Store) -> None:
     assert sum(waited) >= 0.4
 
 
-def test_database_errors_say_what_to_do(tmp_path: Path) -> None:
+def test_database_errors_name_remedy(tmp_path: Path) -> None:
     file = tmp_path / "some.sqlite"
     for content, kind, text in ((b"no database at all" * 500, DatabaseDamaged, "fleetmap verify"),):
         file.write_bytes(content)
@@ -253,7 +251,7 @@ def test_database_errors_say_what_to_do(tmp_path: Path) -> None:
     store.close()
 
 
-def test_a_full_and_a_read_only_database_refuse_writes(sqlite_store: Store) -> None:
+def test_full_or_read_only_database_rejects_writes(sqlite_store: Store) -> None:
     sqlite_store.environments.create("farm")
     with sqlite_store._database.read() as connection:
         pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
@@ -265,7 +263,7 @@ def test_a_full_and_a_read_only_database_refuse_writes(sqlite_store: Store) -> N
 
     sqlite_store._database.engine.dispose()
     event.listen(sqlite_store._database.engine, "begin", limit)
-    with pytest.raises(NoRoom, match="room"):
+    with pytest.raises(NoRoom, match="no disk space"):
         save(sqlite_store, "farm", *replaces(everything()))
     event.remove(sqlite_store._database.engine, "begin", limit)
     assert sqlite_store.versions.get("farm").number == 0
@@ -279,7 +277,7 @@ def test_a_full_and_a_read_only_database_refuse_writes(sqlite_store: Store) -> N
     ("state", "kind"),
     [("XX001", DatabaseDamaged), ("XX002", DatabaseDamaged), ("58P01", DatabaseDamaged), ("53100", NoRoom)],
 )
-def test_errors_of_postgresql_have_their_meaning(sqlite_store: Store, state: str, kind: type[Unavailable]) -> None:
+def test_postgresql_errors_are_classified(sqlite_store: Store, state: str, kind: type[Unavailable]) -> None:
     class Refused(Exception):
         sqlstate = state
 
@@ -290,7 +288,7 @@ def test_errors_of_postgresql_have_their_meaning(sqlite_store: Store, state: str
             sqlite_store.check()
 
 
-def test_a_missing_library_of_postgresql_is_no_damage(sqlite_store: Store) -> None:
+def test_missing_postgresql_library_is_no_damage(sqlite_store: Store) -> None:
     class Refused(Exception):
         sqlstate = "58P01"
 
@@ -301,7 +299,7 @@ def test_a_missing_library_of_postgresql_is_no_damage(sqlite_store: Store) -> No
     sqlite_store.check()
 
 
-def test_a_file_that_a_worker_missed_is_no_lasting_damage(sqlite_store: Store) -> None:
+def test_temporarily_missing_database_file_is_no_permanent_damage(sqlite_store: Store) -> None:
     file = Path(sqlite_store.database_url.removeprefix("sqlite:///"))
     away = file.rename(file.with_suffix(".away"))
     with pytest.raises(DatabaseDamaged, match="missing") as caught:
@@ -314,7 +312,7 @@ def test_a_file_that_a_worker_missed_is_no_lasting_damage(sqlite_store: Store) -
         sqlite_store.check()
 
 
-def test_one_check_of_the_pages_at_a_time(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_checks_run_one_at_a_time(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     database, release, checks = sqlite_store._database, threading.Event(), list[int]()
 
     def integrity(limit: int) -> str:
@@ -345,14 +343,14 @@ def test_one_check_of_the_pages_at_a_time(sqlite_store: Store, monkeypatch: pyte
     database.check()
 
 
-def test_only_chunks_that_are_still_damaged_and_unused_are_removed(store: Store) -> None:
+def test_repair_removes_only_damaged_unused_chunks(store: Store) -> None:
     raws = {digest(raw).hex(): raw for raw in (b"healed" * 50, b"in use" * 50, b"unused" * 50)}
     healed, in_use, unused = raws
     with store._database.write() as connection:
         insert(connection, dict.fromkeys(raws, b"damaged"), now=time.time() - 100)
     verification = store.verifier().run()
     assert {f.name for f in verification.findings} == set(raws)
-    with store._database.write() as connection:  # uploads of other processes, while the check goes on
+    with store._database.write() as connection:  # uploads of other processes during the check
         insert(connection, {healed: compress(raws[healed])}, now=time.time() - 50)
         insert(connection, {in_use: b"damaged"})
     assert store.chunks.remove_damaged(verification.unused_chunks, verification.started) == {unused}

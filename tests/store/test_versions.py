@@ -1,4 +1,4 @@
-"""The conformance suite of versions and content; every test runs on both databases."""
+"""Conformance suite of versions and content; every test runs on both databases."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def farm(store: Store) -> Store:
     return store
 
 
-def test_every_kind_of_part_comes_back_whole(farm: Store):
+def test_every_kind_of_part_round_trips(farm: Store):
     parts = everything()
     version = save(farm, "farm", *replaces(parts))
     assert version.number == 2
@@ -61,7 +61,7 @@ def test_every_kind_of_part_comes_back_whole(farm: Store):
         farm.content.load(version, [PartKey("occupancy", "ground", "keepout")])
 
 
-def test_another_process_reads_the_same(farm: Store, tmp_path: Path):
+def test_content_is_equal_in_another_process(farm: Store, tmp_path: Path):
     parts = everything()
     version = save(farm, "farm", *replaces(parts))
     other = Store(farm.database_url, farm.blob_dir, readonly=True)
@@ -79,7 +79,7 @@ def test_equal_content_has_equal_roots_on_both_databases(store: Store, sqlite_st
     assert store.versions.get("farm").root == sqlite_store.versions.get("farm").root
 
 
-def test_the_root_depends_on_content_alone(farm: Store):
+def test_root_depends_on_content_only(farm: Store):
     farm.environments.create("other", title="t")
     save(farm, "other", *replaces(everything()))
     other = save(farm, "other", datum=DATUM)
@@ -96,7 +96,7 @@ def test_the_root_depends_on_content_alone(farm: Store):
         assert farm.versions.prepare(other, changed).root != other.root
 
 
-def test_the_same_again_changes_nothing(farm: Store):
+def test_replace_with_same_content_changes_nothing(farm: Store):
     first = save(farm, "farm", *replaces(everything()))
     farm.chunks.forget()
     reads = farm.chunks.reads
@@ -116,7 +116,7 @@ def test_the_same_again_changes_nothing(farm: Store):
 
 
 def edits(seed: int) -> Callable[[Store], None]:
-    """Rounds of random puts and deletes; after each one the root must be that of a layer uploaded anew."""
+    """Rounds of random puts and deletes; after each one the root must equal that of an upload of the layer."""
 
     def run(store: Store) -> None:
         random.seed(seed)
@@ -153,13 +153,13 @@ def edits(seed: int) -> Callable[[Store], None]:
                 head = save(store, "a", *operations)
                 from app.model.features import concatenate
 
-                anew = concatenate(
+                uploaded = concatenate(
                     [
                         features([(i, g, p) for i, (g, p, is_local) in items.items() if is_local is flag], anchor)
                         for flag, anchor in ((True, "local"), (False, "wgs84"))
                     ]
                 )
-                fresh = save(store, "b", Replace(TOPOLOGY, anew))
+                fresh = save(store, "b", Replace(TOPOLOGY, uploaded))
                 assert head.root == fresh.root
                 entry = head.part(TOPOLOGY)
                 assert entry is not None
@@ -173,15 +173,15 @@ def edits(seed: int) -> Callable[[Store], None]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_edits_lead_to_the_root_of_a_new_upload(sqlite_store: Store, seed: int):
+def test_edits_give_root_of_new_upload(sqlite_store: Store, seed: int):
     edits(seed)(sqlite_store)
 
 
-def test_edits_lead_to_the_root_of_a_new_upload_on_each_database(store: Store):
+def test_edits_give_root_of_new_upload_on_each_database(store: Store):
     edits(99)(store)
 
 
-def test_put_and_delete_say_what_they_changed(farm: Store):
+def test_put_and_delete_report_changes(farm: Store):
     save(farm, "farm", Replace(TOPOLOGY, network(200)))
     new = features(
         [("n1", shapely.Point(1, 1), {"kind": "node"}), ("new", shapely.Point(2, 2), {"v": 1})],
@@ -206,7 +206,7 @@ def test_put_and_delete_say_what_they_changed(farm: Store):
         farm.versions.prepare(version, Changes((Replace(GRID, new),)))
 
 
-def test_an_integer_that_becomes_a_float_is_a_change(farm: Store):
+def test_integer_replaced_by_float_is_change(farm: Store):
     save(farm, "farm", Replace(TOPOLOGY, features([("a", shapely.Point(0, 0), {"v": 1, "w": 2})], "local")))
     before = farm.versions.get("farm")
     after = save(farm, "farm", Replace(TOPOLOGY, features([("a", shapely.Point(0, 0), {"v": 1.0, "w": 2})], "local")))
@@ -216,7 +216,7 @@ def test_an_integer_that_becomes_a_float_is_a_change(farm: Store):
     }
 
 
-def test_features_come_by_id_and_by_document_order(farm: Store):
+def test_features_are_ordered_by_id_and_documents_keep_order(farm: Store):
     version = save(farm, "farm", Replace(TOPOLOGY, network(300)))
     part = farm.content.load(version).parts[TOPOLOGY]
     assert isinstance(part, Features)
@@ -229,7 +229,7 @@ def test_features_come_by_id_and_by_document_order(farm: Store):
     assert rows(some) == rows(part.select([index["n250"], index["n7"]]))
 
 
-def test_an_old_version_reads_like_the_head(farm: Store):
+def test_old_version_reads_like_head(farm: Store):
     first = save(farm, "farm", *replaces(everything()))
     farm.chunks.forget()
     before = farm.chunks.reads
@@ -245,7 +245,7 @@ def test_an_old_version_reads_like_the_head(farm: Store):
     assert farm.chunks.reads - before == cost
 
 
-def test_a_version_costs_what_it_changes(farm: Store):
+def test_version_stores_only_changed_chunks(farm: Store):
     save(farm, "farm", Replace(TOPOLOGY, network(20_000, side=3000)), Replace(GRID, grid(3000, 3000)))
     head = farm.versions.get("farm")
     near = farm.content.features(head, TOPOLOGY, bbox=(1000, 1000, 1300, 1300))
@@ -279,7 +279,7 @@ def grid_of(cells: Any) -> Any:
     )
 
 
-def test_a_diff_reads_what_differs(farm: Store):
+def test_diff_reads_only_differing_chunks(farm: Store):
     save(farm, "farm", Replace(TOPOLOGY, network(20_000, side=3000)))
     a = farm.versions.get("farm")
     moved = features([("n17", shapely.Point(5.0, 5.0), {"kind": "node"}), ("new", None, {})], "local")
@@ -293,7 +293,7 @@ def test_a_diff_reads_what_differs(farm: Store):
     assert farm.content.diff(a, a) == {}
 
 
-def test_a_box_is_found_at_any_version_without_reading_all(farm: Store):
+def test_box_query_reads_few_chunks_at_any_version(farm: Store):
     network_part = network(20_000, side=3000)
     old = save(farm, "farm", Replace(TOPOLOGY, network_part))
     save(farm, "farm", Drop(TOPOLOGY))
@@ -318,7 +318,7 @@ def test_a_box_is_found_at_any_version_without_reading_all(farm: Store):
     assert some.ids == hits.ids[:3]
 
 
-def test_items_on_earth_and_local_ones_are_found_by_either_kind_of_box(farm: Store):
+def test_box_query_finds_wgs84_and_local_items_in_either_crs(farm: Store):
     version = save(farm, "farm", Replace(OBJECTS, mixed()))
     assert set(farm.content.features(version, OBJECTS, bbox=(-100, -100, 100, 100)).ids) == set("pzlaem")
     assert set(farm.content.features(version, OBJECTS, bbox=(-100, -100, 100, -1)).ids) == {"p", "m"}
@@ -333,7 +333,7 @@ def test_items_on_earth_and_local_ones_are_found_by_either_kind_of_box(farm: Sto
         farm.content.features(blind, OBJECTS, bbox=(-1, 53, 0, 54), crs="wgs84")
 
 
-def test_cells_that_change_are_counted_and_boxed(farm: Store):
+def test_grid_diff_counts_and_bounds_changed_cells(farm: Store):
     cells = np.zeros((600, 700), np.uint8)
     save(farm, "farm", Replace(GRID, grid_of(cells)))
     a = farm.versions.get("farm")
@@ -361,7 +361,7 @@ def test_cells_that_change_are_counted_and_boxed(farm: Store):
     assert sum(r.cells.size for r in delta.grids[0].rectangles) <= 10
 
 
-def test_a_grid_that_grows_is_laid_over_the_old_one(farm: Store):
+def test_grid_diff_aligns_grown_grid_with_old_one(farm: Store):
     cells = np.zeros((50, 60), np.uint8)
     a = save(farm, "farm", Replace(GRID, grid(60, 50)))
     old = grid(60, 50).cells
@@ -384,7 +384,7 @@ def test_a_grid_that_grows_is_laid_over_the_old_one(farm: Store):
     assert farm.content.delta_parts(c, deletion).grids[0].deleted
 
 
-def test_other_layers_tell_counts(farm: Store):
+def test_diff_of_other_layers_has_counts(farm: Store):
     key, photo, files = (
         PartKey("voxels", "ground", "v"),
         PartKey("imagery", "ground", "i"),
@@ -412,7 +412,7 @@ def test_other_layers_tell_counts(farm: Store):
         assert_same_part(farm.content.load(again, [photo]).parts[photo], picture(dtype=dtype))
 
 
-def test_voxels_tell_which_came_changed_and_went(farm: Store):
+def test_voxel_diff_counts_added_changed_and_deleted(farm: Store):
     key = PartKey("voxels", "ground", "v")
     original = voxels(30_000)
     assert original.colour is not None
@@ -422,7 +422,7 @@ def test_voxels_tell_which_came_changed_and_went(farm: Store):
     odds[[5, 20_000]] += 0.5
     colour[[5, 7]] ^= 1
     depth, code = original.depth.copy(), original.code.copy()
-    depth[100], code[100] = 15, code[100] >> np.uint64(3)  # a larger leaf in the place of one
+    depth[100], code[100] = 15, code[100] >> np.uint64(3)  # a larger leaf in place of a smaller one
     remaining = np.arange(len(original)) >= 3
     remaining[101:110] = original.code[101:110] >> np.uint64(3) != code[100]
     columns = (c[remaining] for c in (depth, code, odds, colour))
@@ -439,7 +439,7 @@ def test_voxels_tell_which_came_changed_and_went(farm: Store):
     assert none.changes["voxels"]["v"]["deleted"] == len(other)
 
 
-def test_a_delta_turns_one_version_into_the_other(farm: Store):
+def test_delta_turns_one_version_into_the_other(farm: Store):
     a = save(farm, "farm", Replace(TOPOLOGY, network(500)))
     put = features([("n3", shapely.Point(9, 9), {"v": 2}), ("x", None, {})], "local")
     b = save(farm, "farm", Put(TOPOLOGY, put), Delete(TOPOLOGY, ("n4",)), datum=Datum(1, 2))
@@ -451,7 +451,7 @@ def test_a_delta_turns_one_version_into_the_other(farm: Store):
     assert one.deleted == ("n4",)
 
 
-def test_only_one_of_two_changes_of_the_same_head_wins(farm: Store):
+def test_second_commit_on_same_head_raises_stale_parent(farm: Store):
     head = farm.versions.get("farm")
     first = farm.versions.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
     second = farm.versions.prepare(head, Changes((Replace(TOPOLOGY, network(11)),)))
@@ -461,7 +461,7 @@ def test_only_one_of_two_changes_of_the_same_head_wins(farm: Store):
     assert farm.versions.get("farm").part(TOPOLOGY).count == 10  # type: ignore[union-attr]
 
 
-def test_many_writers_make_one_line_of_versions(farm: Store):
+def test_concurrent_writers_create_one_line_of_versions(farm: Store):
     def write(k: int) -> int:
         store = Store(farm.database_url, farm.blob_dir)
         try:
@@ -475,7 +475,7 @@ def test_many_writers_make_one_line_of_versions(farm: Store):
                     except StaleParent:
                         continue
                 else:
-                    raise AssertionError("never came through")
+                    raise AssertionError("never succeeded")
         finally:
             store.close()
         return k
@@ -489,7 +489,7 @@ def test_many_writers_make_one_line_of_versions(farm: Store):
     assert [e.sequence for e in farm.events.page("farm")] == list(range(1, 19))
 
 
-def test_threads_may_share_a_store(farm: Store):
+def test_store_is_shared_between_threads(farm: Store):
     version = save(farm, "farm", *replaces(everything()))
     expected = Layers(everything(), DATUM)
 
@@ -502,7 +502,7 @@ def test_threads_may_share_a_store(farm: Store):
         list(pool.map(read, range(12)))
 
 
-def test_a_key_makes_one_version_however_often_it_is_sent(farm: Store):
+def test_idempotency_key_creates_one_version(farm: Store):
     head = farm.versions.get("farm")
     prepared = farm.versions.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
     key = Idempotency("abc", "print")
@@ -534,7 +534,7 @@ def test_revert_copies_a_manifest(farm: Store):
         farm.versions.revert("farm", 77, author="bob", message="x")
 
 
-def test_a_version_says_where_it_comes_from(farm: Store):
+def test_version_lists_sources_and_provenance(farm: Store):
     digest = farm.blobs.put(b"content")
     prepared = farm.versions.prepare(
         farm.versions.get("farm"),
@@ -573,7 +573,7 @@ def test_a_version_says_where_it_comes_from(farm: Store):
         farm.versions.commit("farm", prepared, author="ann", message="a\x00b")
 
 
-def test_versions_are_found_by_number_channel_and_latest(farm: Store):
+def test_versions_resolve_by_number_channel_and_latest(farm: Store):
     for n in range(3):
         save(farm, "farm", Replace(TOPOLOGY, network(5 + n)))
     farm.channels.move("farm", "production", 2, author="a")
@@ -591,7 +591,7 @@ def test_versions_are_found_by_number_channel_and_latest(farm: Store):
             farm.versions.get("farm", ref)
 
 
-def test_a_datum_moves_no_item(farm: Store):
+def test_datum_change_moves_no_item(farm: Store):
     a = save(farm, "farm", Replace(OBJECTS, mixed()))
     b = save(farm, "farm", datum=Datum(10.0, 20.0))
     assert a.part(OBJECTS) == b.part(OBJECTS)
@@ -601,7 +601,7 @@ def test_a_datum_moves_no_item(farm: Store):
         save(farm, "farm", levels=(Level("a"), Level("a", 2.0)))
 
 
-def test_nothing_is_collected_that_a_version_needs(farm: Store):
+def test_garbage_collection_keeps_content_of_versions(farm: Store):
     a = save(farm, "farm", *replaces(everything()))
     digest = farm.blobs.put(b"original")
     farm.versions.add_sources("farm", a.number, [Source("o", 8, digest)])
@@ -614,7 +614,7 @@ def test_nothing_is_collected_that_a_version_needs(farm: Store):
     assert farm.blobs.get(digest) == b"original"
 
 
-def test_what_nothing_needs_is_gone_after_one_collection(farm: Store):
+def test_garbage_collection_removes_all_unused_content(farm: Store):
     save(farm, "farm", *replaces(everything()))
     farm.environments.create("copy", clone=farm.versions.get("farm"))
     files = [bytes([k]) * 1000 for k in range(20)]
@@ -642,8 +642,8 @@ def test_what_nothing_needs_is_gone_after_one_collection(farm: Store):
     assert not [p for p in farm.blob_dir.rglob("*") if p.is_file() and not p.name.startswith(".")]
 
 
-def test_a_chunk_that_is_used_again_is_kept(farm: Store):
-    """A commit that finds its chunks there already marks them as used: a collection with a grace period passes."""
+def test_garbage_collection_keeps_reused_chunks(farm: Store):
+    """A commit of existing chunks marks them as used, so that a collection with a grace period keeps them."""
     prepared = farm.versions.prepare(farm.versions.get("farm"), Changes((Replace(TOPOLOGY, network(100)),)))
     farm.versions.commit("farm", prepared, author="a", message="1")
     with farm._database.write() as connection:
@@ -670,7 +670,7 @@ OUTDOOR = Templates(
 )
 
 
-def say(store: Store, templates: Templates, env: str = "farm") -> Any:
+def set_templates(store: Store, templates: Templates, env: str = "farm") -> Any:
     prepared = store.versions.prepare(store.versions.get(env), Changes(templates=templates))
     return store.versions.commit(env, prepared, author="a", message="templates")
 
@@ -678,18 +678,18 @@ def say(store: Store, templates: Templates, env: str = "farm") -> Any:
 def test_templates_are_part_of_a_version(farm: Store):
     before = save(farm, "farm", *replaces(everything()))
     assert before.templates == NO_TEMPLATES
-    version = say(farm, OUTDOOR)
+    version = set_templates(farm, OUTDOOR)
     assert (version.number, version.parts) == (before.number + 1, before.parts)
     assert version.root != before.root
     assert version.changes.keys() == {"templates"}
     assert farm.versions.get("farm").templates == OUTDOOR
     assert farm.versions.get("farm", before.number).templates == NO_TEMPLATES
     assert farm.content.diff(before, version) == version.changes
-    assert say(farm, OUTDOOR).number == version.number, "nothing new"
+    assert set_templates(farm, OUTDOOR).number == version.number, "nothing new"
     event = farm.events.page("farm", since=0)[-1]
     assert (event.body["version"], event.body["layers"]) == (version.number, [])
     later = save(farm, "farm", Drop(GRID))
-    assert later.templates == OUTDOOR, "other changes leave them"
+    assert later.templates == OUTDOOR, "other changes keep them"
     moved = farm.versions.commit("farm", farm.versions.prepare(later, Changes(datum=None)), author="a", message="")
     assert moved.templates == OUTDOOR
     back = farm.versions.revert("farm", before.number, author="a", message="")
@@ -703,17 +703,17 @@ def test_templates_are_part_of_a_version(farm: Store):
     assert farm.versions.get("farm", version.number).templates == OUTDOOR
 
 
-def test_templates_count_for_roots_alike_on_both_databases(store: Store, sqlite_store: Store):
+def test_templates_give_equal_roots_on_both_databases(store: Store, sqlite_store: Store):
     roots = []
     for one in (store, sqlite_store):
         one.environments.create("farm", datum=DATUM)
         bare = one.versions.get("farm").root
-        roots.append((bare, say(one, OUTDOOR).root, say(one, Templates()).root))
+        roots.append((bare, set_templates(one, OUTDOOR).root, set_templates(one, Templates()).root))
     assert roots[0] == roots[1]
     assert roots[0][0] == roots[0][2] != roots[0][1]
 
 
-# --- provenance that is renewed ---
+# --- renewed provenance ---
 
 
 def derived(hash_: str, join: float = 1.0) -> Provenance:
@@ -721,10 +721,10 @@ def derived(hash_: str, join: float = 1.0) -> Provenance:
     return Provenance("derived", steps=({"step": "objects_to_topology", "parameters": {"join": join}},), inputs=inputs)
 
 
-def test_what_is_derived_anew_from_other_inputs_is_a_version_though_it_is_the_same(farm: Store):
+def test_equal_part_derived_from_other_inputs_creates_version(farm: Store):
     first = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("a")))
     again = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("a")))
-    assert again.number == first.number, "the same again"
+    assert again.number == first.number, "equal again"
     new = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("b")))
     assert (new.number, new.root) == (first.number + 1, first.root)
     assert new.changes["renewed"] == [{"layer": "topology", "level": "ground", "name": TOPOLOGY.name}]
@@ -732,16 +732,14 @@ def test_what_is_derived_anew_from_other_inputs_is_a_version_though_it_is_the_sa
     assert farm.versions.get("farm", first.number).part(TOPOLOGY).provenance.inputs[0]["hash"] == "a"  # type: ignore[union-attr]
     assert farm.content.diff(first, new) == {}
     other = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("b", 2.0)))
-    assert other.number == new.number + 1, "by another way"
+    assert other.number == new.number + 1, "by other steps"
     raw_version = save(farm, "farm", Replace(TOPOLOGY, network(3), Provenance(sources=("n.yaml",))))
-    assert (raw_version.number, raw_version.information["topology"]) == (other.number + 1, "raw"), (
-        "a source says it now"
-    )
+    assert (raw_version.number, raw_version.information["topology"]) == (other.number + 1, "raw"), "a source has it now"
     same = save(farm, "farm", Replace(TOPOLOGY, network(3), Provenance(sources=("m.yaml",))))
-    assert same.number == raw_version.number, "of two sources that say the same the first one stays"
+    assert same.number == raw_version.number, "of two sources with equal content the first one stays"
 
 
-def test_an_edit_that_changes_nothing_renews_nothing(farm: Store):
+def test_edit_without_change_renews_no_provenance(farm: Store):
     first = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("a")))
     assert save(farm, "farm", Put(TOPOLOGY, network(3).select([0]))).number == first.number
     edited = derived("a").with_edit_step()

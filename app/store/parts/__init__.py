@@ -1,6 +1,6 @@
-"""Parts as chunk trees, whatever their kind: from values to chunks and back, and the chunks that a part refers to.
+"""Parts of any kind as chunk trees: from values to chunks and back, and the chunks that a part refers to.
 
-``roots`` the first chunk · ``features``, ``rasters``, ``voxels``, ``resources`` the kinds · ``boxes`` where things lie.
+``roots`` the first chunk · ``features``, ``rasters``, ``voxels``, ``resources`` the kinds · ``boxes`` bounding boxes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from app.store.tree import ChunkStage
 
 
 def compose(draft: ChunkStage, part: Part, base: PartRoot | None, base_digest: str) -> EncodedPart | None:
-    """A part as chunks in the draft; None where its canonical upload is the very one that the base was made of."""
+    """Write a part as chunks into the stage; None if its canonical upload is the one that the base was made from."""
     if isinstance(part, Features):
         return compose_features(draft, part, base_digest)
     if isinstance(part, OccupancyGrid):
@@ -37,7 +37,7 @@ def compose(draft: ChunkStage, part: Part, base: PartRoot | None, base_digest: s
 
 
 def load(draft: ChunkStage, root_hashes: Mapping[Any, bytes], fetch: FetchBlobs) -> dict[Any, Part]:
-    """Parts by their hashes, with few queries for all of them together."""
+    """Load parts by their hashes, with few queries for all of them together."""
     draft.read_many(list(root_hashes.values()))
     roots = {key: read_root(draft, name) for key, name in root_hashes.items()}
     with gc_paused():
@@ -55,7 +55,7 @@ def load(draft: ChunkStage, root_hashes: Mapping[Any, bytes], fetch: FetchBlobs)
 
 
 def all_chunks(draft: ChunkStage, name: bytes, existing_names: Container[bytes]) -> tuple[set[bytes], set[str]]:
-    """Everything a part refers to, but what is below known nodes: hashes of its chunks, and of its blobs (hex)."""
+    """Return all chunks and blobs (hex) of a part by hash, except those below nodes with ``existing_names``."""
     root = read_root(draft, name)
     out = {name, *document_chunks(root)}
     blobs: set[str] = set()
@@ -69,7 +69,7 @@ def all_chunks(draft: ChunkStage, name: bytes, existing_names: Container[bytes])
 
 
 def new_chunks(draft: ChunkStage, name: bytes, existing_names: Container[bytes]) -> tuple[list[bytes], list[bytes]]:
-    """The draft's own chunks that a part needs: (nodes and documents, tiles). existing_names: of the base."""
+    """Return the stage's new chunks of a part: (nodes and documents, tiles). existing_names: of the base."""
     root = read_root(draft, name)
     nodes = [h for h in (name, *document_chunks(root)) if h in draft.new and not draft.was_read(h)]
     tiles: list[bytes] = []

@@ -1,4 +1,4 @@
-"""Boxes in metres and in degrees: around points, across the antimeridian, from one frame to the other."""
+"""Bounding boxes in metres and in degrees: around points, across the antimeridian, between frames."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from app.store.values import Box
 
 
 def bounding_box(points: NDArray[np.float64]) -> Box:
-    """The box around points: float64 [n, 2]."""
+    """Return the box around points: float64 [n, 2]."""
     x0, y0 = points.min(axis=0).tolist()
     x1, y1 = points.max(axis=0).tolist()
     return (x0, y0, x1, y1)
 
 
 def crossing_box(points: NDArray[np.float64]) -> Box:
-    """The box in degrees around (longitude, latitude) points that leaves out the widest gap of longitudes."""
+    """Return the box in degrees around (longitude, latitude) points that excludes the widest gap of longitudes."""
     longitude = np.unique(points[:, 0])
     south, north = float(points[:, 1].min()), float(points[:, 1].max())
     gaps = np.diff(longitude, append=longitude[:1] + 360.0)
@@ -31,7 +31,7 @@ def crossing_box(points: NDArray[np.float64]) -> Box:
 
 
 def split_box(box: Box) -> list[Box]:
-    """A box in degrees as one or two that do not cross the antimeridian."""
+    """Split a box in degrees into one or two that do not cross the antimeridian."""
     west, south, east, north = box
     if west <= east:
         return [box]
@@ -39,11 +39,11 @@ def split_box(box: Box) -> list[Box]:
 
 
 EDGE_POINTS: Final = 9
-"""Points on each side of a box when it goes from one frame to the other, since its sides become curves."""
+"""Number of points on each side of a box that is transformed, since its sides become curves."""
 
 
 def ring(box: Box) -> NDArray[np.float64]:
-    """Points around a box: float64 [n, 2]."""
+    """Sample points along a box: float64 [n, 2]."""
     x0, y0, x1, y1 = box
     t = np.linspace(0.0, 1.0, EDGE_POINTS)
     xs, ys = x0 + (x1 - x0) * t, y0 + (y1 - y0) * t
@@ -52,7 +52,7 @@ def ring(box: Box) -> NDArray[np.float64]:
 
 
 def boxes_in_other_frame(box: Box, crs: str, frame: LocalFrame | None) -> list[Box]:
-    """Boxes around a box of ``crs`` in the other frame, a little wider: degrees for ``local``, metres for ``wgs84``."""
+    """Transform a box of ``crs`` into boxes of the other frame, slightly wider: degrees or metres."""
     assert frame is not None
     if crs == "wgs84":
         points = frame.to_local(ring(box))
@@ -63,7 +63,7 @@ def boxes_in_other_frame(box: Box, crs: str, frame: LocalFrame | None) -> list[B
 
 
 def _wider(box: Box) -> Box:
-    """A little more on each side, for the bulge of a curve between the points."""
+    """Widen a box slightly on each side, for the bulge of a curve between the points."""
     x0, y0, x1, y1 = box
     dx = abs(x1 - x0) * 0.01
     dy = abs(y1 - y0) * 0.01
@@ -71,23 +71,23 @@ def _wider(box: Box) -> Box:
 
 
 def local_box_to_wgs84(box: Box, frame: LocalFrame) -> Box:
-    """The box in degrees around a box in local metres; west > east where it crosses the antimeridian."""
+    """Return the box in degrees around a box in local metres; west > east if it crosses the antimeridian."""
     points = frame.to_wgs84(ring(box))
     return unwrapped_box(points, frame.datum.longitude)
 
 
 def unwrapped_box(points: NDArray[np.float64], around: float) -> Box:
-    """The box of (longitude, latitude) points whose longitudes lie within 180 degrees of a given one."""
+    """Return the box of (longitude, latitude) points with longitudes shifted to within 180 degrees of a given one."""
     longitude = (points[:, 0] - around + 180.0) % 360.0 - 180.0 + around
     west, east = float(longitude.min()), float(longitude.max())
     return (wrap(west), float(points[:, 1].min()), wrap(east), float(points[:, 1].max()))
 
 
 def wrap(longitude: float) -> float:
-    """A longitude in [-180, 180]."""
+    """Normalise a longitude to [-180, 180]."""
     return longitude if -180.0 <= longitude <= 180.0 else (longitude + 180.0) % 360.0 - 180.0
 
 
 def coordinates(geometry: Any) -> NDArray[np.float64]:
-    """All (x, y) of one geometry: float64 [n, 2]."""
+    """Return all (x, y) of one geometry: float64 [n, 2]."""
     return np.asarray(shapely.get_coordinates(geometry), np.float64)

@@ -41,10 +41,10 @@ from app.store.tree import ChunkStage, Node
 from app.store.values import Bounds, Box
 
 BATCH: Final = 512
-"""Leaves that are read at once when a whole part is loaded: enough for few queries, and bounded memory."""
+"""Maximum number of leaves that are read at once when a whole part is loaded: few queries, bounded memory."""
 
 _FEATURES_HEAD: Final = array_header(8) + pack(ENCODING) + pack("features") + b"\xc4\x04"
-"""A leaf of vector items up to its tail's four bytes."""
+"""Parser of a leaf of vector items up to its tail's four bytes."""
 
 
 class Item(NamedTuple):
@@ -56,7 +56,7 @@ class Item(NamedTuple):
 
     @property
     def properties(self) -> dict[str, Any]:
-        """The properties, unpacked."""
+        """Return the unpacked properties."""
         members: dict[str, Any] = ormsgpack.unpackb(self.packed)
         return members
 
@@ -70,42 +70,42 @@ class FeatureLeaf:
     bits = 6
 
     def decode(self, raw: bytes) -> tuple[list[bytes], list[tuple[bytes, bytes]]]:
-        """A leaf's keys and items."""
+        """Decode a leaf into keys and items."""
         ids, cells, wkb, packed = split_leaf(raw)
         keys = [cells[8 * k : 8 * k + 8] + i.encode() for k, i in enumerate(ids)]
         return keys, list(zip(wkb, packed, strict=True))
 
     def encode(self, keys: Sequence[bytes], items: Sequence[tuple[bytes, bytes]]) -> bytes:
-        """A leaf's bytes."""
+        """Encode a leaf."""
         ids = [k[8:].decode() for k in keys]
         cells = b"".join([k[:8] for k in keys])
         return encode_leaf(ids, cells, [w for w, _ in items], [p for _, p in items])
 
     def boxes(self, items: Sequence[tuple[bytes, bytes]]) -> NDArray[np.float64]:
-        """The items' boxes."""
+        """Return the items' boxes."""
         return wkb_bounds([w for w, _ in items])
 
 
 class IdLeaf:
-    """Leaves of the table id -> place: key = the id's UTF-8; item = anchor and cell, 9 bytes."""
+    """Leaves of the table id -> position: key = the id's UTF-8; item = anchor and cell, 9 bytes."""
 
     bits = 8
 
     def decode(self, raw: bytes) -> tuple[list[bytes], list[bytes]]:
-        """A leaf's keys and items."""
+        """Decode a leaf into keys and items."""
         ids, places = leaf_members(raw, "ids")
         return [i.encode() for i in ids], [places[9 * k : 9 * k + 9] for k in range(len(ids))]
 
     def encode(self, keys: Sequence[bytes], items: Sequence[bytes]) -> bytes:
-        """A leaf's bytes."""
+        """Encode a leaf."""
         return pack([ENCODING, "ids", [k.decode() for k in keys], b"".join(items)])
 
     def boxes(self, items: Sequence[bytes]) -> None:
-        """Ids have no place."""
+        """Return None: ids have no coordinates."""
 
 
 def encode_leaf(ids: Sequence[str], cells: bytes, wkb: Sequence[bytes], packed: Sequence[bytes]) -> bytes:
-    """A leaf of vector items whose properties are packed already: what MessagePack makes of all of it at once."""
+    """Encode a leaf of vector items with packed properties, byte for byte as MessagePack encodes the whole array."""
     sizes = [len(p) for p in packed]
     header = array_header(len(packed))
     return b"".join(
@@ -123,13 +123,13 @@ def encode_leaf(ids: Sequence[str], cells: bytes, wkb: Sequence[bytes], packed: 
 
 
 def split_leaf(raw: bytes) -> tuple[list[str], bytes, list[bytes], list[bytes]]:
-    """A leaf of vector items: ids, cells, WKB, and properties that stay packed."""
+    """Split a leaf of vector items into ids, cells, WKB, and properties that stay packed."""
     start = len(_FEATURES_HEAD)
     if not raw.startswith(_FEATURES_HEAD):
         leaf_members(raw, "features")
-        raise Damaged("a stored leaf of vector items has another form than its encoding says")
+        raise Damaged("a stored leaf of vector items is malformed")
     end = len(raw) - int.from_bytes(raw[start : start + 4], "little")
-    # The array without its last member.
+    # the array without its last member
     _, _, _, ids, cells, wkb, sizes = ormsgpack.unpackb(array_header(7) + raw[1:end])
     ends = np.cumsum(np.frombuffer(sizes, "<u4")).tolist()
     first = end + len(array_header(len(ids)))
@@ -141,7 +141,7 @@ def split_leaf(raw: bytes) -> tuple[list[str], bytes, list[bytes], list[bytes]]:
 
 
 def compose_features(draft: ChunkStage, part: Features, base_digest: str) -> EncodedPart | None:
-    """Features as chunks; None where their digest is the base's."""
+    """Write features as chunks; None if their digest is the base's."""
     document = put_document(draft, part.document)
     table = columns(part)
     digest = table.digest(pack(document))
@@ -159,7 +159,7 @@ def _build_features(draft: ChunkStage, table: Columns, index: NDArray[np.intp]) 
     if not len(index):
         return None
     cells = table.cells[index]
-    # Nearly sorted by NumPy, so that Python's sort has little left to do.
+    # nearly sorted by NumPy, so that Python's sort is fast
     index = index[np.argsort(cells, kind="stable")]
     cell_bytes = table.cells[index].astype(">u8").tobytes()
     ids = table.ids
@@ -200,7 +200,7 @@ def _places(table: Columns) -> list[bytes]:
 
 
 def feature_bounds(draft: ChunkStage, trees: Mapping[str, Node | None], part: Features | None = None) -> Bounds:
-    """Where a collection's items lie; the box of wgs84 items crosses the antimeridian where that makes it smaller."""
+    """Return the extent of a collection; the box of wgs84 items crosses the antimeridian if that makes it smaller."""
     local, wgs84 = trees["local"], trees["wgs84"]
     out: dict[Literal["local", "wgs84"], Box | None] = {
         "local": local.box if local and local.box != EMPTY_BOX else None,
@@ -224,7 +224,7 @@ def feature_bounds(draft: ChunkStage, trees: Mapping[str, Node | None], part: Fe
 def edit_features(
     draft: ChunkStage, root: PartRoot, put: Features | None, deleted: Collection[str], label: str
 ) -> EncodedPart:
-    """A collection with features put (added, or replaced by id) and others deleted; NotFound names unknown ids."""
+    """Put features (add, or replace by id) and delete others. Raises NotFound with unknown ids to delete."""
     table = columns(put) if put is not None and len(put) else None
     touched = sorted({*(table.ids if table else ()), *deleted})
     places = find_places(draft, root, touched)
@@ -259,16 +259,16 @@ def edit_features(
 
 
 def empty_features(draft: ChunkStage) -> bytes:
-    """An empty collection's root."""
+    """Return an empty collection's root."""
     return put_root(draft, "features", {"document": []}, {"local": None, "wgs84": None, "ids": None})
 
 
 def find_places(draft: ChunkStage, root: PartRoot, ids: Sequence[str]) -> dict[str, bytes]:
-    """Sorted ids -> anchor and cell (9 bytes), of those that exist."""
+    """Look up sorted ids -> anchor and cell (9 bytes), of those that exist."""
     keys = [i.encode() for i in ids]
     out: dict[str, bytes] = {}
     for name in tree.paths(draft, root.trees["ids"], keys):
-        # Code points sort like their UTF-8.
+        # code points sort like their UTF-8
         member_ids, places = leaf_members(draft.read(name), "ids")
         for i in ids[bisect_left(ids, member_ids[0]) : bisect_right(ids, member_ids[-1])]:
             k = bisect_left(member_ids, i)
@@ -278,7 +278,7 @@ def find_places(draft: ChunkStage, root: PartRoot, ids: Sequence[str]) -> dict[s
 
 
 def items_by_id(draft: ChunkStage, root: PartRoot, ids: Collection[str]) -> dict[str, Item]:
-    """The stored items with these ids, as far as they exist."""
+    """Read the stored items with these ids, if they exist."""
     places = find_places(draft, root, sorted(set(ids)))
     out: dict[str, Item] = {}
     for anchor, name in enumerate(("local", "wgs84")):
@@ -289,7 +289,7 @@ def items_by_id(draft: ChunkStage, root: PartRoot, ids: Collection[str]) -> dict
 
 
 def leaf_items(draft: ChunkStage, names: Sequence[bytes], anchor: int) -> Iterator[tuple[str, Item]]:
-    """(id, item) of leaves of vector items."""
+    """Return (id, item) of leaves of vector items."""
     for start in range(0, len(names), BATCH):
         some = names[start : start + BATCH]
         raws = draft.stream(some)
@@ -300,7 +300,7 @@ def leaf_items(draft: ChunkStage, names: Sequence[bytes], anchor: int) -> Iterat
 
 
 def features_from_items(items: Mapping[str, Item], document: Mapping[str, Any]) -> Features:
-    """Stored items as a collection, in the order of their ids."""
+    """Convert stored items into a collection, in the order of their ids."""
     ids = sorted(items)
     rows = [items[i] for i in ids]
     return unchecked_features(
@@ -319,7 +319,7 @@ def unchecked_features(
     local: NDArray[np.bool_],
     document: Mapping[str, Any],
 ) -> Features:
-    """A collection without the checks: its columns were checked before they were stored, and their hashes agree."""
+    """Build a collection without checks: its columns were checked before they were stored, and their hashes match."""
     features = object.__new__(Features)
     geometry.flags.writeable = False
     local.flags.writeable = False
@@ -332,7 +332,7 @@ def unchecked_features(
 
 
 def features_in_box(draft: ChunkStage, root: PartRoot, box: Box, crs: str, frame: LocalFrame | None) -> dict[str, Item]:
-    """Items whose box meets ``box``, given in local metres or in degrees (west > east crosses the antimeridian)."""
+    """Find items whose box intersects ``box``, in local metres or in degrees (west > east: antimeridian)."""
     out: dict[str, Item] = {}
     for anchor, name in enumerate(("local", "wgs84")):
         node = root.trees[name]
@@ -342,7 +342,7 @@ def features_in_box(draft: ChunkStage, root: PartRoot, box: Box, crs: str, frame
         if not same and frame is None:
             raise MissingDatum(
                 f"the environment has no datum, so its {name} items cannot be found by a box in {crs} coordinates: "
-                f"ask with crs={name}, or set a datum"
+                f"use crs={name}, or set a datum"
             )
         boxes = split_box(box) if crs == "wgs84" else [box]
         coarse = boxes if same else [c for b in boxes for c in boxes_in_other_frame(b, crs, frame)]
@@ -381,7 +381,7 @@ class _Columns:
 
 
 def load_collections(draft: ChunkStage, roots: Mapping[Any, PartRoot]) -> Iterator[tuple[Any, Features]]:
-    """(key, features) of vector parts, with few queries for all of them together."""
+    """Load vector parts as (key, features), with few queries for all of them together."""
     trees = [(key, name, r.trees[name]) for key, r in roots.items() for name in ("local", "wgs84")]
     present = [(key, name, node) for key, name, node in trees if node is not None]
     documents = [name for r in roots.values() for name in document_chunks(r)]

@@ -1,4 +1,4 @@
-"""Grids and pictures as trees of tiles in Morton order, and back."""
+"""Grids and images as trees of tiles in Morton order, and back."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TILE: Final = 256
 
 
 def compose_grid(draft: ChunkStage, part: OccupancyGrid, base: PartRoot | None) -> EncodedPart:
-    """A grid as chunks; tiles that the base has are not stored again."""
+    """Write a grid as chunks; tiles of the base are not stored again."""
     header = {
         "height": part.height,
         "width": part.width,
@@ -42,7 +42,7 @@ def compose_grid(draft: ChunkStage, part: OccupancyGrid, base: PartRoot | None) 
 
 
 def compose_picture(draft: ChunkStage, part: GeoImage, base: PartRoot | None) -> EncodedPart:
-    """A picture as chunks; tiles that the base has are not stored again."""
+    """Write an image as chunks; tiles of the base are not stored again."""
     pixels = part.pixels
     header = {
         "height": pixels.shape[0],
@@ -85,12 +85,12 @@ def _build_tiles(draft: ChunkStage, cells: NDArray[Any], existing_names: Contain
 
 
 def tile_counts(height: int, width: int) -> tuple[int, int]:
-    """(rows, columns) of tiles."""
+    """Return (rows, columns) of tiles."""
     return -(-height // TILE), -(-width // TILE)
 
 
 def tile_leaf(raw: bytes) -> list[tuple[int, bytes]]:
-    """(Morton code, tile's name) of a leaf of a raster."""
+    """Return (Morton code, tile's name) of a leaf of a raster."""
     codes, names = leaf_members(raw, "tiles")
     return [
         (int.from_bytes(codes[8 * k : 8 * k + 8], "big"), names[32 * k : 32 * k + 32]) for k in range(len(codes) // 8)
@@ -98,7 +98,7 @@ def tile_leaf(raw: bytes) -> list[tuple[int, bytes]]:
 
 
 def tile_names(draft: ChunkStage, base: PartRoot | None) -> set[bytes]:
-    """The names of a raster's tiles."""
+    """Return the names of a raster's tiles."""
     root = base.trees.get("tiles") if base else None
     if root is None:
         return set()
@@ -107,7 +107,7 @@ def tile_names(draft: ChunkStage, base: PartRoot | None) -> set[bytes]:
 
 
 def picture_bounds(header: Mapping[str, Any]) -> Bounds:
-    """Where a picture lies."""
+    """Return the extent of an image."""
     a, b, c, d, e, f = header["transform"]
     w, h = header["width"], header["height"]
     corners = np.array([[a * u + b * v + c, d * u + e * v + f] for u, v in ((0, 0), (w, 0), (w, h), (0, h))])
@@ -134,7 +134,7 @@ def _load_tiles(draft: ChunkStage, root: PartRoot, out: NDArray[Any]) -> None:
 
 
 def morton(code: int) -> tuple[int, int]:
-    """(row, column) of a tile's code."""
+    """Return (row, column) of a tile's code."""
     col = row = 0
     for bit in range(32):
         col |= (code >> (2 * bit) & 1) << bit
@@ -143,7 +143,7 @@ def morton(code: int) -> tuple[int, int]:
 
 
 def place_tile(out: NDArray[Any], code: int, raw: bytes) -> None:
-    """Copy a tile's values to its place in [height, width(, bands)]."""
+    """Copy a tile's values to its position in [height, width(, bands)]."""
     row, col = morton(code)
     target = out[row * TILE : (row + 1) * TILE, col * TILE : (col + 1) * TILE]
     (data,) = leaf_members(raw, "tile")
@@ -151,7 +151,7 @@ def place_tile(out: NDArray[Any], code: int, raw: bytes) -> None:
 
 
 def tile_shape(header: Mapping[str, Any], code: int) -> tuple[int, int, int, int]:
-    """(first row, first column, height, width) of a tile."""
+    """Return (first row, first column, height, width) of a tile."""
     row, col = morton(code)
     return (
         row * TILE,
@@ -162,20 +162,20 @@ def tile_shape(header: Mapping[str, Any], code: int) -> tuple[int, int, int, int
 
 
 def tile_cells(raw: bytes) -> NDArray[np.uint8]:
-    """A grid tile's cells, flat."""
+    """Return a grid tile's cells, flat."""
     (data,) = leaf_members(raw, "tile")
     return np.frombuffer(data, np.uint8)
 
 
 def grid_cells(draft: ChunkStage, root: PartRoot) -> NDArray[np.uint8]:
-    """A grid's cells."""
+    """Return a grid's cells."""
     cells = np.empty((root.header["height"], root.header["width"]), np.uint8)
     _load_tiles(draft, root, cells)
     return cells
 
 
 def load_grid(draft: ChunkStage, root: PartRoot) -> OccupancyGrid:
-    """A grid with all its tiles."""
+    """Load a grid with all its tiles."""
     h = root.header
     cells = grid_cells(draft, root)
     x, y, yaw = h["origin"]
@@ -192,7 +192,7 @@ def load_grid(draft: ChunkStage, root: PartRoot) -> OccupancyGrid:
 
 
 def load_picture(draft: ChunkStage, root: PartRoot) -> GeoImage:
-    """A picture with all its tiles."""
+    """Load an image with all its tiles."""
     h = root.header
     pixels = np.empty((h["height"], h["width"], h["bands"]), np.dtype(h["dtype"]) if h["dtype"] != "b1" else np.bool_)
     _load_tiles(draft, root, pixels)

@@ -15,7 +15,7 @@ FetchBlobs = Callable[[Sequence[str]], Mapping[str, bytes]]
 
 
 def compose_resources(draft: ChunkStage, part: Resources) -> EncodedPart:
-    """Files as chunks, and as blobs."""
+    """Write files as chunks, and as blobs."""
     paths = sorted(part.files)
     contents = [bytes(part.files[p]) for p in paths]
     hashes = [hashlib.sha256(data).digest() for data in contents]
@@ -30,13 +30,13 @@ def compose_resources(draft: ChunkStage, part: Resources) -> EncodedPart:
 
 
 def file_leaf(raw: bytes) -> list[tuple[str, int, str]]:
-    """(path, size, SHA-256 in hex) of a leaf of resources."""
+    """Return (path, size, SHA-256 in hex) of a leaf of resources."""
     paths, sizes, hashes = leaf_members(raw, "files")
     return [(p, sizes[k], hashes[32 * k : 32 * k + 32].hex()) for k, p in enumerate(paths)]
 
 
 def resource_files(draft: ChunkStage, root: PartRoot) -> list[tuple[str, int, str]]:
-    """(path, size, SHA-256 in hex) of all files of a resources part."""
+    """Return (path, size, SHA-256 in hex) of all files of a resources part."""
     node = root.trees["files"]
     if node is None:
         return []
@@ -46,7 +46,7 @@ def resource_files(draft: ChunkStage, root: PartRoot) -> list[tuple[str, int, st
 
 
 def load_resources(draft: ChunkStage, root: PartRoot, fetch: FetchBlobs) -> Resources:
-    """Files with their bytes, fetched by their hashes."""
+    """Load files with their bytes, fetched by their hashes."""
     rows = resource_files(draft, root)
     contents = fetch([h for _, _, h in rows])
     return Resources({path: contents[h] for path, _, h in rows})

@@ -1,4 +1,4 @@
-"""Part roots: a part's first chunk with its header, its trees and its document, and what all kinds of parts share."""
+"""Part roots: a part's first chunk with its header, trees and document, and helpers for all kinds of parts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from app.store.values import Bounds
 PartType = Literal["features", "grid", "voxels", "picture", "resources"]
 
 INLINE: Final = 2048
-"""Bytes up to which a member of a document stands in the part's chunk."""
+"""Maximum size of a document's member inside the part's chunk, in bytes; larger ones get a chunk of their own."""
 
 TILE_BATCH: Final = 128
 
@@ -32,7 +32,7 @@ class PartRoot:
 
 @dataclass(frozen=True, slots=True)
 class EncodedPart:
-    """A part that became chunks. digest: of the canonical upload, empty where it is not worth one."""
+    """A part written as chunks. digest: of the canonical upload, empty if it is not worth one."""
 
     hash: bytes
     count: int
@@ -42,27 +42,27 @@ class EncodedPart:
 
 
 def leaf_members(raw: bytes, kind: str) -> list[Any]:
-    """A chunk's members after its kind; Damaged where it is of another kind."""
+    """Return a chunk's members after its kind. Raises Damaged if it is of another kind."""
     members = unpack(raw)
     if members[1] != kind:
-        raise Damaged(f"a stored chunk is {members[1]!r} where {kind!r} belongs")
+        raise Damaged(f"a stored chunk is of kind {members[1]!r} instead of {kind!r}")
     return members[2:]
 
 
 def read_root(draft: ChunkStage, name: bytes) -> PartRoot:
-    """A part's root chunk."""
+    """Read a part's root chunk."""
     kind, header, trees = leaf_members(draft.read(name), "part")
     return PartRoot(kind, header, {t: Node.from_list(n) for t, n in trees.items()})
 
 
 def put_root(draft: ChunkStage, kind: PartType, header: Mapping[str, Any], trees: Mapping[str, Node | None]) -> bytes:
-    """Keep a part's root chunk; its hash is the part's."""
+    """Stage a part's root chunk; its hash is the part's."""
     listed = {t: n.as_list() if n else None for t, n in trees.items()}
     return draft.put(pack([ENCODING, "part", kind, dict(header), listed]))
 
 
 def put_document(draft: ChunkStage, document: Mapping[str, Any]) -> list[list[Any]]:
-    """A document's members for the header, in order: [key, 0, value], or [key, 1, hash] of a chunk of its own."""
+    """Return a document's members for the header, in order: [key, 0, value], or [key, 1, hash] of a separate chunk."""
     out: list[list[Any]] = []
     for key in sorted(document):
         packed = pack_value(document[key], f"document.{key}")
@@ -74,12 +74,12 @@ def put_document(draft: ChunkStage, document: Mapping[str, Any]) -> list[list[An
 
 
 def document_chunks(root: PartRoot) -> list[bytes]:
-    """The chunks of a document's large members."""
+    """Return the chunks of a document's large members."""
     return [value for _, inline, value in root.header.get("document", ()) if inline]
 
 
 def read_document(draft: ChunkStage, root: PartRoot) -> dict[str, Any]:
-    """A collection's document."""
+    """Load a collection's document."""
     raws = draft.read_many(document_chunks(root))
     return {
         key: leaf_members(raws[value], "document")[0] if chunk else value

@@ -19,11 +19,11 @@ from app.store.tree import ChunkStage
 from app.store.values import Box
 
 VOXEL_KEY: Final = 9
-"""Bytes of a voxel's key: its place, its depth."""
+"""Size of a voxel's key in bytes: its position and depth."""
 
 
 def compose_voxels(draft: ChunkStage, part: VoxelMap) -> EncodedPart:
-    """A voxel map as chunks."""
+    """Write a voxel map as chunks."""
     depth, code = part.depth, part.code
     log_odds = (part.log_odds + np.float32(0.0)).astype("<f4")
     colour = None if part.colour is None else np.ascontiguousarray(part.colour)
@@ -48,7 +48,7 @@ def compose_voxels(draft: ChunkStage, part: VoxelMap) -> EncodedPart:
 
 
 class _FixedWidthKeys(Sequence[bytes]):
-    """Keys of one length, cut from one text when they are asked for: millions of objects would take their time."""
+    """Sequence of keys of one length, cut from one string on access: millions of objects would be slow."""
 
     def __init__(self, flat: bytes, width: int) -> None:
         self._flat, self._width = flat, width
@@ -79,7 +79,7 @@ def _voxel_box(part: VoxelMap) -> Box | None:
 
 
 def voxel_leaf(raw: bytes, colour: bool) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any] | None]:
-    """(depth, code, log-odds, colour or None) of a leaf of voxels."""
+    """Return (depth, code, log-odds, colour or None) of a leaf of voxels."""
     depth, steps, log_odds, shades = leaf_members(raw, "voxels")
     code = np.cumsum(np.frombuffer(steps, "<u8"), dtype=np.uint64)
     return (
@@ -91,7 +91,7 @@ def voxel_leaf(raw: bytes, colour: bool) -> tuple[NDArray[Any], NDArray[Any], ND
 
 
 def load_voxels(draft: ChunkStage, root: PartRoot) -> VoxelMap:
-    """A voxel map with all its leaves."""
+    """Load a voxel map with all its leaves."""
     h = root.header
     node = root.trees["voxels"]
     leaves = tree.leaves(draft, [node])[0] if node else []

@@ -1,4 +1,4 @@
-"""The number that tells caches of a change, in this process and in another one."""
+"""Commit counter: changes seen in this process and in another one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from app.store.commit_counter import CommitCounter
 from app.store.store import Store
 
 
-def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> None:
+def test_commit_counter_changes_with_writes_only(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path}/a.sqlite", tmp_path / "blobs")
     store.migrate()
     before = store.generation()
@@ -24,7 +24,7 @@ def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> No
     store.close()
 
 
-def test_another_process_sees_it(tmp_path: Path) -> None:
+def test_commit_counter_is_shared_between_processes(tmp_path: Path) -> None:
     counter = CommitCounter(tmp_path)
     before = counter()
     code = "from pathlib import Path; from app.store.commit_counter import CommitCounter; "
@@ -34,7 +34,7 @@ def test_another_process_sees_it(tmp_path: Path) -> None:
     counter.close()
 
 
-def test_without_a_folder_it_works_in_this_process(tmp_path: Path) -> None:
+def test_commit_counter_without_folder_counts_in_process(tmp_path: Path) -> None:
     counter = CommitCounter(tmp_path / "absent")
     before = counter()
     counter.change()
