@@ -1,4 +1,4 @@
-"""What can be read and served."""
+"""File formats that the server reads and writes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from app.catalogue import describe_formats
 
 
 class FormatOut(BaseModel):
-    """A file format; ``options`` are the parameters of its maps (and of reading it, with ``for: read``)."""
+    """File format. `options` are the parameters of its maps (and, with `for: read`, of reading it)."""
 
     id: str
     title: str
@@ -30,7 +30,7 @@ class FormatOut(BaseModel):
 router = APIRouter(prefix="/formats", tags=["formats"], route_class=StrictRoute)
 
 
-@router.get("", responses=problem_responses(list[FormatOut]), summary="All formats")
+@router.get("", responses=problem_responses(list[FormatOut]), summary="List formats")
 def list_formats(_: Viewer) -> Response:
-    """What can be read and served, with parameters, and which information each format gives."""
+    """List the formats with their parameters and the information that each provides."""
     return json_response(describe_formats())

@@ -109,7 +109,7 @@ def test_log_names_changes_and_refused_tokens_but_no_token(
     assert [r.levelname for r in records] == ["INFO", "WARNING"]
     assert "POST /api/v1/environments 201" in records[0].getMessage()
     assert "administrator (admin), 127.0.0.1" in records[0].getMessage()
-    assert "the token is unknown or has expired" in records[1].getMessage()
+    assert "unknown or expired token" in records[1].getMessage()
     assert ADMIN not in caplog.text
     assert "not-a-token" not in caplog.text
     line = TextFormatter().format(records[1])

@@ -129,4 +129,4 @@ def test_refusals(api: Api, bare: str) -> None:
     assert (head.headers["content-type"], head.content) == ("text/event-stream; charset=utf-8", b"")
     api.get("/healthz", timeout=10)  # on the same connection
     for query in (f"environment={bare}&since=2", f"since={10**9}"):
-        assert "nothing with the number" in api.problem("GET", f"events?{query}&follow=false", 422)["detail"]
+        assert "is beyond the event log" in api.problem("GET", f"events?{query}&follow=false", 422)["detail"]

@@ -102,7 +102,7 @@ def test_end_is_given_as_a_time_or_as_seconds(api: Api, farm: str) -> None:
         (rfc3339(datetime.now(UTC) - timedelta(seconds=1)), {}, "in the past"),
         (rfc3339(soon + timedelta(days=400)), {}, "days ahead"),
         (soon.replace(tzinfo=None).isoformat(), {}, "time zone"),
-        (rfc3339(soon), {"ttl_seconds": 5}, "one of them"),
+        (rfc3339(soon), {"ttl_seconds": 5}, "exclude each other"),
     ):
         body = {"kind": "blocked", "edge": "gate_barn", "expires": expires, **more}
         assert text in api.problem("POST", url, 422, json=body)["detail"]

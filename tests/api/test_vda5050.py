@@ -88,13 +88,13 @@ def test_actions_come_for_each_level(api: Api, tower: str) -> None:
     assert "ground, L2, roof" in api.problem("GET", f"{url}?level=L9", 404)["detail"]
     assert "no level has this map" in api.problem("GET", f"{url}?level=*&grid=other&derive=false", 422)["detail"]
     problem = api.problem("GET", f"{url}?level=*&format=nav2_route", 422)
-    assert "holds all levels" in problem["detail"]
+    assert "contains all levels" in problem["detail"]
     assert "occupancy_grid" in problem["detail"]
 
 
 def test_lif_is_not_offered_to_vehicles(api: Api, farm: str) -> None:
     problem = api.problem("GET", f"environments/{farm}/versions/3/vda5050/actions?format=lif", 422)
-    assert "for the fleet manager, never for vehicles" in problem["detail"]
+    assert "for fleet managers, not for vehicles" in problem["detail"]
     api.get(f"environments/{farm}/versions/3/maps/lif")
 
 
@@ -180,7 +180,7 @@ def test_what_is_not_known_is_told(api: Api, farm: str, bare: str) -> None:
     assert result["robots"] == []
     assert [i["mapId"] for i in result["ignored"]] == sorted([farm, "nowhere", bare])
     result = editor.post("robots/agv-2/vda5050/state", maps(farm, ("a-b", "ENABLED")), 200).json()
-    assert "no version's number" in result["ignored"][0]["why"]
+    assert "must be the number of a version" in result["ignored"][0]["why"]
     editor.problem("POST", f"robots/agv-2/vda5050/state?environment={farm}", 422, json=body)
     api.token_for("robot", robot="agv-1").problem("POST", "robots/agv-2/vda5050/state", 403, json=body)
     api.token_for("viewer").problem("POST", "robots/agv-2/vda5050/state", 403, json=body)
