@@ -56,7 +56,7 @@ class ChannelBody(RequestModel):
         json_schema_extra={"examples": [{"version": 1}, {"version": 1, "rollout": {"ready": 0.9, "failed": 0.2}}]},
     )
 
-    version: int | str = Field(description="Number, channel or `latest`; stored as the number.")
+    version: int | str = Field(description="Version: number, channel or `latest`; stored as the number.")
     activate_at: ApiTime | None = Field(
         None, description="RFC 3339 time with time zone at which the channel moves. Default: now."
     )
@@ -127,7 +127,7 @@ class ChannelOut(BaseModel):
     robots: ChannelRobotsOut | None = Field(None, description="Omitted with `robots=false`.")
 
 
-ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="A channel's name.", examples=["production"])]
+ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="Name of the channel.", examples=["production"])]
 
 router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=StrictRoute)
 

@@ -42,7 +42,7 @@ router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=
 
 Ref = Annotated[
     str | None,
-    Query(pattern=VERSION, description="Number, channel, or `latest`."),
+    Query(pattern=VERSION, description="The newer version: number, channel, or `latest`."),
 ]
 
 SIDE = 1024

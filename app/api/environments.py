@@ -50,7 +50,7 @@ class CloneBody(RequestModel):
     """Environment whose content the new one starts with."""
 
     environment: str = Field(examples=["orchard"])
-    version: int | str = Field("latest", description="Number, channel or `latest`.", examples=["latest"])
+    version: int | str = Field("latest", description="Version: number, channel or `latest`.", examples=["latest"])
 
 
 class EnvironmentBody(RequestModel):

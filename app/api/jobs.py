@@ -32,7 +32,7 @@ class JobOut(BaseModel):
     updated: datetime
 
 
-JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
+JobPath = Annotated[str, Path(max_length=100, description="Id of the job.")]
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=StrictRoute)
 

@@ -33,7 +33,7 @@ class LinkBody(RequestModel):
         json_schema_extra={"examples": [{"format": "geojson", "file": "map.geojson", "seconds": 3600}]},
     )
 
-    format: str = Field(max_length=64, description="A format's id.")
+    format: str = Field(max_length=64, description="Id of the format.")
     file: str | None = Field(
         None,
         min_length=1,

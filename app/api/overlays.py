@@ -138,7 +138,7 @@ class ZoneSetsOut(BaseModel):
     closed_edges: list[dict[str, Any]] = Field(alias="closedEdges")
 
 
-OverlayPath = Annotated[str, Path(max_length=100, description="An overlay's id.")]
+OverlayPath = Annotated[str, Path(max_length=100, description="Id of the overlay.")]
 
 router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=StrictRoute)
 

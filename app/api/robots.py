@@ -113,7 +113,7 @@ class RobotDetailOut(RobotOut):
 
 RobotPath = Annotated[
     str,
-    Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$", description="A robot's name.", examples=["mower-3"]),
+    Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$", description="Name of the robot.", examples=["mower-3"]),
 ]
 
 router = APIRouter(prefix="/robots", tags=["robots"], route_class=StrictRoute)

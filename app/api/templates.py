@@ -118,7 +118,8 @@ FormatPath = Annotated[
     str, Path(max_length=64, description="Id of a format; see `GET /api/v1/formats`.", examples=["tmap2"])
 ]
 TemplateVersion = Annotated[
-    str, Query(alias="version", pattern=VERSION, description="Number, channel, or `latest`.", examples=["latest"])
+    str,
+    Query(alias="version", pattern=VERSION, description="Version: number, channel, or `latest`.", examples=["latest"]),
 ]
 Message = Annotated[str, Query(max_length=MAX_TEXT, description="Reason of the change, for the history.")]
 DryRun = Annotated[bool, Query(description="Report the result without committing it.")]

@@ -63,7 +63,7 @@ class NewTokenOut(TokenOut):
     token: str
 
 
-TokenPath = Annotated[str, Path(max_length=100, description="A token's id.")]
+TokenPath = Annotated[str, Path(max_length=100, description="Id of the token.")]
 
 router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=StrictRoute)
 

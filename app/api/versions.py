@@ -334,7 +334,7 @@ def list_sources(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _:
 )
 def get_source(
     env: EnvironmentPath,
-    v: Annotated[str, Path(pattern=VERSION, description="Number, channel, or `latest`.", examples=["latest"])],
+    v: Annotated[str, Path(pattern=VERSION, description="Version: number, channel, or `latest`.", examples=["latest"])],
     name: Annotated[
         str, Path(max_length=1024, description="Name of the file, with its folders.", examples=["datum.yaml"])
     ],

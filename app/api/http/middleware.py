@@ -139,7 +139,7 @@ class Guard:
 
 
 def _template(scope: Scope) -> str:
-    """Return the full path template of the route; routers of the API omit their prefix."""
+    """The answering route's whole path template: the API's routers tell theirs without its prefix."""
     path = str(getattr(scope.get("route"), "path", ""))
     if not path:
         return "other"

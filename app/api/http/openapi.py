@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
@@ -248,11 +249,23 @@ def _writer_parameters(fmt: formats.Format) -> list[dict[str, Any]]:
         {
             "name": option["name"],
             "in": "query",
-            "description": f"{option['description']} Default: {option['default']!r}.",
+            "description": _option_text(option),
             "schema": dict(option["schema"]),
         }
         for option in parameters.describe(fmt.write_options)
     ]
+
+
+def _option_text(option: Mapping[str, Any]) -> str:
+    """Describe an option, with its default as written in a URL."""
+    text, default = option["description"].rstrip("."), option["default"]
+    if default is None:
+        return f"{text}."
+    if isinstance(default, bool):
+        default = str(default).lower()
+    elif isinstance(default, tuple):
+        default = ",".join(map(str, default))
+    return f"{text}. Default: {f'`{default}`' if default != '' else 'empty'}."
 
 
 _HEADERS: dict[str, Any] = {
@@ -299,7 +312,7 @@ def _query_parameters() -> list[dict[str, Any]]:
     declared += [(step.name, step.parameters) for step in all_derivations().values()]
     for name, options in declared:
         for option in parameters.describe(options):
-            text = f"`{name}`: {option['description']} Default: {option['default']!r}."
+            text = f"`{name}`: {_option_text(option)}"
             entry = out.setdefault(
                 option["name"],
                 {"name": option["name"], "in": "query", "description": "", "schema": dict(option["schema"])},
