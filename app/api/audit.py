@@ -27,8 +27,10 @@ class AuditTokenOut(BaseModel):
 
 
 class AuditOut(BaseModel):
-    """One change. `request` is the `X-Request-Id` of the response, which the server's log contains as well. `target`
-    names the created object if the path does not.
+    """One change.
+
+    `request` is the `X-Request-Id` of the response, which the server's log contains as well. `target` names the
+    created object if the path does not.
     """
 
     id: int

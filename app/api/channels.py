@@ -211,8 +211,9 @@ def _list_response(services: Services, env: str, request: Request, robots: bool)
 def move_channel(
     env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, services: ServicesDep, principal: Editor
 ) -> Response:
-    """Move a channel to a newer or an older version, now or at a given time. `latest` cannot be moved: it follows the
-    head.
+    """Move a channel to a newer or an older version, now or at a given time.
+
+    `latest` cannot be moved: it follows the head.
 
     With `rollout`, the channel moves in two stages. Robots learn of the planned version (`channel.planned`), fetch it
     and report `ready`. The channel moves when the share `ready` of its online robots has the version, but not before

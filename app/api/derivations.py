@@ -73,8 +73,9 @@ def as_online() -> dict[str, Any]:
 
 @router.get("/derivations", responses=problem_responses(list[DerivationOut]), summary="List derivations")
 def list_derivations(services: ServicesDep, _: Viewer) -> Response:
-    """List the derivations with their inputs and parameters. Maps run them when needed; pass their parameters in the
-    query of a map.
+    """List the derivations with their inputs and parameters.
+
+    Maps run them when needed; pass their parameters in the query of a map.
     """
     return json_response(describe_derivations() + ([as_online()] if services.ingest.provider is not None else []))
 
@@ -96,8 +97,9 @@ def create_derivation(
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Create a version whose provenance records the derivation, its parameters and its inputs. The layer becomes
-    stale when the inputs change.
+    """Create a version whose provenance records the derivation, its parameters and its inputs.
+
+    The layer becomes stale when the inputs change.
 
     Returns 409 if the layer was uploaded or edited, unless `replace` is true. `location_to_imagery` downloads an
     image of the site if the operator has configured a provider, and returns 503 while the provider is down. The image

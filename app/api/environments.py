@@ -253,8 +253,9 @@ def get_environment(env: EnvironmentPath, services: ServicesDep, _: Viewer) -> R
 def update_environment(
     env: EnvironmentPath, body: EnvironmentPatch, services: ServicesDep, principal: Editor, if_match: IfMatch = None
 ) -> Response:
-    """Change the given members. A new datum creates a version and requires an editor; all else requires an
-    administrator.
+    """Change the given members.
+
+    A new datum creates a version and requires an editor; all else requires an administrator.
     """
     given = body.model_dump(exclude_none=True)
     if not given:

@@ -111,8 +111,9 @@ async def readyz(
     responses={200: {"description": "Prometheus text format", "content": {"text/plain": {}}}},
 )
 async def metrics(services: ServicesDep, _: ServerViewer) -> Response:
-    """Return counters of requests, conversions and cache hits, and the head of each environment. Requires a token for
-    all environments.
+    """Return counters of requests, conversions and cache hits, and the head of each environment.
+
+    Requires a token for all environments.
     """
     services.response_cache.flush_counters()
     response = Response(await run_in_threadpool(services.metrics.render, services.store))

@@ -52,8 +52,9 @@ def list_jobs(
     state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
     limit: Limit = 100,
 ) -> Response:
-    """List the jobs of the caller's token, newest first. Administrators with a token for all environments see all
-    jobs.
+    """List the jobs of the caller's token, newest first.
+
+    Administrators with a token for all environments see all jobs.
     """
     every = principal.role == "admin" and principal.environments is None
     visible_jobs = (job for job in reversed(services.store.jobs.all()) if every or job.owner == principal.id)
@@ -71,8 +72,9 @@ def get_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
 
 @router.delete("/{id}", status_code=204, responses=problem_responses(None, 404), summary="Cancel or delete a job")
 def delete_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
-    """Cancel a running job, or delete a finished one. Cancelling stops the conversion unless another request waits
-    for it.
+    """Cancel a running job, or delete a finished one.
+
+    Cancelling stops the conversion unless another request waits for it.
     """
     job = _require_job_owner(services, principal, id)
     if job_as_json(job)["state"] in ("queued", "running"):

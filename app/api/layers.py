@@ -432,8 +432,9 @@ def _box(text: str | None, crs: Anchor) -> Box | None:
 
 
 def _local_box(version: Version, text: str | None, crs: Anchor | None) -> Box | None:
-    """Convert a box to the local frame; a WGS 84 box becomes the bounding box of its edges. Grids default to the
-    local frame.
+    """Convert a box to the local frame; a WGS 84 box becomes the bounding box of its edges.
+
+    Grids default to the local frame.
     """
     if text is None or crs != "wgs84":
         anchor: Anchor = "wgs84" if crs is None and version.datum else "local"

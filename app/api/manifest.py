@@ -132,8 +132,9 @@ router = APIRouter(tags=["manifest"], route_class=StrictRoute)
 
 @router.get("/keys", responses=problem_responses(list[KeyOut]), summary="List signing keys")
 def list_keys(services: ServicesDep, _: Viewer) -> Response:
-    """List the keys, newest first; the newest one signs. `endorsement` is the signature of the previous key over the
-    raw public key.
+    """List the keys, newest first; the newest one signs.
+
+    `endorsement` is the signature of the previous key over the raw public key.
     """
     return json_response([key.as_dict() for key in services.keys.public()])
 
@@ -145,8 +146,10 @@ def list_keys(services: ServicesDep, _: Viewer) -> Response:
     summary="Rotate the signing key",
 )
 def rotate_key(services: ServicesDep, _: ServerAdmin) -> Response:
-    """Create a new signing key. Robots that trust the old key accept the new one, because the old key endorses it.
-    Requires an administrator's token for all environments.
+    """Create a new signing key.
+
+    Robots that trust the old key accept the new one, because the old key endorses it. Requires an administrator's
+    token for all environments.
 
     Signed links get a new secret as well; existing links stay valid until they expire.
     """

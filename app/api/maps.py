@@ -344,8 +344,9 @@ async def report(
     principal: Viewer,
     derive: bool = Query(True, description="Allow derived information."),
 ) -> Response:
-    """Return which information of a map is raw, derived or filled in, and what was dropped and why. Accepts the
-    parameters of the map.
+    """Return which information of a map is raw, derived or filled in, and what was dropped and why.
+
+    Accepts the parameters of the map.
     """
     values, allowed, closures = parse_query(request.scope["query_string"])
     plan = partial(resolve_recipe, services, MapRequest(env, v, format, None, values, allowed and derive, closures))

@@ -164,8 +164,10 @@ def list_overlays(
         ),
     ] = None,
 ) -> Response:
-    """List overlays, oldest first. `pending` waits for a decision, `accepted` is in force on every channel,
-    `rejected` was declined, `expired` ended without a decision, `ended` is over.
+    """List overlays, oldest first.
+
+    `pending` waits for a decision, `accepted` is in force on every channel, `rejected` was declined, `expired` ended
+    without a decision, `ended` is over.
     """
     return json_response([overlay.as_dict() for overlay in services.store.overlays.all(env, state)])
 
@@ -180,8 +182,9 @@ def list_overlays(
     summary="Report an obstruction",
 )
 def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDep, principal: RobotRole) -> Response:
-    """Report that a polygon or an edge is blocked until a given time. With `state: "accepted"` (editors only) it is
-    in force at once, on every channel; otherwise an editor decides.
+    """Report that a polygon or an edge is blocked until a given time.
+
+    With `state: "accepted"` (editors only) it is in force at once, on every channel; otherwise an editor decides.
     """
     if (body.polygon is None) == (body.edge is None):
         raise Invalid(
@@ -274,8 +277,9 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
 
 @router.post("/{id}/accept", responses=problem_responses(OverlayOut, 404, 409, 422, 503), summary="Accept an overlay")
 def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
-    """Put an overlay in force on every channel until its end: areas become keepout zones, edges are closed. No
-    version changes.
+    """Put an overlay in force on every channel until its end: areas become keepout zones, edges are closed.
+
+    No version changes.
     """
     now = datetime.now(UTC)
     overlay = services.store.overlays.get(env, id)
@@ -310,8 +314,9 @@ def end_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, pr
     summary="Make an accepted overlay permanent",
 )
 def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
-    """Create a version with the obstruction: an area as a keepout zone, an edge with `blocked: true`. The overlay
-    stays in force until its end. Promote the version before that, so that robots keep out permanently.
+    """Create a version with the obstruction: an area as a keepout zone, an edge with `blocked: true`.
+
+    The overlay stays in force until its end. Promote the version before that, so that robots keep out permanently.
     """
     overlay = services.store.overlays.get(env, id)
     if overlay.state != "accepted":

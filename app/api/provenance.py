@@ -197,8 +197,9 @@ def _short(text: str, limit: int) -> str:
     summary="Get the provenance graph",
 )
 def provenance(env: EnvironmentPath, v: VersionPath, request: Request, services: ServicesDep, _: Viewer) -> Response:
-    """Return the provenance graph as an SVG image, or as JSON with `Accept: application/json`. Stale items are
-    marked.
+    """Return the provenance graph as an SVG image, or as JSON with `Accept: application/json`.
+
+    Stale items are marked.
     """
     version = services.store.versions.get(env, parse_version_ref(v))
     lineage = graph(services.maps, version)

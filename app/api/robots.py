@@ -79,8 +79,10 @@ class HoldsOut(BaseModel):
 
 
 class RobotOut(BaseModel):
-    """Status of a robot in an environment. `time` is from the robot's clock if it sent one. `received` and `since`
-    (first report of the same status) are from the server's clock. `lag` is null if the channel has no version.
+    """Status of a robot in an environment.
+
+    `time` is from the robot's clock if it sent one. `received` and `since` (first report of the same status) are from
+    the server's clock. `lag` is null if the channel has no version.
     """
 
     robot: str
@@ -151,8 +153,10 @@ def get_robot(
     environment: EnvironmentQuery = None,
     limit: Annotated[int, Query(ge=1, le=200, description="Number of reports in `history`.")] = 50,
 ) -> Response:
-    """Return a robot's status in `environment`, by default in the one of its latest report. `history` has the reports
-    with a new status, newest first; `environments` lists all environments in which the robot reported.
+    """Return a robot's status in `environment`, by default in the one of its latest report.
+
+    `history` has the reports with a new status, newest first; `environments` lists all environments in which the
+    robot reported.
     """
     robots = [r for r in services.store.robots.all(None, robot) if principal.can_access(r.environment)]
     if environment is not None:
@@ -184,8 +188,9 @@ async def put_status(
     principal: RobotRole,
     prefer: Annotated[str | None, Header(description="`return=minimal` (RFC 7240): return 204 without a body.")] = None,
 ) -> Response:
-    """Store a status, as if it were published over Zenoh. A token with the role `robot` may report only for its
-    robot; editors may report for any.
+    """Store a status, as if it were published over Zenoh.
+
+    A token with the role `robot` may report only for its robot; editors may report for any.
     """
     require_report_permission(principal, robot)
     principal.require_environment(body.environment)

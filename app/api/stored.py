@@ -37,8 +37,9 @@ def stored(
     services: ServicesDep,
     _: ServerAdmin,
 ) -> Response:
-    """Return stored bytes, with which another server of the same data can repair itself. Requires an administrator's
-    token for all environments.
+    """Return stored bytes, with which another server of the same data can repair itself.
+
+    Requires an administrator's token for all environments.
     """
     try:
         if kind == "blobs" and (size := services.store.blobs.size(sha256)) > IN_MEMORY:

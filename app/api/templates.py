@@ -84,8 +84,10 @@ class TemplateSetOut(BaseModel):
 
 
 class FormatTemplateOut(BaseModel):
-    """Templates of one format. `set`: set of this format, if it differs from the environment's. `ignored`: stored
-    parameters that this release cannot use.
+    """Templates of one format.
+
+    `set`: set of this format, if it differs from the environment's. `ignored`: stored parameters that this release
+    cannot use.
     """
 
     format: str
@@ -132,8 +134,9 @@ CHANGED: dict[int | str, dict[str, Any]] = {
 
 @router.get("/templates", responses=problem_responses(list[TemplateSetOut]), summary="List template sets")
 def list_sets(_: Viewer) -> Response:
-    """List the named sets of values for parameters of formats. Parameters that a set does not define have the
-    defaults of the format.
+    """List the named sets of values for parameters of formats.
+
+    Parameters that a set does not define have the defaults of the format.
     """
     return json_response(sets())
 
@@ -179,8 +182,9 @@ def put_templates(
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Create a version with another template set, or with other values of several formats. Omitted formats keep their
-    values.
+    """Create a version with another template set, or with other values of several formats.
+
+    Omitted formats keep their values.
     """
     format_templates = {name: FormatTemplate(template.set, template.values) for name, template in body.formats.items()}
     update = TemplateUpdate(body.set, format_templates, dry_run=body.dry_run).validated()
@@ -210,8 +214,10 @@ def delete_templates(
 def get_format_templates(
     env: EnvironmentPath, format: FormatPath, services: ServicesDep, _: Viewer, version: TemplateVersion = "latest"
 ) -> Response:
-    """Return the templates of a format. `values`: the environment's own. `effective`: each parameter's value, and
-    `from`: `environment`, `set NAME` or `default`.
+    """Return the templates of a format.
+
+    `values`: the environment's own. `effective`: each parameter's value, and `from`: `environment`, `set NAME` or
+    `default`.
     """
     fmt = templates.check_format(format)
     stored_version = services.store.versions.get(env, parse_version_ref(version))

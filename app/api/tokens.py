@@ -134,8 +134,9 @@ def _robot_name(body: TokenBody) -> str | None:
 
 @router.delete("/{id}", status_code=204, responses=problem_responses(None, 404, 409), summary="Revoke a token")
 def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Response:
-    """Revoke a token; other worker processes refuse it within a second. The last token of a full administrator cannot
-    be revoked.
+    """Revoke a token; other worker processes refuse it within a second.
+
+    The last token of a full administrator cannot be revoked.
     """
     tokens = {token.id: token for token in services.store.tokens.all()}
     if id not in tokens:

@@ -248,9 +248,11 @@ def post_state(
         ),
     ] = None,
 ) -> Response:
-    """Convert the `maps` of a vehicle's state to the robot's status. `mapVersion` is the number of a version. ENABLED
-    becomes `active`; DISABLED becomes `ready` if the version is planned for the channel; a failed action of this
-    server becomes `failed`. The rest of the message is for the fleet manager.
+    """Convert the `maps` of a vehicle's state to the robot's status.
+
+    `mapVersion` is the number of a version. ENABLED becomes `active`; DISABLED becomes `ready` if the version is
+    planned for the channel; a failed action of this server becomes `failed`. The rest of the message is for the fleet
+    manager.
 
     The levels of a site (`<mapId>/<level>`) count together: the vehicle is `ready` with a version if it has it for
     each level in the message, and `active` with the oldest version that is enabled on any level. `ignored` lists the

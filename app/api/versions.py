@@ -230,8 +230,9 @@ async def create_version(
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Create one version from one upload, or none if it fails. The files are stored unchanged; doubtful content
-    causes warnings.
+    """Create one version from one upload, or none if it fails.
+
+    The files are stored unchanged; doubtful content causes warnings.
     """
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media == "multipart/form-data":
@@ -283,8 +284,9 @@ def create_edit(
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Put or delete features and set cells: one version, or none. Edits that leave edges without their nodes are
-    refused.
+    """Put or delete features and set cells: one version, or none.
+
+    Edits that leave edges without their nodes are refused.
     """
     changes = [change.model_dump(exclude_none=True) for change in body.changes]
     outcome = _counted(

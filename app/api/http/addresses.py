@@ -81,8 +81,9 @@ def resolve_recipe(services: Services, wanted: MapRequest) -> Recipe:
 
 
 def resolve_version(services: Services, wanted: MapRequest) -> Version:
-    """Resolve a URL to a version, with the closures that its maps show. A short URL means the channel ``production``
-    if it exists, else the head.
+    """Resolve a URL to a version, with the closures that its maps show.
+
+    A short URL means the channel ``production`` if it exists, else the head.
     """
     target = partial(services.store.channels.target, wanted.environment)
     if wanted.version is not None:

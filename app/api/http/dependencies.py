@@ -52,8 +52,9 @@ class ApiOptions:
 
 
 class Writability:
-    """Cached check for whether data can be stored. Thread-safe; ``checks`` run at most every WRITABLE_SECONDS, never
-    concurrently.
+    """Cached check for whether data can be stored.
+
+    Thread-safe; ``checks`` run at most every WRITABLE_SECONDS, never concurrently.
     """
 
     def __init__(self, *checks: Callable[[], None]) -> None:

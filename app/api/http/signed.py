@@ -83,8 +83,9 @@ class SignedLinks:
         return Grant(f"{quote(path, safe='/')}?{query}", datetime.fromtimestamp(expires, UTC))
 
     def check(self, address: SignedAddress, client: str | None) -> Principal:
-        """Verify a link; return its principal, which may read the linked map. Reads the store, so call it from a
-        thread.
+        """Verify a link; return its principal, which may read the linked map.
+
+        Reads the store, so call it from a thread.
 
         A valid link is accepted even from an address with too many failures, because links cannot be guessed.
 
