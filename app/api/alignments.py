@@ -112,11 +112,10 @@ def create_alignment(
     if_match: IfMatch = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Compute the rotation and translation that fit a stored grid onto another grid, a slice of the objects, or given
-    points.
+    """Fit a stored grid onto another grid, a slice of the objects, or given points.
 
-    The grid's origin changes, its cells do not. To rotate the cells, download the grid with `normalize=true`
-    (`occupancy_grid`).
+    The alignment is a rotation and a translation: the grid's origin changes, its cells do not. To rotate the cells,
+    download the grid with `normalize=true` (`occupancy_grid`).
     """
     if (body.onto is None) == (body.pairs is None):
         reason = "give either onto or pairs"

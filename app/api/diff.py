@@ -77,8 +77,10 @@ def diff(
         Query(description="`png`: an image with added features in green, deleted in red, changed in orange."),
     ] = "json",
 ) -> Response:
-    """Return the differences by layer: ids of added, changed (with the fields) and deleted features; for grids the
-    numbers of freed and blocked cells.
+    """Return the differences by layer.
+
+    Features are listed by id as added, changed (with the fields) or deleted. For grids the numbers of freed and
+    blocked cells are given.
     """
     new = services.store.versions.get(env, parse_version_ref(to or "latest"))
     if from_ is not None:

@@ -31,10 +31,10 @@ _LOOPBACK = ("127.0.0.1", "[::1]", "localhost")
 
 
 def advertised_router(advertised: str, listen: str, host: str) -> str:
-    """Return the router's endpoints, comma-separated, for a client that reached this server as ``host``; may be
-    empty.
+    """Return the router's endpoints, comma-separated, as reachable by a client of ``host``; may be empty.
 
-    A router on a loopback address is announced only to clients on loopback, unless the operator advertises it.
+    host: host name with which the client reached this server. A router on a loopback address is announced only to
+    clients on loopback, unless the operator advertises it.
     """
     host = host if _HOST.fullmatch(host) else ""
     host = f"[{host}]" if ":" in host else host

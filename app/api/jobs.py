@@ -64,8 +64,10 @@ def list_jobs(
 
 @router.get("/{id}", responses=problem_responses(JobOut, 404), summary="Get a job")
 def get_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
-    """Return the state of a job of the caller's token; administrators with a token for all environments see all jobs.
-    `result.location` is the address of the finished map.
+    """Return the state of a job of the caller's token.
+
+    Administrators with a token for all environments see all jobs. `result.location` is the address of the finished
+    map.
     """
     return json_response(job_as_json(_require_job_owner(services, principal, id)))
 

@@ -341,8 +341,10 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, p
 async def nav2_edges(
     env: EnvironmentPath, request: Request, services: ServicesDep, principal: Viewer, version: Ref = None
 ) -> Response:
-    """Return a request of `nav2_msgs/srv/DynamicEdges`: numbers of closed edges, and of edges that are open again, in
-    the graph of `maps/nav2_route?closures=mark`.
+    """Return a request of `nav2_msgs/srv/DynamicEdges`.
+
+    It has the numbers of closed edges, and of edges that are open again, in the graph of
+    `maps/nav2_route?closures=mark`.
     """
     maps = await _files_with_marks(services, env, version, "nav2_route", request, principal)
     if isinstance(maps, JobStarted):
@@ -364,8 +366,10 @@ async def rmf_lanes(
     version: Ref = None,
     fleet: Annotated[str, Query(max_length=256, description="`fleet_name` of the messages.")] = "",
 ) -> Response:
-    """Return messages of `rmf_fleet_msgs/msg/LaneRequest`, one per graph: lanes to close, and lanes to open again, by
-    their indexes in the graphs of `maps/rmf_nav_graph?closures=mark`.
+    """Return messages of `rmf_fleet_msgs/msg/LaneRequest`, one per graph.
+
+    They have the lanes to close, and the lanes to open again, by their indexes in the graphs of
+    `maps/rmf_nav_graph?closures=mark`.
     """
     maps = await _files_with_marks(services, env, version, "rmf_nav_graph", request, principal)
     if isinstance(maps, JobStarted):
@@ -405,8 +409,10 @@ def vda5050_zones(
         ),
     ] = None,
 ) -> Response:
-    """Return zone sets of VDA 5050 3.0, one per level, with a `BLOCKED` zone for each closed area, and the ids of
-    closed edges for the fleet manager's own routing. The id of a set changes with its content.
+    """Return zone sets of VDA 5050 3.0, one per level, with a `BLOCKED` zone for each closed area.
+
+    `closedEdges` has the ids of closed edges, for the fleet manager's own routing. The id of a set changes with its
+    content.
     """
     shown = _as_json(services, env, version)
     closures = shown.closures or Closures()

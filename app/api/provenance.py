@@ -44,8 +44,10 @@ COLOURS = {
 
 
 def graph(maps: Maps, version: Version) -> dict[str, Any]:
-    """Build ``{sources, parts, maps, links}``: file names, parts with their provenance, formats with their coverage,
-    and links (``from``, ``to``: ids of the others).
+    """Build ``{sources, parts, maps, links}``, the nodes and links of the graph.
+
+    They have file names, parts with their provenance, formats with their coverage, and links between ids (``from``,
+    ``to``).
     """
     stale = version.stale
     links: list[dict[str, str]] = []

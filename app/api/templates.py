@@ -154,8 +154,7 @@ def sets() -> list[dict[str, Any]]:
 def get_templates(
     env: EnvironmentPath, services: ServicesDep, _: Viewer, version: TemplateVersion = "latest"
 ) -> Response:
-    """Return the template set, and for each format with parameters its own values and the effective ones with their
-    origin.
+    """Return the template set, and for each format its own and its effective values with their origin.
 
     Precedence: parameters of a request, values of the environment, values of the set, defaults of the format.
     """

@@ -127,9 +127,11 @@ async def get_actions(
     signed: SignedQuery = True,
     seconds: SecondsQuery = None,
 ) -> Response:
-    """Return the actions `downloadMap` (with the link to one file, or a zip of several, and its SHA-256), `enableMap`
-    and `deleteMap`, which the fleet manager sends as `instantActions`. Further query parameters are those of the
-    map.
+    """Return the actions `downloadMap`, `enableMap` and `deleteMap`, which the fleet manager sends as
+    `instantActions`.
+
+    `downloadMap` has the link to one file (a zip of several) and its SHA-256. Further query parameters are those of
+    the map.
 
     VDA 5050 has one `mapId` per level: `mapId` itself for the default level, `<mapId>/<level>` for another one.
     `maps` has the actions of each requested level; the members beside it are those of the first. `mapVersion` is the

@@ -95,9 +95,7 @@ class ConversionJobs:
     async def convert(
         self, plan: Callable[[], Recipe], principal: Principal, address: str
     ) -> tuple[Recipe, CachedMap] | JobStarted:
-        """Return the map of a planned recipe, from the cache or converted, or the job that converts it for
-        ``address``.
-        """
+        """Return a planned map from the cache or a conversion, or the job that converts it for ``address``."""
         recipe = await run_in_threadpool(plan)
         cached_map = await run_in_threadpool(self._maps.get_cached, recipe)
         if cached_map is not None:

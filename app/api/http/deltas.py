@@ -40,8 +40,9 @@ class Deltas:
         self._lock = threading.Lock()
 
     async def between(self, old: str, new: str, body: bytes | CachedFile) -> bytes | None:
-        """Return ``dcz`` of the new file (by SHA-256) against an old one; None if the old one is not cached or the
-        delta is not smaller than the file.
+        """Return ``dcz`` of the new file (by SHA-256) against an old one.
+
+        None if the old one is not cached or the delta is not smaller than the file.
         """
         key = (old, new)
         with self._lock:

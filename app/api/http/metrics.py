@@ -53,8 +53,9 @@ class Metrics:
         self._reserve()
 
     def _reserve(self) -> None:
-        """Allocate disk space for this process's shared counters: a write to a sparse file on a full disk would kill
-        it.
+        """Allocate disk space for this process's shared counters.
+
+        A write to a sparse file on a full disk would kill the process.
         """
         folder = os.environ.get("PROMETHEUS_MULTIPROC_DIR")
         if folder:
