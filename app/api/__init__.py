@@ -1,8 +1,8 @@
-"""The HTTP interface: one module for each noun, which is discovered: it exposes its routes as ``router``.
+"""HTTP interface: one module per resource, discovered by its ``router``.
 
-``http`` has all that is below the nouns: ``http.middleware`` stands in front (token, bodies, errors),
-``http.application`` before it (repeated requests from memory); ``http.problems`` knows the status of every error,
-``http.schemas`` the shapes that nouns share.
+``http`` holds everything below the resources: ``http.middleware`` runs before all routes (tokens, bodies, errors),
+``http.application`` before the middleware (repeated requests from memory). ``http.problems`` maps each error class to
+a status, and ``http.schemas`` defines the shapes that resources share.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from fastapi import APIRouter
 
 
 def routers() -> Iterator[APIRouter]:
-    """The routes below ``/api/v1`` of all nouns, by the names of their modules."""
+    """Yield the routers below ``/api/v1`` of all resources, by module name."""
     for name in sorted(module.name for module in pkgutil.iter_modules(__path__)):
         router = getattr(importlib.import_module(f"{__name__}.{name}"), "router", None)
         if isinstance(router, APIRouter):

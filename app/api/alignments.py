@@ -1,4 +1,4 @@
-"""Grids laid onto other maps: where they should lie, told or committed."""
+"""Grid alignment: fit a grid onto another map, and report or commit the result."""
 
 from __future__ import annotations
 
@@ -23,15 +23,17 @@ from app.ingest import AlignmentRequest
 
 
 class OntoBody(RequestModel):
-    """The map that a grid is laid onto."""
+    """Map to fit the grid onto."""
 
     layer: Literal["occupancy", "objects", "voxels"] = Field(
-        "occupancy", description="A stored grid, or a layer that a grid is derived from."
+        "occupancy",
+        description="Layer of the target map: `occupancy` for a stored grid, or a layer from which a grid is derived.",
     )
     level: str = Field("ground", max_length=256)
-    name: str = Field("map", max_length=256, description="Of a stored grid.")
+    name: str = Field("map", max_length=256, description="Name of the target grid, if it is stored.")
     parameters: dict[str, Any] = Field(
-        default_factory=dict, description="Of the derivation, where there is one: `height`, `world` …"
+        default_factory=dict,
+        description="Parameters of the derivation that makes the target grid, if it is derived: `height`, `world` …",
     )
 
 
@@ -39,7 +41,7 @@ Place = tuple[float, float]
 
 
 class AlignmentBody(RequestModel):
-    """A stored grid that does not lie where it should, and what says where that is: another map, or pairs of points."""
+    """Alignment of a stored grid with another map (`onto`) or with pairs of points (`pairs`)."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -47,30 +49,40 @@ class AlignmentBody(RequestModel):
         },
     )
 
-    grid: str = Field("map", max_length=256, description="The name of the grid that is moved.")
+    grid: str = Field("map", max_length=256, description="Name of the grid to move.")
     level: str = Field("ground", max_length=256)
-    onto: OntoBody | None = Field(None, description="The map that it shall lie on.")
+    onto: OntoBody | None = Field(None, description="Map to fit the grid onto, instead of `pairs`.")
     pairs: list[tuple[Place, Place]] | None = Field(
         None,
         min_length=2,
         max_length=1000,
-        description="Points [[x, y], [x, y]]: where it is, and where it should be, m.",
+        description="Pairs of points [[x, y], [x, y]] in metres: present position, correct position.",
     )
-    angle: float = Field(180.0, ge=0, le=180, description="The largest turn that is tried, degrees.")
-    reach: float | None = Field(None, ge=0, le=1e7, description="The farthest that the grid's middle may go, m.")
+    angle: float = Field(180.0, ge=0, le=180, description="Maximum rotation to try, in degrees.")
+    reach: float | None = Field(
+        None,
+        ge=0,
+        le=1e7,
+        description="Maximum distance that the grid's centre may move, in metres. Default: no limit.",
+    )
     near: float | None = Field(
-        None, gt=0, le=1000, description="What agrees: cells this near to each other (0.1 m), or points (0.5 m)."
+        None,
+        gt=0,
+        le=1000,
+        description="Maximum distance in metres at which cells or points match. Default: 0.1 for cells, 0.5 "
+        "for points.",
     )
-    least: float = Field(0.5, ge=0, le=1, description="The share that has to agree.")
-    dry_run: bool = Field(False, description="Only tell what was found.")
+    least: float = Field(0.5, ge=0, le=1, description="Minimum share of matching cells or points, from 0 to 1.")
+    dry_run: bool = Field(False, description="Report the alignment without committing it.")
     message: str = Field("", max_length=MAX_TEXT)
 
 
 class AlignmentOut(BaseModel):
-    """A motion p -> R(yaw) p + (x, y) in metres and radians, how well it fits, and the version in which it was made."""
+    """Alignment p -> R(yaw) p + (x, y) in metres and radians, how well it fits, and the version that it created."""
 
     alignment: dict[str, Any] | None = Field(
-        description="`x`, `y`, `yaw`, `residual` (m), `agreement` and `overlap` (shares), `origin` and `before`."
+        description="`x`, `y`, `yaw`, `residual` (m), `agreement` and `overlap` (0 to 1), `origin` and the previous "
+        "origin `before`."
     )
     version: VersionOut | None
     warnings: list[ProblemItem]
@@ -86,12 +98,13 @@ router = api_router("alignments")
         **problem_responses(AlignmentOut, 400, 404, 409, 412, 415, 422, 503, ok=201, description="A new version"),
         200: {"model": AlignmentOut, "description": "A dry run, or nothing changed."},
     },
-    summary="Lay a grid onto another map",
+    summary="Align a grid with another map",
 )
 def create_alignment(env: EnvironmentPath, body: AlignmentBody, services: ServicesDep, commit: CommitDep) -> Response:
-    """Find the turn and the shift that lay a stored grid onto another grid, a slice of the objects, or given points.
+    """Fit a stored grid onto another grid, a slice of the objects, or given points.
 
-    The grid's origin changes, its cells do not; `normalize=true` of `occupancy_grid` bakes a turn into the cells.
+    The alignment is a rotation and a translation: the grid's origin changes, its cells do not. To rotate the cells,
+    download the grid with `normalize=true` (`occupancy_grid`).
     """
     if (body.onto is None) == (body.pairs is None):
         reason = "give either onto or pairs"

@@ -19,7 +19,7 @@ from app.store.values import rfc3339
 
 
 class AuditTokenOut(BaseModel):
-    """The token that made a change, as it was called then."""
+    """Token that made a change, with its name and role at that time."""
 
     id: str
     name: str
@@ -27,8 +27,11 @@ class AuditTokenOut(BaseModel):
 
 
 class AuditOut(BaseModel):
-    """One change. request: the `X-Request-Id` of its answer, which the server's log has, too. target: what was made,
-    where the path does not name it."""
+    """One change.
+
+    `request` is the `X-Request-Id` of the response, which the server's log contains as well. `target` names the
+    created object if the path does not.
+    """
 
     id: int
     time: datetime
@@ -44,7 +47,7 @@ class AuditOut(BaseModel):
 router = api_router("audit", "/audit")
 
 
-@router.get("", responses=problem_responses(list[AuditOut]), summary="Who changed what, from where")
+@router.get("", responses=problem_responses(list[AuditOut]), summary="List changes with their authors and addresses")
 def list_audit(
     request: Request,
     services: ServicesDep,
@@ -53,16 +56,16 @@ def list_audit(
     token_id: Annotated[str | None, Query(max_length=32, description="Only changes made with this token.")] = None,
     limit: Limit = 100,
     cursor: Annotated[
-        str | None, Query(max_length=18, description="Where the page starts: taken from the last page's `Link` header.")
+        str | None, Query(max_length=18, description="Start of the page, from the `Link` header of the previous page.")
     ] = None,
 ) -> Response:
-    """The newest change first. An entry is stored in the same transaction as its change.
+    """List changes, newest first. Each entry is stored in the same transaction as its change.
 
-    Takes an administrator's token for all environments. Robots' reports and what the server does by itself (planned
-    moves, closures that end) are not changes of anybody: the events tell of them.
+    Requires an administrator's token for all environments. Reports of robots and actions of the server itself
+    (planned moves, closures that expire) are not listed: read the events.
     """
     if cursor is not None and not (cursor.isascii() and cursor.isdigit()):
-        raise Invalid("cursor must be taken from the Link header of the page before")
+        raise Invalid("invalid cursor: take it from the Link header of the previous page")
     before = None if cursor is None else int(cursor)
     entries = services.store.audit.page(environment=environment, token_id=token_id, before=before, limit=limit + 1)
     more = str(entries[limit - 1].id) if len(entries) > limit else None
@@ -70,7 +73,7 @@ def list_audit(
 
 
 def as_dict(entry: AuditEntry) -> dict[str, object]:
-    """One entry as JSON."""
+    """Convert one entry to JSON."""
     return {
         "id": entry.id,
         "time": rfc3339(entry.time),

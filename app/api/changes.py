@@ -1,4 +1,4 @@
-"""What changed in meaning between two versions, for robots that patch their live maps."""
+"""Semantic differences between two versions, for robots that patch their live maps."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from app.model.layers import VECTOR_LAYERS, PartKey
 from app.store.values import ChangedCells, Delta, FeatureDelta, GridDelta, Version
 
 MAX_CELLS = 4 * 2**20
-"""Where more cells of a grid changed, fetching the grid is less work than reading them as JSON."""
+"""Maximum number of changed cells in a delta; beyond it, fetching the whole grid is cheaper than reading JSON."""
 
 
 class DeltaOut(BaseModel):
-    """What turns one version into another."""
+    """Changes that turn one version into another."""
 
     environment: str
     since: dict[str, Any]
@@ -52,8 +52,11 @@ router = api_router("versions", "/environments/{env}/versions/{v}")
 
 @router.get(
     "/delta",
-    responses={**problem_responses(DeltaOut, 404, 422), 304: {"description": "The client has it"}},
-    summary="What changed in meaning since a version",
+    responses={
+        **problem_responses(DeltaOut, 404, 422),
+        304: {"description": "Not modified: the client has this delta"},
+    },
+    summary="Get the changes since a version",
 )
 def get_delta(
     env: EnvironmentPath,
@@ -62,17 +65,19 @@ def get_delta(
     services: ServicesDep,
     _: Viewer,
     since: Annotated[
-        str, Query(pattern=VERSION, description="What the client has: number, channel, or `latest`.", examples=["0"])
+        str, Query(pattern=VERSION, description="The client's version: number, channel, or `latest`.", examples=["0"])
     ],
     crs: Crs = None,
 ) -> Response:
-    """What turns the version `since` into `v`, which may also be the older one.
+    """Return the changes that turn the version `since` into `v`. `v` may be the older one.
 
-    `layers`: for each vector layer the features to put (GeoJSON as `/layers/{layer}` has it; id, `level` and `part`
-    name one) and those to delete. Where the datum changed, places change that nobody edited: all features are put.
-    `grids`: rectangles of changed cells, each as a `map_msgs/OccupancyGridUpdate`: `x`, `y`, `width`, `height` in cells
-    of the grid, row 0 at the bottom, `data` row by row, 0…100 and -1 for unknown. `whole`: the grid's frame is another
-    one (or most of a large grid changed): fetch it. `other`: parts that have no delta: fetch what is made of them.
+    - `layers`: for each vector layer, the features to put (GeoJSON, as in `/layers/{layer}`) and those to delete. A
+      feature is identified by id, `level` and `part`. If the datum changed, all features are put, because unedited
+      ones move too.
+    - `grids`: rectangles of changed cells, each as a `map_msgs/OccupancyGridUpdate`: `x`, `y`, `width`, `height` in
+      cells of the grid, row 0 at the bottom, `data` row by row, 0…100 and -1 for unknown. If `whole` is true, the
+      grid's frame changed (or most of a large grid did): fetch the grid.
+    - `other`: parts without a delta: fetch the maps that use them.
     """
     new, old = (
         services.store.versions.get(env, parse_version_ref(v)),
@@ -114,8 +119,8 @@ def _layers(services: Services, new: Version, delta: Delta, crs: Anchor) -> dict
         layer = change.key.layer
         if frame is None and len(change.put) and bool((change.put.local != (crs == "local")).any()):
             raise MissingDatum(
-                f"{new.environment} has no datum in version {new.number}, so local metres have no place on earth: ask "
-                "for the other crs, or give it a datum"
+                f"{new.environment} has no datum in version {new.number}, so local metres cannot be converted "
+                "to WGS 84: request the other crs, or set a datum"
             )
         puts.setdefault(layer, []).append((change.key, change.put))
         removed_items = [{"id": item, "level": change.key.level, "part": change.key.name} for item in change.deleted]
@@ -130,7 +135,7 @@ def _layers(services: Services, new: Version, delta: Delta, crs: Anchor) -> dict
 
 
 def _all_features(services: Services, new: Version, changes: Sequence[FeatureDelta]) -> list[FeatureDelta]:
-    """All features are put, since in the frame that is answered in each may have moved."""
+    """Put all features: with another datum each of them may have moved in the requested frame."""
     out = {change.key: change for change in changes}
     for entry in new.parts:
         if entry.key.layer in VECTOR_LAYERS:

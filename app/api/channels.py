@@ -1,4 +1,4 @@
-"""Channels: which version robots drive on, now and from when."""
+"""Channels: the version that robots run, current and planned."""
 
 from __future__ import annotations
 
@@ -23,58 +23,70 @@ from app.store.fleet_values import Channel, Robot, Rollout, RolloutState
 from app.store.values import LATEST, rfc3339
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
-"""A time that is past by less may lie ahead by the clock of whoever asks: the channel moves at once."""
+"""Tolerance for ``activate_at`` in the past: the client's clock may be behind. The channel then moves at once."""
 
 
 class RolloutBody(RequestModel):
-    """A move in two stages. At least one of ``ready`` and ``failed``."""
+    """Two-stage move. Requires `ready`, `failed`, or both."""
 
     ready: float | None = Field(
-        None, gt=0, le=1, description="The channel moves when this share of its online robots has the version."
+        None,
+        gt=0,
+        le=1,
+        description="Share of the channel's online robots that must have the version before the channel moves.",
     )
     failed: float | None = Field(
-        None, gt=0, le=1, description="It does not move, or moves back, when this share of its robots reports `failed`."
+        None,
+        gt=0,
+        le=1,
+        description="Share of the channel's robots that report `failed` at which the move is cancelled or reverted.",
     )
-    deadline: ApiTime | None = Field(None, description="RFC 3339 time with zone: without enough robots it stays then.")
-    window: float = Field(600.0, ge=1, le=604_800, description="Seconds for which robots are watched after the move.")
+    deadline: ApiTime | None = Field(
+        None, description="RFC 3339 time with time zone: if too few robots are ready by then, the move is cancelled."
+    )
+    window: float = Field(
+        600.0, ge=1, le=604_800, description="Seconds after the move during which failures revert it."
+    )
 
 
 class ChannelBody(RequestModel):
-    """Where a channel is to stand, and since when."""
+    """Version for a channel, and when to move."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"version": 1}, {"version": 1, "rollout": {"ready": 0.9, "failed": 0.2}}]},
     )
 
-    version: int | str = Field(description="Number, channel or `latest`; kept as the number.")
+    version: int | str = Field(description="Version: number, channel or `latest`; stored as the number.")
     activate_at: ApiTime | None = Field(
-        None, description="RFC 3339 time with zone at which the channel moves; left out: now."
+        None, description="RFC 3339 time with time zone at which the channel moves. Default: now."
     )
-    rollout: RolloutBody | None = Field(None, description="Let robots fetch it first, and watch them afterwards.")
+    rollout: RolloutBody | None = Field(
+        None, description="Let robots prefetch the version before the move, and watch for failures after it."
+    )
 
     @field_validator("version", mode="before")
     @classmethod
     def _no_truth(cls, value: Any) -> Any:
-        """To JSON ``true`` is no number."""
+        """Reject JSON ``true``, which Python would take for 1."""
         if isinstance(value, bool):
-            raise ValueError("a version is a number or a channel's name")
+            raise ValueError("version must be a number or a channel's name")
         return value
 
 
 class ChannelRobotsOut(BaseModel):
-    """A channel's robots. ``since``: since when all hold its root and closures; null while any does not."""
+    """Robots of a channel. `since`: time from which all of them run its root and closures, or null."""
 
     total: int
     online: int
     holding: int
     lagging: int
     failed: int
-    ready: int = Field(description="Those that have the planned version and count in its roll-out (`vouched`).")
+    ready: int = Field(description="Robots that have the planned version and count in its rollout (`vouched`).")
     since: datetime | None
 
 
 class RolloutOut(BaseModel):
-    """The last roll-out of a channel. ``before``: the version that it moves back to; ``detail``: why it stands so."""
+    """Last rollout of a channel. `before` is the version to which it moves back; `detail` explains the state."""
 
     version: int
     root: str
@@ -91,37 +103,40 @@ class RolloutOut(BaseModel):
 
 
 class OverlaysOut(BaseModel):
-    """The closures in force."""
+    """Closures in force."""
 
     count: int
     digest: str = Field(description="Robots with equal roots and equal digests hold the same map.")
-    sequence: int = Field(description="Of the last event that changed them; 0: none did.")
+    sequence: int = Field(description="Sequence of the last event that changed the closures, or 0.")
 
 
 class ChannelOut(BaseModel):
-    """A movable name for a version."""
+    """Movable name for a version."""
 
     channel: str
     version: int | None
     root: str | None
     sequence: int
     overlays: OverlaysOut | None = Field(
-        None, description="The closures in force, the same on all channels. Left out with `robots=false`."
+        None, description="Closures in force, the same on all channels. Omitted with `robots=false`."
     )
     author: str
     time: datetime
     planned: dict[str, Any] | None = None
     rollout: RolloutOut | None = None
-    robots: ChannelRobotsOut | None = Field(None, description="Left out with `robots=false`.")
+    robots: ChannelRobotsOut | None = Field(None, description="Omitted with `robots=false`.")
 
 
-ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="A channel's name.", examples=["production"])]
+ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="Name of the channel.", examples=["production"])]
 
 router = api_router("channels", "/environments/{env}/channels")
 
 
 def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> dict[str, Any]:
-    """The channel as clients see it, with how its robots stand. robots: of the environment; None leaves that out."""
+    """Convert a channel to JSON, with the status of its robots.
+
+    robots: robots of the environment; None omits their status and the closures.
+    """
     planned = None
     if channel.planned is not None:
         planned = {
@@ -156,22 +171,20 @@ def _channel_as_json(services: Services, env: str, channel: Channel) -> dict[str
     return as_dict(channel, services.store.robots.all(env), datetime.now(UTC))
 
 
-@router.get("", responses=problem_responses(list[ChannelOut], 404), summary="All channels")
+@router.get("", responses=problem_responses(list[ChannelOut], 404), summary="List channels")
 async def list_channels(
     env: EnvironmentPath,
     request: Request,
     services: ServicesDep,
     _: Viewer,
-    robots: Annotated[
-        bool, Query(description="`false`: without how their robots stand, which costs a look at all.")
-    ] = True,
+    robots: Annotated[bool, Query(description="Include the status of robots. `false` is faster.")] = True,
 ) -> Response:
-    """`latest` first, then the others by name, with what is planned for them, and how their robots stand.
+    """List channels, `latest` first, then by name, with planned moves and the status of their robots.
 
-    `robots.since` is told where all robots of a channel hold its root: from then on they have. `holding`, `lagging` and
-    `failed` make up the `total`; `ready` have what is planned.
+    `robots.since` is set if all robots of a channel run its root: the time since when they do. `holding`, `lagging`
+    and `failed` add up to `total`; `ready` counts the robots that have the planned version.
     """
-    if robots:  # a look of one's own: what robots say is no commit that others' looks would be too old for
+    if robots:  # not shared: a shared result is valid until the next commit, and robot reports are not commits
         headers, data = await run_in_threadpool(_list_response, services, env, request, robots)
     else:
         headers, data = await services.response_cache.run_shared(
@@ -187,31 +200,37 @@ def _list_response(services: Services, env: str, request: Request, robots: bool)
     fleet_of = services.store.robots.all(env) if robots else None
     data = json_bytes([as_dict(channel, fleet_of, now) for channel in services.store.channels.all(env)])
     headers = {"etag": f'"{hashlib.sha256(data).hexdigest()[:40]}"', "cache-control": "no-cache"}
-    if not robots:  # this is what robots ask for, all of them at once
+    if not robots:  # the request that all robots of a fleet send at once
         services.response_cache.store_response(request, env, headers, data, generation)
     return headers, data
 
 
 @router.put(
-    "/{channel}", responses=problem_responses(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it"
+    "/{channel}", responses=problem_responses(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan a move"
 )
 def move_channel(
     env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, services: ServicesDep, principal: Editor
 ) -> Response:
-    """To a newer version or back to an older one, now or at a time to come. `latest` moves by itself.
+    """Move a channel to a newer or an older version, now or at a given time.
 
-    With `rollout` in two stages: robots are told (`channel.planned`), fetch the version and report `ready`; the channel
-    moves when the share `ready` of its online robots has it, and not before `activate_at`. When the share `failed`
-    reports `failed` before that, it does not move; within `window` seconds after it, it moves back, with a higher
-    sequence and `rollback: true`. By `deadline` the move is given up.
+    `latest` cannot be moved: it follows the head.
+
+    With `rollout`, the channel moves in two stages. Robots learn of the planned version (`channel.planned`), fetch it
+    and report `ready`. The channel moves when the share `ready` of its online robots has the version, but not before
+    `activate_at`. If the share `failed` reports `failed` before the move, the move is cancelled. If it does within
+    `window` seconds after the move, the channel moves back, with a higher sequence and `rollback: true`. The move is
+    also cancelled at `deadline`.
     """
     if channel == LATEST:
-        raise Invalid("latest moves by itself: choose another channel", [Problem("not to be moved", where="channel")])
+        raise Invalid(
+            "latest cannot be moved, it follows the head: choose another channel",
+            [Problem("cannot be moved", where="channel")],
+        )
     if body.activate_at is not None:
         if body.activate_at.tzinfo is None:
-            raise _invalid_body_error("activate_at needs a zone, like 2030-01-31T06:00:00Z")
+            raise _invalid_body_error("activate_at needs a time zone, for example 2030-01-31T06:00:00Z")
         if body.activate_at <= datetime.now(UTC) - MAX_CLOCK_SKEW:
-            raise _invalid_body_error("activate_at is in the past: leave it out to move now")
+            raise _invalid_body_error("activate_at is in the past: omit it to move now")
     rollout = _rollout(body) if body.rollout is not None else None
     version = services.store.versions.get(env, body.version).number
     moved = services.store.channels.move(
@@ -224,15 +243,15 @@ def _rollout(body: ChannelBody) -> Rollout:
     request, now = body.rollout, datetime.now(UTC)
     assert request is not None
     if request.ready is None and request.failed is None:
-        raise _invalid_body_error("a rollout takes ready, failed, or both", "body.rollout")
+        raise _invalid_body_error("rollout is incomplete: give ready, failed, or both", "body.rollout")
     if request.deadline is not None:
         location = "body.rollout.deadline"
         if request.ready is None:
-            raise _invalid_body_error("deadline limits the waiting for robots: it needs ready", location)
+            raise _invalid_body_error("deadline requires ready: it limits the wait for ready robots", location)
         if request.deadline.tzinfo is None:
-            raise _invalid_body_error("deadline needs a zone, like 2030-01-31T06:00:00Z", location)
+            raise _invalid_body_error("deadline needs a time zone, for example 2030-01-31T06:00:00Z", location)
         if request.deadline <= (body.activate_at or now):
-            raise _invalid_body_error("deadline must lie in the future, and after activate_at", location)
+            raise _invalid_body_error("deadline must be in the future and after activate_at", location)
     return Rollout(
         version=0,
         root="",
@@ -249,9 +268,9 @@ def _invalid_body_error(detail: str, location: str = "body.activate_at") -> Inva
 
 
 @router.delete(
-    "/{channel}/planned", status_code=204, responses=problem_responses(None, 404), summary="Cancel what is planned"
+    "/{channel}/planned", status_code=204, responses=problem_responses(None, 404), summary="Cancel a planned move"
 )
 def cancel_planned(env: EnvironmentPath, channel: ChannelPath, services: ServicesDep, principal: Editor) -> Response:
-    """The channel stays where it is."""
+    """Cancel the planned move or rollout. The channel keeps its version."""
     services.store.channels.cancel_planned(env, channel, principal.name)
     return Response(status_code=204)

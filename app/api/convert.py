@@ -1,4 +1,4 @@
-"""Convert without storing."""
+"""Conversion of files without storing them."""
 
 from __future__ import annotations
 
@@ -43,22 +43,28 @@ _BODY: dict[str, Any] = {
                     "required": ["files", "to"],
                     "properties": {
                         "files": {"type": "array", "items": {"type": "string", "format": "binary"}},
-                        "to": {"type": "string", "description": "The id of the wanted format."},
+                        "to": {"type": "string", "description": "Id of the output format."},
                         "datum": {
                             "type": "string",
-                            "description": "`LAT,LON` or JSON; else the south-west corner of places on earth.",
+                            "description": (
+                                "`LAT,LON` or JSON. Default: the south-west corner of geographic coordinates in "
+                                "the files."
+                            ),
                         },
-                        "format": {"type": "string", "description": "What the files are; left out: by content."},
+                        "format": {
+                            "type": "string",
+                            "description": "Id of the files' format. Default: detected from the content.",
+                        },
                         "layer": {"type": "string", "enum": list(DRAWN_LAYERS)},
                         "level": {"type": "string", "default": "ground"},
-                        "grid": {"type": "string", "description": "The name of a grid that is read."},
+                        "grid": {"type": "string", "description": "Name for an uploaded grid."},
                         "report": {
                             "type": "boolean",
                             "default": False,
-                            "description": "Answer only the report: what would be derived, filled in and dropped.",
+                            "description": "Return only the report: derived, filled-in and dropped information.",
                         },
                     },
-                    "additionalProperties": {"type": "string", "description": "Options of the wanted format."},
+                    "additionalProperties": {"type": "string", "description": "Options of the output format."},
                 },
                 "examples": {"datum": {"value": {"files": ["datum.yaml"], "to": "kml"}}},
             }
@@ -73,7 +79,7 @@ _BODY: dict[str, Any] = {
     responses={
         **problem_responses(None, 400, 404, 409, 413, 415, 422, 503),
         200: {
-            "description": "The file, or a zip of several",
+            "description": "The file, or a zip if there are several",
             "content": {"application/octet-stream": {}, "application/zip": {}, "application/json": {}},
         },
     },
@@ -81,10 +87,10 @@ _BODY: dict[str, Any] = {
     openapi_extra=_BODY,
 )
 async def convert(request: Request, services: ServicesDep, _: Editor) -> Response:
-    """The wanted format made of the files in the request. `Fleetmap-Warnings` counts what was doubtful."""
+    """Convert the files of the request to another format. The header `Fleetmap-Warnings` counts the warnings."""
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media != "multipart/form-data":
-        raise UnsupportedMedia("send the files as multipart/form-data")
+        raise UnsupportedMedia("unsupported media type: send the files as multipart/form-data")
     async with services.intake.receive(request) as form:
         return await run_in_threadpool(_convert, services, form)
 
@@ -93,10 +99,12 @@ def _convert(services: Services, form: UploadForm) -> Response:
     form_fields = FormFields(form)
     to = form_fields.take_format("to")
     if to is None:
-        raise Invalid("say in the field 'to' which format is wanted", [Problem("missing", where="to")])
+        raise Invalid("missing field 'to': set it to the id of the output format", [Problem("missing", where="to")])
     fmt = formats.get_format(to)
     if not form.files:
-        raise Invalid("there is no file: send at least one in the field 'files'", [Problem("missing", where="files")])
+        raise Invalid(
+            "no file in the upload: send at least one in the field 'files'", [Problem("missing", where="files")]
+        )
     check_file_names(form.files)
     hints = form_fields.take_hints()
     datum = _datum(form_fields.take("datum"))
@@ -107,7 +115,7 @@ def _convert(services: Services, form: UploadForm) -> Response:
     read = {p["name"] for f in formats.all_formats().values() if f.read for p in parameters.describe(f.read_options)}
     for name in fields.keys() - written - read:
         accepted = ", ".join(sorted(written)) or "none"
-        detail = f"{to} has no parameter {name[:80]!r}{did_you_mean(name, written | read)}; accepted: {accepted}"
+        detail = f"unknown parameter {name[:80]!r} of {to}{did_you_mean(name, written | read)}; accepted: {accepted}"
         raise Invalid(detail, [Problem(f"unknown; accepted: {accepted}", where=name[:80])])
     hints = replace(hints, options={k: v for k, v in fields.items() if k not in written})
     values = {k: v for k, v in fields.items() if k in written}
@@ -133,7 +141,7 @@ def _answer(done: Converted, to: str, only_report: bool) -> Response:
 
 
 def _datum(text: str) -> Datum | None:
-    """``LAT,LON`` or a JSON object with latitude and longitude."""
+    """Parse ``LAT,LON`` or a JSON object with latitude and longitude."""
     if not text:
         return None
     if text.lstrip().startswith("{"):

@@ -1,4 +1,4 @@
-"""Layers computed from others: which ways there are, and committing what one of them gives."""
+"""Layers computed from others: list the derivations, run one and commit its result."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from app.ingest import DerivationRequest, online
 
 
 class DerivationBody(RequestModel):
-    """A layer to be computed from others."""
+    """Derivation to run and commit."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -32,16 +32,16 @@ class DerivationBody(RequestModel):
         },
     )
 
-    method: str = Field(max_length=200, description="A derivation's name; see `/api/v1/derivations`.")
+    method: str = Field(max_length=200, description="Name of a derivation; see `GET /api/v1/derivations`.")
     parameters: dict[str, Any] = Field(
-        default_factory=dict, description="Of the method, and of the derivations that have to come before it."
+        default_factory=dict, description="Parameters of the derivation, and of derivations that must run before it."
     )
     message: str = Field("", max_length=MAX_TEXT)
-    replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
+    replace: bool = Field(False, description="Replace uploaded or edited content as well.")
 
 
 class DerivationOut(BaseModel):
-    """A way to compute a layer from others."""
+    """Derivation: computes a layer from others."""
 
     id: str
     title: str
@@ -56,10 +56,10 @@ router = api_router("derivations")
 
 
 def as_online() -> dict[str, Any]:
-    """The one that asks a provider on the net; no map takes it by itself."""
+    """Describe the derivation that queries the online imagery provider; maps never run it implicitly."""
     return {
         "id": online.METHOD,
-        "title": "A picture of the site from the configured provider.",
+        "title": "Download an image of the site from the configured provider.",
         "gives": "imagery",
         "needs": ["location"],
         "cost": 100.0,
@@ -68,9 +68,12 @@ def as_online() -> dict[str, Any]:
     }
 
 
-@router.get("/derivations", responses=problem_responses(list[DerivationOut]), summary="All derivations")
+@router.get("/derivations", responses=problem_responses(list[DerivationOut]), summary="List derivations")
 def list_derivations(services: ServicesDep, _: Viewer) -> Response:
-    """What can be computed from what. Maps use them by themselves; their parameters go into a map's query."""
+    """List the derivations with their inputs and parameters.
+
+    Maps run them when needed; pass their parameters in the query of a map.
+    """
     return json_response(describe_derivations() + ([as_online()] if services.ingest.provider is not None else []))
 
 
@@ -81,14 +84,16 @@ def list_derivations(services: ServicesDep, _: Viewer) -> Response:
         **problem_responses(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
         200: {"model": VersionOut, "description": "Nothing changed: the head."},
     },
-    summary="Compute a layer and commit it",
+    summary="Derive a layer and commit it",
 )
 def create_derivation(env: EnvironmentPath, body: DerivationBody, services: ServicesDep, commit: CommitDep) -> Response:
-    """A version whose provenance says how the layer was made and from what. It goes stale when that changes.
+    """Create a version whose provenance records the derivation, its parameters and its inputs.
 
-    409 where a source has told that layer, unless `replace` is true. `location_to_imagery` fetches a picture of the
-    site where the operator has set up a provider (503 while that is down); it goes stale when the fence or the datum
-    changes, and is still used then.
+    The layer becomes stale when the inputs change.
+
+    Returns 409 if the layer was uploaded or edited, unless `replace` is true. `location_to_imagery` downloads an
+    image of the site if the operator has configured a provider, and returns 503 while the provider is down. The image
+    becomes stale when the fence or the datum changes, but maps keep using it.
     """
     request = DerivationRequest(body.method, body.parameters, body.replace)
     try:
@@ -97,5 +102,5 @@ def create_derivation(env: EnvironmentPath, body: DerivationBody, services: Serv
     except NotFound as error:
         if body.method in derive.all_derivations():
             raise
-        raise Invalid(error.detail, [Problem("no such derivation", where="body.method")]) from None
+        raise Invalid(error.detail, [Problem("unknown derivation", where="body.method")]) from None
     return commit_response(outcome)

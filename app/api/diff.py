@@ -1,4 +1,4 @@
-"""What differs between two versions: as JSON, or as a picture."""
+"""Differences between two versions, as JSON or as an image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from app.store.values import Version
 
 
 class DiffOut(BaseModel):
-    """What differs between two versions."""
+    """Differences between two versions."""
 
     model_config = ConfigDict(populate_by_name=True)
 
@@ -42,7 +42,7 @@ router = api_router("versions", "/environments/{env}")
 
 Ref = Annotated[
     str | None,
-    Query(pattern=VERSION, description="Number, channel, or `latest`."),
+    Query(pattern=VERSION, description="The newer version: number, channel, or `latest`."),
 ]
 
 SIDE = 1024
@@ -55,9 +55,9 @@ FREED, BLOCKED, OTHER = (120, 200, 140), (225, 120, 120), (240, 205, 120)
     "/diff",
     responses={
         **problem_responses(DiffOut, 404),
-        200: {"model": DiffOut, "description": "What differs", "content": {"image/png": {}}},
+        200: {"model": DiffOut, "description": "The differences", "content": {"image/png": {}}},
     },
-    summary="What differs between two versions",
+    summary="Compare two versions",
 )
 def diff(
     env: EnvironmentPath,
@@ -68,21 +68,26 @@ def diff(
         Query(
             alias="from",
             pattern=VERSION,
-            description="The older one: number, channel, or `latest`. Default: the parent of `to`.",
+            description="The older version: number, channel, or `latest`. Default: the parent of `to`.",
         ),
     ] = None,
     to: Ref = "latest",
     render: Annotated[
-        Literal["json", "png"], Query(description="`png`: added green, deleted red, changed orange.")
+        Literal["json", "png"],
+        Query(description="`png`: an image with added features in green, deleted in red, changed in orange."),
     ] = "json",
 ) -> Response:
-    """By layer: ids added, changed (with the fields) and deleted; for grids how many cells were freed and blocked."""
+    """Return the differences by layer.
+
+    Features are listed by id as added, changed (with the fields) or deleted. For grids the numbers of freed and
+    blocked cells are given.
+    """
     new = services.store.versions.get(env, parse_version_ref(to or "latest"))
     if from_ is not None:
         old = services.store.versions.get(env, parse_version_ref(from_))
     else:
         if new.parent is None:
-            raise Invalid("version 0 has no parent to compare with: say 'from'")
+            raise Invalid("version 0 has no parent to compare with: set from to a version")
         old = services.store.versions.get(env, new.parent)
     if render == "png":
         return Response(_picture(services, old, new), media_type="image/png")
@@ -91,7 +96,7 @@ def diff(
 
 
 def _picture(services: Services, old: Version, new: Version) -> bytes:
-    """At most 1024 × 1024 pixels around what differs, what stayed in grey, +y (or north) on top."""
+    """Draw the differences in at most 1024 × 1024 pixels, unchanged features in grey, +y (or north) up."""
     delta = services.store.content.delta_parts(old, new)
     groups: list[tuple[tuple[int, int, int], Features]] = []
     for changed in delta.features:
@@ -106,7 +111,7 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
     grids = [(k, *_grids(services, old, new, k)) for k in sorted({g.key for g in delta.grids})]
     datum = new.datum or old.datum
     frame = local_frame(datum) if datum else None
-    # Without a datum, metres and degrees have no common picture: metres where there are any.
+    # Without a datum, metres and degrees cannot be drawn together: metres take precedence.
     degrees = frame is None and not grids and all(features.needs_datum for _, features in groups if len(features))
     drawn = [(colour, _shapes(features, frame, degrees)) for colour, features in groups]
     boxes = [shapely.total_bounds(shapes) for _, shapes in drawn if len(shapes)]
@@ -114,7 +119,7 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
     boxes = [b for b in boxes if np.isfinite(b).all()]
     if not boxes:
         image = Image.new("RGB", (256, 64), "white")
-        ImageDraw.Draw(image).text((12, 24), "nothing to be drawn differs", fill=(60, 60, 60))
+        ImageDraw.Draw(image).text((12, 24), "no differences to draw", fill=(60, 60, 60))
         return _png(image)
     view = _Viewport(np.array(boxes), degrees)
     image = Image.new("RGB", (view.width, view.height), "white")
@@ -132,7 +137,7 @@ def _picture(services: Services, old: Version, new: Version) -> bytes:
 
 
 def _select_features(services: Services, version: Version, key: PartKey, ids: tuple[str, ...]) -> Features:
-    """Those of the features that the version has."""
+    """Load the given features, skipping those that the version lacks."""
     if version.part(key) is None:
         return features((), "local")
     return services.store.content.features(version, key, ids=ids)
@@ -145,7 +150,7 @@ def _png(image: Image.Image) -> bytes:
 
 
 def _shapes(features: Features, frame: LocalFrame | None, degrees: bool) -> NDArray[np.object_]:
-    """Geometries in the picture's coordinates; what has no place in them is left out."""
+    """Transform geometries to the coordinates of the image; skip those that cannot be converted."""
     if frame is not None:
         return features.in_local(frame)
     shapes: NDArray[np.object_] = features.geometry[features.local != degrees]
@@ -173,7 +178,7 @@ def _is_same_frame(a: OccupancyGrid | None, b: OccupancyGrid | None) -> bool:
 
 
 def _box_of_changes(a: OccupancyGrid | None, b: OccupancyGrid | None) -> NDArray[np.float64]:
-    """Around the changed cells of a grid, or around both grids where their frames differ: [x0, y0, x1, y1]."""
+    """Bound the changed cells of a grid, or both grids if their frames differ: [x0, y0, x1, y1]."""
     if a is not None and b is not None and _is_same_frame(a, b):
         rows, columns = np.nonzero(a.cells != b.cells)
         if not len(rows):
@@ -193,7 +198,7 @@ def _cells_to_local(grid: OccupancyGrid, cells: NDArray[np.float64]) -> NDArray[
 
 
 class _Viewport:
-    """Where the picture looks: local metres (or degrees) to pixels."""
+    """Viewport: local metres (or degrees) to pixels."""
 
     def __init__(self, boxes: NDArray[np.float64], degrees: bool) -> None:
         x0, y0 = boxes[:, 0].min(), boxes[:, 1].min()
@@ -208,12 +213,12 @@ class _Viewport:
         self.height = max(64, math.ceil((y1 - y0 + 2 * pad) * self._scale) + 2 * MARGIN)
 
     def box(self) -> tuple[float, float, float, float]:
-        """What the picture shows: x0, y0, x1, y1."""
+        """Return the visible area: x0, y0, x1, y1."""
         west, south = self._x0 - MARGIN / self._scale, self._y1 - (self.height - MARGIN) / self._scale
         return west, south, west + self.width / self._scale, south + self.height / self._scale
 
     def draw(self, pen: ImageDraw.ImageDraw, colour: tuple[int, int, int], shapes: NDArray[np.object_]) -> None:
-        """Points as dots, lines and outlines as lines."""
+        """Draw points as dots, lines and outlines as lines."""
         for shape in shapely.get_parts(shapes) if len(shapes) else ():
             lines = [shape.exterior, *shape.interiors] if shape.geom_type == "Polygon" else [shape]
             for line in lines:
@@ -227,7 +232,7 @@ class _Viewport:
                     pen.line(points, fill=colour, width=2)
 
     def paint(self, image: Image.Image, a: OccupancyGrid | None, b: OccupancyGrid | None) -> None:
-        """A grid's new state in light grey tones, changed cells in colour."""
+        """Paint a grid's new state in light grey, changed cells in colour."""
         shown = b if b is not None else a
         assert shown is not None
         rows, columns = np.mgrid[0 : self.height, 0 : self.width]

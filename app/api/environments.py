@@ -1,4 +1,4 @@
-"""Environments: made, found, described, moved, deleted, restored."""
+"""Environments: create, find, update, rename, delete, restore and purge."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ from app.store.audit import set_audit_target
 from app.store.values import Environment, Match, rfc3339
 
 CONTAINS: Final = f"""\
-`LAT,LON` in degrees: the environments that this position is in (which map am I on?).
+`LAT,LON` in degrees: environments that contain this position (which map am I on?).
 
-- An environment with a GNSS fence (polygons of its location layer) answers where the fence covers the position.
-- One without answers on what is mapped as floor within {NEIGHBOURHOOD_METRES:.0f} m of its datum: the rectangle around
+- An environment with a GNSS fence (polygons of its location layer) matches if the fence covers the position.
+- One without a fence matches on mapped floor within {NEIGHBOURHOOD_METRES:.0f} m of its datum: the rectangle around
   a grid's free cells, the convex hull of a network, objects of kind `floor`, and {MARGIN_METRES:.0f} m around them.
-- If nothing is mapped there, it answers within {DATUM_METRES:.0f} m of its datum.
+- If nothing is mapped there, it matches within {DATUM_METRES:.0f} m of its datum.
 
-A datum at exactly 0, 0 counts as none. Fences come first, then the smallest area, then the nearest datum. `match` says
-why: `by`, `area_m2`, and `distance_m` from the position to the datum."""
+A datum at exactly 0, 0 is ignored. Order: fences first, then the smallest area, then the nearest datum. `match` gives
+the reason: `by`, `area_m2`, and `distance_m` from the position to the datum."""
 
 RESERVED = frozenset({"robots", "server"})
 
 
 class CloneBody(RequestModel):
-    """Whose content a new environment starts with."""
+    """Environment whose content the new one starts with."""
 
     environment: str = Field(examples=["orchard"])
-    version: int | str = Field("latest", description="Number, channel or `latest`.", examples=["latest"])
+    version: int | str = Field("latest", description="Version: number, channel or `latest`.", examples=["latest"])
 
 
 class EnvironmentBody(RequestModel):
@@ -73,41 +73,45 @@ class EnvironmentBody(RequestModel):
     name: str = Field(pattern=NAME, description="Lower case letters, digits, `_` and `-`; not `robots` or `server`.")
     title: str = Field("", max_length=200)
     description: str = Field("", max_length=MAX_TEXT)
-    datum: DatumBody | None = Field(None, description="Gives version 1; without it the environment starts empty.")
+    datum: DatumBody | None = Field(
+        None, description="Local origin; creates version 1. Default: none, the environment starts empty."
+    )
     tags: list[Annotated[str, Field(min_length=1, max_length=100)]] = Field(default_factory=list, max_length=100)
-    clone: CloneBody | None = Field(None, description="Start with the content of another one (gives version 1).")
+    clone: CloneBody | None = Field(
+        None, description="Start with the content of another environment (creates version 1)."
+    )
 
 
 class EnvironmentPatch(RequestModel):
-    """What is to change; what is left out stays."""
+    """Members to change; the others keep their value."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"title": "The farm by the river", "tags": ["wheat"]}]},
     )
 
-    name: str | None = Field(None, pattern=NAME, description="A new name; the old one is free at once.")
+    name: str | None = Field(None, pattern=NAME, description="New name; the old one is available at once.")
     title: str | None = Field(None, max_length=200)
     description: str | None = Field(None, max_length=MAX_TEXT)
     tags: list[Annotated[str, Field(min_length=1, max_length=100)]] | None = Field(None, max_length=100)
     datum: DatumBody | None = Field(
         None,
-        description="Makes a version: local items keep their metres, wgs84 items their place on earth, and the answer "
-        "warns.",
+        description="New local origin; creates a version. Local items keep their metres, wgs84 items their geographic "
+        "position; the response contains warnings.",
     )
 
 
 class MatchOut(BaseModel):
-    """Why an environment is an answer to a position."""
+    """Reason for which an environment matches a position."""
 
     by: Literal["fence", "floor", "datum"] = Field(
         description="`fence`: inside the GNSS fence; `floor`: on mapped floor; `datum`: within 200 m of the datum."
     )
     area_m2: float = Field(description="Area of the fence, floor or neighbourhood in square metres.")
-    distance_m: float | None = Field(description="Metres from the position to the datum, null if there is none.")
+    distance_m: float | None = Field(description="Metres from the position to the datum, or null if there is none.")
 
 
 class EnvironmentOut(BaseModel):
-    """An environment as it is now. ``bounds``: west, south, east, north."""
+    """Environment with the state of its head. `bounds`: west, south, east, north in degrees."""
 
     name: str
     title: str
@@ -120,14 +124,14 @@ class EnvironmentOut(BaseModel):
     created: datetime
     updated: datetime
     deleted: datetime | None = None
-    match: MatchOut | None = Field(default=None, description="Only in the answer to `contains`.")
+    match: MatchOut | None = Field(default=None, description="Only with `contains`.")
 
 
 router = api_router("environments", "/environments")
 
 
 def as_dict(environment: Environment, match: Match | None = None) -> dict[str, Any]:
-    """The environment as clients see it. match: why it is an answer to a position."""
+    """Convert an environment to JSON. match: why it matches a position."""
     members = {
         "name": environment.name,
         "title": environment.title,
@@ -145,7 +149,7 @@ def as_dict(environment: Environment, match: Match | None = None) -> dict[str, A
 
 
 def parse_datum(body: DatumBody) -> Datum:
-    """The datum of a request."""
+    """Convert the datum of a request."""
     return Datum(body.latitude, body.longitude, body.altitude, body.heading)
 
 
@@ -163,7 +167,7 @@ def list_environments(
         Query(
             max_length=200,
             pattern=r"^[^\x00]*$",
-            description="Text in name, title, description or tags.",
+            description="Text to find in name, title, description or tags.",
             examples=["orchard"],
         ),
     ] = None,
@@ -175,13 +179,16 @@ def list_environments(
         ),
     ] = None,
     bbox: Annotated[
-        str | None, Query(description="`W,S,E,N` in degrees: environments that meet this box.", examples=["-1,53,0,54"])
+        str | None,
+        Query(description="`W,S,E,N` in degrees: environments that intersect this box.", examples=["-1,53,0,54"]),
     ] = None,
-    deleted: Annotated[bool, Query(description="Those that wait for being restored or purged.")] = False,
+    deleted: Annotated[
+        bool, Query(description="List deleted environments instead, which can be restored or purged.")
+    ] = False,
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> Response:
-    """Environments by name, or the best match first with `contains`; those that the token reaches."""
+    """List the environments that the token can access, by name, or the best match first with `contains`."""
     position = None if contains is None else parse_position(contains)
     box = parse_box(bbox) if bbox is not None else None
     if position is not None:
@@ -204,17 +211,17 @@ def list_environments(
 @router.post(
     "",
     status_code=201,
-    responses=problem_responses(EnvironmentOut, 400, 404, 409, 415, ok=201, description="Made"),
-    summary="Make an environment",
+    responses=problem_responses(EnvironmentOut, 400, 404, 409, 415, ok=201, description="The environment"),
+    summary="Create an environment",
 )
 def create_environment(body: EnvironmentBody, services: ServicesDep, principal: Admin) -> Response:
-    """Empty (version 0), with a datum (version 1), or with the content of another one (version 1)."""
+    """Create an environment: empty (version 0), with a datum, or with the content of another one (version 1)."""
     principal.require_environment(body.name)
     _check_name(body.name)
     clone = None
     if body.clone is not None:
         if body.datum is not None:
-            raise Invalid("a clone has the datum of what it is cloned from: give datum or clone, and PATCH it later")
+            raise Invalid("datum and clone exclude each other: give one, and PATCH the datum of a clone later")
         principal.require_environment(body.clone.environment)
         clone = services.store.versions.get(body.clone.environment, body.clone.version)
     set_audit_target(environment=body.name, target=f"environment {body.name}")
@@ -232,9 +239,9 @@ def create_environment(body: EnvironmentBody, services: ServicesDep, principal: 
     )
 
 
-@router.get("/{env}", responses=problem_responses(EnvironmentOut, 404), summary="One environment")
+@router.get("/{env}", responses=problem_responses(EnvironmentOut, 404), summary="Get an environment")
 def get_environment(env: EnvironmentPath, services: ServicesDep, _: Viewer) -> Response:
-    """The environment as it is now; its `ETag` is the head's number, for `If-Match`."""
+    """Return an environment. Its `ETag` is the number of the head, for `If-Match`."""
     environment = services.store.environments.get(env)
     return json_response(as_dict(environment), headers=_headers(environment))
 
@@ -242,15 +249,18 @@ def get_environment(env: EnvironmentPath, services: ServicesDep, _: Viewer) -> R
 @router.patch(
     "/{env}",
     responses=problem_responses(EnvironmentOut, 400, 404, 409, 412, 415),
-    summary="Describe, rename, or set the datum",
+    summary="Update, rename, or set the datum",
 )
 def update_environment(
     env: EnvironmentPath, body: EnvironmentPatch, services: ServicesDep, principal: Editor, if_match: IfMatch = None
 ) -> Response:
-    """What is left out stays. A new datum makes a version and takes an editor; all else takes an administrator."""
+    """Change the given members.
+
+    A new datum creates a version and requires an editor; all else requires an administrator.
+    """
     given = body.model_dump(exclude_none=True)
     if not given:
-        raise Invalid("there is nothing to change: give at least one of name, title, description, tags, datum")
+        raise Invalid("no changes in the request: give at least one of name, title, description, tags, datum")
     if set(given) != {"datum"}:
         principal.require_role("admin")
     if if_match is not None:
@@ -280,21 +290,25 @@ def update_environment(
 
 @router.delete("/{env}", status_code=204, responses=problem_responses(None, 404), summary="Delete an environment")
 def delete_environment(env: EnvironmentPath, services: ServicesDep, principal: Admin) -> Response:
-    """It can be restored until it is purged; its name stays taken until then."""
+    """Delete an environment. It can be restored until it is purged; its name stays in use until then."""
     services.store.environments.delete(env, principal.name)
     return Response(status_code=204)
 
 
-@router.post("/{env}/restore", responses=problem_responses(EnvironmentOut, 404, 409), summary="Undo a deletion")
+@router.post(
+    "/{env}/restore", responses=problem_responses(EnvironmentOut, 404, 409), summary="Restore a deleted environment"
+)
 def restore_environment(env: EnvironmentPath, services: ServicesDep, principal: Admin) -> Response:
-    """A deleted environment comes back with all its versions and channels."""
+    """Restore a deleted environment with all its versions and channels."""
     environment = services.store.environments.restore(env, principal.name)
     return json_response(as_dict(environment), headers=_headers(environment))
 
 
-@router.post("/{env}/purge", status_code=204, responses=problem_responses(None, 404, 409), summary="Remove for good")
+@router.post(
+    "/{env}/purge", status_code=204, responses=problem_responses(None, 404, 409), summary="Purge a deleted environment"
+)
 def purge_environment(env: EnvironmentPath, services: ServicesDep, _: Admin) -> Response:
-    """Removes a deleted environment with all its versions for good; only then its name is free again."""
+    """Remove a deleted environment and all its versions permanently. Its name becomes available."""
     services.store.environments.purge(env)
     return Response(status_code=204)
 
@@ -305,7 +319,7 @@ def _check_name(name: str) -> None:
 
 
 def _check_free(services: Services, name: str, principal: Principal) -> None:
-    """Before anything else of a PATCH is done: the new name can be had."""
+    """Check that a new name is available, before any part of a PATCH is applied."""
     principal.require_environment(name)
     _check_name(name)
     try:
@@ -314,4 +328,4 @@ def _check_free(services: Services, name: str, principal: Principal) -> None:
         pass
     except NotFound:
         return
-    raise Conflict(f"there is an environment {name!r} already, or a deleted one that is not yet purged")
+    raise Conflict(f"the environment {name!r} already exists, or is deleted and not yet purged: choose another name")

@@ -1,7 +1,7 @@
-"""Events as server-sent events, resumable, and the same maps over Zenoh.
+"""Events as resumable server-sent events, and replies to Zenoh queries.
 
-A stream of one environment has its ``sequence`` as ids, a stream of several the place in the log of all. Streams that
-stand at the same place share each look at the log. A stream ends soon after its token does.
+The ids of a stream are the ``sequence`` of one environment, or log positions if the stream has several. Streams at
+the same position share each read of the log. A stream ends soon after its token expires or is revoked.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ from app.events.bus import DeferredReply, Reply
 from app.store.values import Event
 
 COMMIT_POLL_SECONDS = 0.02
-"""How often a stream looks at the host's generation number."""
+"""Seconds between reads of the host's commit counter."""
 
 POLL_SECONDS = 1.0
 KEEP_ALIVE_SECONDS = 15.0
 RECHECK_SECONDS = 5.0
-"""How long a stream goes on before its token is looked up again; one revoked in this process ends it at once."""
+"""Seconds until a stream's token is checked again; a token revoked in this process ends its streams at once."""
 
 PAGE = 200
 MAX_ENVIRONMENTS = 100
-"""Environments in an answer over Zenoh."""
+"""Maximum number of environments in a Zenoh reply."""
 
 STREAMS = 1000
-"""So many streams at once for each worker."""
+"""Maximum number of concurrent streams per worker process."""
 
 router = api_router("events")
 
 
 @dataclass(frozen=True, slots=True)
 class StreamEvent:
-    """An event as it goes out. number: its id in the stream."""
+    """Event in the form of a stream. number: its id in the stream."""
 
     number: int
     environment: str
@@ -61,7 +61,7 @@ class StreamEvent:
 
 
 class EventFeed:
-    """Who listens at this moment: all wait for one look at the store."""
+    """Feed for all streams of a process: they share each read of the log."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -73,7 +73,7 @@ class EventFeed:
         self.ending = False
 
     async def wait(self, seconds: float) -> None:
-        """Until something was committed, at most this long."""
+        """Wait for a commit, but no longer than ``seconds``."""
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._read_counter())
         changed = self._changed
@@ -84,7 +84,10 @@ class EventFeed:
             return
 
     async def events(self, environment: str | None, start: int) -> list[StreamEvent]:
-        """The next events after a place; all who stand there share a look. NotFound, Unavailable."""
+        """Return the next events after a position; streams at the same position share the read.
+
+        Raises NotFound or Unavailable.
+        """
         key = (environment, start, self._services.store.generation())
         return await self._poll_task.run(key, self._read, environment, start)
 
@@ -96,12 +99,12 @@ class EventFeed:
         return out
 
     async def check(self, header: bytes | None, client: str | None) -> None:
-        """Look a token up: Unauthenticated, Throttled, Unavailable."""
+        """Check a token. Raises Unauthenticated, Throttled or Unavailable."""
         key = (header, client, self._services.store.generation())
         await self._checks.run(key, self._services.access.authenticate, header, client)
 
     def close(self) -> None:
-        """The server stops: streams end, and begin again where it is back."""
+        """End all streams, since the server stops; clients reconnect later."""
         self.ending = True
         self._changed.set()
 
@@ -123,37 +126,48 @@ class EventFeed:
     response_class=Response,
     responses={
         **problem_responses(None, 404, 503),
-        200: {"description": "A stream that does not end", "content": {"text/event-stream": {}}},
+        200: {"description": "An endless stream", "content": {"text/event-stream": {}}},
     },
-    summary="Events as they happen",
+    summary="Stream events",
 )
 async def stream_events(
     request: Request,
     services: ServicesDep,
     principal: Viewer,
     environment: Annotated[
-        str | None, Query(description="Only of this environment; else of all that the token reaches.")
+        str | None,
+        Query(description="Only events of this environment. Default: all environments that the token can access."),
     ] = None,
     since: Annotated[
         int | None,
-        Query(ge=0, description="Events after this sequence (without `environment`: place in the log); left out: new."),
+        Query(
+            ge=0,
+            description="Events after this sequence, or, without `environment`, after this log position. Default: only "
+            "new events.",
+        ),
     ] = None,
-    last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", description="Resumes a stream.")] = None,
-    follow: Annotated[bool, Query(description="`false`: end after what has happened so far.")] = True,
+    last_event_id: Annotated[
+        str | None, Header(alias="Last-Event-ID", description="Id of the last received event: resume after it.")
+    ] = None,
+    follow: Annotated[bool, Query(description="`false`: end after the stored events.")] = True,
 ) -> Response:
-    """Server-sent events: `event` is the type, `data` the JSON, `id` what to resume from."""
+    """Stream server-sent events: `event` is the type, `data` the JSON, `id` the number from which to resume."""
     if environment is not None:
         principal.require_environment(environment)
     start = since
     if last_event_id is not None and last_event_id.strip():
         text = last_event_id.strip()
         if not (text.isascii() and text.isdigit() and len(text) <= 18):
-            raise Invalid("Last-Event-ID is a number from an event's id", [Problem("not a number", where="id")])
+            raise Invalid(
+                "invalid Last-Event-ID: it must be the number in an event's id", [Problem("not a number", where="id")]
+            )
         start = int(text)
-    start = await run_in_threadpool(_start_position, services, environment, start)  # NotFound comes before the stream
+    start = await run_in_threadpool(
+        _start_position, services, environment, start
+    )  # raise NotFound before the stream starts
     feed: EventFeed = request.app.state.feed
     if feed.streams >= STREAMS:
-        raise Unavailable("too many streams of events are open: close some, or poll with follow=false")
+        raise Unavailable("too many event streams are open: close some, or poll with follow=false")
     headers = {"cache-control": "no-store", "x-accel-buffering": "no", "x-content-type-options": "nosniff"}
     state = request.scope["state"]
     if state.get("head"):
@@ -166,11 +180,11 @@ async def stream_events(
 
 
 def _start_position(services: Services, environment: str | None, start: int | None) -> int:
-    """Where a stream begins; without a start with what happens from now on.
+    """Resolve the start of a stream. Default: after the newest event.
 
-    NotFound for an environment that is not there, unless its end is still to be told. Invalid for a place that the log
-    has not come to: whoever was further has seen another log (one from before a backup was put back, say), and would
-    miss all that happens until then.
+    Raises NotFound for an unknown environment, unless its last events are still to be sent. Raises Invalid for a
+    position beyond the log: the client has seen another log (for example one from before a restored backup) and would
+    miss events.
     """
     try:
         newest = (
@@ -183,20 +197,20 @@ def _start_position(services: Services, environment: str | None, start: int | No
             raise
         return start
     if start is not None and start > newest:
-        reason = f"nothing with the number {start} has happened here, the last is {newest}: begin with a lower one"
-        raise Invalid(reason, [Problem("later than the log", where="since")])
+        reason = f"since={start} is beyond the event log, which ends at {newest}: use a lower number"
+        raise Invalid(reason, [Problem("beyond the event log", where="since")])
     return newest if start is None else start
 
 
 async def _empty_stream() -> AsyncIterator[bytes]:
-    """What is left of a stream whose head alone is asked for."""
+    """Stream nothing, for HEAD requests."""
     lines: tuple[bytes, ...] = ()
     for line in lines:
         yield line
 
 
 class _StreamAuth:
-    """Whether a stream's token is still one."""
+    """Check of a stream's token while the stream runs."""
 
     def __init__(
         self, access: Authenticator, feed: EventFeed, principal: Principal, header: str | None, client: str | None
@@ -207,7 +221,7 @@ class _StreamAuth:
         self._invalidated_at, self._checked = access.is_invalidated, time.monotonic()
 
     async def is_valid(self) -> bool:
-        """Raises Unavailable where that cannot be known at this moment."""
+        """Check the token. Raises Unavailable if that is impossible at the moment."""
         if self._access.insecure:
             return True
         if self.principal.has_expired():
@@ -236,17 +250,19 @@ async def _stream(
                 page = await feed.events(environment, start)
                 if not await bearer.is_valid():
                     return
-            except Unavailable:  # the log is still there when the database is back
-                yield b": the database is away\n\n"
+            except Unavailable:  # the log is available again when the database is
+                yield b": the database is unavailable\n\n"
                 await asyncio.sleep(POLL_SECONDS)
                 if feed.ending:
                     return
                 continue
             except NotFound:
-                return  # purged: whoever asks again is told so
+                return  # purged: the next request returns 404
             for event in page:
                 start = event.number
-                if bearer.principal.can_access(event.environment):  # it may have had another name then
+                if bearer.principal.can_access(
+                    event.environment
+                ):  # an event may carry a former name of its environment
                     yield event.line
             if page:
                 quiet = 0.0
@@ -258,7 +274,7 @@ async def _stream(
             quiet += loop.time() - before
             if quiet >= KEEP_ALIVE_SECONDS:
                 quiet = 0.0
-                yield b": still here\n\n"
+                yield b": keep-alive\n\n"
     finally:
         feed.streams -= 1
 
@@ -270,10 +286,12 @@ def _line(event: Event, number: int) -> bytes:
 def answer_zenoh_query(
     services: Services, max_bytes: int, environment: str, rest: str, parameters: Mapping[str, str]
 ) -> Reply | DeferredReply:
-    """What HTTP answers at ``/environments/{environment}/versions/{rest}``: ``{v}/version``, ``{v}/maps/{format}/…``;
-    for a map that is not there, what makes it. ``server/where``: what ``/environments?contains=`` answers.
+    """Answer a Zenoh query like HTTP at ``/environments/{environment}/versions/{rest}``.
 
-    max_bytes: so many bytes are answered. Blocks. Raises what the calls over HTTP answer as problems.
+    ``rest`` is ``{v}/version`` or ``{v}/maps/{format}/…``; a map that is not cached gives a deferred reply, which
+    converts it. ``server/where`` answers like ``/environments?contains=``.
+
+    max_bytes: maximum size of a reply. Blocks. Raises the same errors as the HTTP calls.
     """
     if (environment, rest) == messages.POSITION_QUERY:
         return _locate(services, parameters)
@@ -283,7 +301,7 @@ def answer_zenoh_query(
         _no_parameters(parameters)
         return Reply(orjson.dumps(version.as_dict()), "application/json")
     if len(pieces) < 3 or pieces[1] != "maps":
-        raise NotFound("there is a version and its maps: {v}/version, {v}/maps/{format}, {v}/maps/{format}/{file}")
+        raise NotFound("unknown key: use {v}/version, {v}/maps/{format} or {v}/maps/{format}/{file}")
     values = dict(parameters)
     derive = values.pop("derive", "true")
     if derive not in ("true", "false"):
@@ -301,12 +319,13 @@ def answer_zenoh_query(
 
 
 def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
-    """The environments that a position is in, best match first, as over HTTP."""
+    """Find the environments at a position, best match first, as over HTTP."""
     given = dict(parameters)
     latitude, longitude = given.pop("lat", None), given.pop("lon", None)
     if given or latitude is None or longitude is None:
         raise Invalid(
-            "a position needs lat and lon in degrees and nothing else: server/where?lat=53.2687;lon=-0.5244",
+            "invalid position: give lat and lon in degrees, and no other parameter, as in "
+            "server/where?lat=53.2687;lon=-0.5244",
             [Problem("lat and lon", where="parameters")],
         )
     hits, _ = services.store.areas.locate(*parse_position(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
@@ -315,10 +334,10 @@ def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
 
 def _reply_from(file: CachedFile, max_bytes: int) -> Reply:
     if file.size > max_bytes:
-        raise TooLarge(f"the map has {file.size} bytes, more than is sent over Zenoh ({max_bytes}): fetch it over HTTP")
+        raise TooLarge(f"the map has {file.size} bytes, and the limit over Zenoh is {max_bytes}: fetch it over HTTP")
     return Reply(file.read(), file.media_type)
 
 
 def _no_parameters(parameters: Mapping[str, Any]) -> None:
     for name in parameters:
-        raise Invalid(f"a version takes no parameter {name[:80]!r}", [Problem("unknown", where=name[:80])])
+        raise Invalid(f"unknown parameter {name[:80]!r}: a version takes none", [Problem("unknown", where=name[:80])])

@@ -1,4 +1,4 @@
-"""What can be read and served."""
+"""File formats that the server reads and writes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.catalogue import describe_formats
 
 
 class FormatOut(BaseModel):
-    """A file format; ``options`` are the parameters of its maps (and of reading it, with ``for: read``)."""
+    """File format. `options` are the parameters of its maps (and, with `for: read`, of reading it)."""
 
     id: str
     title: str
@@ -29,7 +29,7 @@ class FormatOut(BaseModel):
 router = api_router("formats", "/formats")
 
 
-@router.get("", responses=problem_responses(list[FormatOut]), summary="All formats")
+@router.get("", responses=problem_responses(list[FormatOut]), summary="List formats")
 def list_formats(_: Viewer) -> Response:
-    """What can be read and served, with parameters, and which information each format gives."""
+    """List the formats with their parameters and the information that each provides."""
     return json_response(describe_formats())

@@ -1,4 +1,4 @@
-"""Sites made up from parameters and a seed: which generators there are, and committing what one of them makes."""
+"""Synthetic sites: list the generators, run one and commit its result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from app.ingest import GenerationRequest
 
 
 class GenerationBody(RequestModel):
-    """A site to be made up."""
+    """Synthetic site to generate."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -31,22 +31,25 @@ class GenerationBody(RequestModel):
         },
     )
 
-    generator: str = Field(max_length=200, description="A generator's name; see `/api/v1/generators`.")
-    seed: int = Field(0, ge=0, le=2**63 - 1, description="The same seed and parameters give the same site again.")
-    parameters: dict[str, Any] = Field(default_factory=dict, description="Of the generator.")
+    generator: str = Field(max_length=200, description="Name of a generator; see `GET /api/v1/generators`.")
+    seed: int = Field(
+        0, ge=0, le=2**63 - 1, description="Random seed: the same seed and parameters give the same site."
+    )
+    parameters: dict[str, Any] = Field(default_factory=dict, description="Parameters of the generator.")
     message: str = Field("", max_length=MAX_TEXT)
-    replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
+    replace: bool = Field(False, description="Replace uploaded or edited content as well.")
 
 
 class GeneratorOut(BaseModel):
-    """A way to make up a site."""
+    """Generator of synthetic sites."""
 
     id: str
     title: str
     gives: list[str]
-    needs: list[str] = Field(description="Layers that it works on.")
+    needs: list[str] = Field(description="Layers that it requires.")
     changes: list[str] = Field(
-        description="Layers that it works on where they are there, one at least. With neither it makes a whole site."
+        description="Layers of which it requires at least one, and changes those that exist. If `needs` and `changes` "
+        "are empty, it creates a complete site."
     )
     version: int
     parameters: list[dict[str, Any]]
@@ -55,9 +58,9 @@ class GeneratorOut(BaseModel):
 router = api_router("generations")
 
 
-@router.get("/generators", responses=problem_responses(list[GeneratorOut]), summary="All generators")
+@router.get("/generators", responses=problem_responses(list[GeneratorOut]), summary="List generators")
 def list_generators(_: Viewer) -> Response:
-    """What can be made up, and with which parameters."""
+    """List the generators of synthetic sites with their parameters."""
     return json_response([generator.as_dict() for generator in generate.all_generators().values()])
 
 
@@ -68,12 +71,13 @@ def list_generators(_: Viewer) -> Response:
         **problem_responses(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
         200: {"model": VersionOut, "description": "Nothing changed: the head."},
     },
-    summary="Make up a site and commit it",
+    summary="Generate a synthetic site and commit it",
 )
 def create_generation(env: EnvironmentPath, body: GenerationBody, services: ServicesDep, commit: CommitDep) -> Response:
-    """A version whose provenance says generator, seed and parameters: the same ones give the same layers again.
+    """Create a version whose provenance records generator, seed and parameters. The same values give the same layers.
 
-    What was made up here before gives way; 409 where a source has told a part, unless `replace` is true.
+    Layers that were generated before are replaced. Returns 409 if a layer was uploaded or edited, unless `replace` is
+    true.
     """
     order = GenerationRequest(body.generator, body.seed, body.parameters, body.replace)
     try:
@@ -81,5 +85,5 @@ def create_generation(env: EnvironmentPath, body: GenerationBody, services: Serv
     except NotFound as error:
         if body.generator in generate.all_generators():
             raise
-        raise Invalid(error.detail, [Problem("no such generator", where="body.generator")]) from None
+        raise Invalid(error.detail, [Problem("unknown generator", where="body.generator")]) from None
     return commit_response(outcome)

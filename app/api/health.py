@@ -1,4 +1,4 @@
-"""Alive, ready, and what Prometheus reads."""
+"""Liveness, readiness and metrics."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ _LOOPBACK = ("127.0.0.1", "[::1]", "localhost")
 
 
 def advertised_router(advertised: str, listen: str, host: str) -> str:
-    """Endpoints of the router for who has reached this server under ``host``, separated by commas; may be empty.
+    """Return the router's endpoints, comma-separated, as reachable by a client of ``host``; may be empty.
 
-    A router on a loopback address is told only to who has come over one, unless the operator says so.
+    host: host name with which the client reached this server. A router on a loopback address is announced only to
+    clients on loopback, unless the operator advertises it.
     """
     host = host if _HOST.fullmatch(host) else ""
     host = f"[{host}]" if ":" in host else host
@@ -53,26 +54,27 @@ def advertised_router(advertised: str, listen: str, host: str) -> str:
     return ",".join(out)
 
 
-@root_router.get("/healthz", summary="Alive")
+@root_router.get("/healthz", summary="Check liveness")
 async def healthz() -> Response:
-    """Answers as long as the process does, whatever the database and the conversions do."""
+    """Return 200 while the process runs, whatever the state of the database and of conversions."""
     return json_response({"status": "ok"})
 
 
-@root_router.get("/readyz", responses=problem_responses(None, 422, 503), summary="Ready")
+@root_router.get("/readyz", responses=problem_responses(None, 422, 503), summary="Check readiness")
 async def readyz(
     request: Request,
     for_: Literal["reads", "writes"] = Query(
-        "reads", alias="for", description="What has to work: `writes` also wants room on the disk."
+        "reads", alias="for", description="What to check: `writes` also requires free disk space."
     ),
 ) -> Response:
-    """Whether the database answers, is whole as far as is known, and has this release's schema.
+    """Check that the database responds, is not known to be damaged, and has this release's schema.
 
-    `status` is `ready`, or `read-only` where maps are served and nothing can be stored: `writes` then says why, and
-    `?for=writes` answers 503. `cache` says why maps are not kept on disk at the moment.
-    It also tells whether events go out over Zenoh, and where a robot finds the router (`events.connect`,
-    `events.prefix`); where they do not, maps are served all the same. Where maps go out to ROS 2, `ros2` tells how many
-    topics there are.
+    - `status`: `ready`, or `read-only` if maps are served but nothing can be stored. `writes` then gives the reason,
+      and `?for=writes` returns 503.
+    - `cache`: why maps are currently not cached on disk, or `ok`.
+    - `events`: whether events are published over Zenoh, and where robots find the router (`connect`, `prefix`). Maps
+      are served even if events are not.
+    - `ros2`: number of published topics, if the ROS 2 publisher is enabled.
     """
     services: Services = request.app.state.services
     try:
@@ -80,11 +82,11 @@ async def readyz(
             await run_in_threadpool(services.store.check)
             refusal = await run_in_threadpool(services.writability.refusal)
     except TimeoutError:
-        raise Unavailable(f"database or file store did not answer within {READY_SECONDS:g} seconds") from None
+        raise Unavailable(f"database or file store did not respond within {READY_SECONDS:g} seconds") from None
     if refusal is not None and for_ == "writes":
         raise Unavailable(f"nothing can be stored: {refusal}")
     if not services.prepared.is_set():
-        raise Unavailable("conversions are being prepared: ready in a few seconds")
+        raise Unavailable("the server is starting: ready in a few seconds")
     events = relay_state(services.options.data_dir, services.options.zenoh_mode)
     if services.options.zenoh_mode != "off":
         options = services.options
@@ -104,12 +106,15 @@ async def readyz(
 
 @root_router.get(
     "/metrics",
-    summary="Prometheus metrics",
+    summary="Get Prometheus metrics",
     response_class=Response,
     responses={200: {"description": "Prometheus text format", "content": {"text/plain": {}}}},
 )
 async def metrics(services: ServicesDep, _: ServerViewer) -> Response:
-    """Requests, conversions, cache hits, heads. Takes a token for all environments."""
+    """Return counters of requests, conversions and cache hits, and the head of each environment.
+
+    Requires a token for all environments.
+    """
     services.response_cache.flush_counters()
     response = Response(await run_in_threadpool(services.metrics.render, services.store))
     response.headers["content-type"] = CONTENT_TYPE

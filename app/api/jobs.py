@@ -1,4 +1,4 @@
-"""Jobs: conversions that take longer than an answer may."""
+"""Jobs: conversions that outlive their request."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from app.store.values import Job, State
 
 
 class JobOut(BaseModel):
-    """Work that takes long."""
+    """Long-running conversion."""
 
     id: str
     state: Literal["queued", "running", "done", "failed", "cancelled"]
@@ -32,13 +32,13 @@ class JobOut(BaseModel):
     updated: datetime
 
 
-JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
+JobPath = Annotated[str, Path(max_length=100, description="Id of the job.")]
 
 router = api_router("jobs", "/jobs")
 
 
 def _require_job_owner(services: ServicesDep, principal: Principal, id: str) -> Job:
-    """A job that the caller may see; NotFound for all others, as if there were none."""
+    """Return a job that the caller may see. Raises NotFound for any other job, as if it did not exist."""
     job = services.store.jobs.get(id)
     if job.owner != principal.id and not (principal.has_role("admin") and principal.environments is None):
         raise NotFound(f"there is no job {id[:80]!r}")
@@ -52,30 +52,36 @@ def list_jobs(
     state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
     limit: Limit = 100,
 ) -> Response:
-    """List the jobs of the own token, newest first; administrators whose token is for all environments see all."""
+    """List the jobs of the caller's token, newest first.
+
+    Administrators with a token for all environments see all jobs.
+    """
     every = principal.role == "admin" and principal.environments is None
     visible_jobs = (job for job in reversed(services.store.jobs.all()) if every or job.owner == principal.id)
     bodies = (body for body in map(job_as_json, visible_jobs) if state in (None, body["state"]))
     return json_response(list(itertools.islice(bodies, limit)))
 
 
-@router.get("/{id}", responses=problem_responses(JobOut, 404), summary="How far a job is")
+@router.get("/{id}", responses=problem_responses(JobOut, 404), summary="Get a job")
 def get_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
-    """A job of the own token; an administrator of all environments sees all. ``result.location`` is where a
-    finished map is had.
+    """Return the state of a job of the caller's token.
+
+    Administrators with a token for all environments see all jobs. `result.location` is the address of the finished
+    map.
     """
     return json_response(job_as_json(_require_job_owner(services, principal, id)))
 
 
-@router.delete("/{id}", status_code=204, responses=problem_responses(None, 404), summary="Cancel or forget a job")
+@router.delete("/{id}", status_code=204, responses=problem_responses(None, 404), summary="Cancel or delete a job")
 def delete_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Response:
-    """Cancels a job that runs: the work is stopped, unless somebody else waits for it too. Forgets one that has
-    ended.
+    """Cancel a running job, or delete a finished one.
+
+    Cancelling stops the conversion unless another request waits for it.
     """
     job = _require_job_owner(services, principal, id)
     if job_as_json(job)["state"] in ("queued", "running"):
         services.store.jobs.update(id, state="cancelled", detail="cancelled")
-        services.jobs.cancel(id)  # where another process is at it, that one notices within seconds
+        services.jobs.cancel(id)  # if another process runs it, that process notices within seconds
     else:
         services.store.jobs.delete(id)
     return Response(status_code=204)

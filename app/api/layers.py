@@ -1,4 +1,4 @@
-"""Canonical content: vector layers as GeoJSON, grids and pictures as PNG, or JSON about them."""
+"""Canonical content: vector layers as GeoJSON, grids and images as PNG, or JSON metadata."""
 
 from __future__ import annotations
 
@@ -54,25 +54,28 @@ class LayerOut(BaseModel):
 
 LayerPath = Annotated[
     Literal["location", "objects", "topology", "occupancy", "voxels", "imagery", "zones"],
-    Path(description="A layer.", examples=["topology"]),
+    Path(description="Name of the layer.", examples=["topology"]),
 ]
 
 router = api_router("layers", "/environments/{env}/versions/{v}/layers")
 
 LOCAL_CRS = "urn:fleetmap:crs:local"
-"""The local frame's name in JSON-FG's ``coordRefSys``; where it lies stands in the member ``datum``."""
+"""Name of the local frame in JSON-FG's ``coordRefSys``; the member ``datum`` gives its origin."""
 
 CONFORMS = ["http://www.opengis.net/spec/json-fg-1/1.0/conf/core"]
 GEOJSON = "application/geo+json"
 
 Crs = Annotated[
     Literal["local", "wgs84"] | None,
-    Query(description="`wgs84`: longitude, latitude. `local`: metres. Default: wgs84 where there is a datum."),
+    Query(
+        description="`wgs84`: longitude, latitude in degrees. `local`: metres. Default: `wgs84` if there is a datum, "
+        "else `local`."
+    ),
 ]
 
 
 def entry_dict(entry: PartEntry) -> dict[str, Any]:
-    """A part as the list of layers shows it."""
+    """Convert a part entry to an item of the list of layers."""
     bounds = {name: list(box) if box else None for name, box in (entry.bounds or {}).items()}
     p = entry.provenance
     return {
@@ -89,9 +92,9 @@ def entry_dict(entry: PartEntry) -> dict[str, Any]:
     }
 
 
-@router.get("", responses=problem_responses(list[LayerOut], 404), summary="What a version holds")
+@router.get("", responses=problem_responses(list[LayerOut], 404), summary="List the layers of a version")
 def list_layers(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
-    """Every part: layer, level and name, how much it holds, where, and where it comes from."""
+    """List the parts of a version: layer, level, name, item count, bounds and provenance."""
     version = services.store.versions.get(env, parse_version_ref(v))
     return json_response([entry_dict(entry) for entry in version.parts if entry.key.layer != "resources"])
 
@@ -110,9 +113,9 @@ def list_layers(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: 
                 "application/octet-stream": {},
             },
         },
-        304: {"description": "The client has it"},
+        304: {"description": "Not modified: the client has this content"},
     },
-    summary="A layer's content",
+    summary="Get a layer",
 )
 def get_layer(
     env: EnvironmentPath,
@@ -121,15 +124,18 @@ def get_layer(
     request: Request,
     services: ServicesDep,
     _: Viewer,
-    level: Annotated[str | None, Query(max_length=256, description="Of this storey only.")] = None,
-    name: Annotated[str | None, Query(max_length=256, description="The part's name: a grid's, a network's …")] = None,
-    bbox: Annotated[str | None, Query(description="Only what meets this box, in the same `crs`.")] = None,
+    level: Annotated[str | None, Query(max_length=256, description="Only parts of this level.")] = None,
+    name: Annotated[
+        str | None, Query(max_length=256, description="Name of the part, for example of a grid or a network.")
+    ] = None,
+    bbox: Annotated[str | None, Query(description="Only content that intersects this box, given in `crs`.")] = None,
     crs: Crs = None,
 ) -> Response:
-    """Vector layers are GeoJSON; in the local frame they are JSON-FG, with metres under `place`, never as lon/lat.
+    """Return the content of a layer. Vector layers are GeoJSON; in the local frame JSON-FG, with metres in `place`.
 
-    `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`; `voxels` are JSON (`counts` in
-    smallest voxels, however leaves were merged), or the `.bt` with `Accept: application/octet-stream`.
+    `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`. `voxels` are JSON (`counts` in voxels
+    of the finest resolution, whether or not leaves are merged), or an OctoMap `.bt` with `Accept:
+    application/octet-stream`.
     """
     version = services.store.versions.get(env, parse_version_ref(v))
     accept = request.headers.get("accept", "*/*")
@@ -158,7 +164,9 @@ def get_layer(
             assert isinstance(part, OccupancyGrid)
             response = _grid(key, part, box, accept)
         elif bbox is not None:
-            raise Invalid(f"{layer} cannot be cut to a bbox", [Problem("not for this layer", where="bbox")])
+            raise Invalid(
+                f"bbox is not supported for {layer}: omit it", [Problem("not supported for this layer", where="bbox")]
+            )
         else:
             part = services.store.content.load(version, [key]).parts[key]
             assert isinstance(part, GeoImage)
@@ -203,10 +211,10 @@ def feature_collection(
     *,
     with_datum: bool,
 ) -> bytes:
-    """GeoJSON (wgs84) or JSON-FG (local) of some parts; each feature says its level and its part's name.
+    """Write parts as GeoJSON (wgs84) or JSON-FG (local); each feature has its level and the name of its part.
 
-    Coordinates are rounded to 1e-12 degrees and 1e-9 metres. with_datum: the datum as a point of its own, for an
-    environment that has one and no fence to tell it.
+    Coordinates are rounded to 1e-12 degrees and 1e-9 metres. with_datum: add the datum as a point, for environments
+    that have a datum but no fence.
     """
     features: list[dict[str, Any]] = []
     local = crs == "local"
@@ -239,7 +247,7 @@ def feature_collection(
 
 
 def _datum_within(version: Version, box: Box, crs: Anchor) -> bool:
-    """Whether the local origin lies in a box."""
+    """Test if the local origin is in a box."""
     if version.datum is None:
         return False
     x, y = (0.0, 0.0) if crs == "local" else (version.datum.longitude, version.datum.latitude)
@@ -248,7 +256,7 @@ def _datum_within(version: Version, box: Box, crs: Anchor) -> bool:
 
 
 def geometries_as_geojson(geometry: NDArray[np.object_], digits: int) -> list[orjson.Fragment | None]:
-    """Each geometry as GeoJSON, rounded; None for those without coordinates."""
+    """Write each geometry as GeoJSON, rounded to ``digits``; None for empty geometries."""
     if not len(geometry):
         return []
     flat = ~shapely.has_z(geometry)
@@ -265,7 +273,7 @@ def geometries_as_geojson(geometry: NDArray[np.object_], digits: int) -> list[or
     return [None if none else orjson.Fragment(text) for none, text in zip(empty, texts, strict=True)]
 
 
-# --- grids, voxels, pictures ---
+# --- grids, voxels, images ---
 
 
 def _grid(key: PartKey, grid: OccupancyGrid, box: Box | None, accept: str) -> Response:
@@ -288,7 +296,7 @@ def _grid(key: PartKey, grid: OccupancyGrid, box: Box | None, accept: str) -> Re
 
 
 def crop_grid(grid: OccupancyGrid, box: Box) -> OccupancyGrid:
-    """The smallest part of a grid that holds all its cells meeting a local box; Invalid where there are none."""
+    """Crop a grid to the cells that intersect a box in the local frame. Raises NotFound if there are none."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     west, south, east, north = box
@@ -298,14 +306,14 @@ def crop_grid(grid: OccupancyGrid, box: Box) -> OccupancyGrid:
     left, right = max(0, math.floor(min(u))), min(grid.width, math.ceil(max(u)))
     low, high = max(0, math.floor(min(v))), min(grid.height, math.ceil(max(v)))
     if left >= right or low >= high:
-        raise NotFound("the bbox lies outside of the grid")
+        raise NotFound("the bbox does not intersect the grid")
     du, dv = left * grid.resolution, low * grid.resolution
     origin = (x + c * du - s * dv, y + s * du + c * dv, yaw)
     return replace(grid, cells=grid.cells[low:high, left:right].copy(), origin=origin)
 
 
 def png(pixels: NDArray[Any]) -> bytes:
-    """Pixels [height, width] or [height, width, 1…4] as PNG; quick rather than small."""
+    """Encode pixels [height, width] or [height, width, 1…4] as PNG, fast rather than small."""
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[:, :, 0]
     modes = {2: "LA", 3: "RGB", 4: "RGBA"}
@@ -318,7 +326,7 @@ def png(pixels: NDArray[Any]) -> bytes:
 
 
 def _voxels(services: Services, version: Version, key: PartKey, box: Box | None, accept: str) -> Response:
-    """What a voxel map holds, or its ``.bt``; a box cuts columns of full height."""
+    """Return metadata of a voxel map, or its ``.bt``; a box selects columns of full height."""
     kind = _choose(accept, "application/json", "application/octet-stream")
     column: Box3 | None = None
     if box is not None:
@@ -335,7 +343,7 @@ def _voxels(services: Services, version: Version, key: PartKey, box: Box | None,
     if column is not None:
         part = cut_voxels(part, column)
         if not len(part):
-            raise NotFound("the bbox lies outside of the voxel map")
+            raise NotFound("the bbox does not intersect the voxel map")
     bounds = part.bounds()
     return json_response(
         {
@@ -372,7 +380,7 @@ def _picture(key: PartKey, picture: GeoImage, accept: str) -> Response:
     return Response(png(display_pixels(picture)), media_type=kind)
 
 
-# --- choosing ---
+# --- selection of parts ---
 
 
 def _fit_to_size(version: Version, layer: Layer, level: str | None, name: str | None) -> list[PartKey]:
@@ -381,7 +389,7 @@ def _fit_to_size(version: Version, layer: Layer, level: str | None, name: str | 
 
 
 def _select_part(version: Version, layer: Layer, level: str | None, name: str | None) -> PartKey:
-    """The part that is meant: the named one, else ``map``, else the only one; Ambiguous names the choices."""
+    """Select a part: the named one, else ``map``, else the only one. Raises Ambiguous with the choices."""
     keys = _fit_to_size(version, layer, level, name)
     if not keys:
         raise _no_such_part_error(version, layer, level, name)
@@ -392,7 +400,7 @@ def _select_part(version: Version, layer: Layer, level: str | None, name: str | 
     names = ", ".join(sorted({k.name for k in keys}))
     levels = ", ".join(sorted({k.level for k in choices}))
     raise Ambiguous(
-        f"several parts of {layer} fit: give name (one of {names})"
+        f"several parts of {layer} match: give name (one of {names})"
         + (f" and level (one of {levels})" if len({k.level for k in choices}) > 1 else ""),
         [Problem(f"level {k.level}", where=k.name) for k in keys],
     )
@@ -402,13 +410,13 @@ def _no_such_part_error(version: Version, layer: Layer, level: str | None, name:
     existing_names = [f"{e.key.name} (level {e.key.level})" for e in version.parts if e.key.layer == layer]
     selection = " ".join(f"{k}={t!r}" for k, t in (("level", level), ("name", name)) if t is not None)
     description = f"{layer} {selection}".strip()
-    return NotFound(f"version {version.number} has no {description}; it has: {', '.join(existing_names) or 'none'}")
+    return NotFound(f"version {version.number} has no {description}; available: {', '.join(existing_names) or 'none'}")
 
 
 def _no_datum(environment: str) -> MissingDatum:
     return MissingDatum(
-        f'{environment} has no datum, so local metres have no place on earth: PATCH it with {{"datum": {{…}}}}, '
-        "upload a datum.yaml, or ask for the other crs"
+        f"{environment} has no datum, so local metres cannot be converted to WGS 84: PATCH it with "
+        f'{{"datum": {{…}}}}, upload a datum.yaml, or request the other crs'
     )
 
 
@@ -419,12 +427,15 @@ def _box(text: str | None, crs: Anchor) -> Box | None:
         return parse_box(text)
     x0, y0, x1, y1 = numbers(text, "bbox", "X0,Y0,X1,Y1")
     if not (x0 <= x1 and y0 <= y1 and max(map(abs, (x0, y0, x1, y1))) <= MAX_METRES):
-        raise Invalid("bbox must be X0,Y0,X1,Y1 in metres, the smaller ones first", [Problem("range", where="bbox")])
+        raise Invalid("bbox must be X0,Y0,X1,Y1 in metres, with X0 ≤ X1 and Y0 ≤ Y1", [Problem("range", where="bbox")])
     return x0, y0, x1, y1
 
 
 def _local_box(version: Version, text: str | None, crs: Anchor | None) -> Box | None:
-    """A box as one of the local frame: around the corners of one on earth. Grids default to the local frame."""
+    """Convert a box to the local frame; a WGS 84 box becomes the bounding box of its edges.
+
+    Grids default to the local frame.
+    """
     if text is None or crs != "wgs84":
         anchor: Anchor = "wgs84" if crs is None and version.datum else "local"
         if text is None or anchor == "local":
@@ -441,14 +452,14 @@ def _local_box(version: Version, text: str | None, crs: Anchor | None) -> Box | 
 
 
 def _choose(accept: str, *offered: str) -> str:
-    """The offered media type that the client likes best (RFC 9110, 12.5.1); NotAcceptable where there is none."""
+    """Select the media type that the client prefers (RFC 9110, 12.5.1). Raises NotAcceptable if none is offered."""
     best, choice = 0.0, None
     for kind in offered:
         quality = _quality(accept, kind)
         if quality > best:
             best, choice = quality, kind
     if choice is None:
-        raise NotAcceptable(f"this can be had as {' or '.join(offered)}, not as {accept[:200]}")
+        raise NotAcceptable(f"cannot return {accept[:200]}: accept {' or '.join(offered)}")
     return choice
 
 

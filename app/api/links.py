@@ -1,4 +1,4 @@
-"""Signed links to maps, for clients that have no place for a token."""
+"""Signed links to maps, for clients that cannot send a token."""
 
 from __future__ import annotations
 
@@ -27,33 +27,38 @@ from app.store.values import Version, rfc3339
 
 
 class LinkBody(RequestModel):
-    """The map, or one file of it, that a signed link gives."""
+    """Map, or file of a map, to which a signed link gives access."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"format": "geojson", "file": "map.geojson", "seconds": 3600}]},
     )
 
-    format: str = Field(max_length=64, description="A format's id.")
+    format: str = Field(max_length=64, description="Id of the format.")
     file: str | None = Field(
-        None, min_length=1, max_length=1000, description="One file of the map; left out: the file itself or a zip."
+        None,
+        min_length=1,
+        max_length=1000,
+        description="One file of the map. Default: the complete map, as its file or a zip.",
     )
     parameters: dict[str, str | int | float | bool] = Field(
-        default_factory=dict, max_length=50, description="Parameters of the map, as in its address."
+        default_factory=dict, max_length=50, description="Parameters of the map, as in its URL."
     )
     seconds: int | None = Field(
-        None, ge=1, description="Life of the link. Default and maximum: the setting `FLEETMAP_LINK_SECONDS`."
+        None,
+        ge=1,
+        description="Lifetime of the link in seconds. Default and maximum: the setting `FLEETMAP_LINK_SECONDS`.",
     )
 
 
 class LinkOut(BaseModel):
-    """A signed link, and the file that it gives."""
+    """Signed link, with the file to which it gives access."""
 
-    url: str = Field(description="Needs no token until it expires. Whoever has it can read this map.")
+    url: str = Field(description="Link that needs no token until it expires. Anyone who has it can read this map.")
     expires: datetime
     version: int
     root: str
-    name: str = Field(description="Of the file.")
-    size: int = Field(description="Bytes.")
+    name: str = Field(description="Name of the file.")
+    size: int = Field(description="Size of the file in bytes.")
     sha256: str
 
 
@@ -65,18 +70,18 @@ router = api_router("maps", "/environments/{env}/versions/{v}")
     status_code=201,
     responses={
         **problem_responses(LinkOut, 400, 404, 409, 415, ok=201, description="The link"),
-        202: {"description": "The map takes long: follow the job at `Location`, then ask again."},
+        202: {"description": "The conversion takes long: follow the job at `Location`, then repeat the request."},
     },
     summary="Create a signed link to a map",
 )
 async def create_link(
     env: EnvironmentPath, v: VersionPath, body: LinkBody, request: Request, services: ServicesDep, principal: Viewer
 ) -> Response:
-    """The `url` needs no token until it `expires`, for `GET` and `HEAD` alone.
+    """Create a link to a map that needs no token until it expires, for `GET` and `HEAD`.
 
-    It names the version by number, so that its bytes stay the same, and ends with the environment. It does not outlive
-    the token that created it, but is not revoked with it. The map is converted first: a map that cannot be made has no
-    link.
+    The link names the version by number, so its bytes never change. It stops working when the environment is deleted
+    or the token that created it expires, but not when that token is revoked. The map is converted first: if that
+    fails, there is no link.
     """
     services.links.check_life(body.seconds)
     version = await run_in_threadpool(services.store.versions.get, env, parse_version_ref(v))
@@ -100,7 +105,7 @@ async def create_link(
 
 @dataclass(frozen=True, slots=True)
 class LinkedFile:
-    """A file behind a link. url: full address. expires: RFC 3339; None for a link that needs a token."""
+    """File behind a link. url: full address. expires: RFC 3339; None for a link that needs a token."""
 
     url: str
     expires: str | None
@@ -119,14 +124,14 @@ async def link_to(
     *,
     signed: bool = True,
 ) -> LinkedFile | JobStarted:
-    """Convert a version's map, and link to it or to one of its files; the job where converting takes long.
+    """Convert a version's map, and link to it or to one of its files; return a job if the conversion takes long.
 
     Args:
-        values: the map's parameters, as in its address.
-        seconds: life of the link; default: the maximum.
-        signed: whether the link needs no token.
+        values: parameters of the map, as in its URL.
+        seconds: lifetime of the link. Default: the maximum.
+        signed: create a link that needs no token.
 
-    Raises what converting raises; NotFound for a file that the map does not have.
+    Raises the errors of the conversion; NotFound if the map has no such file.
     """
     query = urlencode(sorted(values.items()))
     wanted = MapRequest(version.environment, str(version.number), format, file, *parse_options(query))
@@ -152,7 +157,7 @@ async def link_to(
 
 
 def _text(value: str | float | bool) -> str:
-    """A parameter as an address has it."""
+    """Format a parameter as in a URL."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return value if isinstance(value, str) else repr(value)

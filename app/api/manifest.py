@@ -1,4 +1,4 @@
-"""What a robot verifies: a signed list of a version's files, and the keys that sign."""
+"""Signed manifest of a version's files, and the keys that sign it."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from app.model.closures import NO_CLOSURES, ClosureMode
 from app.store.values import Version, frame_input
 
 STEP_SECONDS = 600
-"""The time of expiry moves in steps, so that a robot that polls gets the same bytes, and 304."""
+"""Step of the signing time: within a step a polling robot gets the same bytes, and 304."""
 
 MAX_FORMATS = 32
 MAX_LIST = 4000
-"""Characters of a list of formats with their parameters."""
+"""Maximum length of a list of formats with their parameters."""
 
 UNAVAILABLE = (CannotConvert, NotFound, Invalid)
-"""Why a format cannot be given. Anything else concerns the whole request."""
+"""Errors that make one format unavailable; all others fail the whole request."""
 
 LAYER_DIGITS = 16
 
 
 class KeyOut(BaseModel):
-    """A public key; bytes in base64."""
+    """Public key; bytes in base64."""
 
     id: str
     algorithm: Literal["Ed25519"]
@@ -60,73 +60,82 @@ class ManifestFile(BaseModel):
     """One file of a map."""
 
     format: str
-    name: str = Field(description="With the folder of its level, if that is not the default one: `L2/map.yaml`.")
+    name: str = Field(
+        description="Name of the file. Files of other levels than the default one are below a folder of the level: "
+        "`L2/map.yaml`."
+    )
     size: int
     sha256: str
-    level: str | None = Field(None, description="Of a file that belongs to one level.")
+    level: str | None = Field(None, description="Level of the file, if it belongs to one.")
 
 
 class ManifestLevel(BaseModel):
-    """A storey."""
+    """Level of the environment."""
 
     name: str
     elevation: float = Field(description="Metres above the local origin.")
 
 
 class ManifestMissing(BaseModel):
-    """An optional format that cannot be given."""
+    """Optional format that is not available."""
 
     format: str
-    detail: str = Field(description="Why, and what to supply.")
+    detail: str = Field(description="Reason, and what to supply.")
 
 
 class ManifestOut(BaseModel):
-    """What a robot verifies; its signature is in a header."""
+    """Signed manifest that a robot verifies; the signature is in a header."""
 
     environment: str
     channel: str | None = None
     epoch: int = Field(
         0,
-        description="Order is by epoch, then sequence. The operator raises it after a restore; left out at 0.",
+        description="Epoch of the server: orders manifests before the sequence. The operator raises it after a "
+        "restore. Omitted if 0.",
     )
     sequence: int
     version: int
     root: str
-    time: datetime = Field(description="When it was signed, in steps of ten minutes.")
+    time: datetime = Field(description="Time of signing, in steps of ten minutes.")
     expires: datetime
-    levels: list[ManifestLevel] = Field(description="From the lowest up.")
+    levels: list[ManifestLevel] = Field(description="Levels, lowest first.")
     files: list[ManifestFile]
-    missing: list[ManifestMissing] = Field([], description="Optional formats that cannot be given; left out if none.")
+    missing: list[ManifestMissing] = Field([], description="Optional formats that are not available. Omitted if empty.")
     overlays: list[dict[str, Any]] = Field(
-        [], description="The closures in force that its files show, by id; left out if there are none."
+        [], description="Closures in force that the files show, by id. Omitted if empty."
     )
     closures: Literal["mark", "ignore"] | None = Field(
-        None, description="How its files show the closures in force; left out for `apply`."
+        None, description="How the files show the closures in force. Omitted if `apply`."
     )
     parameters: dict[str, dict[str, str]] = Field(
-        {}, description="The parameters that each format was requested with; left out if there are none."
+        {}, description="Parameters with which each format was requested. Omitted if empty."
     )
-    overlays_digest: str = Field(description="SHA-256 of that list; `Fleetmap-Overlays` of each file.")
-    layers: dict[str, str] = Field(description="A hash of each layer: equal where the layer is, in any two versions.")
+    overlays_digest: str = Field(description="SHA-256 of `overlays`; equals `Fleetmap-Overlays` of each file.")
+    layers: dict[str, str] = Field(
+        description="Hash of each layer. Equal layers of any two versions have equal hashes."
+    )
     variables: dict[str, str] | None = Field(
-        None, description="What the place is called: literal variables of an environment_template's scripts."
+        None, description="Names of the site: literal variables for scripts of an `environment_template`."
     )
 
 
 ClosuresQuery = Annotated[
     ClosureMode | None,
     Query(
-        description="How maps show the closures in force: `apply` (closed edges are left out of formats that "
-        "cannot express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` for a version's number."
+        description="How maps show the closures in force: `apply` (closed edges are omitted from formats that cannot "
+        "express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` for a version number."
     ),
 ]
 
 router = api_router("manifest")
 
 
-@router.get("/keys", responses=problem_responses(list[KeyOut]), summary="Keys that sign manifests")
+@router.get("/keys", responses=problem_responses(list[KeyOut]), summary="List signing keys")
 def list_keys(services: ServicesDep, _: Viewer) -> Response:
-    """The newest first: it signs. `endorsement` is the signature of the key before it over the raw public key."""
+    """List the keys, newest first; the newest one signs.
+
+    `endorsement` is the signature of the previous key over the raw public key.
+    """
     return json_response([key.as_dict() for key in services.keys.public()])
 
 
@@ -134,27 +143,32 @@ def list_keys(services: ServicesDep, _: Viewer) -> Response:
     "/keys",
     status_code=201,
     responses=problem_responses(KeyOut, ok=201, description="The new key"),
-    summary="Rotate the key",
+    summary="Rotate the signing key",
 )
 def rotate_key(services: ServicesDep, _: ServerAdmin) -> Response:
-    """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one. Takes a
+    """Create a new signing key.
+
+    Robots that trust the old key accept the new one, because the old key endorses it. Requires an administrator's
     token for all environments.
 
-    Signed links get a new secret as well; links that were made before stay valid until they expire.
+    Signed links get a new secret as well; existing links stay valid until they expire.
     """
     try:
         with services.store.audit.changing():
             key = services.keys.rotate()
             services.links.rotate()
     finally:
-        services.store.generation.change()  # what was signed with the old key is in memory no longer
+        services.store.generation.change()  # invalidate cached responses that the old key signed
     return json_response(key.as_dict(), 201)
 
 
 @router.get(
     "/environments/{env}/versions/{v}/manifest",
-    responses={**problem_responses(ManifestOut, 404, 409), 304: {"description": "The client has it"}},
-    summary="A signed list of a version's files",
+    responses={
+        **problem_responses(ManifestOut, 404, 409),
+        304: {"description": "Not modified: the client has this manifest"},
+    },
+    summary="Get the signed manifest of a version",
 )
 async def get_manifest(
     env: EnvironmentPath,
@@ -165,9 +179,9 @@ async def get_manifest(
     formats: Annotated[
         str,
         Query(
-            description="Formats, comma-separated. Each may carry parameters as in an address: "
-            "`occupancy_grid?level=L2&grid=map,tmap2`; a comma or `&` in a value is percent-encoded once more. "
-            "Default of a format that has levels and named parts: all of them.",
+            description="Formats, comma-separated. Each may have parameters as in a URL: "
+            "`occupancy_grid?level=L2&grid=map,tmap2`; percent-encode a comma or `&` in a value once more. "
+            "Default for formats with levels and named parts: all of them.",
             max_length=MAX_LIST,
             examples=["geojson,kml"],
         ),
@@ -175,19 +189,19 @@ async def get_manifest(
     optional: Annotated[
         str,
         Query(
-            description="Further formats, written in the same way. Those that cannot be given are listed in `missing`.",
+            description="Further formats, in the same syntax. Unavailable ones are listed in `missing`.",
             max_length=MAX_LIST,
             examples=["lanelet2"],
         ),
     ] = "",
     closures: ClosuresQuery = None,
 ) -> Response:
-    """Names, sizes and hashes of the files of maps, signed with the server's key over exactly these bytes.
+    """Return names, sizes and hashes of map files, signed with the server's key over exactly these bytes.
 
-    The header `Fleetmap-Signature` is `<key id>:<base64 of the Ed25519 signature>`; `/keys` has the keys. `sequence`
-    is that of the event that brought the channel (or the version) there, or that last changed which closures are in
-    force: a robot refuses a lower one. Files of a level other than the default one are below a folder of its name;
-    `level` names a file's level.
+    The header `Fleetmap-Signature` is `<key id>:<base64 of the Ed25519 signature>`; see `/keys` for the keys.
+    `sequence` belongs to the event that moved the channel (or created the version), or that last changed the closures
+    in force. A robot refuses a lower sequence. Files of other levels than the default one are below a folder named
+    like the level; `level` gives the level of a file.
     """
     entries = _entries(formats, optional)
     cached_maps: dict[str, CachedMap] = {}
@@ -197,7 +211,7 @@ async def get_manifest(
         )
         if (
             isinstance(outcome, _PendingConversion) and outcome.recipe.key in cached_maps
-        ):  # the cache has no room for all of them at once
+        ):  # the cache is too small for all maps of the manifest
             outcome = await run_in_threadpool(_sign_manifest, services, env, v, entries, closures, request, cached_maps)
         if not isinstance(outcome, _PendingConversion):
             break
@@ -206,7 +220,7 @@ async def get_manifest(
         except UNAVAILABLE as error:
             if outcome.entry.required:
                 raise _with_format_name(error, outcome.entry) from error
-            continue  # it is remembered: the next look lists it as missing
+            continue  # the failure is cached: the next attempt lists the format as missing
         if isinstance(conversion, JobStarted):
             return job_started_response(conversion.job)
         recipe, cached_map = conversion
@@ -219,7 +233,7 @@ async def get_manifest(
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """A format of the request, with the parameters of its maps. requested: all of them, as texts."""
+    """Requested format with the parameters of its maps. requested: all of them, as texts."""
 
     format: str
     values: Mapping[str, str]
@@ -231,7 +245,7 @@ class _Entry:
 
 @dataclass(frozen=True, slots=True)
 class _PendingConversion:
-    """A map that is to be made before the manifest can be written."""
+    """Map to convert before the manifest can be written."""
 
     entry: _Entry
     recipe: Recipe
@@ -246,9 +260,9 @@ def _sign_manifest(
     request: Request,
     cached_maps: Mapping[str, CachedMap],
 ) -> tuple[dict[str, str], bytes] | _PendingConversion:
-    """The headers and the signed bytes; the first map that is to be made before that can be said.
+    """Write and sign the manifest; return headers and bytes, or the first map to convert before that.
 
-    cached_maps: maps that were made for this answer, by their recipes' keys: they may have left the cache again.
+    cached_maps: maps converted for this response, by recipe key; the cache may have evicted them since.
     """
     channel = None if isinstance(parse_version_ref(v), int) else v
     generation = services.response_cache.generation()
@@ -274,8 +288,8 @@ def _sign_manifest(
         "overlays_digest": closures.digest,
         "layers": _layers(version),
     }
-    # What is not the default is signed: nobody on the way can change what was requested. A robot pays for each byte
-    # with every change: what is empty is left out.
+    # Sign every value that is not the default, so that a proxy cannot change the request. Omit empty members:
+    # robots download every byte with each change.
     shown = version.closures.mode if version.closures is not None else "ignore"
     parameters = {entry.format: entry.requested for entry in entries if entry.requested}
     body |= {"closures": shown} if shown != "apply" else {}
@@ -295,14 +309,14 @@ def _sign_manifest(
 
 
 def _seconds(moment: float) -> str:
-    """RFC 3339 in UTC, to the second."""
+    """Format a time as RFC 3339 in UTC, to the second."""
     return datetime.fromtimestamp(int(moment), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def _list_files(
     services: Services, version: Version, entries: list[_Entry], cached_maps: Mapping[str, CachedMap]
 ) -> tuple[list[dict[str, Any]], list[dict[str, str]]] | _PendingConversion:
-    """The files of all formats, and the optional formats that cannot be given; or a map that is to be made first."""
+    """List the files of all formats and the unavailable optional formats; or return a map to convert first."""
     files: list[dict[str, Any]] = []
     missing: list[dict[str, str]] = []
     for entry in entries:
@@ -326,7 +340,7 @@ def _list_files(
 
 
 def _recipe(services: Services, version: Version, entry: _Entry) -> Recipe:
-    """Plan the whole site in a format, or what the entry's parameters select of it."""
+    """Plan the whole site in a format, or the selection that the entry's parameters make."""
     values = {**site.whole_site_options(formats.get_format(entry.format)), **entry.values}
     if entry.closures is not None:
         in_force = version.closures or services.store.overlays.closures(version.environment)
@@ -335,20 +349,20 @@ def _recipe(services: Services, version: Version, entry: _Entry) -> Recipe:
 
 
 def _with_format_name(error: FleetMapError, entry: _Entry) -> FleetMapError:
-    """The same error, saying which format cannot be given."""
+    """Return the same error with the name of the format."""
     if entry.format in error.detail:
         return error
     return type(error)(f"{entry.format}: {error.detail}", error.problems)
 
 
 def _levels(version: Version) -> list[dict[str, Any]]:
-    """The levels from the lowest up; one that only parts name is at 0 m."""
+    """List the levels, lowest first; a level that only occurs as the name of a part is at 0 m."""
     heights = {entry.key.level: 0.0 for entry in version.parts} | {one.name: one.elevation for one in version.levels}
     return [{"name": name, "elevation": heights[name]} for name in sorted(heights, key=lambda n: (heights[n], n))]
 
 
 def _layers(version: Version) -> dict[str, str]:
-    """A hash of each layer's content: who has two manifests knows which layers differ, without asking anybody."""
+    """Hash each layer's content: a robot with two manifests can tell which layers differ without a request."""
     parts: dict[str, list[Any]] = {}
     for entry in version.parts:
         parts.setdefault(entry.key.layer, []).append([entry.key.level, entry.key.name, entry.hash])
@@ -359,17 +373,21 @@ def _layers(version: Version) -> dict[str, str]:
 
 
 def _entries(required: str, optional: str) -> list[_Entry]:
-    """The formats of a request. Invalid for unknown ones, for what is named twice, and for unreadable parameters."""
+    """Parse the formats of a request. Raises Invalid for unknown or duplicate formats and unreadable parameters."""
     entries = [_entry(text, "formats", required=True) for text in required.split(",") if text.strip()]
     if not entries:
-        raise Invalid(f"name 1 to {MAX_FORMATS} formats, comma-separated", [Problem("empty", where="formats")])
+        raise Invalid(
+            f"no format given: list 1 to {MAX_FORMATS} formats, comma-separated", [Problem("empty", where="formats")]
+        )
     entries += [_entry(text, "optional", required=False) for text in optional.split(",") if text.strip()]
     names = [entry.format for entry in entries]
     if len(names) > MAX_FORMATS:
-        raise Invalid(f"name 1 to {MAX_FORMATS} formats, comma-separated", [Problem("too many", where="formats")])
+        raise Invalid(
+            f"too many formats: list 1 to {MAX_FORMATS}, comma-separated", [Problem("too many", where="formats")]
+        )
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        reason = f"the format {twice} is named twice: give each format once"
+        reason = f"duplicate format {twice}: give each format once"
         raise Invalid(reason, [Problem(reason, where="formats")])
     return entries
 
@@ -378,7 +396,10 @@ def _entry(text: str, location: str, *, required: bool) -> _Entry:
     name, _, query = text.strip().partition("?")
     fmt = require_format(name, location)
     if fmt.write is None:
-        raise Invalid(f"{name} is not served", [Problem("not served", where=location)])
+        raise Invalid(
+            f"{name} cannot be written: see GET /api/v1/formats for formats with write",
+            [Problem("read-only format", where=location)],
+        )
     try:
         values, derive, closures = parse_options(query)
         writer_options(fmt, values)

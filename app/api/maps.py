@@ -1,4 +1,4 @@
-"""Maps as robots fetch them: plain routes over the answers in memory, the cache on disk and conversion."""
+"""Map downloads: plain routes on top of the response cache, the disk cache and conversion."""
 
 from __future__ import annotations
 
@@ -39,32 +39,32 @@ from app.convert.recipe import Recipe
 from app.errors import Unavailable
 
 MAX_LOST_ATTEMPTS = 5
-"""How often a map is made again that was lost from the cache before it was read."""
+"""Maximum number of conversions if a map leaves the cache before it is read."""
 
 OVERLAYS = b"fleetmap-overlays"
-"""Header: digest of the closures in force that a map shows."""
+"""Name of the header with the digest of the closures in force that a map shows."""
 
 
 async def download(template: str, request: Request) -> Response:
-    """A map, or one of its files: the long way."""
-    request.scope["state"]["route"] = template  # for the metrics; plain routes leave none in the scope
+    """Serve a map, or one of its files, on the slow path."""
+    request.scope["state"]["route"] = template  # for the metrics: plain routes leave no route in the scope
     services: Services = request.app.state.services
     for _ in range(MAX_LOST_ATTEMPTS):
         try:
             return await _answer(request, services, await _get_or_convert(request, services))
-        except LostMap:  # it left the cache since it was found
+        except LostMap:  # evicted after the lookup
             services.response_cache.evict(request)
-    raise Unavailable("the map is removed from the cache faster than it is sent: try again in a few seconds")
+    raise Unavailable("the map is evicted from the cache before it can be sent: try again in a few seconds")
 
 
 async def _get_or_convert(request: Request, services: Services) -> CachedResponse | JobStarted:
-    """What stands at the request's address; made where need be, or the job that makes it."""
+    """Return the response for the request's address, converting if needed, or the job that converts."""
     memory, key = services.response_cache, request_key(request)
     fresh = memory.get_fresh(key)
     if fresh is not None and (fresh.body is not None or fresh.file is not None):
         return fresh
     wanted = parse_map_request(request)
-    # Taken before anything is read: a commit in between makes this answer stale, never fresh.
+    # Taken before any read: a concurrent commit makes this response stale, never wrongly fresh.
     generation, until = memory.generation(), time.monotonic() + FRESH_SECONDS
     for attempt in itertools.count():
         recipe = await memory.run_shared(request, resolve_recipe, services, wanted)
@@ -82,12 +82,12 @@ async def _get_or_convert(request: Request, services: Services) -> CachedRespons
         if _matches(request, empty.etag):
             memory.insert(key, empty)
             return empty
-        # From here on the recipe says what is meant: who was told of a later commit has another one.
+        # Key by recipe: a client that saw a later commit has another recipe and does not join this call.
         try:
             answer = await _fetch(request, services, key, wanted, recipe, empty)
             if answer is not None:
                 return answer
-        except LostMap:  # damaged or evicted while it was read: it is made again
+        except LostMap:  # damaged or evicted while being read: convert again
             if attempt >= MAX_LOST_ATTEMPTS:
                 raise
     raise AssertionError("unreachable")
@@ -96,9 +96,9 @@ async def _get_or_convert(request: Request, services: Services) -> CachedRespons
 async def _fetch(
     request: Request, services: Services, key: Key, wanted: MapRequest, recipe: Recipe, empty: CachedResponse
 ) -> CachedResponse | JobStarted | None:
-    """The answer with the map that a recipe gives: from disk, or made; once for all who ask for it meanwhile.
+    """Build the response of a recipe from disk, or by conversion; concurrent requests share one call.
 
-    None: it was made another way, so with another tag, which the client may have.
+    Returns None if the conversion used another recipe: the response then has another ETag, which the client may have.
     """
     memory = services.response_cache
 
@@ -130,7 +130,7 @@ async def _fetch(
 def _without_body(
     request: Request, services: Services, wanted: MapRequest, recipe: Recipe, generation: int, until: float
 ) -> CachedResponse:
-    """What is known of an answer before its map is made."""
+    """Build the part of a response that is known before the conversion."""
     version = recipe.version
     etag = recipe.etag if wanted.file is None else _file_etag(recipe, wanted.file)
     closures = version.closures
@@ -143,7 +143,7 @@ def _without_body(
         (b"fleetmap-version", str(version.number).encode()),
         (b"fleetmap-root", version.root.encode()),
         *([] if closures is None else [(OVERLAYS, closures.digest.encode())]),
-        (b"vary", b"accept-encoding, available-dictionary"),  # with 304 as well (RFC 9110, 15.4.5)
+        (b"vary", b"accept-encoding, available-dictionary"),  # required with 304 as well (RFC 9110, 15.4.5)
     ]
     report_link = f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()
     headers = [*bare, (b"link", report_link), (b"x-content-type-options", b"nosniff")]
@@ -169,7 +169,7 @@ def _without_body(
 
 
 def _private(headers: Headers) -> Headers:
-    """The same for a link: only its holder may cache it, and no page learns the link as a referrer."""
+    """Adapt headers to a signed link: no shared caching, and no referrer that contains the link."""
     others = [(name, value) for name, value in headers if name != b"cache-control"]
     return [*others, (b"cache-control", b"private, no-cache"), (b"referrer-policy", b"no-referrer")]
 
@@ -179,19 +179,19 @@ def _file_etag(recipe: Recipe, name: str) -> str:
 
 
 def _identity(recipe: Recipe) -> tuple[str, int, str, str]:
-    """What tells recipes at one address apart."""
+    """Return a key that distinguishes recipes at one address."""
     closures = recipe.version.closures
     return recipe.key, recipe.version.number, recipe.version.environment, closures.digest if closures else ""
 
 
 def _matches(request: Request, etag: str) -> bool:
-    """Whether the client has it already; ``*`` says nothing about a file that may not exist."""
+    """Test if the client has the response already; ``*`` does not match, since the file may not exist."""
     header = request.headers.get("if-none-match")
     return header is not None and header.strip() != "*" and none_match(header, etag)
 
 
 def _with_body(empty: CachedResponse, wanted: MapRequest, recipe: Recipe, cached_map: CachedMap) -> CachedResponse:
-    """With headers and content of the made map. NotFound where it has no such file."""
+    """Complete a response with the headers and content of its map. Raises NotFound if there is no such file."""
     file = select_file(recipe, cached_map, wanted.file)
     headers = [
         (b"content-type", _media_type(file).encode()),
@@ -208,7 +208,7 @@ def _with_body(empty: CachedResponse, wanted: MapRequest, recipe: Recipe, cached
 
 
 def _dictionary(map_request: MapRequest) -> str:
-    """For which addresses this file is a dictionary: the same file of any version (RFC 9842, URL pattern)."""
+    """Return the URL pattern for which this file is a dictionary: the same file of any version (RFC 9842)."""
     env, name = quote(map_request.environment, safe=""), quote(map_request.format, safe="")
     file = "/" + quote(map_request.file, safe="/") if map_request.file else ""
     if map_request.version is None:
@@ -225,7 +225,7 @@ def _media_type(file: CachedFile) -> str:
 
 async def _answer(request: Request, services: Services, outcome: CachedResponse | JobStarted) -> Response:
     if isinstance(outcome, JobStarted):
-        if signed_link(request) is not None:  # its holder has no token to follow a job with
+        if signed_link(request) is not None:  # a link's holder has no token to follow a job
             raise Unavailable("the map is still being converted: try again in a few seconds")
         return job_started_response(outcome.job)
     if none_match(request.headers.get("if-none-match"), outcome.etag):
@@ -243,7 +243,7 @@ async def _answer(request: Request, services: Services, outcome: CachedResponse 
 
 
 async def _delta(request: Request, services: Services, entry: CachedResponse) -> Response | None:
-    """The file as a delta to the one that the client has, if it has one that is known here."""
+    """Return the file as a delta to the client's file, if the server has that file."""
     old = deltas.offered_dictionary(request.headers)
     if old is None or "range" in request.headers or entry.size > deltas.MAX_BYTES:
         return None
@@ -268,7 +268,7 @@ def _partial_headers(entry: CachedResponse, part: tuple[int, int] | None) -> Hea
 async def _from_disk(
     request: Request, entry: CachedResponse, cached_file: CachedFile, part: tuple[int, int] | None
 ) -> Response:
-    """A large file, in chunks. It is opened before the answer starts, so the cache may drop it meanwhile."""
+    """Stream a large file. It is opened before the response starts, so the cache may evict it meanwhile."""
     assert cached_file.path is not None
     headers, status = _partial_headers(entry, part), 206 if part else 200
     if request.scope["state"].get("head"):
@@ -282,57 +282,57 @@ async def _from_disk(
 
 
 def add_routes(app: FastAPI) -> None:
-    """The plain routes of maps; documented in ``app.api.http.openapi``."""
+    """Add the plain routes of maps; documented in ``app.api.http.openapi``."""
     base = f"{API}/environments/{{env}}/versions/{{v}}/maps/{{format}}"
     for path in (base, base + "/{file:path}", "/maps/{env}/{format}", "/maps/{env}/{format}/{file:path}"):
         app.router.add_route(path, partial(download, path), methods=["GET"], include_in_schema=False)
 
 
 class CoverageOut(BaseModel):
-    """Whether a format can be had, by which steps, and else what to supply."""
+    """Availability of a format: direct, derivable with a chain of steps, or missing."""
 
     format: str
     state: Literal["direct", "derivable", "missing"]
     chain: list[dict[str, Any]]
     missing: list[str]
-    choose: str | None = Field(None, description="What the query has to name, where there are several of a kind.")
+    choose: str | None = Field(None, description="Parts to select in the query, if there are several of a kind.")
 
 
 class ReportOut(BaseModel):
-    """What a map is made of and what was lost on the way."""
+    """Report on a map: inputs, derivations, filled-in values, and dropped data."""
 
     format: str
     version: int
     layers: list[dict[str, Any]]
     attribution: list[str] = Field(description="Licences and credits of the sources, to be shown with the map.")
     template: list[dict[str, Any]] = Field(
-        description="What was filled in: `what`, `value`, `why`, where a parameter says it `option`, and `from`: "
-        "`request`, `environment`, `set NAME` or `default`."
+        description="Filled-in values: `what`, `value`, `why`, `option` (the parameter that sets it, if any), and "
+        "`from`: `request`, `environment`, `set NAME` or `default`."
     )
     dropped: list[dict[str, Any]]
     warnings: list[ProblemItem]
     closures: list[dict[str, Any]] = Field(
-        description="Each closure in force with its `effect` on this map, and the `edges` that it closes."
+        description="Closures in force, each with its `effect` on this map and the `edges` that it closes."
     )
 
 
 FormatPath = Annotated[
-    str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["geojson"])
+    str, Path(max_length=64, description="Id of a format; see `GET /api/v1/formats`.", examples=["geojson"])
 ]
 
 router = api_router("maps", "/environments/{env}/versions/{v}")
 
 
-@router.get("/maps", responses=problem_responses(list[CoverageOut], 404), summary="Which formats can be had")
+@router.get("/maps", responses=problem_responses(list[CoverageOut], 404), summary="List the available formats")
 def coverage(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
-    """For every format: whether it can be written as it is, by deriving what lacks, or what to supply."""
+    """List for each format whether the version provides it directly, by derivation, or what is missing."""
     return json_response(services.maps.coverage(services.store.versions.get(env, parse_version_ref(v))))
 
 
 @router.get(
     "/reports/{format}",
     responses=problem_responses(ReportOut, 404, 409, 422),
-    summary="What a map is made of",
+    summary="Get the report of a map",
     openapi_extra={"x-free-query": True},
 )
 async def report(
@@ -342,9 +342,12 @@ async def report(
     request: Request,
     services: ServicesDep,
     principal: Viewer,
-    derive: bool = Query(True, description="Whether derived information is allowed."),
+    derive: bool = Query(True, description="Allow derived information."),
 ) -> Response:
-    """Raw, derived and filled-in information of a map, what was dropped and why. Takes the map's own parameters."""
+    """Return which information of a map is raw, derived or filled in, and what was dropped and why.
+
+    Accepts the parameters of the map.
+    """
     values, allowed, closures = parse_query(request.scope["query_string"])
     plan = partial(resolve_recipe, services, MapRequest(env, v, format, None, values, allowed and derive, closures))
     outcome = await services.jobs.convert(plan, principal, request_address(request))

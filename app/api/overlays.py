@@ -1,4 +1,4 @@
-"""Overlays: robots report what is blocked, editors decide; what they accept is in force on every channel."""
+"""Overlays: robots report obstructions, editors decide; accepted overlays are in force on every channel."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from app.store.fleet_values import Overlay
 from app.store.values import Version
 
 MAX_POINTS = 1000
-"""Maximum number of points of a reported polygon: it goes to every robot in an event."""
+"""Maximum number of points of a reported polygon, because an event carries it to every robot."""
 
 DEFAULT_SECONDS = 3600.0
 MAX_SECONDS = 2_592_000.0
 
 
 class OverlayBody(RequestModel):
-    """What is blocked: a polygon or an edge."""
+    """Obstruction: a polygon or an edge."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -59,19 +59,23 @@ class OverlayBody(RequestModel):
     )
 
     kind: Literal["blocked"]
-    polygon: dict[str, Any] | None = Field(None, description="GeoJSON Polygon or MultiPolygon.")
-    edge: str | None = Field(None, min_length=1, max_length=512, description="An edge's id: one direction of a lane.")
-    crs: Literal["local", "wgs84"] | None = Field(
-        None, description="What the polygon is in; default: wgs84 where there is a datum."
+    polygon: dict[str, Any] | None = Field(None, description="Blocked area: GeoJSON Polygon or MultiPolygon.")
+    edge: str | None = Field(
+        None, min_length=1, max_length=512, description="Blocked edge, by id: one direction of a lane."
     )
-    level: str | None = Field(None, min_length=1, max_length=256, description="Of the polygon; default: `ground`.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="CRS of the polygon. Default: `wgs84` if there is a datum, else `local`."
+    )
+    level: str | None = Field(
+        None, min_length=1, max_length=256, description="Level of the polygon. Default: `ground`."
+    )
     ttl_seconds: float | None = Field(
         None,
         ge=1,
         le=2_592_000,
-        description="How long it is blocked from now on; default: 3600 unless `expires` is given.",
+        description="Duration in seconds from now. Default: 3600 unless `expires` is given.",
     )
-    expires: ApiTime | None = Field(None, description="End, instead of `ttl_seconds`: RFC 3339 time with zone.")
+    expires: ApiTime | None = Field(None, description="End, instead of `ttl_seconds`: RFC 3339 time with time zone.")
     state: Literal["pending", "accepted"] = Field(
         "pending", description="`accepted` (editors only): in force at once, on every channel."
     )
@@ -79,7 +83,7 @@ class OverlayBody(RequestModel):
 
 
 class OverlayOut(BaseModel):
-    """What was reported as blocked, and what became of it."""
+    """Reported obstruction and its state."""
 
     id: str
     environment: str
@@ -95,18 +99,18 @@ class OverlayOut(BaseModel):
     detail: str | None = None
     decided_by: str | None = None
     decided: datetime | None = None
-    version: int | None = Field(None, description="The version that made it permanent.")
+    version: int | None = Field(None, description="Version that made it permanent.")
 
 
 class DynamicEdgesOut(BaseModel):
-    """A request of `nav2_msgs/srv/DynamicEdges`."""
+    """Request of `nav2_msgs/srv/DynamicEdges`."""
 
     closed_edges: list[int]
     opened_edges: list[int]
 
 
 class LaneRequestOut(BaseModel):
-    """A message of `rmf_fleet_msgs/msg/LaneRequest`."""
+    """Message of `rmf_fleet_msgs/msg/LaneRequest`."""
 
     fleet_name: str
     open_lanes: list[int]
@@ -114,20 +118,20 @@ class LaneRequestOut(BaseModel):
 
 
 class GraphLanesOut(BaseModel):
-    """What to publish for one navigation graph."""
+    """Message to publish for one navigation graph."""
 
-    graph: str = Field(description="The graph's file, `0.yaml` …")
+    graph: str = Field(description="File of the graph, `0.yaml` …")
     message: LaneRequestOut
 
 
 class LaneRequestsOut(BaseModel):
-    """One message for each navigation graph."""
+    """One message per navigation graph."""
 
     requests: list[GraphLanesOut]
 
 
 class ZoneSetsOut(BaseModel):
-    """Closures in the words of VDA 5050 3.0."""
+    """Closures as zone sets of VDA 5050 3.0."""
 
     model_config = ConfigDict(populate_by_name=True)
 
@@ -135,7 +139,7 @@ class ZoneSetsOut(BaseModel):
     closed_edges: list[dict[str, Any]] = Field(alias="closedEdges")
 
 
-OverlayPath = Annotated[str, Path(max_length=100, description="An overlay's id.")]
+OverlayPath = Annotated[str, Path(max_length=100, description="Id of the overlay.")]
 
 router = api_router("overlays", "/environments/{env}/overlays")
 
@@ -143,7 +147,7 @@ Ref = Annotated[
     str | None,
     Query(
         pattern=r"^([a-z][a-z0-9_-]{0,62}|\d{1,18})$",
-        description="The version that planners have loaded: a channel or number. Default: `production` if it exists, "
+        description="Version that the planners have loaded: a channel or number. Default: `production` if it exists, "
         "else `latest`.",
     ),
 ]
@@ -156,11 +160,15 @@ def list_overlays(
     _: Viewer,
     state: Annotated[
         Literal["pending", "accepted", "rejected", "expired", "ended"] | None,
-        Query(description="Only these; left out: all of the last 30 days. `accepted` are in force."),
+        Query(
+            description="Only overlays in this state. Default: all of the last 30 days. `accepted` ones are in force."
+        ),
     ] = None,
 ) -> Response:
-    """Oldest first. `pending` waits for a decision, `accepted` is in force on every channel, `expired` was never
-    decided on, `ended` is over.
+    """List overlays, oldest first.
+
+    `pending` waits for a decision, `accepted` is in force on every channel, `rejected` was declined, `expired` ended
+    without a decision, `ended` is over.
     """
     return json_response([overlay.as_dict() for overlay in services.store.overlays.all(env, state)])
 
@@ -169,21 +177,22 @@ def list_overlays(
     "",
     status_code=201,
     responses={
-        **problem_responses(
-            OverlayOut, 400, 404, 409, 415, ok=201, description="It waits for a decision, or is in force"
-        ),
-        200: {"model": OverlayOut, "description": "The same was reported before: its end has moved."},
+        **problem_responses(OverlayOut, 400, 404, 409, 415, ok=201, description="Pending, or in force"),
+        200: {"model": OverlayOut, "description": "Already reported; the expiry was updated."},
     },
-    summary="Report what is blocked",
+    summary="Report an obstruction",
 )
 def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDep, principal: RobotRole) -> Response:
-    """Report that a polygon or an edge cannot be used until a time. With `state: "accepted"` (editors) it is in force
-    at once, on every channel; otherwise an editor decides.
+    """Report that a polygon or an edge is blocked until a given time.
+
+    With `state: "accepted"` (editors only) it is in force at once, on every channel; otherwise an editor decides.
     """
     if (body.polygon is None) == (body.edge is None):
-        raise Invalid("give polygon or edge, one of them", [Problem("one of polygon and edge", where="body")])
+        raise Invalid(
+            "invalid obstruction: give either polygon or edge", [Problem("one of polygon and edge", where="body")]
+        )
     if body.state == "accepted" and principal.role not in ("editor", "admin"):
-        raise Denied("only editors can accept an overlay: report it without state, an editor decides")
+        raise Denied("only editors can accept an overlay: report it without state, and an editor decides")
     versions = list(_shown_versions(services, env))
     head = versions[0]
     now = datetime.now(UTC)
@@ -214,25 +223,28 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
 
 
 def _expiry_of(body: OverlayBody, now: datetime) -> datetime:
-    """When a report ends. Raises Invalid."""
+    """Compute the end of a report. Raises Invalid."""
     if body.expires is None:
         return now + timedelta(seconds=DEFAULT_SECONDS if body.ttl_seconds is None else body.ttl_seconds)
     problem = ""
     if body.ttl_seconds is not None:
-        problem = "give expires or ttl_seconds, one of them"
+        problem = "expires and ttl_seconds exclude each other: give one"
     elif body.expires.tzinfo is None:
         problem = "expires needs a time zone, for example 2030-01-31T06:00:00Z"
     elif body.expires <= now:
-        problem = "expires is in the past: nothing would be blocked"
+        problem = "expires is in the past: give a later time"
     elif body.expires > now + timedelta(seconds=MAX_SECONDS):
-        problem = f"expires is more than {MAX_SECONDS / 86400:g} days ahead: block it by an edit, or for a shorter time"
+        problem = (
+            f"expires is more than {MAX_SECONDS / 86400:g} days ahead: give an earlier time, or block it "
+            "permanently with an edit"
+        )
     if problem:
         raise Invalid(problem, [Problem(problem, where="body.expires")])
     return body.expires
 
 
 def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
-    """Raise Invalid if an area has no place in any of the versions that robots may have."""
+    """Raise Invalid if an area cannot be placed in any version that robots may run."""
     if overlay.polygon is None:
         return
     problems = [place_problem(overlay.closure, version) for version in versions]
@@ -242,7 +254,7 @@ def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
 
 
 def _shown_versions(services: Services, env: str) -> Iterator[Version]:
-    """The newest version, then those that channels stand on: robots report from any of them."""
+    """Yield the head, then the versions of channels: robots report from any of them."""
     head = services.store.versions.get(env)
     yield head
     numbers = {channel.version for channel in services.store.channels.all(env)} - {None, head.number}
@@ -251,14 +263,14 @@ def _shown_versions(services: Services, env: str) -> Iterator[Version]:
 
 
 def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
-    """A valid GeoJSON polygon and nothing else that came with it. Raises Invalid."""
+    """Parse a valid GeoJSON polygon, without foreign members. Raises Invalid."""
     shape = parse_geometry(given)
     if shape.geom_type not in ("Polygon", "MultiPolygon") or shape.is_empty or not shape.is_valid:
         reason = shapely.is_valid_reason(shape)
         problem = f"must be a valid GeoJSON Polygon or MultiPolygon, got {shape.geom_type}: {reason}"
         raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
     if (count := int(shapely.get_num_coordinates(shape))) > MAX_POINTS:
-        problem = f"has {count} points, at most {MAX_POINTS} are taken: send its outline with fewer"
+        problem = f"has {count} points, and the maximum is {MAX_POINTS}: simplify it"
         raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
     clean: dict[str, Any] = json.loads(shapely.to_geojson(shape))
     return clean
@@ -266,7 +278,10 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
 
 @router.post("/{id}/accept", responses=problem_responses(OverlayOut, 404, 409, 422, 503), summary="Accept an overlay")
 def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
-    """Put it in force on every channel until its end: areas become keepout, edges are closed. No version changes."""
+    """Put an overlay in force on every channel until its end: areas become keepout zones, edges are closed.
+
+    No version changes.
+    """
     now = datetime.now(UTC)
     overlay = services.store.overlays.get(env, id)
     if overlay.state == "pending" and overlay.expires <= now:
@@ -281,7 +296,7 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep,
 
 @router.post("/{id}/reject", responses=problem_responses(OverlayOut, 404, 409), summary="Reject an overlay")
 def reject_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
-    """It stays in the list, and nothing changes."""
+    """Reject a pending overlay. It stays in the list and has no effect."""
     decided = services.store.overlays.decide(env, id, "pending", "rejected", principal.name, datetime.now(UTC))
     return json_response(decided.as_dict())
 
@@ -300,12 +315,13 @@ def end_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, pr
     summary="Make an accepted overlay permanent",
 )
 def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
-    """A new version holds it: an area as a keepout zone, an edge with `blocked: true`. The overlay stays in force until
-    its end; promote the version before that to keep robots out for good.
+    """Create a version with the obstruction: an area as a keepout zone, an edge with `blocked: true`.
+
+    The overlay stays in force until its end. Promote the version before that, so that robots keep out permanently.
     """
     overlay = services.store.overlays.get(env, id)
     if overlay.state != "accepted":
-        raise Conflict(f"the overlay {id} is {overlay.state}: only accepted ones can be kept")
+        raise Conflict(f"the overlay {id} is {overlay.state}: only accepted overlays can be made permanent")
     obstruction = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
     outcome = services.ingest.amend(
         env,
@@ -316,17 +332,19 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, p
     return json_response(services.store.overlays.note_kept(env, id, outcome.version.number).as_dict())
 
 
-# --- ready-made for planners that take closures live ---
+# --- closures in the formats of planners ---
 
 
 @router.get(
-    "/nav2", responses=problem_responses(DynamicEdgesOut, 404, 409, 422), summary="Closures for Nav2's route server"
+    "/nav2", responses=problem_responses(DynamicEdgesOut, 404, 409, 422), summary="Get closures for Nav2's route server"
 )
 async def nav2_edges(
     env: EnvironmentPath, request: Request, services: ServicesDep, principal: Viewer, version: Ref = None
 ) -> Response:
-    """A request of `nav2_msgs/srv/DynamicEdges`: the numbers of closed edges, and of those that were closed and are
-    open again, in the graph that `maps/nav2_route?closures=mark` gives.
+    """Return a request of `nav2_msgs/srv/DynamicEdges`.
+
+    It has the numbers of closed edges, and of edges that are open again, in the graph of
+    `maps/nav2_route?closures=mark`.
     """
     maps = await _files_with_marks(services, env, version, "nav2_route", request, principal)
     if isinstance(maps, JobStarted):
@@ -338,7 +356,7 @@ async def nav2_edges(
 @router.get(
     "/rmf",
     responses=problem_responses(LaneRequestsOut, 404, 409, 422),
-    summary="Closures for Open-RMF's fleet adapters",
+    summary="Get closures for Open-RMF fleet adapters",
 )
 async def rmf_lanes(
     env: EnvironmentPath,
@@ -348,8 +366,10 @@ async def rmf_lanes(
     version: Ref = None,
     fleet: Annotated[str, Query(max_length=256, description="`fleet_name` of the messages.")] = "",
 ) -> Response:
-    """Messages of `rmf_fleet_msgs/msg/LaneRequest`, one for each graph: lanes to close, and lanes that were closed and
-    are open again, by their indexes in the graphs that `maps/rmf_nav_graph?closures=mark` gives.
+    """Return messages of `rmf_fleet_msgs/msg/LaneRequest`, one per graph.
+
+    They have the lanes to close, and the lanes to open again, by their indexes in the graphs of
+    `maps/rmf_nav_graph?closures=mark`.
     """
     maps = await _files_with_marks(services, env, version, "rmf_nav_graph", request, principal)
     if isinstance(maps, JobStarted):
@@ -370,7 +390,9 @@ async def rmf_lanes(
 
 
 @router.get(
-    "/vda5050", responses=problem_responses(ZoneSetsOut, 404, 409, 422), summary="Closures for VDA 5050 fleet managers"
+    "/vda5050",
+    responses=problem_responses(ZoneSetsOut, 404, 409, 422),
+    summary="Get closures for VDA 5050 fleet managers",
 )
 def vda5050_zones(
     env: EnvironmentPath,
@@ -379,11 +401,18 @@ def vda5050_zones(
     version: Ref = None,
     map_id: Annotated[
         str | None,
-        Query(alias="mapId", min_length=1, max_length=256, description="What the fleet manager calls the map."),
+        Query(
+            alias="mapId",
+            min_length=1,
+            max_length=256,
+            description="Id of the map in the fleet manager. Default: the environment's name.",
+        ),
     ] = None,
 ) -> Response:
-    """Zone sets of VDA 5050 3.0 with a `BLOCKED` zone for each closed area, one set for each level, and the closed
-    edges by id, for the fleet manager's own routing. A set's id changes with its content.
+    """Return zone sets of VDA 5050 3.0, one per level, with a `BLOCKED` zone for each closed area.
+
+    `closedEdges` has the ids of closed edges, for the fleet manager's own routing. The id of a set changes with its
+    content.
     """
     shown = _as_json(services, env, version)
     closures = shown.closures or Closures()
@@ -396,7 +425,7 @@ def vda5050_zones(
 
 
 def _as_json(services: Services, env: str, ref: str | None) -> Version:
-    """The version that planners have loaded, with the closures in force. Raises NotFound."""
+    """Load the version that planners run, with the closures in force. Raises NotFound."""
     refs: list[str | int] = ["production", "latest"] if ref is None else [int(ref) if ref.isdigit() else ref]
     for name in refs[:-1]:
         try:
@@ -409,7 +438,7 @@ def _as_json(services: Services, env: str, ref: str | None) -> Version:
 async def _files_with_marks(
     services: Services, env: str, ref: str | None, name: str, request: Request, principal: Principal
 ) -> list[dict[str, bytes]] | JobStarted:
-    """A map's files twice, with marks: of the closures in force, and of those that ended."""
+    """Load the files of a map twice, with marks: for the closures in force, and for those that ended."""
     shown = await run_in_threadpool(_as_json, services, env, ref)
     ended = [o for o in await run_in_threadpool(services.store.overlays.all, env) if o.state == "ended"]
     out = []

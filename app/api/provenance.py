@@ -1,4 +1,4 @@
-"""Where a version's content comes from, as a picture: which file made which layer, and which map is made of them."""
+"""Provenance graph of a version: files, the layers made of them, and the maps made of those."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from app.store.values import Version
 
 
 class ProvenanceOut(BaseModel):
-    """Which file made which layer, and which map is made of them; ``links`` lead from id to id."""
+    """Provenance graph: files, layers and maps. `links` connect them by id."""
 
     environment: str
     version: int
@@ -44,8 +44,11 @@ COLOURS = {
 
 
 def graph(maps: Maps, version: Version) -> dict[str, Any]:
-    """``{sources, parts, maps, links}``: names of files, parts with how they came, formats with their state, and what
-    leads to what (``from``, ``to``: ids of these)."""
+    """Build ``{sources, parts, maps, links}``, the nodes and links of the graph.
+
+    They have file names, parts with their provenance, formats with their coverage, and links between ids (``from``,
+    ``to``).
+    """
     stale = version.stale
     links: list[dict[str, str]] = []
     parts = []
@@ -101,7 +104,7 @@ class _Box:
 
 
 def svg(graph: dict[str, Any], title: str) -> bytes:
-    """The graph as an SVG picture: files on the left, layers in the middle, maps on the right; stale ones in red."""
+    """Draw the graph as SVG: files on the left, layers in the middle, maps on the right; stale items in red."""
     boxes: dict[str, _Box] = {}
     columns = _columns(graph)
     for column, rows in enumerate(columns):
@@ -129,10 +132,10 @@ def svg(graph: dict[str, Any], title: str) -> bytes:
 
 
 def _columns(graph: dict[str, Any]) -> list[list[tuple[str, str, str, str, str]]]:
-    """Files, layers and maps: of each its id, text, note, colour and full text."""
+    """List files, layers and maps, each with id, text, note, colour and full text."""
     return [
         [
-            (s["id"], s["name"].rpartition("/")[2], "" if s["used"] else "kept, not used", "raw", s["name"])
+            (s["id"], s["name"].rpartition("/")[2], "" if s["used"] else "stored, not used", "raw", s["name"])
             for s in graph["sources"]
         ],
         [
@@ -153,7 +156,7 @@ def _columns(graph: dict[str, Any]) -> list[list[tuple[str, str, str, str, str]]
 
 
 def _curve(a: _Box, b: _Box) -> str:
-    """From the right of a box to the left of the next column's, or around to the right of one in its own column."""
+    """Draw a curve from the right of a box to the left of the next column, or around to the right within a column."""
     same = a.x == b.x
     x1, y1, y2 = a.x + WIDTH, a.y + 13, b.y + 13
     x2 = b.x + WIDTH if same else b.x
@@ -193,10 +196,13 @@ def _short(text: str, limit: int) -> str:
         **problem_responses(ProvenanceOut, 404),
         200: {"model": ProvenanceOut, "content": {"image/svg+xml": {}}},
     },
-    summary="Which file made which map",
+    summary="Get the provenance graph",
 )
 def provenance(env: EnvironmentPath, v: VersionPath, request: Request, services: ServicesDep, _: Viewer) -> Response:
-    """An SVG picture, or the same as JSON with `Accept: application/json`. What is stale is marked."""
+    """Return the provenance graph as an SVG image, or as JSON with `Accept: application/json`.
+
+    Stale items are marked.
+    """
     version = services.store.versions.get(env, parse_version_ref(v))
     lineage = graph(services.maps, version)
     if "application/json" in request.headers.get("accept", ""):

@@ -1,4 +1,4 @@
-"""Robots: who holds what since when, who lags."""
+"""Robots: status, active map and lag."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from app.store.values import rfc3339
 
 
 class StatusHoldsBody(RequestModel):
-    """A version that a robot has loaded."""
+    """Version that a robot has loaded."""
 
     version: int = Field(ge=0, lt=2**63)
     root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Root hash of the version; 64 zeros: no map is loaded.")
 
 
 class StatusBody(RequestModel):
-    """What a robot says of itself."""
+    """Status of a robot."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -43,17 +43,19 @@ class StatusBody(RequestModel):
     )
 
     environment: str = Field(pattern=NAME)
-    channel: str = Field(pattern=CHANNEL, description="The channel that it follows.")
+    channel: str = Field(pattern=CHANNEL, description="Channel that the robot follows.")
     version: int = Field(ge=0, lt=2**63)
-    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Of the version, as the manifest says it.")
+    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Root hash of the version, from the manifest.")
     state: RobotState = Field(
-        description="`ready`: it has the version and does not drive on it yet; `active`: it does."
+        description="`ready`: the robot has the version but does not run it yet; `active`: it runs it."
     )
     detail: str | None = Field(None, max_length=2000)
-    time: ApiTime | None = Field(None, description="RFC 3339 time with zone, by the robot's clock.")
-    sequence: int | None = Field(None, ge=0, lt=2**63, description="Of the last event that it has processed.")
+    time: ApiTime | None = Field(None, description="RFC 3339 time with time zone, from the robot's clock.")
+    sequence: int | None = Field(
+        None, ge=0, lt=2**63, description="Sequence of the last event that the robot has processed."
+    )
     overlays: str | None = Field(
-        None, pattern=r"^[0-9a-f]{64}$", description="Digest of the closures in the map that it has loaded."
+        None, pattern=r"^[0-9a-f]{64}$", description="Digest of the closures in the loaded map."
     )
     holds: StatusHoldsBody | None = Field(
         None, description="The loaded map, if the status is about another version. Default: the last `active` one."
@@ -61,7 +63,7 @@ class StatusBody(RequestModel):
 
 
 class LagOut(BaseModel):
-    """How far a robot is behind its channel: events not acted on, whether its root differs, since when."""
+    """Lag of a robot behind its channel: number of events not applied, whether its root differs, and since when."""
 
     events: int
     differs: bool
@@ -69,17 +71,19 @@ class LagOut(BaseModel):
 
 
 class HoldsOut(BaseModel):
-    """What a robot drives on, and since when it said so (the server's clock)."""
+    """Active map of a robot. `since`: when it first reported it, by the server's clock."""
 
     version: int
     root: str
-    overlays: str | None = Field(None, description="Digest of the closures in it.")
+    overlays: str | None = Field(None, description="Digest of the closures in the active map.")
     since: datetime
 
 
 class RobotOut(BaseModel):
-    """A robot in an environment. ``time``: by its clock, where it told one; ``received`` and ``since`` (when it first
-    said the same) by the server's. ``lag`` is null where its channel stands nowhere.
+    """Status of a robot in an environment.
+
+    `time` is from the robot's clock if it sent one. `received` and `since` (first report of the same status) are from
+    the server's clock. `lag` is null if the channel has no version.
     """
 
     robot: str
@@ -97,14 +101,14 @@ class RobotOut(BaseModel):
     holds: HoldsOut | None
     online: bool
     vouched: bool = Field(
-        description="Whether a report came with authority (by a token that may report for it, or over a router with "
-        "users). Other robots do not count in roll-outs."
+        description="Whether a report was authenticated (by a token that may report for the robot, or by a router "
+        "with users). Other robots do not count in rollouts."
     )
     lag: LagOut | None
 
 
 class RobotDetailOut(RobotOut):
-    """A robot with its past."""
+    """Status of a robot, with its history."""
 
     environments: list[str]
     history: list[dict[str, Any]]
@@ -112,29 +116,28 @@ class RobotDetailOut(RobotOut):
 
 RobotPath = Annotated[
     str,
-    Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$", description="A robot's name.", examples=["mower-3"]),
+    Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$", description="Name of the robot.", examples=["mower-3"]),
 ]
 
 router = api_router("robots", "/robots")
 
 EnvironmentQuery = Annotated[
-    str | None, Query(pattern=NAME, description="Only in this environment; else in all that the token reaches.")
+    str | None,
+    Query(pattern=NAME, description="Only in this environment. Default: all environments that the token can access."),
 ]
 
 
-@router.get("", responses=problem_responses(list[RobotOut], 404), summary="All robots")
+@router.get("", responses=problem_responses(list[RobotOut], 404), summary="List robots")
 def list_robots(
     request: Request,
     services: ServicesDep,
     principal: Viewer,
     environment: EnvironmentQuery = None,
-    channel: Annotated[str | None, Query(pattern=CHANNEL, description="Only on this channel.")] = None,
+    channel: Annotated[str | None, Query(pattern=CHANNEL, description="Only robots of this channel.")] = None,
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> Response:
-    """What each says of itself, what it drives on, whether it is there, and how far it is behind its channel. By
-    environment and name.
-    """
+    """List the status, active map, presence and lag of robots, by environment and name."""
     if environment is not None:
         principal.require_environment(environment)
     robots, following = services.store.robots.page(
@@ -143,16 +146,18 @@ def list_robots(
     return page_response(request, _robots_as_json(services, robots), following)
 
 
-@router.get("/{robot}", responses=problem_responses(RobotDetailOut, 404), summary="One robot, with what it said before")
+@router.get("/{robot}", responses=problem_responses(RobotDetailOut, 404), summary="Get a robot with its history")
 def get_robot(
     robot: RobotPath,
     services: ServicesDep,
     principal: Viewer,
     environment: EnvironmentQuery = None,
-    limit: Annotated[int, Query(ge=1, le=200, description="Reports in `history`.")] = 50,
+    limit: Annotated[int, Query(ge=1, le=200, description="Number of reports in `history`.")] = 50,
 ) -> Response:
-    """In the environment where it reported last, unless one is named. `history`: newest first, each time that it said
-    something new; `environments`: all in which it reported.
+    """Return a robot's status in `environment`, by default in the one of its latest report.
+
+    `history` has the reports with a new status, newest first; `environments` lists all environments in which the
+    robot reported.
     """
     robots = [r for r in services.store.robots.all(None, robot) if principal.can_access(r.environment)]
     if environment is not None:
@@ -160,7 +165,7 @@ def get_robot(
     chosen = [r for r in robots if environment is None or r.environment == environment]
     if not chosen:
         scope = "" if environment is None else f" in {environment}"
-        raise NotFound(f"no robot {robot[:80]!r} has reported{scope}")
+        raise NotFound(f"unknown robot {robot[:80]!r}: it has not reported{scope}")
     newest = max(chosen, key=lambda r: r.time)
     history = services.store.robots.history(newest.environment, robot, limit)
     body = _only_robot(services, [newest])
@@ -173,26 +178,32 @@ def get_robot(
     "/{robot}/status",
     responses={
         **problem_responses(RobotOut, 400, 404, 409, 415, 503),
-        204: {"description": "Taken (`Prefer: return=minimal`)"},
+        204: {"description": "Stored (`Prefer: return=minimal`)"},
     },
-    summary="A robot says what it holds",
+    summary="Report a robot's status",
 )
 async def put_status(
     robot: RobotPath,
     body: StatusBody,
     services: ServicesDep,
     principal: RobotRole,
-    prefer: Annotated[str | None, Header(description="`return=minimal` (RFC 7240): 204 instead of the robot.")] = None,
+    prefer: Annotated[str | None, Header(description="`return=minimal` (RFC 7240): return 204 without a body.")] = None,
 ) -> Response:
-    """The same as over Zenoh. A robot's token may tell of the robot that it names; editors may tell of any."""
+    """Store a status, as if it were published over Zenoh.
+
+    A token with the role `robot` may report only for its robot; editors may report for any.
+    """
     require_report_permission(principal, robot)
     principal.require_environment(body.environment)
     if body.time is not None and body.time.tzinfo is None:
-        raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
+        raise Invalid(
+            "time needs a time zone, for example 2030-01-31T06:00:00Z",
+            [Problem("missing time zone", where="body.time")],
+        )
     holds = None if body.holds is None else (body.holds.version, body.holds.root)
     more = (body.detail, body.sequence, body.time, body.overlays, holds)
     report = RobotReport(body.channel, body.version, body.root, body.state, *more)
-    # No thread waits for the store: a whole fleet reports at once, and others want maps meanwhile.
+    # Wait without a thread: a whole fleet reports at once, and threads are needed for maps.
     noting = services.fleet.submit_report(ReceivedReport(body.environment, robot, report, datetime.now(UTC)))
     await asyncio.wait({asyncio.wrap_future(noting)}, timeout=fleet.WARN_SECONDS)
     fleet.wait_until_stored(noting)
@@ -203,16 +214,16 @@ async def put_status(
     )
 
 
-@router.delete(
-    "/{robot}", status_code=204, responses=problem_responses(None, 404), summary="Forget a robot that is gone for good"
-)
+@router.delete("/{robot}", status_code=204, responses=problem_responses(None, 404), summary="Delete a robot")
 def forget_robot(
     robot: RobotPath,
     services: ServicesDep,
     principal: Editor,
-    environment: Annotated[str, Query(pattern=NAME, description="Where it is to be forgotten.", examples=["orchard"])],
+    environment: Annotated[
+        str, Query(pattern=NAME, description="Environment from which to delete the robot.", examples=["orchard"])
+    ],
 ) -> Response:
-    """It no longer counts among its channel's robots. It comes back with its next report."""
+    """Delete a robot's status, so that it no longer counts in its channel. Its next report adds it again."""
     principal.require_environment(environment)
     set_audit_target(environment=environment)
     services.store.robots.forget(environment, robot)
@@ -220,28 +231,28 @@ def forget_robot(
 
 
 def require_report_permission(principal: Principal, robot: str) -> None:
-    """Denied for a robot's token that names another robot, or none."""
+    """Raise Denied for a robot's token that names another robot, or none."""
     if principal.role != "robot" or principal.robot == robot:
         return
     names = "names no robot" if principal.robot is None else f"names the robot {principal.robot}"
-    raise Denied(f"your token {names}: it cannot tell the status of {robot[:128]}")
+    raise Denied(f"your token {names}: it cannot report the status of {robot[:128]}")
 
 
 def store_report(services: Services, environment: str, robot: str, report: RobotReport) -> dict[str, Any]:
-    """Store a report; the robot as it is now."""
+    """Store a report and return the robot's status."""
     services.fleet.store_report(ReceivedReport(environment, robot, report, datetime.now(UTC)))
     return _only_robot(services, services.store.robots.all(environment, robot))
 
 
 def _only_robot(services: Services, robots: Sequence[Robot]) -> dict[str, Any]:
-    """The only one of them; NotFound where it, or its environment, went meanwhile."""
+    """Convert the only robot to JSON. Raises NotFound if the robot or its environment was deleted meanwhile."""
     for body in _robots_as_json(services, robots):
         return body
-    raise NotFound("the robot, or its environment, is no longer there")
+    raise NotFound("the robot or its environment was deleted meanwhile")
 
 
 def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
-    """As clients see them; without those whose environment is deleted meanwhile."""
+    """Convert robots to JSON, skipping those whose environment was deleted meanwhile."""
     now = datetime.now(UTC)
     channels: dict[str, dict[str, Channel]] = {}
     moves: dict[tuple[str, str], list[ChannelMove]] = {}
@@ -258,7 +269,7 @@ def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[st
             if behind and (robot.environment, name) not in moves:
                 moves[robot.environment, name] = services.store.channels.moves(robot.environment, name)
         except NotFound:
-            continue  # its environment went since
+            continue  # its environment was deleted meanwhile
         lag = None
         if channel is not None and channel.root is not None:
             lag = fleet.robot_lag(robot, channel, moves.get((robot.environment, name), [])).as_dict()

@@ -1,4 +1,4 @@
-"""What goes out as topics of ROS 2: the same maps as over HTTP, read back from the files that robots would load."""
+"""Content of ROS 2 topics: the maps of the HTTP interface, read back from the files that robots would load."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ PAGE = 1000
 
 
 def channel_versions(services: Services, chosen: tuple[EnvironmentSelector, ...], channel: str) -> dict[str, Version]:
-    """The chosen environments that there are, each with the version and closures that the channel shows.
+    """Resolve the selected environments, each to the version and closures of the channel.
 
-    channel: empty for production where there is one, else the latest. Where it stands nowhere, nothing goes out.
+    channel: empty for production if it exists, else latest. Environments whose channel has no version are skipped.
     """
     names = [entry.pattern for entry in chosen if entry.is_single]
     if any(not entry.is_single for entry in chosen):
@@ -52,7 +52,7 @@ def _all_names(services: Services) -> list[str]:
 
 
 def topic_content(services: Services, derive: bool, version: Version) -> TopicContent:
-    """Each level's grid, and the network. derive: also what is not stored but can be computed."""
+    """Load the grid of each level, and the network. derive: also derive content that is not stored."""
     absent: list[str] = []
     grids: dict[str, cdr.Grid] = {}
     for values in _grids(version, derive):
@@ -73,7 +73,7 @@ def topic_content(services: Services, derive: bool, version: Version) -> TopicCo
 
 
 def _grids(version: Version, derive: bool) -> list[dict[str, str]]:
-    """What to ask of ``occupancy_grid``: on each level the stored grid ``map``, else the only one by whatever name."""
+    """Select options of ``occupancy_grid``: on each level the stored grid ``map``, else the only one of any name."""
     stored = [e.key for e in version.parts if e.key.layer == "occupancy" and e.count]
     names = {key.name for key in stored}
     name = MAP if MAP in names or len(names) != 1 else names.pop()
@@ -91,12 +91,12 @@ def _grid(services: Services, version: Version, values: Mapping[str, str], deriv
     read = fmt.read(files, ReadContext(services.options.limits, main=cached_map.files[0].name))
     grid = next(iter(read.parts.values()))
     assert isinstance(grid, OccupancyGrid)
-    # Unknown is 255, which is -1 in a byte with a sign.
+    # Unknown is 255, which is -1 as a signed byte.
     return cdr.Grid(grid.width, grid.height, grid.resolution, grid.origin, grid.cells.tobytes())
 
 
 def _network(services: Services, version: Version, derive: bool) -> str:
-    """The tmap2 as JSON: topological_navigation publishes it so, and who reads YAML reads JSON."""
+    """Return the tmap2 as JSON: topological_navigation publishes it so, and YAML parsers read JSON."""
     cached_map = services.maps.get_blocking(version, "tmap2", {}, derive=derive)
     document = yaml.load(cached_map.files[0].read(), services.options.limits)
     return json.dumps(document, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""Stored bytes by their hash, for another server that has lost them (``fleetmap verify --repair --from URL``)."""
+"""Stored bytes by hash, for another server that has lost them (``fleetmap verify --repair --from URL``)."""
 
 from __future__ import annotations
 
@@ -26,23 +26,26 @@ router = api_router("stored data", "/stored")
         200: {"description": "The bytes", "content": {TYPE: {}}},
         **problem_responses(None, 404),
     },
-    summary="Stored bytes by their hash",
+    summary="Get stored bytes by their hash",
 )
 def stored(
     kind: Annotated[
         Literal["blobs", "chunks"],
-        Path(description="Uploaded files, or chunks of versions' content.", examples=["blobs"]),
+        Path(description="Uploaded files, or chunks of versions.", examples=["blobs"]),
     ],
-    sha256: Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the bytes, in hex.")],
+    sha256: Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the bytes in hex.")],
     services: ServicesDep,
     _: ServerAdmin,
 ) -> Response:
-    """What another server of the same data heals with. Takes an administrator's token for all environments."""
+    """Return stored bytes, with which another server of the same data can repair itself.
+
+    Requires an administrator's token for all environments.
+    """
     try:
         if kind == "blobs" and (size := services.store.blobs.size(sha256)) > IN_MEMORY:
             headers = [(b"content-type", TYPE.encode()), (b"content-length", str(size).encode())]
             return stream_file(services.store.blobs.open(sha256), 0, size, 200, headers)
         data = services.store.blobs.get(sha256) if kind == "blobs" else services.store.chunks.read(sha256)
-    except Damaged as error:  # a chunk that was never here is the same as a lost one
-        raise NotFound(f"there are no such {kind}: {sha256}") from error
+    except Damaged as error:  # a chunk that never existed looks like a lost one
+        raise NotFound(f"no {kind} with this hash: {sha256}") from error
     return Response(data, media_type=TYPE)

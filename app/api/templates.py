@@ -1,4 +1,4 @@
-"""Templates: what formats ask for and no layer has, by named sets and for each environment."""
+"""Templates: values that formats need and no layer provides, as named sets and per environment."""
 
 from __future__ import annotations
 
@@ -27,29 +27,35 @@ from app.model.templates import FormatTemplate, Templates
 
 
 class FormatTemplatesBody(RequestModel):
-    """What is filled in where the format asks for more than the layers have."""
+    """Values for one format, filled in if the layers lack them."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"values": {"action": "NavigateToPose", "xy_goal_tolerance": 0.4}}]},
     )
 
-    set: str | None = Field(None, max_length=100, description="Another set than the environment's; see `/templates`.")
+    set: str | None = Field(
+        None,
+        max_length=100,
+        description="Another set than the environment's for this format; see `GET /api/v1/templates`.",
+    )
     values: dict[str, Any] = Field(
-        default_factory=dict, max_length=100, description="By parameter of the format, as `/formats` lists them."
+        default_factory=dict,
+        max_length=100,
+        description="Values by parameter of the format; see `GET /api/v1/formats`.",
     )
     message: str = Field("", max_length=MAX_TEXT)
-    dry_run: bool = Field(False, description="Only say what would be.")
+    dry_run: bool = Field(False, description="Report the result without committing it.")
 
 
 class OwnTemplatesBody(RequestModel):
-    """One format's templates among others."""
+    """Values for one format of several."""
 
     set: str | None = Field(None, max_length=100)
     values: dict[str, Any] = Field(default_factory=dict, max_length=100)
 
 
 class TemplatesBody(RequestModel):
-    """The set of an environment, and values for several formats at once."""
+    """Template set of an environment, and values for several formats."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -57,16 +63,18 @@ class TemplatesBody(RequestModel):
         },
     )
 
-    set: str | None = Field(None, max_length=100, description="A set's name; left out: it stays.")
+    set: str | None = Field(None, max_length=100, description="Name of a set. Default: unchanged.")
     formats: dict[str, OwnTemplatesBody] = Field(
-        default_factory=dict, max_length=100, description="What is said of these, instead of all that was."
+        default_factory=dict,
+        max_length=100,
+        description="Values of these formats, which replace their previous values.",
     )
     message: str = Field("", max_length=MAX_TEXT)
-    dry_run: bool = Field(False, description="Only say what would be.")
+    dry_run: bool = Field(False, description="Report the result without committing it.")
 
 
 class TemplateSetOut(BaseModel):
-    """A named set of values, by format and parameter."""
+    """Named set of values, by format and parameter."""
 
     name: str
     title: str
@@ -74,8 +82,11 @@ class TemplateSetOut(BaseModel):
 
 
 class FormatTemplateOut(BaseModel):
-    """One format's templates. ``set``: where it is another than the environment's. ``ignored``: what was kept once and
-    this release cannot use."""
+    """Templates of one format.
+
+    `set`: set of this format, if it differs from the environment's. `ignored`: stored parameters that this release
+    cannot use.
+    """
 
     format: str
     set: str | None
@@ -85,14 +96,14 @@ class FormatTemplateOut(BaseModel):
 
 
 class FormatTemplatesOut(FormatTemplateOut):
-    """A format's templates in a version of an environment."""
+    """Templates of a format in a version of an environment."""
 
     environment: str
     version: int
 
 
 class TemplatesOut(BaseModel):
-    """A version's templates."""
+    """Templates of a version."""
 
     environment: str
     version: int
@@ -104,13 +115,14 @@ class TemplatesOut(BaseModel):
 router = api_router("templates")
 
 FormatPath = Annotated[
-    str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["tmap2"])
+    str, Path(max_length=64, description="Id of a format; see `GET /api/v1/formats`.", examples=["tmap2"])
 ]
 TemplateVersion = Annotated[
-    str, Query(alias="version", pattern=VERSION, description="Number, channel, or `latest`.", examples=["latest"])
+    str,
+    Query(alias="version", pattern=VERSION, description="Version: number, channel, or `latest`.", examples=["latest"]),
 ]
-Message = Annotated[str, Query(max_length=MAX_TEXT, description="Why, for the history.")]
-DryRun = Annotated[bool, Query(description="Only say what would be.")]
+Message = Annotated[str, Query(max_length=MAX_TEXT, description="Reason of the change, for the history.")]
+DryRun = Annotated[bool, Query(description="Report the result without committing it.")]
 
 CHANGED: dict[int | str, dict[str, Any]] = {
     **problem_responses(VersionOut, 400, 404, 409, 412, 415, ok=201, description="A new version"),
@@ -118,29 +130,31 @@ CHANGED: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get("/templates", responses=problem_responses(list[TemplateSetOut]), summary="All template sets")
+@router.get("/templates", responses=problem_responses(list[TemplateSetOut]), summary="List template sets")
 def list_sets(_: Viewer) -> Response:
-    """Named sets of values for parameters of formats. What one does not say is left to the format's defaults."""
+    """List the named sets of values for parameters of formats.
+
+    Parameters that a set does not define have the defaults of the format.
+    """
     return json_response(sets())
 
 
 def sets() -> list[dict[str, Any]]:
-    """The named sets as clients see them."""
+    """Convert the named sets to JSON."""
     return [one.as_dict(name) for name, one in templates.SETS.items()]
 
 
 @router.get(
     "/environments/{env}/templates",
     responses=problem_responses(TemplatesOut, 404),
-    summary="An environment's templates",
+    summary="Get an environment's templates",
 )
 def get_templates(
     env: EnvironmentPath, services: ServicesDep, _: Viewer, version: TemplateVersion = "latest"
 ) -> Response:
-    """The chosen set, and for each format with parameters the values of its own, what holds, and from where.
+    """Return the template set, and for each format its own and its effective values with their origin.
 
-    A parameter of a request goes before the environment's values, these before the set's, these before the format's
-    defaults.
+    Precedence: parameters of a request, values of the environment, values of the set, defaults of the format.
     """
     stored_version = services.store.versions.get(env, parse_version_ref(version))
     fmts = [f for f in formats.all_formats().values() if f.write is not None and templates.has_parameters(f)]
@@ -154,15 +168,20 @@ def get_templates(
     return json_response(body, headers=version_headers(stored_version))
 
 
-@router.put("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Choose a template set")
+@router.put(
+    "/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Set an environment's templates"
+)
 def put_templates(env: EnvironmentPath, body: TemplatesBody, services: ServicesDep, commit: CommitDep) -> Response:
-    """A version in which another set holds, or other values of several formats at once. What is left out stays."""
+    """Create a version with another template set, or with other values of several formats.
+
+    Omitted formats keep their values.
+    """
     format_templates = {name: FormatTemplate(template.set, template.values) for name, template in body.formats.items()}
     update = TemplateUpdate(body.set, format_templates, dry_run=body.dry_run).validated()
     return _commit_templates(services, env, update, commit.with_message(body.message))
 
 
-@router.delete("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Take all templates back")
+@router.delete("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Reset all templates")
 def delete_templates(
     env: EnvironmentPath,
     services: ServicesDep,
@@ -170,7 +189,7 @@ def delete_templates(
     message: Message = "",
     dry_run: DryRun = False,
 ) -> Response:
-    """A version in which the formats' own defaults hold."""
+    """Create a version without templates: the formats' own defaults apply."""
     update = TemplateUpdate(clear=True, dry_run=dry_run)
     return _commit_templates(services, env, update, commit.with_message(message))
 
@@ -178,13 +197,16 @@ def delete_templates(
 @router.get(
     "/environments/{env}/templates/{format}",
     responses=problem_responses(FormatTemplatesOut, 404),
-    summary="An environment's templates for a format",
+    summary="Get a format's templates",
 )
 def get_format_templates(
     env: EnvironmentPath, format: FormatPath, services: ServicesDep, _: Viewer, version: TemplateVersion = "latest"
 ) -> Response:
-    """`values`: the environment's own. `effective`: each parameter's value, and `from`: `environment`, `set NAME` or
-    `default`."""
+    """Return the templates of a format.
+
+    `values`: the environment's own. `effective`: each parameter's value, and `from`: `environment`, `set NAME` or
+    `default`.
+    """
     fmt = templates.check_format(format)
     stored_version = services.store.versions.get(env, parse_version_ref(version))
     body = {"environment": env, "version": stored_version.number, **_line(stored_version.templates, fmt)}
@@ -195,7 +217,7 @@ def get_format_templates(
     "/environments/{env}/templates/{format}",
     status_code=201,
     responses=CHANGED,
-    summary="Set an environment's templates for a format",
+    summary="Set a format's templates",
 )
 def put_format_templates(
     env: EnvironmentPath,
@@ -204,9 +226,9 @@ def put_format_templates(
     services: ServicesDep,
     commit: CommitDep,
 ) -> Response:
-    """A version with these values of the format's parameters, instead of all that was said of the format before.
+    """Create a version with these values of the format's parameters. They replace all previous values of the format.
 
-    Maps of the new version are made with them; old versions keep answering as they did.
+    Maps of the new version use them; maps of old versions do not change.
     """
     update = TemplateUpdate(None, {format: FormatTemplate(body.set, body.values)}, dry_run=body.dry_run).validated(
         "body"
@@ -218,7 +240,7 @@ def put_format_templates(
     "/environments/{env}/templates/{format}",
     status_code=201,
     responses=CHANGED,
-    summary="Take an environment's templates for a format back",
+    summary="Reset a format's template",
 )
 def delete_format_templates(
     env: EnvironmentPath,
@@ -228,7 +250,7 @@ def delete_format_templates(
     message: Message = "",
     dry_run: DryRun = False,
 ) -> Response:
-    """A version in which the environment's set holds for the format again."""
+    """Create a version in which the environment's template set applies to the format again."""
     update = TemplateUpdate(None, {format: FormatTemplate()}, dry_run=dry_run).validated()
     return _commit_templates(services, env, update, commit.with_message(message))
 
@@ -243,7 +265,7 @@ def _commit_templates(
 
 
 def _line(stored_templates: Templates, fmt: Format) -> dict[str, Any]:
-    """One format's templates as clients see them."""
+    """Convert a format's templates to JSON."""
     format_template, ignored = stored_templates.for_format(fmt.name), templates.resolve(stored_templates, fmt).ignored
     return {
         "format": fmt.name,

@@ -27,18 +27,21 @@ class TokenBody(RequestModel):
         },
     )
 
-    name: str = Field(min_length=1, max_length=200, description="Who it is for; it stands as author in the history.")
+    name: str = Field(min_length=1, max_length=200, description="Name shown in lists and as author in the history.")
     role: Literal["viewer", "robot", "editor", "admin"]
     environments: str | None = Field(
-        None, min_length=1, max_length=200, description="Name pattern (`farm-*`) of the environments it reaches."
+        None,
+        min_length=1,
+        max_length=200,
+        description="Name pattern (`farm-*`) of the environments that the token can access. Default: all.",
     )
     robot: str | None = Field(
         None,
         min_length=1,
         max_length=200,
-        description="Role `robot`: the robot whose status it may set. Default: `name`.",
+        description="Role `robot`: robot whose status the token may report. Default: `name`.",
     )
-    expires: ApiTime | None = Field(None, description="RFC 3339 time with zone; left out: never.")
+    expires: ApiTime | None = Field(None, description="RFC 3339 time with time zone. Default: never.")
 
 
 class TokenOut(BaseModel):
@@ -51,22 +54,22 @@ class TokenOut(BaseModel):
     robot: str | None
     expires: datetime | None
     created: datetime
-    ended: datetime | None = Field(description="When it was seen to have expired; it stays expired.")
+    ended: datetime | None = Field(description="When the token was found to have expired; it stays expired.")
 
 
 class NewTokenOut(TokenOut):
-    """A new token with its secret, which is told only now."""
+    """New token with its secret, which is returned only once."""
 
     token: str
 
 
-TokenPath = Annotated[str, Path(max_length=100, description="A token's id.")]
+TokenPath = Annotated[str, Path(max_length=100, description="Id of the token.")]
 
 router = api_router("tokens", "/tokens")
 
 
 def as_dict(token: Token) -> dict[str, Any]:
-    """The token without its secret."""
+    """Convert a token to JSON, without its secret."""
     return {
         "id": token.id,
         "name": token.name,
@@ -79,37 +82,43 @@ def as_dict(token: Token) -> dict[str, Any]:
     }
 
 
-@router.get("", responses=problem_responses(list[TokenOut]), summary="All tokens, without their secrets")
+@router.get("", responses=problem_responses(list[TokenOut]), summary="List tokens")
 def list_tokens(services: ServicesDep, _: ServerAdmin) -> Response:
-    """Oldest first."""
+    """List the tokens, oldest first, without their secrets."""
     return json_response([as_dict(token) for token in services.store.tokens.all()])
 
 
 @router.post(
     "",
     status_code=201,
-    responses=problem_responses(NewTokenOut, 400, 415, ok=201, description="Made"),
-    summary="Make a token",
+    responses=problem_responses(NewTokenOut, 400, 415, ok=201, description="The token"),
+    summary="Create a token",
 )
 def create_token(body: TokenBody, services: ServicesDep, _: ServerAdmin) -> Response:
-    """Its secret stands in this answer and nowhere else: only its hash is stored.
+    """Create a token. Its secret is only in this response; the server stores a hash.
 
-    A token with the role `robot` names its robot: `robot`, by default its own `name`.
+    A token with the role `robot` is bound to a robot: `robot`, by default its own `name`.
     """
     if body.expires is not None:
         if body.expires.tzinfo is None:
-            raise Invalid("expires needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="expires")])
+            raise Invalid(
+                "expires needs a time zone, for example 2030-01-31T06:00:00Z",
+                [Problem("missing time zone", where="expires")],
+            )
         if body.expires <= datetime.now(UTC):
-            raise Invalid("expires is in the past", [Problem("past", where="expires")])
+            raise Invalid("expires is in the past: give a later time", [Problem("past", where="expires")])
     if body.robot is not None and body.role != "robot":
-        raise Invalid("only a token with the role robot names a robot", [Problem("role is not robot", where="robot")])
+        raise Invalid(
+            "robot requires the role robot: omit it, or set role to robot",
+            [Problem("role is not robot", where="robot")],
+        )
     robot = _robot_name(body)
     token, secret = services.store.tokens.create(body.name, body.role, body.environments, robot, body.expires)
     return json_response({**as_dict(token), "token": secret}, 201, {"cache-control": "no-store"})
 
 
 def _robot_name(body: TokenBody) -> str | None:
-    """The robot that a token names; None for other roles than ``robot``."""
+    """Return the robot to which a token is bound; None for other roles than ``robot``."""
     if body.role != "robot":
         return None
     name = body.name if body.robot is None else body.robot
@@ -117,7 +126,7 @@ def _robot_name(body: TokenBody) -> str | None:
         rule = "at most 128 of A-Z, a-z, 0-9, _, . and -, starting with a letter or digit"
         field = "name" if body.robot is None else "robot"
         raise Invalid(
-            f"{name[:80]!r} is no robot's name, which must be {rule}: set 'robot' (on the command line --robot)",
+            f"{name[:80]!r} is not a valid robot name, which must be {rule}: set 'robot' (on the command line --robot)",
             [Problem(f"must be {rule}", where=field)],
         )
     return name
@@ -125,17 +134,20 @@ def _robot_name(body: TokenBody) -> str | None:
 
 @router.delete("/{id}", status_code=204, responses=problem_responses(None, 404, 409), summary="Revoke a token")
 def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Response:
-    """It is refused from now on (within a second by other worker processes). The last administrator's stays."""
+    """Revoke a token; other worker processes refuse it within a second.
+
+    The last token of a full administrator cannot be revoked.
+    """
     tokens = {token.id: token for token in services.store.tokens.all()}
     if id not in tokens:
-        raise NotFound("there is no token with this id")
+        raise NotFound("no token has this id")
     if _is_full_admin(tokens[id]) and not any(_is_full_admin(t) for t in tokens.values() if t.id != id):
-        raise Conflict("this is the last administrator's token: make another one first")
+        raise Conflict("this is the last administrator's token: create another one first")
     services.store.tokens.delete(id)
     services.access.invalidate()
     return Response(status_code=204)
 
 
 def _is_full_admin(token: Token) -> bool:
-    """Whether it is an administrator's for everything, and for good."""
+    """Test if a token is an administrator's for all environments without expiry."""
     return token.role == "admin" and token.environments is None and token.expires is None

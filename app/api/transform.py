@@ -1,4 +1,4 @@
-"""Between earth and the local frame."""
+"""Transformation between WGS 84 and the local frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from app.model.geodesy import local_frame
 
 
 class TransformOut(BaseModel):
-    """One place in both frames."""
+    """One position in both frames."""
 
     latlon: list[float]
     xy: list[float]
@@ -30,14 +30,18 @@ class TransformOut(BaseModel):
 router = api_router("transform", "/environments/{env}")
 
 
-TOO_FAR = "the place is too far from the datum for the local frame"
+TOO_FAR = "the position is too far from the datum for the local frame"
 
 
 def _invalid_place_error(location: str, detail: str) -> Invalid:
     return Invalid(detail, [Problem(detail, where=location)])
 
 
-@router.get("/transform", responses=problem_responses(TransformOut, 404), summary="Between earth and local frame")
+@router.get(
+    "/transform",
+    responses=problem_responses(TransformOut, 404),
+    summary="Convert a position between WGS 84 and the local frame",
+)
 def transform(
     env: EnvironmentPath,
     services: ServicesDep,
@@ -46,9 +50,9 @@ def transform(
         str | None, Query(description="`LAT,LON` in degrees (WGS 84).", examples=["52.4206,5.6134"])
     ] = None,
     xy: Annotated[str | None, Query(description="`X,Y` in metres of the local frame.")] = None,
-    version: Annotated[str, Query(pattern=VERSION, description="Whose datum is meant.")] = "latest",
+    version: Annotated[str, Query(pattern=VERSION, description="Version whose datum to use.")] = "latest",
 ) -> Response:
-    """Give ``latlon`` or ``xy``; the answer has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
+    """Convert `latlon` or `xy`; the response has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
     if (latlon is None) == (xy is None):
         raise Invalid("give either latlon=LAT,LON or xy=X,Y", [Problem("one of latlon and xy", where="query")])
     datum = services.store.versions.get(env, parse_version_ref(version)).datum

@@ -1,4 +1,4 @@
-"""VDA 5050: a version as instant actions, and a vehicle's state as a robot's status."""
+"""VDA 5050: instant actions for a version, and a vehicle's state as a robot status."""
 
 from __future__ import annotations
 
@@ -29,39 +29,39 @@ from app.store.values import Version
 
 
 class FloorActionsOut(BaseModel):
-    """Instant actions of VDA 5050 for one floor of a version."""
+    """Instant actions of VDA 5050 for one level of a version."""
 
     model_config = ConfigDict(populate_by_name=True)
 
     map_id: str = Field(alias="mapId")
     map_version: str = Field(alias="mapVersion")
-    level: str | None = Field(description="Null where no level was named.")
-    size: int = Field(description="Bytes behind the link.")
-    expires: datetime | None = Field(description="End of the link; null where it needs a token.")
+    level: str | None = Field(description="Level, or null if none was requested.")
+    size: int = Field(description="Size of the linked file in bytes.")
+    expires: datetime | None = Field(description="Expiry of the link, or null if the link needs a token.")
     download_map: dict[str, Any] = Field(alias="downloadMap")
     enable_map: dict[str, Any] = Field(alias="enableMap")
     delete_map: dict[str, Any] = Field(alias="deleteMap")
 
 
 class MissingLevelOut(BaseModel):
-    """A level without such a map, and why."""
+    """Level without such a map, and the reason."""
 
     level: str
     detail: str
 
 
 class ActionsOut(FloorActionsOut):
-    """Instant actions of VDA 5050 for one version: of its first floor, and in ``maps`` of each."""
+    """Instant actions of VDA 5050 for one version: those of its first level, and in `maps` of each level."""
 
     environment: str
     version: int
     root: str
     maps: list[FloorActionsOut]
-    missing: list[MissingLevelOut] = Field(description="With `level=*`: levels that have no such map.")
+    missing: list[MissingLevelOut] = Field(description="Levels without such a map, with `level=*`.")
 
 
 class StateOut(BaseModel):
-    """What became of a vehicle's state."""
+    """Result of processing a vehicle's state."""
 
     robots: list[RobotOut]
     ignored: list[dict[str, str]]
@@ -69,13 +69,15 @@ class StateOut(BaseModel):
 
 MapIdQuery = Annotated[
     str | None,
-    Query(alias="mapId", min_length=1, max_length=256, description="The map's id in the fleet manager. Default: env."),
+    Query(
+        alias="mapId", min_length=1, max_length=256, description="Id of the map in the fleet manager. Default: `env`."
+    ),
 ]
 FormatQuery = Annotated[
     str,
     Query(
         max_length=64,
-        description="The format that the vehicles read: any but `lif`, which is for fleet managers.",
+        description="Format that the vehicles read: any except `lif`, which is for fleet managers.",
         examples=["geojson"],
     ),
 ]
@@ -84,15 +86,16 @@ LevelQuery = Annotated[
     Query(
         min_length=1,
         max_length=256,
-        description="A level's name, or `*` for one map of each level that has one. Default: the default level. "
-        "Only for formats with a parameter `level`.",
+        description="Name of a level, or `*` for one map of each level that has one. Default: the default level. Only "
+        "for formats with a parameter `level`.",
     ),
 ]
 SignedQuery = Annotated[
-    bool, Query(description="Whether the links need no token until they expire. `false`: they need one.")
+    bool, Query(description="Create links that need no token until they expire. `false`: links that need one.")
 ]
 SecondsQuery = Annotated[
-    int | None, Query(ge=1, description="Life of the links. Default and maximum: `FLEETMAP_LINK_SECONDS`.")
+    int | None,
+    Query(ge=1, description="Lifetime of the links in seconds. Default and maximum: `FLEETMAP_LINK_SECONDS`."),
 ]
 
 router = api_router("vda5050")
@@ -108,9 +111,9 @@ STATE: dict[str, Any] = {
     "/environments/{env}/versions/{v}/vda5050/actions",
     responses={
         **problem_responses(ActionsOut, 404, 409),
-        202: {"description": "The map takes long: follow the job at `Location`, then ask again."},
+        202: {"description": "The conversion takes long: follow the job at `Location`, then repeat the request."},
     },
-    summary="A version as VDA 5050 instant actions",
+    summary="Get VDA 5050 instant actions for a version",
     openapi_extra={"x-free-query": True},
 )
 async def get_actions(
@@ -125,13 +128,15 @@ async def get_actions(
     signed: SignedQuery = True,
     seconds: SecondsQuery = None,
 ) -> Response:
-    """`downloadMap` with the link to one file (a zip where the format has several) and its SHA-256, `enableMap`,
-    `deleteMap`: to be sent as `instantActions` by the fleet manager. Further query parameters are the map's.
+    """Return the actions `downloadMap`, `enableMap` and `deleteMap`, which the fleet manager sends as
+    `instantActions`.
 
-    VDA 5050 has a `mapId` for each floor: `mapId` itself is the default level, `<mapId>/<level>` another one. `maps`
-    has the actions of each floor that was asked for; the members beside it are those of the first. `mapVersion` is the
-    version's number, and the link names it, so that its bytes stay the same whatever is promoted later. Each answer
-    has new action ids.
+    `downloadMap` has the link to one file (a zip of several) and its SHA-256. Further query parameters are those of
+    the map.
+
+    VDA 5050 has one `mapId` per level: `mapId` itself for the default level, `<mapId>/<level>` for another one.
+    `maps` has the actions of each requested level; the members beside it are those of the first. `mapVersion` is the
+    number of the version. The link contains it too, so the bytes never change. Each response has new action ids.
     """
     reserved_names = {"mapId", "format", "level", "signed", "seconds"}
     values = {name: text for name, text in request.query_params.multi_items() if name not in reserved_names}
@@ -163,20 +168,23 @@ async def get_actions(
 
 
 def _check_format(name: str, *, by_level: bool) -> None:
-    """Invalid for what no vehicle reads, and for a level of a format that has all of them in one map."""
+    """Raise Invalid for a format that vehicles cannot read, or that has no parameter ``level`` if one is requested."""
     if name == "lif":
         raise Invalid(
-            "lif is a layout for the fleet manager, never for vehicles: give them occupancy_grid or nav2_route, or the "
-            "format that they read, and fetch lif from .../maps/lif for the fleet manager itself",
+            "lif is a layout for fleet managers, not for vehicles: request occupancy_grid, nav2_route or "
+            "another format that the vehicles read, and download lif from .../maps/lif for the fleet manager",
             [Problem("not for vehicles", where="format")],
         )
     fmt = formats.get_format(name)
     if fmt.write is None:
-        raise Invalid(f"{name} is not served", [Problem("not served", where="format")])
+        raise Invalid(
+            f"{name} cannot be written: see GET /api/v1/formats for formats with write",
+            [Problem("read-only format", where="format")],
+        )
     if by_level and not _has_level(fmt):
         others = ", ".join(f.name for f in formats.all_formats().values() if f.write is not None and _has_level(f))
         raise Invalid(
-            f"a map in {name} holds all levels: leave out level, or use one of {others}",
+            f"a map in {name} contains all levels: omit level, or use one of {others}",
             [Problem("the format has no levels", where="level")],
         )
 
@@ -186,7 +194,7 @@ def _has_level(fmt: formats.Format) -> bool:
 
 
 def _levels(version: Version, level: str | None) -> list[str]:
-    """The levels that are asked for, the default one first. NotFound for one that the version does not have."""
+    """List the requested levels, the default one first. Raises NotFound if the version lacks the level."""
     default = vda5050.default_level(version)
     names = [default, *(other.name for other in version.levels if other.name != default)]
     if level == "*":
@@ -197,12 +205,12 @@ def _levels(version: Version, level: str | None) -> list[str]:
 
 
 def _other(version: Version, level: str) -> str | None:
-    """The level's name where it is not the default one."""
+    """Return the level's name, or None for the default level."""
     return None if level == vda5050.default_level(version) else level
 
 
 def _actions(version: Version, map_id: str, level: str | None, link: LinkedFile) -> dict[str, Any]:
-    """The three actions of one floor."""
+    """Build the three actions of one level."""
     unique, number = secrets.token_hex(8), version.number
     return {
         "mapId": map_id,
@@ -221,7 +229,7 @@ def _actions(version: Version, map_id: str, level: str | None, link: LinkedFile)
 @router.post(
     "/robots/{robot}/vda5050/state",
     responses=problem_responses(StateOut, 400, 404, 409, 415),
-    summary="A vehicle's VDA 5050 state",
+    summary="Report a vehicle's VDA 5050 state",
 )
 def post_state(
     robot: RobotPath,
@@ -229,25 +237,29 @@ def post_state(
     services: ServicesDep,
     principal: RobotRole,
     environment: Annotated[
-        str | None, Query(pattern=NAME, description="Environment of the maps. Default: the `mapId` before `/`.")
+        str | None, Query(pattern=NAME, description="Environment of the maps. Default: the part of `mapId` before `/`.")
     ] = None,
     map_id: Annotated[
-        str | None, Query(alias="mapId", min_length=1, max_length=256, description="Only of this map.")
+        str | None, Query(alias="mapId", min_length=1, max_length=256, description="Process only this map.")
     ] = None,
     channel: Annotated[
         str | None,
         Query(
-            pattern=CHANNEL, description="Default: as it said last, else `production` if there is one, else `latest`."
+            pattern=CHANNEL,
+            description="Channel that the vehicle follows. Default: that of its last report, else `production` if it "
+            "exists, else `latest`.",
         ),
     ] = None,
 ) -> Response:
-    """Its `maps` become the robot's status, `mapVersion` being a version's number: ENABLED is `active`; a version that
-    is planned for its channel and DISABLED is `ready`; an action of ours that failed is `failed`. All else in the
-    message is the fleet manager's.
+    """Convert the `maps` of a vehicle's state to the robot's status.
 
-    The floors of a site (`<mapId>/<level>`) count together: the vehicle is `ready` with a version when it has it for
-    each floor in the message, and `active` with the oldest that is enabled on any. `ignored`: what is not known here,
-    and why.
+    `mapVersion` is the number of a version. ENABLED becomes `active`; DISABLED becomes `ready` if the version is
+    planned for the channel; a failed action of this server becomes `failed`. The rest of the message is for the fleet
+    manager.
+
+    The levels of a site (`<mapId>/<level>`) count together: the vehicle is `ready` with a version if it has it for
+    each level in the message, and `active` with the oldest version that is enabled on any level. `ignored` lists the
+    unknown maps, with the reason.
     """
     require_report_permission(principal, robot)
     out: dict[str, list[dict[str, Any]]] = {"robots": [], "ignored": []}
@@ -257,7 +269,7 @@ def post_state(
             sites.setdefault(vda5050.site_name(maps.map_id), []).append(maps)
     if environment is not None and len(sites) > 1:
         names = ", ".join(list(sites)[:20])
-        raise Invalid(f"the state tells of several maps: say which is {environment}'s, mapId being one of {names}")
+        raise Invalid(f"the state has several maps: set mapId to the one of {environment}, one of {names}")
     for site, floors in sites.items():
         _collect_reports(services, principal, robot, floors, environment or site, channel, out)
     return json_response(out)
@@ -274,7 +286,7 @@ def _collect_reports(
 ) -> None:
     try:
         if not principal.can_access(env):
-            raise NotFound("your token does not reach it, or it is none of this server's environments")
+            raise NotFound("unknown environment, or not accessible with your token")
         stored_robot = next(iter(services.store.robots.all(env, robot)), None)
         channels = {c.name: c for c in services.store.channels.all(env)}
     except NotFound as error:
@@ -291,7 +303,7 @@ def _collect_reports(
             out["ignored"].append({"mapId": maps.map_id, "mapVersion": text, "why": error.detail})
             continue
         reports.append(RobotReport(channel or usual, version.number, version.root, state, detail and detail[:2000]))
-    # What it drives on is told only where it is news: else every message would be a change there and back.
+    # Report the active version only if it is new: otherwise every message would alternate between two reports.
     if (
         len(reports) > 1
         and stored_robot is not None
@@ -306,7 +318,7 @@ def _collect_reports(
 
 
 def _states(maps: vda5050.VehicleMaps, channel: Channel | None) -> list[tuple[RobotState, str, str | None]]:
-    """What a vehicle is told to have said: (state, version, detail), what it drives on first."""
+    """Derive the statuses that a vehicle's maps imply: (state, version, detail), the active version first."""
     planned = None if channel is None or channel.planned is None else str(channel.planned.version)
     targets = {planned, None if channel is None or channel.version is None else str(channel.version)} - {None}
     out: list[tuple[RobotState, str, str | None]] = [("active", text, None) for text in maps.enabled]
@@ -323,5 +335,5 @@ def _states(maps: vda5050.VehicleMaps, channel: Channel | None) -> list[tuple[Ro
 
 def _reported_version(services: Services, env: str, text: str) -> Version:
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise NotFound("its mapVersion is no version's number")
+        raise NotFound("invalid mapVersion: it must be the number of a version")
     return services.store.versions.get(env, int(text))

@@ -1,4 +1,4 @@
-"""Versions: uploads, edits, reverts, history, and the files that made them."""
+"""Versions: uploads, edits, reverts, history and source files."""
 
 from __future__ import annotations
 
@@ -40,31 +40,31 @@ from app.upload_reader import DRAWN_LAYERS
 
 
 class RevertBody(RequestModel):
-    """A new version with the content of an old one."""
+    """New version with the content of an old one."""
 
-    revert_to: int = Field(ge=0, description="The old version's number.")
+    revert_to: int = Field(ge=0, description="Number of the old version.")
     message: str = Field("", max_length=MAX_TEXT)
 
 
 class PutChange(RequestModel):
     """Add or replace one feature, by id.
 
-    A feature may be put back as `GET …/layers/{layer}` shows it: what was not edited stays exactly as it is stored. A
-    feature that is there already keeps its anchor (local metres, or a place on earth), whatever `crs` its new place is
-    told in; delete it and put it again to anchor it otherwise. A fence's `properties.datum` sets the environment's
-    datum. Edges that end at a node which is moved move along.
+    A feature can be put back as returned by `GET …/layers/{layer}`: unedited values keep their exact stored form. An
+    existing feature keeps its anchor (local metres, or a geographic position), whatever the `crs` of its new
+    geometry; to change the anchor, delete the feature and put it again. `properties.datum` of a fence sets the
+    environment's datum. Edges move with their nodes.
     """
 
     op: Literal["put"]
     layer: Literal["location", "objects", "topology", "zones"]
     feature: dict[str, Any] = Field(
-        description="GeoJSON Feature with an `id` (a text); `place` instead of `geometry` is local metres. An edge "
-        "without geometry runs straight."
+        description="GeoJSON Feature with an `id` (a text); `place` instead of `geometry` is in local metres. An edge "
+        "without geometry is straight."
     )
     level: str | None = Field(None, max_length=256)
-    name: str | None = Field(None, max_length=256, description="The part's name, where a layer has several.")
+    name: str | None = Field(None, max_length=256, description="Name of the part, if the layer has several.")
     crs: Literal["local", "wgs84"] | None = Field(
-        None, description="What `geometry` is in; default: wgs84 where there is a datum."
+        None, description="CRS of `geometry`. Default: `wgs84` if there is a datum, else `local`."
     )
 
 
@@ -79,23 +79,23 @@ class DeleteChange(RequestModel):
 
 
 class CellsChange(RequestModel):
-    """Set the cells of a grid whose centres lie in a polygon."""
+    """Set the cells of a grid whose centres are in a polygon."""
 
     op: Literal["cells"]
-    grid: str | None = Field(None, max_length=256, description="Default: `map`, else the only grid.")
+    grid: str | None = Field(None, max_length=256, description="Name of the grid. Default: `map`, else the only grid.")
     level: str | None = Field(None, max_length=256)
     polygon: dict[str, Any] = Field(description="GeoJSON Polygon or MultiPolygon.")
     crs: Literal["local", "wgs84"] | None = Field(
-        None, description="What the polygon is in; default: wgs84 where there is a datum."
+        None, description="CRS of the polygon. Default: `wgs84` if there is a datum, else `local`."
     )
-    value: int = Field(ge=0, le=255, description="0 free … 100 occupied, 255 unknown.")
+    value: int = Field(ge=0, le=255, description="New value: 0 free … 100 occupied, 255 unknown.")
 
 
 Change = Annotated[PutChange | DeleteChange | CellsChange, Field(discriminator="op")]
 
 
 class EditsBody(RequestModel):
-    """Changes that make one version together, or none."""
+    """Changes that are committed together as one version, or not at all."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -149,26 +149,35 @@ UPLOAD_BODY: dict[str, Any] = {
                         "files": {
                             "type": "array",
                             "items": {"type": "string", "format": "binary"},
-                            "description": "One file or more; a name may be a relative path. A `.zip` of a folder is "
-                            "the same as its files.",
+                            "description": (
+                                "One or more files; a name may be a relative path. A `.zip` of a folder is "
+                                "equivalent to its files."
+                            ),
                         },
-                        "format": {"type": "string", "description": "A format's id; left out: found by content."},
+                        "format": {
+                            "type": "string",
+                            "description": "Id of the files' format. Default: detected from the content.",
+                        },
                         "layer": {
                             "type": "string",
                             "enum": list(DRAWN_LAYERS),
-                            "description": "What the lines and polygons of a drawing are meant for.",
+                            "description": "Layer for the lines and polygons of a drawing.",
                         },
-                        "level": {"type": "string", "default": "ground", "description": "The storey."},
-                        "grid": {"type": "string", "description": "The name of an uploaded grid."},
+                        "level": {"type": "string", "default": "ground", "description": "Level of the content."},
+                        "grid": {"type": "string", "description": "Name for an uploaded grid."},
                         "mode": {"type": "string", "enum": ["replace", "merge"], "default": "replace"},
-                        "message": {"type": "string", "description": "Why, for the history."},
-                        "dry_run": {"type": "boolean", "default": False, "description": "Only say what would be."},
+                        "message": {"type": "string", "description": "Reason of the change, for the history."},
+                        "dry_run": {
+                            "type": "boolean",
+                            "default": False,
+                            "description": "Report the result without committing it.",
+                        },
                     },
                     "additionalProperties": {"type": "string", "description": "Options of the format."},
                 },
                 "examples": {
                     "datum": {
-                        "summary": "Where the environment is",
+                        "summary": "Position of the environment",
                         "value": {
                             "files": ["datum.yaml"],
                             "message": "measured with GNSS",
@@ -185,13 +194,16 @@ UPLOAD_BODY: dict[str, Any] = {
 }
 
 
-@router.get("/versions", responses=problem_responses(list[VersionOut], 404), summary="History, newest first")
+@router.get("/versions", responses=problem_responses(list[VersionOut], 404), summary="List versions")
 def list_versions(
     env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer, limit: Limit = 100, cursor: Cursor = None
 ) -> Response:
-    """All versions of an environment."""
+    """List the versions of an environment, newest first."""
     if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) <= 18):
-        raise Invalid("the cursor is not one that a page's Link header gave", [Problem("unknown", where="cursor")])
+        raise Invalid(
+            "invalid cursor: take it from the Link header of the previous page",
+            [Problem("invalid cursor", where="cursor")],
+        )
     before = int(cursor) if cursor is not None else None
     versions = services.store.versions.page(env, limit=limit + 1, before=before)
     following = str(versions[limit - 1].number) if len(versions) > limit else None
@@ -205,7 +217,7 @@ def list_versions(
         **problem_responses(VersionOut, 400, 404, 409, 412, 413, 415, 503, ok=201, description="A new version"),
         200: {"model": VersionOut, "description": "Nothing changed: the head. Or a dry run: `version` is null."},
     },
-    summary="Upload files, or revert",
+    summary="Upload files, or revert to a version",
     openapi_extra=UPLOAD_BODY,
 )
 async def create_version(
@@ -214,7 +226,10 @@ async def create_version(
     services: ServicesDep,
     commit: CommitDep,
 ) -> Response:
-    """One upload is one version, all or nothing. Files are taken as they are; what is doubtful comes as warnings."""
+    """Create one version from one upload, or none if it fails.
+
+    The files are stored unchanged; doubtful content causes warnings.
+    """
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media == "multipart/form-data":
         async with services.intake.receive(request) as form:
@@ -232,7 +247,9 @@ async def create_version(
             commit.with_message(body.message),
         )
     else:
-        raise UnsupportedMedia("send multipart/form-data with files, or application/json with revert_to")
+        raise UnsupportedMedia(
+            "unsupported media type: send multipart/form-data with files, or application/json with revert_to"
+        )
     return commit_response(outcome)
 
 
@@ -246,15 +263,18 @@ async def create_version(
     summary="Edit features and cells",
 )
 def create_edit(env: EnvironmentPath, body: EditsBody, services: ServicesDep, commit: CommitDep) -> Response:
-    """Some features put or deleted, some cells set: one version, or none. Edges that would dangle are refused."""
+    """Put or delete features and set cells: one version, or none.
+
+    Edits that leave edges without their nodes are refused.
+    """
     changes = [change.model_dump(exclude_none=True) for change in body.changes]
     outcome = _counted(services, services.ingest.edit, env, changes, commit.with_message(body.message))
     return commit_response(outcome)
 
 
-@router.get("/versions/{v}", responses=problem_responses(VersionOut, 404), summary="One version")
+@router.get("/versions/{v}", responses=problem_responses(VersionOut, 404), summary="Get a version")
 def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
-    """A version by number, by channel, or the newest."""
+    """Return a version by number, by channel, or the newest."""
     version = services.store.versions.get(env, parse_version_ref(v))
     return json_response(version.as_dict(), headers=version_headers(version))
 
@@ -263,10 +283,10 @@ def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: 
     "/versions/{v}/sources",
     tags=["sources"],
     responses=problem_responses(list[SourceOut], 404),
-    summary="Uploaded files",
+    summary="List uploaded files",
 )
 def list_sources(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
-    """The files that made a version, also those that were not used."""
+    """List the files of a version, including unused ones."""
     return json_response(
         [source.as_dict() for source in services.store.versions.get(env, parse_version_ref(v)).sources]
     )
@@ -279,25 +299,25 @@ def list_sources(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _:
     responses={
         **problem_responses(None, 404, 416),
         200: {"description": "The file", "content": {"application/octet-stream": {}}},
-        206: {"description": "A part of it"},
-        304: {"description": "The client has it"},
+        206: {"description": "Part of the file"},
+        304: {"description": "Not modified: the client has this file"},
     },
-    summary="An uploaded file, byte for byte",
+    summary="Download an uploaded file",
 )
 def get_source(
     env: EnvironmentPath,
-    v: Annotated[str, Path(pattern=VERSION, description="Number, channel, or `latest`.", examples=["latest"])],
+    v: Annotated[str, Path(pattern=VERSION, description="Version: number, channel, or `latest`.", examples=["latest"])],
     name: Annotated[
-        str, Path(max_length=1024, description="The file's name, with its folders.", examples=["datum.yaml"])
+        str, Path(max_length=1024, description="Name of the file, with its folders.", examples=["datum.yaml"])
     ],
     request: Request,
     services: ServicesDep,
     _: Viewer,
     sha256: Annotated[
-        str | None, Query(pattern=r"^[0-9a-f]{64}$", description="Which one, where several have this name.")
+        str | None, Query(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the file, if several have this name.")
     ] = None,
 ) -> Response:
-    """Always as an attachment, never to be shown by a browser as what it says it is."""
+    """Return a file byte for byte as it was uploaded, always as an attachment that a browser does not display."""
     source = _source(services.store.versions.get(env, parse_version_ref(v)).sources, name, sha256)
     etag = f'"{source.sha256}"'
     headers = [
@@ -324,12 +344,12 @@ def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Sourc
     fitting = [s for s in sources if s.name == name and sha256 in (None, s.sha256)]
     if not fitting:
         names = ", ".join(s.name for s in sources[:20]) or "none"
-        raise NotFound(f"this version has no source {name[:200]!r}; its sources: {names}")
+        raise NotFound(f"this version has no source {name[:200]!r}; available: {names}")
     return next((s for s in fitting if s.used), fitting[0])
 
 
 def _upload(form: UploadForm, request: Request) -> tuple[Upload, str]:
-    """The upload and the message that the form and the query describe, checked."""
+    """Parse the form and the query of an upload: the upload and its message. Raises Invalid."""
     fields = FormFields(form, request.query_params.multi_items())
     mode = fields.take("mode") or "replace"
     if mode not in ("replace", "merge"):
@@ -345,7 +365,7 @@ def _upload(form: UploadForm, request: Request) -> tuple[Upload, str]:
 
 
 def _counted(services: Services, change: Callable[..., CommitResult], *args: Any) -> CommitResult:
-    """Carry out an upload or edit, and count what became of it."""
+    """Apply an upload or edit, and count its outcome."""
     try:
         outcome = change(*args)
     except FleetMapError:
@@ -369,4 +389,6 @@ async def _revert_body(request: Request) -> RevertBody:
 
 def _no_query(request: Request) -> None:
     for name in request.query_params:
-        raise Invalid(f"a revert takes no query parameter {name[:80]!r}", [Problem("unknown", where=name[:80])])
+        raise Invalid(
+            f"unknown query parameter {name[:80]!r}: a revert takes none", [Problem("unknown", where=name[:80])]
+        )

@@ -1,4 +1,4 @@
-"""A real server on a loopback port, in a thread of its own: what clients see is what is tested."""
+"""Real server on a loopback port, in a thread of its own, so that tests see what clients see."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Files = dict[str, bytes]
 
 @dataclass
 class Api:
-    """A running server and a client with one token."""
+    """Running server and a client with one token."""
 
     url: str
     app: FastAPI
@@ -42,7 +42,7 @@ class Api:
         self.http = httpx.Client(base_url=self.url, headers=headers, timeout=60.0, verify=self.verify)
 
     def __call__(self, method: str, path: str, expect: int | None = None, **more: Any) -> httpx.Response:
-        """Send a request; a path that does not start with / lies below the API."""
+        """Send a request; a path that does not start with / is below the API."""
         answer = self.http.request(method, path if path.startswith("/") else f"{API}/{path}", **more)
         if expect is not None:
             assert answer.status_code == expect, f"{method} {path}: {answer.status_code} {answer.text[:2000]}"
@@ -62,17 +62,17 @@ class Api:
         )
 
     def problem(self, method: str, path: str, status: int, **more: Any) -> dict[str, Any]:
-        """A request that must fail: its problem, in the one shape."""
+        """Send a request that must fail; return its problem, with checked members."""
         return problem(self(method, path, status, **more))
 
     def as_(self, token: str | None) -> Api:
-        """A client with another token; it is closed together with this one."""
+        """Return a client with another token; it is closed together with this one."""
         other = Api(self.url, self.app, token, self.verify)
         self.others.append(other)
         return other
 
     def token_for(self, role: str, **more: Any) -> Api:
-        """A client with a new token."""
+        """Return a client with a new token."""
         return self.as_(self.post("tokens", {"name": f"a-{role}", "role": role, **more}).json()["token"])
 
     def close(self) -> None:
@@ -86,7 +86,7 @@ def parts(files: Files) -> list[tuple[str, tuple[str, bytes]]]:
 
 
 def problem(answer: httpx.Response) -> dict[str, Any]:
-    """The answer's problem: RFC 9457 with its members, `errors` and no others."""
+    """Return the problem of a response: RFC 9457 with its members, `errors` and no others."""
     assert answer.headers["content-type"] == "application/problem+json", answer.text[:500]
     body: dict[str, Any] = answer.json()
     assert set(body) <= {"type", "title", "status", "detail", "errors"}, body
@@ -130,15 +130,15 @@ def running(settings: Settings, verify: ssl.SSLContext | bool = False) -> Iterat
 
 
 def settings_for(folder: Path, **more: Any) -> Settings:
-    """Settings that read nothing of the environment of whoever runs the tests."""
+    """Create settings that ignore the environment variables of the test run."""
     values = {"admin_token": ADMIN, "conversion_workers": 1, "max_memory_bytes": 4 * 2**30, "log_level": "warning"}
-    values["zenoh_mode"] = "off"  # tests of events say where their router listens
+    values["zenoh_mode"] = "off"  # tests of events set the addresses of their router
     return Settings(_env_file=None, data_dir=folder, **{**values, **more})  # type: ignore[call-arg]
 
 
 @pytest.fixture(scope="session")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
-    """The server that most tests share; each uses environments of its own."""
+    """Server that most tests share; each uses its own environments."""
     with running(settings_for(tmp_path_factory.mktemp("server"))) as api:
         yield api
 
@@ -148,13 +148,13 @@ _count = itertools.count(1)
 
 @pytest.fixture
 def fresh() -> Callable[[], str]:
-    """A name that no environment has."""
+    """Return a name that no environment has."""
     return lambda: f"env-{next(_count)}"
 
 
 @pytest.fixture
 def farm(api: Api, fresh: Callable[[], str]) -> str:
-    """An environment with a datum (version 1), a network (2) and a grid (3)."""
+    """Create an environment with a datum (version 1), a network (2) and a grid (3)."""
     name = fresh()
     api.post("environments", {"name": name, "title": "Farm", "tags": ["wheat"]})
     api.upload(name, {"datum.yaml": samples.DATUM}, message="measured")
@@ -165,7 +165,7 @@ def farm(api: Api, fresh: Callable[[], str]) -> str:
 
 @pytest.fixture
 def bare(api: Api, fresh: Callable[[], str]) -> str:
-    """An environment with nothing in it."""
+    """Create an empty environment."""
     name = fresh()
     api.post("environments", {"name": name})
     return name

@@ -1,4 +1,4 @@
-"""Small files of our own: a farm's datum, network, grid and drawing."""
+"""Small synthetic files: a farm's datum, network, grid and drawing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EDGES = (("gate", "barn"), ("barn", "gate"), ("barn", "field"))
 
 
 def tmap2(nodes: dict[str, tuple[float, float]] | None = None, edges: tuple[tuple[str, str], ...] = EDGES) -> bytes:
-    """A network in the local frame, as topological_navigation keeps it."""
+    """Write a network in the local frame, in the format of topological_navigation."""
     positions = nodes or NODES
     lines = [
         "meta:",
@@ -72,7 +72,7 @@ def tmap2(nodes: dict[str, tuple[float, float]] | None = None, edges: tuple[tupl
 
 
 def grid(name: str = "map", *, width: int = 8, height: int = 6, resolution: float = 0.5) -> dict[str, bytes]:
-    """An occupancy grid: a wall of occupied cells at the left, one unknown cell at the lower right, else free."""
+    """Write an occupancy grid: a wall of occupied cells at the left, one unknown cell at the lower right, else free."""
     rows = [[0 if c == 0 else 254 for c in range(width)] for _ in range(height)]
     rows[height - 1][width - 1] = 205
     pixels = bytes(v for row in rows for v in row)

@@ -1,4 +1,4 @@
-"""Tokens, roles and the brake on guessing, without a server."""
+"""Tokens, roles and throttling of failures, without a server."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Clock:
 
 
 class Book:
-    """A store's tokens, counting how often it is asked."""
+    """Tokens of a store, with a count of the lookups."""
 
     def __init__(self, **tokens: Token) -> None:
-        self.tokens, self.asked = tokens, 0
+        self.tokens, self.lookups = tokens, 0
 
     def __call__(self, text: str) -> Token | None:
-        self.asked += 1
+        self.lookups += 1
         return self.tokens.get(text)
 
 
@@ -46,7 +46,7 @@ def token(role: Role = "viewer", environments: str | None = None, expires: datet
     return Token("t1", "somebody", role, environments, None, expires, NOW)
 
 
-def test_a_token_is_asked_for_once_a_second() -> None:
+def test_token_is_looked_up_once_per_second() -> None:
     clock, book = Clock(), Book(good=token())
     access = Authenticator(book, failures=3, clock=clock)
     header = b"Bearer good"
@@ -54,7 +54,7 @@ def test_a_token_is_asked_for_once_a_second() -> None:
     assert access.authenticate(header, "10.0.0.1").name == "somebody"
     assert access.cached_principal(header) is not None
     access.authenticate(header, "10.0.0.1")
-    assert book.asked == 1
+    assert book.lookups == 1
     clock.time += FRESH_SECONDS + 0.01
     assert access.cached_principal(header) is None
     book.tokens.clear()
@@ -62,7 +62,7 @@ def test_a_token_is_asked_for_once_a_second() -> None:
         access.authenticate(header, "10.0.0.1")
 
 
-def test_a_revoked_token_is_forgotten_at_once() -> None:
+def test_revoked_token_is_refused_at_once() -> None:
     book = Book(good=token())
     access = Authenticator(book, failures=3, clock=Clock())
     access.authenticate(b"Bearer good", None)
@@ -73,31 +73,31 @@ def test_a_revoked_token_is_forgotten_at_once() -> None:
 @pytest.mark.parametrize(
     "header", [None, b"", b"Bearer", b"Bearer ", b"Basic good", b"good", b"Bearer \xff", b"Bearer " + b"x" * 999]
 )
-def test_without_a_usable_token(header: bytes | None) -> None:
+def test_unusable_token_raises_unauthenticated_without_lookup(header: bytes | None) -> None:
     book = Book(good=token())
     with pytest.raises(Unauthenticated):
         Authenticator(book, failures=3, clock=Clock()).authenticate(header, None)
-    assert book.asked == 0
+    assert book.lookups == 0
 
 
-def test_the_scheme_is_not_case_sensitive() -> None:
+def test_scheme_is_case_insensitive() -> None:
     assert Authenticator(Book(good=token()), failures=3).authenticate(b"bearer good", None).id == "t1"
 
 
-def test_expired() -> None:
+def test_expired_token_raises_unauthenticated() -> None:
     access = Authenticator(Book(old=token(expires=NOW - timedelta(seconds=1))), failures=3)
     with pytest.raises(Unauthenticated):
         access.authenticate(b"Bearer old", None)
 
 
-def test_guessing_is_slowed_for_its_source_alone() -> None:
+def test_wrong_tokens_throttle_only_their_source() -> None:
     clock, book = Clock(), Book(good=token())
     access = Authenticator(book, failures=3, clock=clock)
     access.authenticate(b"Bearer good", "10.0.0.1")
     for _ in range(3):
         with pytest.raises(Unauthenticated):
             access.authenticate(b"Bearer wrong", "10.0.0.1")
-    with pytest.raises(Throttled, match="accepted at any time"):
+    with pytest.raises(Throttled, match="always accepted"):
         access.authenticate(b"Bearer wrong", "10.0.0.1")
     with pytest.raises(Throttled):
         access.note_failure("::ffff:10.0.0.1")  # a wrong signature of a link
@@ -105,7 +105,7 @@ def test_guessing_is_slowed_for_its_source_alone() -> None:
         access.authenticate(None, "10.0.0.1")
     book.tokens["other"] = token("robot")
     assert access.authenticate(b"Bearer other", "10.0.0.1").role == "robot", "robots behind one NAT share its address"
-    assert access.authenticate(b"Bearer good", "10.0.0.1"), "a token that was good a moment ago stays good"
+    assert access.authenticate(b"Bearer good", "10.0.0.1"), "a cached token stays valid"
     assert access.authenticate(b"Bearer good", "10.0.0.2")
     with pytest.raises(Unauthenticated):
         access.authenticate(b"Bearer wrong", "10.0.0.2")
@@ -114,7 +114,7 @@ def test_guessing_is_slowed_for_its_source_alone() -> None:
         access.authenticate(b"Bearer wrong", "10.0.0.1")
 
 
-def test_asking_without_a_token_is_no_failure() -> None:
+def test_missing_token_counts_as_no_failure() -> None:
     access = Authenticator(Book(good=token()), failures=1, clock=Clock())
     for _ in range(5):
         with pytest.raises(Unauthenticated):
@@ -122,7 +122,7 @@ def test_asking_without_a_token_is_no_failure() -> None:
     assert access.authenticate(b"Bearer good", "10.0.0.1")
 
 
-def test_sources() -> None:
+def test_client_source_groups_addresses() -> None:
     assert client_source("10.0.0.1") == "10.0.0.1"
     assert client_source("2001:db8::1") == client_source("2001:db8::2") != client_source("2001:db9::1")
     assert client_source("::ffff:10.0.0.1") == "10.0.0.1", "an IPv4 client of a server that listens on ::"
@@ -142,7 +142,7 @@ def test_sources() -> None:
         ("admin", {"viewer", "editor", "admin"}),
     ],
 )
-def test_roles(role: Role, may: set[str]) -> None:
+def test_require_role_follows_role_order(role: Role, may: set[str]) -> None:
     principal = Principal.from_token(token(role))
     for need in ("viewer", "editor", "admin"):
         if need in may:
@@ -152,7 +152,7 @@ def test_roles(role: Role, may: set[str]) -> None:
                 principal.require_role(need)  # type: ignore[arg-type]
 
 
-def test_environments_by_pattern() -> None:
+def test_environment_pattern_limits_access() -> None:
     principal = Principal.from_token(token(environments="farm-*"))
     principal.require_environment("farm-1")
     for other in ("farm", "xfarm-1", "street"):
@@ -175,10 +175,10 @@ def test_environments_by_pattern() -> None:
         ("/api/v1/formats", None),
     ],
 )
-def test_the_environment_of_an_address(path: str, environment: str | None) -> None:
+def test_environment_in_path_returns_the_name(path: str, environment: str | None) -> None:
     assert environment_in_path(path) == environment
 
 
-def test_open_addresses() -> None:
+def test_open_paths_need_no_token() -> None:
     assert all(map(is_open, ("/healthz", "/readyz", "/docs", "/docs/swagger-ui.css", "/openapi.json")))
     assert not any(map(is_open, ("//", "/metrics", "/docsx", "/healthz/", "/api/v1/formats", "/maps/a/b")))

@@ -1,4 +1,4 @@
-"""Every route with every kind of token. ``ROWS`` says what is expected; a route without a row fails."""
+"""Every route with every kind of token. ``ROWS`` has the expected results; a route without a row fails."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from app.store.values import Role
 from tests.api import samples
 from tests.api.conftest import API, Api, running, settings_for
 
-FARM, ABSENT, OTHERS = "farm", "farm-of-nobody", "street*"
-"""An environment, a name that none has, and the pattern of the limited tokens, which reach neither."""
+FARM, ABSENT, OTHERS = "farm", "farm-absent", "street*"
+"""Environment, an unused name, and the pattern of the limited tokens, which match neither."""
 
 INCLUDES: dict[str, set[str]] = {
     "viewer": {"viewer", "robot", "editor", "admin"},
@@ -27,17 +27,16 @@ INCLUDES: dict[str, set[str]] = {
     "admin": {"admin"},
 }
 Scope = Literal["environment", "server", "filtered", "job", "open"]
-"""Where a token that is limited to other environments has no access.
+"""Scope to which a token for other environments has no access.
 
 environment: one that the request names (403, whether or not it exists). server: all environments or the server itself
-(403). filtered: the answer leaves out what the token does not reach. job: only the token's own (404). open: no token is
-needed.
+(403). filtered: the response omits inaccessible items. job: only those of the token (404). open: no token is needed.
 """
 
 
 @dataclass(frozen=True)
 class Row:
-    """A request and who may send it. ``{env}`` and ``{job}`` are replaced. creates: sent with the existing name."""
+    """Request and its required role. ``{env}`` and ``{job}`` are replaced. creates: sent with the existing name."""
 
     request: str
     role: Role | None
@@ -49,7 +48,7 @@ class Row:
 
 
 def rows(scope: Scope, **roles: str) -> list[Row]:
-    """Rows without bodies: ``role="METHOD path, METHOD path"``."""
+    """Create rows without bodies: ``role="METHOD path, METHOD path"``."""
     role_names: dict[str, Role] = {role: role for role in get_args(Role)}
     return [Row(line.strip(), role_names.get(role), scope) for role, text in roles.items() for line in text.split(",")]
 
@@ -107,10 +106,10 @@ VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.
 
 @dataclass
 class Site:
-    """A server, a client without a token, and a token for every kind of caller."""
+    """Server, a client without a token, and a token for every kind of caller."""
 
     api: Api
-    nobody: httpx.Client
+    anonymous: httpx.Client
     bearer: dict[str, str]
 
     def send(self, row: Row, caller: str, env: str, method: str | None = None) -> httpx.Response:
@@ -125,7 +124,7 @@ class Site:
         headers = {"content-type": "application/json"} if content else {}
         if caller in self.bearer:
             headers["authorization"] = f"Bearer {self.bearer[caller]}"
-        answer = self.nobody.request(method or row_method, path + query, content=content, headers=headers)
+        answer = self.anonymous.request(method or row_method, path + query, content=content, headers=headers)
         self.text = answer.text.replace(env, "{env}")
         return answer
 
@@ -149,7 +148,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 
 def expected(row: Row, caller: str) -> int | None:
-    """The status for a caller; None for any but 401 and 403."""
+    """Return the expected status for a caller; None for any except 401 and 403."""
     if row.role is None:
         return None
     if caller in NO_TOKEN:
@@ -164,7 +163,7 @@ def expected(row: Row, caller: str) -> int | None:
 
 
 def hidden(routes: list[Any]) -> Iterator[str]:
-    """Paths of routes, also of included routers, that OpenAPI leaves out."""
+    """List the paths of routes, including included routers, that OpenAPI omits."""
     for route in routes:
         if hasattr(route, "original_router"):
             yield from hidden(route.original_router.routes)
@@ -178,7 +177,8 @@ def test_every_route_has_a_row(site: Site) -> None:
         f"{method.upper()} {path}"
         for path, operations in app.openapi()["paths"].items()
         for method in operations
-        if method != "parameters" and operations[method]["tags"] != ["maps by format"]  # they are the short address
+        if method != "parameters"
+        and operations[method]["tags"] != ["maps by format"]  # these are listed by the short URL
     }
     for route in app.routes:
         if isinstance(route, Route):
@@ -188,7 +188,7 @@ def test_every_route_has_a_row(site: Site) -> None:
     assert {row.request.replace("{job}", "{id}") for row in ROWS} == routes
 
 
-def test_each_route_answers_each_caller_as_the_table_says(site: Site) -> None:
+def test_route_returns_expected_status_to_each_caller(site: Site) -> None:
     wrong = []
     for row in ROWS:
         for caller in ("none", *site.bearer):
@@ -204,8 +204,8 @@ def test_each_route_answers_each_caller_as_the_table_says(site: Site) -> None:
     assert wrong == []
 
 
-def test_answers_do_not_tell_whether_a_foreign_environment_exists(site: Site) -> None:
-    """A limited token gets the same answer for one that exists and for one that does not."""
+def test_responses_do_not_reveal_inaccessible_environments(site: Site) -> None:
+    """A limited token gets the same response for an existing and a missing environment."""
     site.api("PUT", "robots/r1/status", 200, json={**STATUS, "environment": FARM})
     differ = []
     for row in ROWS:
@@ -218,11 +218,11 @@ def test_answers_do_not_tell_whether_a_foreign_environment_exists(site: Site) ->
                     differ.append(f"{row.request} {row.query}, {caller}: {answers}")
     assert differ == []
     header = {"Authorization": f"Bearer {site.bearer['viewer' + LIMITED]}"}
-    nobody = site.nobody
+    anonymous = site.anonymous
     for path in ("environments", "robots"):
-        assert nobody.get(f"{API}/{path}", headers=header).json() == []
-    assert "farm" not in nobody.get(f"{API}/events?since=0&follow=false", headers=header).text
-    seen, unseen = (nobody.get(f"{API}/robots/{robot}", headers=header) for robot in ("r1", "r9"))
+        assert anonymous.get(f"{API}/{path}", headers=header).json() == []
+    assert "farm" not in anonymous.get(f"{API}/events?since=0&follow=false", headers=header).text
+    seen, unseen = (anonymous.get(f"{API}/robots/{robot}", headers=header) for robot in ("r1", "r9"))
     assert (seen.status_code, seen.text.replace("r1", "r9")) == (unseen.status_code, unseen.text)
 
 
@@ -231,14 +231,14 @@ def test_foreign_jobs_are_not_found(site: Site) -> None:
     job = store.jobs.create("another token").id
     for caller in ("viewer", "editor", "admin" + LIMITED):
         header = {"Authorization": f"Bearer {site.bearer[caller]}"}
-        foreign, absent = (site.nobody.get(f"{API}/jobs/{number}", headers=header) for number in (job, "0" * 32))
+        foreign, absent = (site.anonymous.get(f"{API}/jobs/{number}", headers=header) for number in (job, "0" * 32))
         assert (
             (foreign.status_code, foreign.text.replace(job, "0" * 32)) == (absent.status_code, absent.text) != (200, "")
         )
     assert store.jobs.get(job)
 
 
-def test_unknown_addresses_need_a_token_as_well(site: Site) -> None:
+def test_unknown_addresses_need_a_token(site: Site) -> None:
     for path in ("/nothing", "/api/v1/nothing", "/docsx", "/healthz/", "/maps"):
         site.api.as_(None).problem("GET", path, 401)
         site.api.problem("GET", path, 404)

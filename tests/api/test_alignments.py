@@ -1,4 +1,4 @@
-"""Grids laid onto other maps, through HTTP."""
+"""Grid alignment over HTTP."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def align(api: Api, env: str, expect: int = 201, **body: Any) -> Any:
     return api.post(f"environments/{env}/alignments", {"grid": "other", **body}, expect=expect).json()
 
 
-def test_a_grid_is_laid_onto_another_and_keeps_its_cells(api: Api, env: str) -> None:
+def test_alignment_with_another_grid_keeps_cells(api: Api, env: str) -> None:
     preview = align(api, env, 200, onto={"name": "map"}, dry_run=True)
     assert preview["version"] is None
     assert origin(api, env, "other") == [4.0, -1.0, 0.3], "a dry run changes nothing"
@@ -64,7 +64,7 @@ def test_a_grid_is_laid_onto_another_and_keeps_its_cells(api: Api, env: str) -> 
     assert report["layers"][0]["steps"][-1]["step"] == "aligned"
 
 
-def test_by_points_and_sent_again(api: Api, env: str) -> None:
+def test_alignment_by_points_is_idempotent(api: Api, env: str) -> None:
     pairs = [[[4, -1], [0, 0]], [[5, -1], [1, 0]], [[4, 3], [0, 4]], [[0, 0], [9, 9]]]
     key = {"idempotency-key": "twice"}
     body = {"grid": "other", "pairs": pairs}
@@ -79,10 +79,10 @@ def test_by_points_and_sent_again(api: Api, env: str) -> None:
     assert same["version"]["version"] == first["version"]["version"], "nothing moved"
 
 
-def test_onto_a_slice_of_the_objects(api: Api, env: str) -> None:
+def test_alignment_with_a_slice_of_objects(api: Api, env: str) -> None:
     wall = '{"type":"Feature","properties":{"kind":"wall"},"geometry":null,"place":{"type":"LineString",'
     wall += '"coordinates":[%s]}}'
-    # The hall's walls by their middle lines, in local metres.
+    # Walls of the hall by their centre lines, in local metres.
     lines = ["[-3,2.05],[9,2.05]", "[-3,9.95],[9,9.95]", "[-2.95,2],[-2.95,10]", "[8.95,2],[8.95,10]",
              "[1.05,2],[1.05,7]", "[1,7.05],[4,7.05]"]  # fmt: skip
     crs = "http://www.opengis.net/def/crs/OGC/0/Engineering2D"
@@ -95,7 +95,7 @@ def test_onto_a_slice_of_the_objects(api: Api, env: str) -> None:
     assert refused["errors"][0]["where"] == "body.onto.parameters.colour"
 
 
-def test_what_cannot_be_aligned(api: Api, env: str) -> None:
+def test_impossible_alignments_are_refused(api: Api, env: str) -> None:
     align(api, env, 422)
     align(api, env, 422, onto={}, pairs=[[[0, 0], [0, 0]], [[1, 0], [1, 0]]])
     align(api, env, 422, onto={"name": "other"})

@@ -1,4 +1,4 @@
-"""Licences and credits of sources: kept with the parts, carried into formats with a place for them."""
+"""Licences and credits of sources: stored with the parts, and written into formats that can express them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MIT = "MIT License, Copyright (c) 2024 A Farm (LICENSE)"
 
 
 def attribution_of(name: str, files: dict[str, bytes]) -> str:
-    """What a map shows of its attribution, read by another parser than ours."""
+    """Read the attribution of a map with an independent parser."""
     data = next(iter(files.values()))
     if name == "kmz":
         with zipfile.ZipFile(BytesIO(data)) as z:
@@ -49,11 +49,11 @@ WITH_A_PLACE = ("osm", "kml", "kmz", "geojson", "tmap2", "nav2_route")
 
 
 @pytest.mark.parametrize("name", WITH_A_PLACE)
-def test_a_format_with_a_place_carries_the_credits_and_gives_them_back(name: str) -> None:
+def test_credits_survive_formats_that_can_express_them(name: str) -> None:
     converted = offline({"a.osm": OSM}, name, datum=HERE)
     assert sorted(converted.report.as_dict()["attribution"]) == sorted(CREDIT)
     assert all(text in attribution_of(name, converted.files) for text in CREDIT)
-    # Read back they are known again: to the report, and to the next format.
+    # Reading them back restores them, for the report and for the next format.
     again = offline(converted.files, name, hints=UploadHints(name), datum=HERE)
     assert again.files == converted.files
     assert all(text in "; ".join(again.report.as_dict()["attribution"]) for text in CREDIT)
@@ -64,7 +64,7 @@ def test_a_format_with_a_place_carries_the_credits_and_gives_them_back(name: str
 
 
 @pytest.mark.parametrize("name", WITH_A_PLACE)
-def test_nothing_is_made_up_where_nobody_claims_anything(name: str) -> None:
+def test_attribution_is_empty_without_credits(name: str) -> None:
     bare = OSM.replace(b'attribution="OpenStreetMap &amp; contributors"', b"").replace(
         f'license="{ODBL}"'.encode(), b""
     )
@@ -73,7 +73,7 @@ def test_nothing_is_made_up_where_nobody_claims_anything(name: str) -> None:
     assert attribution_of(name, converted.files).strip("; ") == ""
 
 
-def test_a_licence_file_is_named_with_what_lies_beside_and_below_it() -> None:
+def test_licence_file_applies_to_its_directory_and_below() -> None:
     files = {"a/LICENSE": LICENSE, "a/maps/gate.kml": KML, "b/field.osm": OSM}
     converted = offline(files, "geojson", datum=HERE)
     lines = {(line["layer"], line["name"]): line["attribution"] for line in converted.report.as_dict()["layers"]}
@@ -95,12 +95,12 @@ def test_a_licence_file_is_named_with_what_lies_beside_and_below_it() -> None:
         ("license_plates.csv", b"AB 123", None),
     ],
 )
-def test_what_a_licence_file_says_in_a_line(name: str, text: bytes, expected: str | None) -> None:
+def test_licence_file_is_summarised_in_one_line(name: str, text: bytes, expected: str | None) -> None:
     converted = offline({name: text, "gate.kml": KML}, "kml", datum=HERE)
     assert converted.report.as_dict()["attribution"] == ([expected] if expected else [])
 
 
-def test_a_drawing_with_a_licence_shows_it_and_comes_back_as_it_was() -> None:
+def test_drawing_with_a_licence_file_survives_a_round_trip() -> None:
     converted = offline({"LICENSE": LICENSE, "gate.kml": KML}, "kml", hints=UploadHints())
     assert attribution_of("kml", converted.files) == MIT
     assert offline(converted.files, "kml").files == converted.files, "read back and written, the same bytes"
@@ -108,20 +108,20 @@ def test_a_drawing_with_a_licence_shows_it_and_comes_back_as_it_was() -> None:
     assert attribution_of("kml", alone.files) == ""
 
 
-def test_a_drawing_that_says_its_credit_itself_is_left_as_it_is() -> None:
+def test_drawing_with_its_own_credit_is_unchanged() -> None:
     kml = KML.replace(b"<Document>", f"<Document><description>{MIT}</description>".encode())
     converted = offline({"LICENSE": LICENSE, "gate.kml": kml}, "kml")
     assert converted.files == offline({"gate.kml": kml}, "kml").files
 
 
-def test_credits_are_part_of_what_a_stored_map_is(api: Api) -> None:
-    """Equal layers under another licence are another map: another tag, and never the cached one."""
+def test_credits_change_the_etag_of_a_map(api: Api) -> None:
+    """Equal layers under another licence are another map: with another tag, and a cache entry of its own."""
     tags = []
     for env, files in (("bare", {"gate.kml": KML}), ("licensed", {"gate.kml": KML, "LICENSE": LICENSE})):
         api.post("environments", {"name": env})
         version = api.upload(env, files).json()
         sources = {s["name"] for s in api.get(f"environments/{env}/versions/1/sources").json()}
-        assert sources == set(files), "the licence file is kept as a source"
+        assert sources == set(files), "the licence file is stored as a source"
         assert version["version"] == 1
         answer = api.get(f"/maps/{env}/kml")
         tags.append(answer.headers["etag"])
@@ -130,10 +130,10 @@ def test_credits_are_part_of_what_a_stored_map_is(api: Api) -> None:
         assert report["attribution"] == ([MIT] if "LICENSE" in files else [])
     assert tags[0] != tags[1]
     roots = {api.get(f"environments/{env}/versions/1").json()["root"] for env in ("bare", "licensed")}
-    assert len(roots) == 1, "a licence is no layer"
+    assert len(roots) == 1, "a licence is not a layer"
 
 
-def test_every_format_that_is_told_a_credit_still_reads_back() -> None:
+def test_formats_with_credits_are_recognised_again() -> None:
     for name in WITH_A_PLACE:
         converted = offline({"LICENSE": LICENSE, "a.osm": OSM}, name, datum=HERE)
         groups, _ = formats.group(converted.files)

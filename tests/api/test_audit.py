@@ -1,4 +1,4 @@
-"""Who changed what, from where: the audit log, and the server's own log lines."""
+"""Audit log, and log lines of requests."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_each_change_has_one_entry(api: Api) -> None:
     assert newest(api, limit=1)[0]["path"] == "/api/v1/keys"
 
 
-def test_robots_reports_are_not_audited(api: Api) -> None:
+def test_robot_reports_are_not_audited(api: Api) -> None:
     api.post("environments", {"name": "reported"})
     count = len(newest(api, limit=1000))
     robot = api.token_for("robot", robot="r1")
@@ -68,7 +68,7 @@ def test_robots_reports_are_not_audited(api: Api) -> None:
     assert len(newest(api, limit=1000)) == count + 1  # the token
 
 
-def test_audit_is_for_unlimited_administrators_and_comes_in_pages(api: Api) -> None:
+def test_audit_is_paginated_and_needs_an_unlimited_administrator(api: Api) -> None:
     for role in ("viewer", "editor"):
         api.token_for(role).problem("GET", "audit", 403)
     api.token_for("admin", environments="farm-*").problem("GET", "audit", 403)
@@ -100,7 +100,9 @@ def test_entry_and_change_are_one_transaction(tmp_path: Path) -> None:
 def test_log_names_changes_and_refused_tokens_but_no_token(
     api: Api, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(middleware, "_rejections", middleware._Quota())  # other tests of this process were refused, too
+    monkeypatch.setattr(
+        middleware, "_rejections", middleware._Quota()
+    )  # other tests of this process caused refusals, too
     with caplog.at_level(logging.INFO, logger="app.requests"):
         api.post("environments", {"name": "logged"})
         api.as_("not-a-token-that-anybody-has").problem("GET", "environments/a%0Ab", 401)
@@ -109,7 +111,7 @@ def test_log_names_changes_and_refused_tokens_but_no_token(
     assert [r.levelname for r in records] == ["INFO", "WARNING"]
     assert "POST /api/v1/environments 201" in records[0].getMessage()
     assert "administrator (admin), 127.0.0.1" in records[0].getMessage()
-    assert "the token is unknown or has expired" in records[1].getMessage()
+    assert "unknown or expired token" in records[1].getMessage()
     assert ADMIN not in caplog.text
     assert "not-a-token" not in caplog.text
     line = TextFormatter().format(records[1])
@@ -117,11 +119,11 @@ def test_log_names_changes_and_refused_tokens_but_no_token(
     assert "a\\nb" in line
 
 
-def test_log_is_not_filled_by_strangers(api: Api, caplog: pytest.LogCaptureFixture) -> None:
-    nobody = api.as_(None)
+def test_log_limits_refusals_per_source(api: Api, caplog: pytest.LogCaptureFixture) -> None:
+    anonymous = api.as_(None)
     with caplog.at_level(logging.INFO, logger="app.requests"):
         for _ in range(MAX_LOGGED_REJECTIONS + 10):
-            nobody("GET", "environments/" + "x" * 3000)
+            anonymous("GET", "environments/" + "x" * 3000)
     lines = [r.getMessage() for r in caplog.records if r.name == "app.requests"]
     assert len(lines) <= MAX_LOGGED_REJECTIONS
     assert all(len(line) < 600 for line in lines)

@@ -59,22 +59,22 @@ def test_if_match_compares_strongly(header: str | None, matches: bool) -> None:
         ("bytes=0-" + "9" * 40, None),
     ],
 )
-def test_range(header: str | None, expected: tuple[int, int] | Unsatisfiable | None) -> None:
+def test_byte_range_parses_single_ranges(header: str | None, expected: tuple[int, int] | Unsatisfiable | None) -> None:
     assert byte_range(header, None, TAG, 100) == expected
 
 
-def test_a_range_holds_only_for_the_present_content() -> None:
+def test_if_range_requires_the_current_etag() -> None:
     assert byte_range("bytes=0-9", TAG, TAG, 100) == (0, 10)
     assert byte_range("bytes=0-9", '"old"', TAG, 100) is None
     assert byte_range("bytes=0-9", f"W/{TAG}", TAG, 100) is None
 
 
-def test_nothing_of_an_empty_file() -> None:
+def test_ranges_of_an_empty_file_are_unsatisfiable() -> None:
     assert byte_range("bytes=0-", None, TAG, 0) == Unsatisfiable()
     assert byte_range("bytes=-1", None, TAG, 0) == Unsatisfiable()
 
 
-def test_names_of_attachments() -> None:
+def test_content_disposition_quotes_file_names() -> None:
     assert content_disposition("a/b/map.yaml") == 'attachment; filename="map.yaml"'
     assert content_disposition('x"y.kml') == "attachment; filename=\"x_y.kml\"; filename*=UTF-8''x%22y.kml"
     assert content_disposition("Höhe.kml") == "attachment; filename=\"H_he.kml\"; filename*=UTF-8''H%C3%B6he.kml"

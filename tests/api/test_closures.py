@@ -1,4 +1,4 @@
-"""Closures on the way out: in force on every channel at once, gone at their end, never in a version."""
+"""Closures in maps: in force on every channel at once, removed at their end, never part of a version."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.api import samples
 from tests.api.conftest import Api
 
 SQUARE = {"type": "Polygon", "coordinates": [[[4, -1], [6, -1], [6, 1], [4, 1], [4, -1]]]}
-"""Across the lane between gate and barn, in metres."""
+"""Polygon across the lane between gate and barn, in metres."""
 
 NO_CLOSURES = closures_digest([])
 
@@ -74,7 +74,7 @@ def test_manifest_lists_closures_and_a_higher_sequence(api: Api, farm: str) -> N
     place = f"environments/{farm}/versions/production/manifest?formats=tmap2"
     before = api.get(place).json()
     assert before["overlays_digest"] == NO_CLOSURES
-    assert not {"overlays", "epoch", "missing"} & before.keys(), "what is empty is left out"
+    assert not {"overlays", "epoch", "missing"} & before.keys(), "empty members are omitted"
     one = close(api, farm, edge="gate_barn", detail="a tree")
     two = close(api, farm, edge="barn_field")
     now = api.get(place).json()
@@ -102,7 +102,7 @@ def test_manifest_lists_closures_and_a_higher_sequence(api: Api, farm: str) -> N
 
 
 def test_manifest_signs_what_was_requested(api: Api, farm: str) -> None:
-    """Else somebody between robot and server could ask for a map without closures in the robot's name."""
+    """Otherwise a proxy could request a map without closures in the robot's name."""
     close(api, farm, edge="gate_barn")
     place = f"environments/{farm}/versions/latest/manifest?formats="
     assert not {"closures", "parameters"} & api.get(f"{place}tmap2").json().keys()
@@ -147,7 +147,7 @@ def test_stored_mask_gets_closed_areas_and_grows_where_they_reach_beyond_it(api:
     close(api, farm, polygon=SQUARE, crs="local")
     after, grown = pgm(api.get(place).content), yaml.safe_load(api.get(place.replace("pgm", "yaml")).content)
     assert grown["origin"] == size["origin"]
-    assert after.shape == (6, 14), "from x = -1 to x = 6, half a metre a cell"
+    assert after.shape == (6, 14), "from x = -1 to x = 6, cells of half a metre"
     assert np.array_equal(after[:, :8], before)
     free = 254
     assert (after[:4, 10:] == 0).all(), "from y = -1 to y = 1, the upper edge of the grid"
@@ -161,7 +161,7 @@ def test_closed_areas_in_degrees_and_without_a_place(api: Api, farm: str, bare: 
     ring = [[lon - d, lat - d], [lon + d, lat - d], [lon + d, lat + d], [lon - d, lat + d], [lon - d, lat - d]]
     close(api, farm, polygon={"type": "Polygon", "coordinates": [ring]})
     assert edges(api.get(f"/maps/{farm}/tmap2").text) == {"barn_field"}
-    # An older version without a datum, on a channel: the area has no place there, and its maps are served all the same.
+    # An older version without a datum, on a channel: the area cannot be placed, but its maps are served.
     api.upload(bare, {"network.tmap2.yaml": samples.tmap2()})
     promote(api, bare, 1)
     api.upload(bare, {"datum.yaml": samples.DATUM})
@@ -208,7 +208,7 @@ def test_closing_an_edge_gives_the_map_that_deleting_it_gives(api: Api, farm: st
     assert ours.replace(farm.encode(), b"NAME") == theirs.replace(other.encode(), b"NAME")
 
 
-def test_folder_of_maps_applies_closures_inside(api: Api, farm: str) -> None:
+def test_environment_package_applies_closures_to_its_maps(api: Api, farm: str) -> None:
     close(api, farm, edge="gate_barn")
     archive = zipfile.ZipFile(BytesIO(api.get(f"/maps/{farm}/environment").content))
     (network,) = [n for n in archive.namelist() if n.endswith(".tmap2.yaml")]
@@ -231,7 +231,7 @@ def test_channels_count_root_and_closures(api: Api, farm: str) -> None:
         return channel
 
     report(None)
-    assert production()["robots"]["holding"] == 1, "a robot that knows of no closures holds the map without any"
+    assert production()["robots"]["holding"] == 1, "a robot that reports no closures runs the map without any"
     close(api, farm, edge="gate_barn")
     now = production()
     assert (now["robots"]["holding"], now["robots"]["lagging"], now["overlays"]["count"]) == (0, 1, 1)
@@ -242,7 +242,7 @@ def test_channels_count_root_and_closures(api: Api, farm: str) -> None:
     assert api.get(f"robots/mower-8?environment={farm}").json()["holds"]["overlays"] == now["overlays"]["digest"]
 
 
-def test_live_requests_for_planners(api: Api, farm: str) -> None:
+def test_planner_requests_contain_closed_edges(api: Api, farm: str) -> None:
     promote(api, farm, 3)
     url = f"environments/{farm}/overlays"
     closure = close(api, farm, edge="gate_barn")
@@ -280,7 +280,7 @@ def test_live_requests_for_planners(api: Api, farm: str) -> None:
 
 
 def pgm(data: bytes) -> np.ndarray[Any, Any]:
-    """The pixels of a binary PGM, row 0 on top."""
+    """Read the pixels of a binary PGM, row 0 at the top."""
     magic, width, height, maximum, rest = data.split(maxsplit=4)
     assert (magic, maximum) == (b"P5", b"255")
     count = int(width) * int(height)
@@ -298,7 +298,7 @@ def test_closures_are_listed_with_their_ends_as_signed(api: Api, farm: str) -> N
 
 
 def test_closing_the_last_edge_marks_it_where_a_graph_must_have_one(api: Api, fresh: Any) -> None:
-    """A manifest that cannot be made would leave robots on the open network."""
+    """A manifest that cannot be converted would leave robots on the open network."""
     env = fresh()
     api.post("environments", {"name": env})
     api.upload(env, {"n.tmap2.yaml": samples.tmap2(edges=(("gate", "barn"),))})
@@ -313,7 +313,7 @@ def test_closing_the_last_edge_marks_it_where_a_graph_must_have_one(api: Api, fr
 
 
 def test_reports_name_the_closures_of_their_own_environment(api: Api, farm: str, fresh: Any) -> None:
-    """Maps are cached by content, and closures often change no bytes of them."""
+    """Maps are cached by content, and closures often change none of their bytes."""
     other = fresh()
     api.post("environments", {"name": other, "clone": {"environment": farm, "version": 3}})
     closure = close(api, farm, edge="gate_barn")
@@ -325,7 +325,7 @@ def test_reports_name_the_closures_of_their_own_environment(api: Api, farm: str,
     assert api.get(place.format(farm)).json()["closures"] == []
 
 
-def test_map_with_closures_that_is_uploaded_again_makes_nothing_permanent(api: Api, farm: str) -> None:
+def test_reupload_of_a_map_with_closures_makes_none_permanent(api: Api, farm: str) -> None:
     promote(api, farm, 3)
     closures = [close(api, farm, edge="barn_field"), close(api, farm, polygon=SQUARE, crs="local")]
     exported = api.get(f"/maps/{farm}/geojson").content
@@ -352,7 +352,7 @@ def test_zones_may_be_called_like_the_closed_areas(api: Api, farm: str) -> None:
 
 
 def test_robots_get_the_mask_of_a_closed_area_with_the_whole_site(api: Api, fresh: Any) -> None:
-    """Also on a level without a mask of its own, beside a stored mask on another level."""
+    """This includes a level without a mask of its own, beside a stored mask on another level."""
     env = fresh()
     api.post("environments", {"name": env})
     for level in ("ground", "L2"):
@@ -373,7 +373,7 @@ def test_robots_get_the_mask_of_a_closed_area_with_the_whole_site(api: Api, fres
     assert {name for name in last if last[name] != after[name]} == {"keepout.pgm"}
 
 
-def test_folder_report_lists_what_closures_did_inside(api: Api, farm: str) -> None:
+def test_environment_package_report_lists_effects_of_closures(api: Api, farm: str) -> None:
     closure = close(api, farm, edge="gate_barn")
     (line,) = api.get(f"environments/{farm}/versions/latest/reports/environment").json()["closures"]
     assert (line["id"], line["edges"]) == (closure["id"], ["gate_barn"])

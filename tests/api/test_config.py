@@ -1,4 +1,4 @@
-"""Settings: from the environment, checked, documented, handed to workers."""
+"""Settings: read from the environment, checked, documented, passed to workers."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def test_every_limit_is_a_setting_with_the_same_default() -> None:
         assert f"max_{field.name}" in Settings.model_fields
 
 
-def test_every_setting_says_what_it_is() -> None:
+def test_settings_have_descriptions() -> None:
     for name, field in Settings.model_fields.items():
         assert field.description, name
         assert field.description.endswith("."), name
 
 
-def test_from_the_environment_and_a_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_environment_variables_override_the_env_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / ".env").write_text("FLEETMAP_PORT=9000\nFLEETMAP_MAX_PIXELS=1000\nOTHER=1\n")
     monkeypatch.setenv("FLEETMAP_MAX_PIXELS", "2000")
     settings = Settings()
@@ -40,7 +40,7 @@ def test_from_the_environment_and_a_file(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert settings.limits.pixels == 2000
 
 
-def test_defaults_lie_in_the_data_folder(tmp_path: Path) -> None:
+def test_default_paths_are_in_the_data_directory(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "x")
     assert settings.database == f"sqlite:///{tmp_path}/x/fleetmap.sqlite3"
     assert settings.blob_dir == tmp_path / "x" / "blobs"
@@ -49,7 +49,7 @@ def test_defaults_lie_in_the_data_folder(tmp_path: Path) -> None:
     assert Settings(blob_url="elsewhere").blob_dir == Path("elsewhere")
 
 
-def test_an_empty_variable_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_variable_means_none(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("ADMIN_TOKEN", "DATABASE_URL", "BLOB_URL"):
         monkeypatch.setenv(f"FLEETMAP_{name}", "")
     settings = Settings()
@@ -62,12 +62,12 @@ def test_an_empty_variable_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     ("name", "value"),
     [("blob_url", "s3://bucket"), ("port", 70000), ("workers", 0), ("max_pixels", 0)],
 )
-def test_refused(name: str, value: object) -> None:
+def test_invalid_settings_are_refused(name: str, value: object) -> None:
     with pytest.raises(ValidationError):
         Settings(**{name: value})  # type: ignore[arg-type]
 
 
-def test_no_access_control_only_on_loopback() -> None:
+def test_insecure_mode_requires_loopback() -> None:
     for host in ("127.0.0.1", "::1", "localhost", "127.9.9.9"):
         assert is_loopback(host)
         assert Settings(insecure_no_auth=True, host=host).insecure_no_auth

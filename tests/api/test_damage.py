@@ -1,4 +1,4 @@
-"""Damaged storage and full disks, as clients meet them: no wrong byte is served, and what can go on goes on."""
+"""Damaged storage and full disks, as seen by clients: no wrong byte is served, and everything else keeps working."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NETWORK = "n.tmap2.yaml"
 
 
 def flip(path: Path, at: int | None = None, count: int = 1) -> None:
-    """Change bytes of a file, and leave its times as they were: what bit rot does."""
+    """Change bytes of a file but keep its timestamps, like bit rot."""
     before = path.stat()
     with path.open("r+b") as file:
         file.seek(before.st_size // 2 if at is None else at)
@@ -44,20 +44,20 @@ def cached(folder: Path) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Api, Path]]:
-    """A server whose files these tests damage."""
+    """Start a server whose files these tests damage."""
     folder = tmp_path_factory.mktemp("damage")
     with running(settings_for(folder, memory_cache_bytes=0)) as api:
         yield api, folder
 
 
 def forget(api: Api) -> None:
-    """What is in the server's memory, as after a start."""
+    """Clear the server's memory, like a restart."""
     services = api.app.state.services
     services.response_cache._entries.clear()
     services.store.chunks.forget()
 
 
-def test_damaged_cached_maps_are_made_again(own: tuple[Api, Path]) -> None:
+def test_damaged_cached_maps_are_converted_again(own: tuple[Api, Path]) -> None:
     api, folder = own
     farm = environment(api, "cached")
     api.upload(farm, {NETWORK: samples.tmap2()})
@@ -76,9 +76,7 @@ def test_damaged_cached_maps_are_made_again(own: tuple[Api, Path]) -> None:
     assert "fleetmap_cache_damaged_total" in api.get("/metrics").text
 
 
-def test_a_large_cached_map_that_is_damaged_is_never_received_whole(
-    own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damaged_large_map_breaks_the_download(own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.api.maps.IN_MEMORY", 100)
     monkeypatch.setattr("app.api.http.streams.CHUNK", 64)
     api, folder = own
@@ -94,12 +92,12 @@ def test_a_large_cached_map_that_is_damaged_is_never_received_whole(
     assert api.get(f"/maps/{farm}/tmap2").content == good
     (file,) = set(cached(folder)) - before
     flip(file)
-    os.utime(file)  # somebody wrote to it
+    os.utime(file)  # something wrote to it
     forget(api)
     assert api.get(f"/maps/{farm}/tmap2", 206, headers={"Range": "bytes=10-2000"}).content == good[10:2001]
 
 
-def test_an_upload_heals_damaged_files_and_chunks_of_all_versions(own: tuple[Api, Path]) -> None:
+def test_upload_repairs_damaged_files_and_chunks(own: tuple[Api, Path]) -> None:
     api, folder = own
     farm = environment(api, "healed")
     other = samples.tmap2().replace(b"0.1", b"0.2")
@@ -128,14 +126,14 @@ def test_an_upload_heals_damaged_files_and_chunks_of_all_versions(own: tuple[Api
         database.execute("UPDATE chunk SET data = zeroblob(length(data))")
     forget(api)
     version = api.upload(farm, {NETWORK: other}).json()["version"]
-    api.get(f"environments/{farm}/versions/{version}/maps/tmap2")  # another upload goes on over the damage
+    api.get(f"environments/{farm}/versions/{version}/maps/tmap2")  # another upload is stored despite the damage
 
 
 # --- the database's own file ---
 
 
 def damage_pages(path: Path) -> None:
-    """Overwrite every page but the first, which says how large the pages are and where tables begin."""
+    """Overwrite every page except the first, which has the page size and the roots of the tables."""
     with contextlib.closing(sqlite3.connect(path)) as database:
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     with path.open("r+b") as file:
@@ -144,11 +142,11 @@ def damage_pages(path: Path) -> None:
 
 
 def reopen(api: Api) -> None:
-    """New connections, whose page caches are empty."""
+    """Open new connections, with empty page caches."""
     api.app.state.services.store._database.engine.dispose()
 
 
-def test_a_malformed_database_is_named_and_not_ready(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_malformed_database_is_reported_as_not_ready(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / "fleetmap.sqlite3"
     with running(settings_for(tmp_path)) as api:
         farm = environment(api, "farm")
@@ -165,11 +163,11 @@ def test_a_malformed_database_is_named_and_not_ready(tmp_path: Path, caplog: pyt
         assert "fleetmap.sqlite3" in body["detail"]
         api.get("/healthz")
         alarms = [r for r in caplog.records if r.levelno >= logging.CRITICAL]
-        assert len(alarms) == 1, "it is logged once"
+        assert len(alarms) == 1, "logged once"
         assert str(file) in alarms[0].getMessage()
 
 
-def test_a_missing_or_replaced_database_file_takes_no_writes(tmp_path: Path) -> None:
+def test_missing_or_replaced_database_file_refuses_writes(tmp_path: Path) -> None:
     file = tmp_path / "fleetmap.sqlite3"
     with running(settings_for(tmp_path)) as api:
         environment(api, "farm")
@@ -178,7 +176,7 @@ def test_a_missing_or_replaced_database_file_takes_no_writes(tmp_path: Path) -> 
             body = api.problem(method, path, 503, **({"json": {"name": "lost"}} if method == "POST" else {}))
             assert "fleetmap.sqlite3 is missing" in body["detail"]
         problem(api("GET", "/readyz", 503))
-        assert not file.exists(), "no empty database takes its place"
+        assert not file.exists(), "no empty database replaces it"
         file.write_bytes((tmp_path / "away").read_bytes())
         assert "replaced" in api.problem("POST", "environments", 503, json={"name": "lost"})["detail"]
         file.unlink()
@@ -191,7 +189,7 @@ def test_a_missing_or_replaced_database_file_takes_no_writes(tmp_path: Path) -> 
 # --- full and read-only disks ---
 
 
-def test_the_disk_is_probed_once_for_many_requests() -> None:
+def test_write_check_runs_once_for_many_requests() -> None:
     probes: list[int] = []
     full = False
 
@@ -203,13 +201,13 @@ def test_the_disk_is_probed_once_for_many_requests() -> None:
     writability = Writability(probe)
     with ThreadPoolExecutor(8) as many:
         assert set(many.map(lambda _: writability.refusal(), range(50))) == {None}
-    assert len(probes) < 25, "few, however slowly they come"
+    assert len(probes) < 25, "few checks, even if requests are slow"
     full = True
     writability.forget()
     assert writability.refusal() == "the disk is full"
 
 
-def test_readiness_probes_the_disk_now_and_then(own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readiness_repeats_the_write_check(own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     api, probes = own[0], list[int]()
     monkeypatch.setattr("app.api.http.dependencies.WRITABLE_SECONDS", 3600.0)
     monkeypatch.setattr("app.api.http.uploads.check_room", lambda _: probes.append(1))
@@ -228,11 +226,11 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def mounted_disk(folder: Path) -> Iterator[Path]:
-    """A disk of 12 MB."""
+    """Mount a disk of 12 MB."""
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", "size=12m,mode=700", "tmpfs", str(folder)]
     if os.geteuid() != 0 or subprocess.run(command, check=False, capture_output=True).returncode != 0:
-        pytest.skip("needs root, who may mount a small disk")
+        pytest.skip("needs root to mount a small disk")
     try:
         yield folder
     finally:
@@ -240,7 +238,7 @@ def mounted_disk(folder: Path) -> Iterator[Path]:
 
 
 def fill(folder: Path) -> Path:
-    """Use up a disk to its last byte."""
+    """Fill a disk to its last byte."""
     ballast = folder / "ballast"
     for block in (bytes(4096), b"x"):
         with contextlib.suppress(OSError), ballast.open("ab", buffering=0) as file:
@@ -249,7 +247,7 @@ def fill(folder: Path) -> Path:
     return ballast
 
 
-def test_a_full_disk_stops_writes_alone(small_disk: Path) -> None:
+def test_full_disk_stops_only_writes(small_disk: Path) -> None:
     settings = settings_for(small_disk / "data")
     for started_full in (False, True):
         with running(settings) as api:
@@ -260,7 +258,7 @@ def test_a_full_disk_stops_writes_alone(small_disk: Path) -> None:
                 ballast = fill(small_disk)
             assert api.get(f"/maps/{farm}/tmap2").status_code == 200
             for name in ("kml", "geojson", "nav2_route", "environment"):
-                assert api.get(f"/maps/{farm}/{name}").content, "it is made without the cache"
+                assert api.get(f"/maps/{farm}/{name}").content, "converted without the cache"
             api.get(f"environments/{farm}/versions/latest/manifest", params={"formats": "tmap2,kml"})
             api.get("keys")
             api.get(f"environments/{farm}/versions/latest/sources/{NETWORK}")
@@ -268,7 +266,7 @@ def test_a_full_disk_stops_writes_alone(small_disk: Path) -> None:
             answer = api.upload(farm, {NETWORK: samples.tmap2().replace(b"0.1", b"0.3")}, 507)
             assert int(answer.headers["retry-after"]) > 0
             problem(answer)
-            for k in range(100):  # as long as the write-ahead log has room in its file
+            for k in range(100):  # as long as the write-ahead log has free space in its file
                 body = {"name": f"other-{started_full}-{k}".lower(), "description": "d" * 15_000}
                 answer = api("POST", "environments", None, json=body)
                 if answer.status_code != 201:

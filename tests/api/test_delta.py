@@ -1,4 +1,4 @@
-"""Deltas in meaning: applied to what a client has, they give the version."""
+"""Semantic deltas: applied to the old version, they give the new one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VECTORS = ("location", "objects", "topology", "zones")
 
 @pytest.fixture(scope="module", params=["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)])
 def api(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
-    """A server on each database."""
+    """Run a server on each database."""
     more: dict[str, Any] = {}
     folder = tmp_path_factory.mktemp("delta")
     if request.param == "postgres":
@@ -47,7 +47,7 @@ def features_of(api: Api, env: str, version: int, crs: str) -> dict[Any, Any]:
 
 
 def cells_of(api: Api, env: str, version: int, name: str) -> Any:
-    """Cells as Nav2 has them, row 0 at the bottom; None where there is no such grid."""
+    """Return cells as Nav2 has them, row 0 at the bottom; None if there is no such grid."""
     answer = api.get(f"environments/{env}/versions/{version}/layers/occupancy?name={name}", expect=None)
     if answer.status_code == 404:
         return None
@@ -57,7 +57,7 @@ def cells_of(api: Api, env: str, version: int, name: str) -> Any:
 
 
 def check(api: Api, env: str, since: int, to: int, crs: str, grids: tuple[str, ...] = ("map", "keepout")) -> Any:
-    """Apply the delta as a robot would."""
+    """Apply the delta like a robot."""
     delta = api.get(f"environments/{env}/versions/{to}/delta?since={since}&crs={crs}").json()
     have = features_of(api, env, since, crs) if not (crs == "wgs84" and since == 0) else {}
     for layer, change in delta["layers"].items():
@@ -94,7 +94,7 @@ def square(x: float, y: float, side: float) -> dict[str, Any]:
     return {"type": "Polygon", "coordinates": [ring]}
 
 
-def test_deltas_lead_from_any_version_to_any(api: Api) -> None:
+def test_delta_turns_any_version_into_any_other(api: Api) -> None:
     env = "field"
     api.post("environments", {"name": env})
     api.upload(env, {"datum.yaml": samples.DATUM, "network.tmap2.yaml": samples.tmap2(), **samples.grid()})
@@ -136,7 +136,7 @@ def test_deltas_lead_from_any_version_to_any(api: Api) -> None:
     assert same["since"]["root"] == same["root"]
 
 
-def test_a_new_frame_means_the_whole_grid(api: Api) -> None:
+def test_delta_with_new_grid_frame_is_whole(api: Api) -> None:
     api.post("environments", {"name": "yard"})
     api.upload("yard", samples.grid())
     grown = {k: v.replace(b"resolution: 0.", b"resolution: 1.") for k, v in samples.grid().items()}
@@ -150,7 +150,7 @@ def test_a_new_frame_means_the_whole_grid(api: Api) -> None:
     ]
 
 
-def test_a_moved_datum_puts_everything(api: Api) -> None:
+def test_delta_with_moved_datum_puts_all_features(api: Api) -> None:
     api.post("environments", {"name": "moved"})
     api.upload("moved", {"datum.yaml": samples.DATUM, "network.tmap2.yaml": samples.tmap2()})
     datum = api.get("environments/moved").json()["datum"]
@@ -163,7 +163,7 @@ def test_a_moved_datum_puts_everything(api: Api) -> None:
     check(api, "moved", 2, 1, "wgs84")
 
 
-def test_large_changes_and_refusals(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_delta_limits_size_and_refuses_bad_requests(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     api.post("environments", {"name": "lawn"})
     api.upload("lawn", samples.grid())
     frame = api.get("environments/lawn/versions/1/layers/occupancy", headers={"accept": "application/json"}).json()

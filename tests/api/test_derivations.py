@@ -1,4 +1,4 @@
-"""Committed derivations: what they say of themselves, when they are stale, and what becomes of them then."""
+"""Committed derivations: provenance, staleness, and derivation from changed inputs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def nodes(api: Api, env: str, version: str = "latest") -> int:
     return sum(f["properties"]["kind"] == "node" for f in features)
 
 
-def test_a_derived_layer_is_a_version_that_says_how_it_came(api: Api, env: str) -> None:
+def test_derivation_creates_a_version_with_provenance(api: Api, env: str) -> None:
     version = derive(api, env, parameters={"join": 0.5}, message="for the tractors")
     assert version["version"] == 3
     assert version["information"]["topology"] == "derived"
@@ -54,19 +54,19 @@ def test_a_derived_layer_is_a_version_that_says_how_it_came(api: Api, env: str) 
     table = {row["format"]: row for row in api.get(f"environments/{env}/versions/3/maps").json()}
     assert table["tmap2"]["state"] == "direct"
     again = derive(api, env, expect=200, parameters={"join": 0.5})
-    assert again["version"] == 3, "nothing new"
+    assert again["version"] == 3, "no new version"
 
 
-def test_what_it_was_made_from_changes_and_maps_follow(api: Api, env: str) -> None:
+def test_changed_inputs_make_derived_layers_stale(api: Api, env: str) -> None:
     derive(api, env, parameters={"join": 0.5})
     api.upload(env, lanes("0.002,0.002"))
     head = api.get(f"environments/{env}/versions/latest").json()
     assert [(s["layer"], s["changed"]) for s in head["stale"]] == [("topology", ["objects ground/kml"])]
-    assert nodes(api, env) == 2, "what is stored stays as it is"
-    assert api.get(f"/maps/{env}/tmap2").content.count(b"- meta:") == 3, "a map is made from what is there now"
+    assert nodes(api, env) == 2, "stored versions do not change"
+    assert api.get(f"/maps/{env}/tmap2").content.count(b"- meta:") == 3, "maps are derived from the current inputs"
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
     line = next(line for line in report["layers"] if line["layer"] == "topology")
-    assert line["steps"][0]["parameters"]["join"] == 0.5, "as it was made before"
+    assert line["steps"][0]["parameters"]["join"] == 0.5, "like before"
     old = api.get(f"environments/{env}/versions/3/maps/tmap2").content
     assert old.count(b"- meta:") == 2
     renewed = derive(api, env, parameters={"join": 0.5})
@@ -74,7 +74,7 @@ def test_what_it_was_made_from_changes_and_maps_follow(api: Api, env: str) -> No
     assert nodes(api, env) == 3
 
 
-def test_what_comes_out_the_same_is_no_longer_stale(api: Api, env: str) -> None:
+def test_derivation_with_equal_result_clears_stale(api: Api, env: str) -> None:
     derive(api, env, parameters={"join": 0.5})
     named = {"lanes.kml": lanes()["lanes.kml"].replace(b"<name>lanes", b"<name>ways")}
     api.upload(env, named)
@@ -86,11 +86,11 @@ def test_what_comes_out_the_same_is_no_longer_stale(api: Api, env: str) -> None:
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
     assert not any("derive it anew" in w["problem"] for w in report["warnings"])
     assert api.get(f"environments/{env}/diff?from=4&to=5").json()["layers"] == {}
-    assert derive(api, env, expect=200, parameters={"join": 0.5})["version"] == 5, "and now nothing is new"
-    assert api.get(f"environments/{env}/versions/4").json()["stale"] == stale["stale"], "history stays"
+    assert derive(api, env, expect=200, parameters={"join": 0.5})["version"] == 5, "now nothing changes"
+    assert api.get(f"environments/{env}/versions/4").json()["stale"] == stale["stale"], "old versions do not change"
 
 
-def test_what_people_have_edited_is_not_thrown_away(api: Api, env: str) -> None:
+def test_derivation_keeps_edited_layers(api: Api, env: str) -> None:
     derive(api, env)
     point = {"type": "Point", "coordinates": [0.003, 0.003]}
     dock = {"type": "Feature", "id": "dock", "geometry": point, "properties": {"kind": "node", "name": "dock"}}
@@ -106,11 +106,11 @@ def test_what_people_have_edited_is_not_thrown_away(api: Api, env: str) -> None:
     assert nodes(api, env) == 3
 
 
-def test_a_sources_word_is_not_overwritten(api: Api, env: str) -> None:
+def test_derivation_keeps_uploaded_layers(api: Api, env: str) -> None:
     api.upload(env, lanes("0.002,0.002"), layer="topology")
     refused = derive(api, env, expect=409)
     assert "is raw" in refused["detail"]
-    assert derive(api, env, expect=200, replace=True)["version"] == 3, "the same network again is nothing new"
+    assert derive(api, env, expect=200, replace=True)["version"] == 3, "the same network creates no version"
     api.upload(env, {"b.kml": lanes("0.003,0.002")["lanes.kml"]}, layer="objects")
     assert derive(api, env, replace=True)["information"]["topology"] == "derived"
 
@@ -124,19 +124,19 @@ def test_a_sources_word_is_not_overwritten(api: Api, env: str) -> None:
         ({"sideways": True}, "sideways"),
     ],
 )
-def test_wrong_requests_are_refused_with_what_is_accepted(api: Api, env: str, body: dict[str, Any], word: str) -> None:
+def test_bad_derivation_requests_list_accepted_values(api: Api, env: str, body: dict[str, Any], word: str) -> None:
     assert word in str(derive(api, env, expect=422, **body))
     assert api.get(f"environments/{env}").json()["version"] == 2
 
 
-def test_nothing_to_derive_from(api: Api) -> None:
+def test_derivation_without_inputs_returns_422(api: Api) -> None:
     api.post("environments", {"name": "nothing-there"})
     refused = api.post("environments/nothing-there/derivations", {"method": "objects_to_topology"}, expect=None)
     assert refused.status_code == 422
     assert "needs objects" in refused.json()["detail"]
 
 
-def test_conditions_and_keys(api: Api, env: str) -> None:
+def test_derivation_honours_if_match_and_idempotency_key(api: Api, env: str) -> None:
     body = {"method": "objects_to_topology"}
     address = f"environments/{env}/derivations"
     assert api.post(address, body, expect=None, headers={"if-match": '"1"'}).status_code == 412
@@ -146,7 +146,7 @@ def test_conditions_and_keys(api: Api, env: str) -> None:
     assert api.post(address, other, expect=None, headers={"idempotency-key": "k"}).status_code == 409
 
 
-def test_the_list(api: Api) -> None:
+def test_list_of_derivations_has_parameters(api: Api) -> None:
     derivations = {d["id"]: d for d in api.get("derivations").json()}
     assert derivations["objects_to_topology"]["gives"] == "topology"
     assert [p["name"] for p in derivations["objects_to_topology"]["parameters"]] == ["join", "outlines"]

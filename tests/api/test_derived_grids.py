@@ -1,4 +1,4 @@
-"""A town, a building or a fence alone gives a grid and an octree, over HTTP, with a true report."""
+"""A town, a building or a fence alone gives a grid and an octree, over HTTP, with a correct report."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ gnss_fence:
 
 
 def fetch_grid(api: Api, env: str, query: str = "") -> tuple[Any, dict[str, Any]]:
-    """(cells as grey values, top row first; what the YAML says)"""
+    """Return (cells as grey values, top row first; content of the YAML)."""
     answer = api.get(f"environments/{env}/versions/latest/maps/occupancy_grid{query}")
     with zipfile.ZipFile(io.BytesIO(answer.content)) as z:
         map_yaml = yaml.safe_load(z.read("map.yaml"))
@@ -45,7 +45,7 @@ def fetch_report(api: Api, env: str, query: str = "") -> dict[str, Any]:
     return report
 
 
-def test_a_town_alone_gives_a_grid(api: Api) -> None:
+def test_town_alone_gives_a_grid(api: Api) -> None:
     api.post("environments", {"name": "hamlet"})
     api.upload("hamlet", {"map.osm": TOWN})
     rows = {row["format"]: row for row in api.get("environments/hamlet/versions/latest/maps").json()}
@@ -69,7 +69,7 @@ def test_a_town_alone_gives_a_grid(api: Api) -> None:
         assert problem.json()["detail"]
 
 
-def test_a_fence_alone_gives_a_blank_grid_and_bounds_a_derived_one(api: Api) -> None:
+def test_fence_gives_a_blank_grid_and_bounds_derived_grids(api: Api) -> None:
     api.post("environments", {"name": "paddock"})
     api.upload("paddock", {"datum.yaml": FENCE})
     grey, _ = fetch_grid(api, "paddock")
@@ -87,7 +87,7 @@ def test_a_fence_alone_gives_a_blank_grid_and_bounds_a_derived_one(api: Api) -> 
     assert sorted(line["sources"]) == ["datum.yaml", "map.osm"]
 
 
-def test_a_committed_grid_goes_stale_with_a_fence_that_comes_later(api: Api) -> None:
+def test_derived_grid_is_stale_after_upload_of_a_fence(api: Api) -> None:
     api.post("environments", {"name": "yard"})
     api.upload("yard", {"map.osm": TOWN})
     body = {"method": "objects_to_occupancy", "parameters": {"resolution": 0.1}}
@@ -100,25 +100,27 @@ def test_a_committed_grid_goes_stale_with_a_fence_that_comes_later(api: Api) -> 
     head = api.upload("yard", {"fence.kml": fence}, layer="location").json()
     assert [(s["layer"], s["changed"]) for s in head["stale"]] == [("occupancy", ["location ground/site"])]
     _, map_yaml = fetch_grid(api, "yard")
-    assert map_yaml["resolution"] == 0.1, "a map is made from what is there now, with the parameters of the stored one"
+    assert map_yaml["resolution"] == 0.1, (
+        "maps are derived from the current inputs, with the parameters of the stored grid"
+    )
     report = next(line for line in fetch_report(api, "yard")["layers"] if line["layer"] == "occupancy")
     assert sorted(report["sources"]) == ["fence.kml", "map.osm"]
     assert report["steps"][0]["also"] == ["location", "resources"]
 
 
 def test_server_and_offline_conversion_give_equal_cells(api: Api) -> None:
-    """Of a world whose walls are a mesh, beside a box, with the mesh and without it."""
+    """This covers a world whose walls are a mesh, beside a box, with the mesh and without it."""
     api.post("environments", {"name": "house"})
     files = {**house(WALLS, CRATE), "datum.yaml": FENCE}
     api.upload("house", files)
     grey, _ = fetch_grid(api, "house")
-    assert (grey == 0).sum() > 400, "a quarter of the house lies in the fence"
+    assert (grey == 0).sum() > 400, "a quarter of the house is in the fence"
     alone = direct.offline(files, "occupancy_grid")
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(alone.files["map.pgm"]))), grey)
     posted = api("POST", "convert", 200, files=parts(files), data={"to": "occupancy_grid"})
     with zipfile.ZipFile(io.BytesIO(posted.content)) as z:
         assert z.read("map.pgm") == alone.files["map.pgm"]
-    # Without the mesh there is one crate, and what stands around it is not known: no blank grid of the fence either.
+    # Without the mesh only the crate is known, and its surroundings are unknown: the fence gives no blank grid either.
     api.post("environments", {"name": "ruin"})
     for extra in ((), (CRATE,)):
         lost = {**house(None, *extra), "datum.yaml": FENCE}
@@ -136,13 +138,13 @@ def test_server_and_offline_conversion_give_equal_cells(api: Api) -> None:
         grey, np.asarray(Image.open(io.BytesIO(direct.offline(lost, "occupancy_grid").files["map.pgm"])))
     )
     assert (grey == 205).sum() * 0.05**2 > 0.2 * math.pi * 5.0**2, (
-        "a quarter of the disc around the house lies in the fence"
+        "a quarter of the disc around the house is in the fence"
     )
     assert any("house" in w["problem"] and "walls.stl" in w["problem"] for w in fetch_report(api, "ruin")["warnings"])
 
 
-def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
-    """Where the objects' solids cannot be read and a network is stored, on the server and offline."""
+def test_fallback_derivation_adds_a_warning(api: Api) -> None:
+    """Applies if the objects' solids are unreadable and a network is stored, on the server and offline."""
     path = TOWN[: TOWN.index(b'<way id="9"')] + TOWN[TOWN.index(b'<way id="8"') :]
     files = {**house(None), "map.osm": path.replace(b"natural", b"note"), "datum.yaml": FENCE}
     api.post("environments", {"name": "lane"})
@@ -156,7 +158,7 @@ def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
         assert "walls.stl is missing" in warning
 
 
-def test_a_drawing_of_regions_is_no_obstacle_and_says_so(api: Api) -> None:
+def test_regions_without_obstacles_give_no_grid(api: Api) -> None:
     api.post("environments", {"name": "sketch"})
     square = [[0.001, 0], [0.002, 0], [0.002, 0.001], [0.001, 0]]
     drawing = {
@@ -171,7 +173,7 @@ def test_a_drawing_of_regions_is_no_obstacle_and_says_so(api: Api) -> None:
     assert "stands in a robot's way" in refused.json()["detail"]
 
 
-def test_real_buildings_and_towns(api: Api, shared: Path) -> None:
+def test_real_buildings_and_towns_give_grids(api: Api, shared: Path) -> None:
     data = shared / "data"
     buildings = ("hotel/hotel.building.yaml", "office/office.building.yaml", "robast_sim/tiplu.building.yaml")
     for name, path in {
@@ -190,7 +192,7 @@ def test_real_buildings_and_towns(api: Api, shared: Path) -> None:
         assert (grey == 254).sum() > 10_000
 
 
-def test_a_world_alone_gives_a_slice(api: Api, shared: Path) -> None:
+def test_world_alone_gives_a_slice(api: Api, shared: Path) -> None:
     root = shared / "data/gazebo_sdf/turtlebot3_world"
     files = [p for p in root.rglob("*") if p.is_file() and "maps" not in p.parts]
     api.post("environments", {"name": "arena"})

@@ -1,4 +1,4 @@
-"""Edits of what the server itself has shown: nothing that was not edited changes, and nothing false is stored."""
+"""Edits of content that the server returned: unedited content does not change, and no wrong content is stored."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def put(layer: str, feature: Json, **more: object) -> Json:
 
 @pytest.mark.parametrize("layer", ["topology", "location"])
 @pytest.mark.parametrize("crs", ["local", "wgs84"])
-def test_what_is_put_back_as_it_was_shown_changes_nothing(api: Api, bare: str, layer: str, crs: str) -> None:
+def test_put_of_an_unedited_feature_creates_no_version(api: Api, bare: str, layer: str, crs: str) -> None:
     odd = {"a": (1 / 3, 2 / 3), "b": (10 / 7, -5 / 9)}
     files = {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2(odd, (("a", "b"), ("b", "a")))}
     before = api.upload(bare, files).json()
@@ -47,7 +47,7 @@ def test_what_is_put_back_as_it_was_shown_changes_nothing(api: Api, bare: str, l
     assert (body["version"], body["root"]) == (1, before["root"])
 
 
-def test_an_edited_item_keeps_its_anchor(api: Api, farm: str) -> None:
+def test_edited_feature_keeps_its_anchor(api: Api, farm: str) -> None:
     node = features(api, farm, "topology", crs="wgs84")["barn"]
     node["geometry"]["coordinates"][1] += 1e-5
     edit(api, farm, put("topology", node, crs="wgs84"))
@@ -58,7 +58,7 @@ def test_an_edited_item_keeps_its_anchor(api: Api, farm: str) -> None:
     assert items["gate_barn"]["place"]["coordinates"][-1] == items["barn"]["place"]["coordinates"]
 
 
-def test_the_datum_is_edited_with_the_fence(api: Api, farm: str) -> None:
+def test_edited_fence_sets_the_datum(api: Api, farm: str) -> None:
     (fence,) = features(api, farm, "location").values()
     fence["properties"]["datum"]["latitude"] += 0.001
     body = edit(api, farm, put("location", fence))
@@ -71,7 +71,7 @@ def test_the_datum_is_edited_with_the_fence(api: Api, farm: str) -> None:
     edit(api, farm, put("location", fence), expect=422)
 
 
-def test_a_datum_without_a_fence(api: Api, bare: str) -> None:
+def test_datum_without_a_fence_is_an_editable_point(api: Api, bare: str) -> None:
     api("PATCH", f"environments/{bare}", 200, json={"datum": {"latitude": 1.0, "longitude": 2.0}})
     (point,) = features(api, bare, "location").values()
     assert (point["id"], point["part"], point["geometry"]["coordinates"]) == ("datum", "site", [2.0, 1.0])
@@ -91,7 +91,7 @@ RING: Json = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]
 
 
 @pytest.mark.parametrize(
-    ("layer", "geometry", "properties", "said"),
+    ("layer", "geometry", "properties", "message"),
     [
         ("topology", None, {"kind": "node"}, "Point"),
         ("topology", RING, {"kind": "node"}, "Point"),
@@ -101,13 +101,13 @@ RING: Json = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]
         ("location", POINT, {"kind": "fence"}, "Polygon"),
     ],
 )
-def test_items_have_the_geometry_of_their_kind(
-    api: Api, farm: str, layer: str, geometry: Json | None, properties: Json, said: str
+def test_features_need_the_geometry_of_their_kind(
+    api: Api, farm: str, layer: str, geometry: Json | None, properties: Json, message: str
 ) -> None:
     feature = {"type": "Feature", "id": "new", "geometry": geometry, "properties": properties}
     change = put(layer, feature, crs="local")
     problem = api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": [change]})
-    assert said in problem["detail"]
+    assert message in problem["detail"]
     assert problem["errors"][0]["where"] == "changes[0]"
 
 
@@ -116,8 +116,8 @@ def placemarks(api: Api, env: str) -> list[str]:
     return re.findall(r"<Placemark[^>]*>\s*<name>([^<]*)</name>", text)
 
 
-def test_an_edited_network_is_not_hidden_behind_its_drawing(api: Api, bare: str) -> None:
-    """A drawing format leaves out what was made from a line it writes: only as long as that line still tells it."""
+def test_drawing_formats_show_edited_networks(api: Api, bare: str) -> None:
+    """A drawing format omits features made from a line that it writes, but only while the line still implies them."""
     api.upload(bare, {"lanes.kml": DRAWING}, layer="topology")
     assert set(placemarks(api, bare)) == {"lane", "other"}
     network = features(api, bare, "topology")
@@ -135,7 +135,7 @@ def test_an_edited_network_is_not_hidden_behind_its_drawing(api: Api, bare: str)
     assert {i for i, f in after.items() if "drawn_from" in f["properties"]} == set(of_other)
 
 
-def test_a_moved_line_does_not_move_the_network(api: Api, bare: str) -> None:
+def test_moved_line_does_not_move_the_network(api: Api, bare: str) -> None:
     api.upload(bare, {"lanes.kml": DRAWING}, layer="topology")
     before = features(api, bare, "topology")
     line = features(api, bare, "objects")["other"]
@@ -146,8 +146,8 @@ def test_a_moved_line_does_not_move_the_network(api: Api, bare: str) -> None:
     assert {"other/0", "other/1"} <= set(before) & set(placemarks(api, bare))
 
 
-def test_a_level_of_its_own(api: Api, farm: str) -> None:
-    """The same names on two levels: a feature goes back to the level that it was shown on."""
+def test_edit_applies_to_the_level_of_the_feature(api: Api, farm: str) -> None:
+    """Same names on two levels: a feature is put back on the level that it was read from."""
     body = api.upload(farm, {"n.tmap2.yaml": samples.tmap2()}, level="upstairs").json()
     assert {"name": "upstairs", "elevation": 0.0} in body["changes"]["levels"]["to"]
     shown = api.get(f"environments/{farm}/versions/4/layers/topology?crs=local").json()["features"]
@@ -164,7 +164,7 @@ def test_a_level_of_its_own(api: Api, farm: str) -> None:
     edit(api, farm, put("topology", {**without, "id": "odd", "level": 5, "part": None}))
 
 
-def test_an_edge_follows_both_of_its_nodes_moved_in_one_edit(api: Api, farm: str) -> None:
+def test_edge_follows_both_nodes_moved_in_one_edit(api: Api, farm: str) -> None:
     shown = features(api, farm, "topology", crs="local")
     edge = next(f for f in shown.values() if f["properties"]["kind"] == "edge")
     ends = [shown[edge["properties"][end]] for end in ("source", "target")]

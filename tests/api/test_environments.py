@@ -1,4 +1,4 @@
-"""Environments over HTTP: made, found, renamed, deleted, restored, purged, cloned."""
+"""Environments over HTTP: create, find, rename, delete, restore, purge, clone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.api.conftest import Api
 Fresh = Callable[[], str]
 
 
-def test_made_empty_or_with_a_datum(api: Api, fresh: Fresh) -> None:
+def test_environment_is_created_empty_or_with_a_datum(api: Api, fresh: Fresh) -> None:
     name = fresh()
     answer = api.post("environments", {"name": name, "title": "T", "description": "D", "tags": ["a", "b"]})
     assert answer.headers["location"] == f"/api/v1/environments/{name}"
@@ -58,13 +58,13 @@ def test_made_empty_or_with_a_datum(api: Api, fresh: Fresh) -> None:
         "text",
     ],
 )
-def test_what_cannot_be_made(api: Api, body: object) -> None:
+def test_invalid_environments_are_refused(api: Api, body: object) -> None:
     problem = api.problem("POST", "environments", 422, json=body)
     if body:
         assert problem.get("errors") or "reserved" in problem["detail"]
 
 
-def test_a_taken_name(api: Api, bare: str) -> None:
+def test_used_name_returns_409(api: Api, bare: str) -> None:
     api.problem("POST", "environments", 409, json={"name": bare})
 
 
@@ -80,14 +80,14 @@ def test_etag_is_the_head(api: Api, farm: str) -> None:
     assert body["datum"]["latitude"] == samples.LATITUDE
 
 
-def test_there_is_no_such_environment(api: Api) -> None:
+def test_unknown_environment_returns_404(api: Api) -> None:
     for path in ("", "/versions", "/versions/latest", "/channels", "/versions/latest/maps/kml", "/versions/1/layers"):
         api.problem("GET", f"environments/nowhere{path}", 404)
     api.problem("DELETE", "environments/nowhere", 404)
     api.problem("GET", "environments/Bad*Name", 422)
 
 
-def test_described_and_renamed(api: Api, farm: str, fresh: Fresh) -> None:
+def test_environment_is_described_and_renamed(api: Api, farm: str, fresh: Fresh) -> None:
     patched = api("PATCH", f"environments/{farm}", 200, json={"title": "New", "tags": []}).json()
     assert (patched["title"], patched["tags"], patched["version"]) == ("New", [], 3)
     new = fresh()
@@ -100,7 +100,7 @@ def test_described_and_renamed(api: Api, farm: str, fresh: Fresh) -> None:
     api.post("environments", {"name": farm})
 
 
-def test_renaming_refused(api: Api, farm: str, bare: str) -> None:
+def test_invalid_new_names_are_refused(api: Api, farm: str, bare: str) -> None:
     api.problem("PATCH", f"environments/{farm}", 409, json={"name": bare})
     api.problem("PATCH", f"environments/{farm}", 422, json={"name": "robots"})
     api.problem("PATCH", f"environments/{farm}", 422, json={})
@@ -111,7 +111,7 @@ def test_renaming_refused(api: Api, farm: str, bare: str) -> None:
     assert api.get(f"environments/{farm}").json()["version"] == 3, "the datum was not set either"
 
 
-def test_a_new_datum_is_a_version_and_warns(api: Api, farm: str) -> None:
+def test_new_datum_creates_a_version_with_warnings(api: Api, farm: str) -> None:
     answer = api("PATCH", f"environments/{farm}", 200, json={"datum": {"latitude": 53.3, "longitude": -0.5}})
     body = answer.json()
     assert body["version"] == 4
@@ -131,7 +131,7 @@ def test_a_new_datum_is_a_version_and_warns(api: Api, farm: str) -> None:
     api("PATCH", f"environments/{farm}", 200, json={"title": "x"}, headers={"If-Match": '"4"'})
 
 
-def test_deleted_restored_purged(api: Api, farm: str) -> None:
+def test_environment_is_deleted_restored_and_purged(api: Api, farm: str) -> None:
     api("DELETE", f"environments/{farm}", 204)
     problem = api.problem("GET", f"environments/{farm}", 404)
     assert "deleted" in problem["detail"]
@@ -148,7 +148,7 @@ def test_deleted_restored_purged(api: Api, farm: str) -> None:
     assert api.post("environments", {"name": farm}).json()["version"] == 0
 
 
-def test_cloned(api: Api, farm: str, fresh: Fresh) -> None:
+def test_clone_has_the_content_of_its_source(api: Api, farm: str, fresh: Fresh) -> None:
     name = fresh()
     environment = api.post("environments", {"name": name, "clone": {"environment": farm, "version": 2}}).json()
     assert environment["version"] == 1
@@ -161,7 +161,7 @@ def test_cloned(api: Api, farm: str, fresh: Fresh) -> None:
     api.problem("POST", "environments", 422, json=both)
 
 
-def test_which_map_am_i_on(api: Api, farm: str) -> None:
+def test_contains_finds_environments_of_a_position(api: Api, farm: str) -> None:
     query = {"contains": "53.2687,-0.5246", "limit": "1000"}
     assert farm in [e["name"] for e in api.get("environments", params=query).json()]
     environment = next(e for e in api.get("environments", params=query).json() if e["name"] == farm)
@@ -189,10 +189,10 @@ FIELDS = {
     "riseholme_park_farm_strawberry_polytunnels": "53.26850,-0.52460",
     "riseholme_park_farm_vineyard": "53.26810,-0.52440",
 }
-"""Real fields of one farm, each with a position that lies within its fence alone."""
+"""Return real fields of one farm, each with a position inside only its own fence."""
 
 
-def test_fields_of_one_farm_answer_for_their_own(api: Api, fresh: Fresh, shared: Path) -> None:
+def test_contains_distinguishes_adjacent_fields(api: Api, fresh: Fresh, shared: Path) -> None:
     names: dict[str, str] = {}
     rings: dict[str, shapely.Polygon] = {}
     for field in FIELDS:
@@ -217,13 +217,15 @@ def test_fields_of_one_farm_answer_for_their_own(api: Api, fresh: Fresh, shared:
 
     for field, position in FIELDS.items():
         latitude, longitude = map(float, position.split(","))
-        assert sum(w <= longitude <= e and s <= latitude <= n for w, s, e, n in boxes) > 1, "boxes would not tell"
+        assert sum(w <= longitude <= e and s <= latitude <= n for w, s, e, n in boxes) > 1, (
+            "bounding boxes would not distinguish them"
+        )
         (hit,) = answers(latitude, longitude)
         assert hit["name"] == names[field]
         area, _ = Geod(ellps="WGS84").geometry_area_perimeter(rings[field])
         assert hit["match"]["by"] == "fence"
         assert hit["match"]["area_m2"] == pytest.approx(abs(area), rel=0.01)
-    # What a hundred positions in and around the farm say, by the fences of the files.
+    # Expected matches of a hundred positions in and around the farm, from the fences in the files.
     for longitude, latitude in np.random.default_rng(1).uniform((-0.5260, 53.2678), (-0.5230, 53.2692), (100, 2)):
         inside = {
             names[field]
@@ -233,7 +235,7 @@ def test_fields_of_one_farm_answer_for_their_own(api: Api, fresh: Fresh, shared:
         assert {e["name"] for e in answers(latitude, longitude)} == inside
 
 
-def test_pages_by_position(api: Api, fresh: Fresh) -> None:
+def test_contains_is_paginated(api: Api, fresh: Fresh) -> None:
     names = sorted(fresh() for _ in range(5))
     for k, name in enumerate(names):
         api.post("environments", {"name": name, "datum": {"latitude": 10.0 + k * 1e-4, "longitude": 20.0}})
@@ -248,7 +250,7 @@ def test_pages_by_position(api: Api, fresh: Fresh) -> None:
     assert [e["name"] for e in limited.get("environments", params={"contains": "10,20"}).json()] == [names[3]]
 
 
-def test_pages(api: Api, fresh: Fresh) -> None:
+def test_list_is_paginated(api: Api, fresh: Fresh) -> None:
     tag = f"paged-{fresh()}"
     names = sorted(fresh() for _ in range(5))
     for name in names:
@@ -268,6 +270,6 @@ def test_pages(api: Api, fresh: Fresh) -> None:
         api.problem("GET", "environments", 422, params=bad)
 
 
-def test_a_misspelt_parameter_is_told(api: Api) -> None:
+def test_misspelt_parameter_is_reported(api: Api) -> None:
     problem = api.problem("GET", "environments", 422, params={"lmit": "3"})
     assert problem["errors"][0]["where"] == "lmit"

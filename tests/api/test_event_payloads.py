@@ -1,4 +1,4 @@
-"""The payloads in the documentation are those that the server sends: the same members, of the same types."""
+"""Documented payloads have the same members, of the same types, as those that the server sends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OF_ALL = frozenset(
 
 
 def shape(value: Any) -> Any:
-    """The members of a JSON value and their types; of a list, the shape of its first item."""
+    """Return the members of a JSON value and their types; for a list, the shape of its first item."""
     if isinstance(value, dict):
         return {name: shape(member) for name, member in value.items()}
     if isinstance(value, list):
@@ -24,7 +24,7 @@ def shape(value: Any) -> Any:
 
 
 def happened(api: Api, env: str) -> dict[str, dict[str, Any]]:
-    """One event of each type, by what causes it."""
+    """Cause one event of each type, and return the events."""
     channel, overlays = f"environments/{env}/channels/production", f"environments/{env}/overlays"
     api("PUT", channel, 200, json={"version": 2})
     api("PUT", channel, 200, json={"version": 3, "rollout": {"ready": 0.9, "failed": 0.2}})

@@ -29,7 +29,7 @@ def stream(api: Api, **query: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
                 fields[name] = value
 
 
-def test_what_happened_and_what_happens(api: Api, bare: str) -> None:
+def test_stream_sends_stored_and_new_events(api: Api, bare: str) -> None:
     api.upload(bare, {"n.tmap2.yaml": samples.tmap2()})
     seen = list(stream(api, environment=bare, since=0, follow="false"))
     assert [(n, kind) for n, kind, _ in seen] == [(1, "environment.created"), (2, "version.created")]
@@ -41,7 +41,7 @@ def test_what_happened_and_what_happens(api: Api, bare: str) -> None:
     following.close()
 
 
-def test_all_environments_of_a_token(api: Api, fresh: Any) -> None:
+def test_stream_covers_all_environments_of_a_token(api: Api, fresh: Any) -> None:
     ours, theirs = fresh(), fresh()
     for name in (ours, theirs):
         api.post("environments", {"name": name})
@@ -51,8 +51,8 @@ def test_all_environments_of_a_token(api: Api, fresh: Any) -> None:
     assert api.as_(token).get(f"events?environment={theirs}&follow=false", expect=None).status_code == 403
 
 
-def test_the_end_of_a_name_is_told_under_it(api: Api, fresh: Any) -> None:
-    """Whoever follows an environment that is renamed, or purged, hears of it; of its new name only who may go there."""
+def test_rename_and_purge_are_sent_under_the_old_name(api: Api, fresh: Any) -> None:
+    """Streams of a renamed or purged environment get that event; events under its new name need access to it."""
     old, new = fresh(), fresh()
     api.post("environments", {"name": old})
     local = api.token_for("viewer", environments=old)
@@ -61,7 +61,7 @@ def test_the_end_of_a_name_is_told_under_it(api: Api, fresh: Any) -> None:
     api("PATCH", f"environments/{old}", 200, json={"name": new})
     number, kind, body = next(following)
     assert (number, kind, body["environment"]) == (2, "environment.deleted", old)
-    assert list(following) == [], "and that is the end"
+    assert list(following) == [], "the stream ends"
     assert new not in json.dumps(body)
     again = list(stream(local, environment=old, headers={"last-event-id": "1"}))
     assert [body for _, _, body in again] == [body]
@@ -79,7 +79,7 @@ def test_the_end_of_a_name_is_told_under_it(api: Api, fresh: Any) -> None:
     assert [(n, kind) for n, kind, _ in events] == [(5, "environment.created")]
 
 
-def test_a_stream_ends_with_its_token(api: Api, bare: str) -> None:
+def test_stream_ends_with_its_token(api: Api, bare: str) -> None:
     token = api.post("tokens", {"name": "seer", "role": "viewer"}).json()
     following = stream(api.as_(token["token"]), environment=bare, since=0)
     assert next(following)[1] == "environment.created"
@@ -91,12 +91,12 @@ def test_a_stream_ends_with_its_token(api: Api, bare: str) -> None:
     assert [kind for _, kind, _ in stream(api.as_(brief["token"]), environment=bare, since=1)] == ["version.created"]
 
 
-def test_streams_at_one_place_share_a_look(api: Api, bare: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_at_one_position_share_reads(api: Api, bare: str, monkeypatch: pytest.MonkeyPatch) -> None:
     events = type(api.app.state.services.store.events)
-    looks, quick = [], events.page
+    reads, quick = [], events.page
 
     def counted(self: Any, environment: Any, since: int = 0, limit: int = 1000) -> Any:
-        looks.append((environment, since))
+        reads.append((environment, since))
         return quick(self, environment, since, limit)
 
     count = 30
@@ -117,10 +117,10 @@ def test_streams_at_one_place_share_a_look(api: Api, bare: str, monkeypatch: pyt
     for thread in threads:
         thread.join(30)
     assert versions == [1] * count
-    assert looks.count((bare, 1)) < count / 2
+    assert reads.count((bare, 1)) < count / 2
 
 
-def test_refusals(api: Api, bare: str) -> None:
+def test_invalid_streams_are_refused(api: Api, bare: str) -> None:
     assert api.get("events?environment=nowhere&follow=false", expect=None).status_code == 404
     bad = api.get(f"events?environment={bare}", expect=None, headers={"last-event-id": "x"})
     assert bad.status_code == 422
@@ -129,4 +129,4 @@ def test_refusals(api: Api, bare: str) -> None:
     assert (head.headers["content-type"], head.content) == ("text/event-stream; charset=utf-8", b"")
     api.get("/healthz", timeout=10)  # on the same connection
     for query in (f"environment={bare}&since=2", f"since={10**9}"):
-        assert "nothing with the number" in api.problem("GET", f"events?{query}&follow=false", 422)["detail"]
+        assert "is beyond the event log" in api.problem("GET", f"events?{query}&follow=false", 422)["detail"]

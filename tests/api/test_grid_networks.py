@@ -1,4 +1,4 @@
-"""A grid alone serves robots that drive by networks: over HTTP and the command line, with true reports."""
+"""A grid alone gives networks, over HTTP and the command line, with correct reports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / HERE
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled() -> None:
-    """Into the user's folder of native code, where the confined workers find it."""
+    """Use the user's directory of native code, which the confined workers can read."""
     for kernels in (_kernels_space, _kernels_skeleton, _kernels_roadmap):
         kernels.compile_all()
 
@@ -42,7 +42,7 @@ def network_in(text: bytes) -> nx.DiGraph:
     return g
 
 
-def test_a_real_grid_alone_gives_networks(api: Api, files: dict[str, bytes]) -> None:
+def test_real_grid_alone_gives_networks(api: Api, files: dict[str, bytes]) -> None:
     api.post("environments", {"name": "polytunnels"})
     api.upload("polytunnels", files)
     table: dict[str, Any] = {r["format"]: r for r in api.get("environments/polytunnels/versions/1/maps").json()}
@@ -76,7 +76,7 @@ def test_a_real_grid_alone_gives_networks(api: Api, files: dict[str, bytes]) -> 
     assert api.get("/maps/polytunnels/tmap2?derive=false", expect=None).status_code == 422
 
 
-def test_the_command_line_does_the_same(files: dict[str, bytes], tmp_path: Path) -> None:
+def test_command_line_derives_the_same_networks(files: dict[str, bytes], tmp_path: Path) -> None:
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
     out = tmp_path / "network.tmap2.yaml"
@@ -97,7 +97,7 @@ def test_the_command_line_does_the_same(files: dict[str, bytes], tmp_path: Path)
     assert 100 < len(network_in(out.read_bytes())) < 2000
 
 
-def test_a_blank_grid_is_refused_with_a_way_out(api: Api) -> None:
+def test_blank_grid_is_refused_with_advice(api: Api) -> None:
     api.post("environments", {"name": "meadow"})
     described = (
         b"image: map.pgm\nresolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"

@@ -1,4 +1,4 @@
-"""Pictures through HTTP: read and written in confined workers, answered as PNG, placed by options."""
+"""Images over HTTP: read and written in confined workers, returned as PNG, placed by options."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def environment(api: Api, name: str, **more: object) -> str:
     return name
 
 
-def test_a_large_picture_goes_in_and_comes_out(api: Api, fresh: Callable[[], str]) -> None:
+def test_large_image_survives_a_round_trip(api: Api, fresh: Callable[[], str]) -> None:
     env = environment(api, fresh(), datum=DATUM)
     rows, columns = np.mgrid[0:2500, 0:3000]
     pixels = np.stack([rows % 251, columns % 241, (rows + columns) % 255], axis=-1).astype(np.uint8)
@@ -58,7 +58,7 @@ def test_a_large_picture_goes_in_and_comes_out(api: Api, fresh: Callable[[], str
     assert local.transform[1] == local.transform[3] == 0.0
 
 
-def test_png_by_the_name_of_the_file(api: Api, fresh: Callable[[], str]) -> None:
+def test_file_name_selects_png(api: Api, fresh: Callable[[], str]) -> None:
     env = environment(api, fresh())
     api.upload(env, {"plan.tif": geotiff(np.full((4, 5, 3), 9, np.uint8))})
     png = api.get(f"/maps/{env}/satellite/satellite.png")
@@ -71,7 +71,7 @@ def test_png_by_the_name_of_the_file(api: Api, fresh: Callable[[], str]) -> None
     api.problem("GET", f"/maps/{env}/satellite/other.tif", 404)
 
 
-def test_terrain_of_floats_is_shown_in_grey(api: Api, fresh: Callable[[], str]) -> None:
+def test_float_terrain_is_shown_in_grey(api: Api, fresh: Callable[[], str]) -> None:
     env = environment(api, fresh())
     heights = np.array([[[10.0], [20.0]], [[-9999.0], [15.0]]], np.float32)
     api.upload(env, {"dtm.tif": geotiff(heights, nodata=-9999)})
@@ -80,7 +80,7 @@ def test_terrain_of_floats_is_shown_in_grey(api: Api, fresh: Callable[[], str]) 
     assert np.array_equal(picture_of(api.get(f"/maps/{env}/satellite").content).pixels, heights)
 
 
-def test_a_floor_plan_is_placed_by_options(api: Api, fresh: Callable[[], str]) -> None:
+def test_floor_plan_is_placed_by_options(api: Api, fresh: Callable[[], str]) -> None:
     env = environment(api, fresh())
     out = io.BytesIO()
     Image.new("RGB", (40, 30), (1, 2, 3)).save(out, "PNG")
@@ -93,7 +93,7 @@ def test_a_floor_plan_is_placed_by_options(api: Api, fresh: Callable[[], str]) -
     api.problem("GET", f"/maps/{env}/satellite?crs=wgs84", 422)
 
 
-def test_damaged_tiles_are_422_with_the_reason(api: Api, fresh: Callable[[], str]) -> None:
+def test_damaged_tiles_return_422_with_the_reason(api: Api, fresh: Callable[[], str]) -> None:
     env = environment(api, fresh())
     data = geotiff(np.random.default_rng(0).integers(0, 255, (600, 600, 3), dtype=np.uint8))
     refused = api.upload(env, {"a.tif": data[: len(data) * 2 // 3]}, expect=422).json()
@@ -102,7 +102,7 @@ def test_damaged_tiles_are_422_with_the_reason(api: Api, fresh: Callable[[], str
     assert api.get(f"environments/{env}").json()["version"] == 0
 
 
-def test_a_grid_is_served_as_a_picture(api: Api) -> None:
+def test_grid_is_served_as_an_image(api: Api) -> None:
     map_yaml = (
         b"image: map.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )

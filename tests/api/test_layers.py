@@ -1,4 +1,4 @@
-"""Canonical content over HTTP, diffs and transforms."""
+"""Canonical content over HTTP, diffs and transformations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ JSON = {"Accept": "application/json"}
 TMERC = Proj(f"+proj=tmerc +lat_0={samples.LATITUDE} +lon_0={samples.LONGITUDE} +k=1 +ellps=WGS84")
 
 
-def test_what_a_version_holds(api: Api, farm: str) -> None:
+def test_list_has_all_parts_of_a_version(api: Api, farm: str) -> None:
     lines = api.get(f"environments/{farm}/versions/3/layers").json()
     by = {(line["layer"], line["name"]): line for line in lines}
     network = by["topology", "network"]
@@ -36,7 +36,7 @@ def test_what_a_version_holds(api: Api, farm: str) -> None:
     assert api.get(f"environments/{farm}/versions/0/layers").json() == []
 
 
-def test_topology_on_earth(api: Api, farm: str) -> None:
+def test_topology_is_geojson_in_wgs84(api: Api, farm: str) -> None:
     answer = api.get(f"environments/{farm}/versions/3/layers/topology")
     assert answer.headers["content-type"] == "application/geo+json"
     body = answer.json()
@@ -58,7 +58,7 @@ def test_topology_on_earth(api: Api, farm: str) -> None:
     assert edge["geometry"]["coordinates"][0] == features["barn"]["geometry"]["coordinates"]
 
 
-def test_metres_never_pass_as_degrees(api: Api, farm: str) -> None:
+def test_local_coordinates_are_never_geometry(api: Api, farm: str) -> None:
     body = api.get(f"environments/{farm}/versions/3/layers/topology?crs=local").json()
     assert body["coordRefSys"]
     assert body["datum"]["latitude"] == samples.LATITUDE
@@ -68,7 +68,7 @@ def test_metres_never_pass_as_degrees(api: Api, farm: str) -> None:
             assert tuple(feature["place"]["coordinates"]) == samples.NODES[feature["id"]]
 
 
-def test_without_a_datum(api: Api, bare: str) -> None:
+def test_layers_without_a_datum_are_local_only(api: Api, bare: str) -> None:
     api.upload(bare, {"n.tmap2.yaml": samples.tmap2()})
     body = api.get(f"environments/{bare}/versions/1/layers/topology").json()
     assert body["coordRefSys"]
@@ -77,7 +77,7 @@ def test_without_a_datum(api: Api, bare: str) -> None:
     assert "datum" in problem["detail"]
 
 
-def test_the_fence_and_the_datum(api: Api, farm: str, bare: str) -> None:
+def test_location_has_fence_and_datum(api: Api, farm: str, bare: str) -> None:
     (fence,) = api.get(f"environments/{farm}/versions/1/layers/location").json()["features"]
     assert fence["geometry"]["type"] == "Polygon"
     assert fence["properties"]["datum"] == {
@@ -89,7 +89,7 @@ def test_the_fence_and_the_datum(api: Api, farm: str, bare: str) -> None:
     assert only["properties"]["datum"]["latitude"] == 1.0
 
 
-def test_by_box(api: Api, farm: str) -> None:
+def test_bbox_selects_features(api: Api, farm: str) -> None:
     url = f"environments/{farm}/versions/3/layers/topology"
     near = api.get(url, params={"crs": "local", "bbox": "-1,-1,1,1"}).json()["features"]
     assert {f["id"] for f in near} == {"gate", "gate_barn", "barn_gate"}
@@ -106,7 +106,7 @@ def test_by_box(api: Api, farm: str) -> None:
     api.problem("GET", url, 422, params={"bbox": "0,91,0,92"})
 
 
-def test_by_level_and_name(api: Api, farm: str) -> None:
+def test_level_and_name_select_parts(api: Api, farm: str) -> None:
     url = f"environments/{farm}/versions/3/layers/topology"
     assert len(api.get(f"{url}?level=ground&name=network").json()["features"]) == 6
     for query in ("level=attic", "name=other"):
@@ -116,14 +116,14 @@ def test_by_level_and_name(api: Api, farm: str) -> None:
     api.problem("GET", f"{url}?crs=utm", 422)
 
 
-def test_occupancy(api: Api, farm: str) -> None:
+def test_occupancy_is_png_or_json(api: Api, farm: str) -> None:
     url = f"environments/{farm}/versions/3/layers/occupancy"
     answer = api.get(url)
     assert answer.headers["content-type"] == "image/png"
     pixels = np.asarray(Image.open(io.BytesIO(answer.content)))
     assert pixels.shape == (6, 8)
     assert (pixels[:, 0] == 100).all()
-    assert pixels[5, 7] == 255, "row 0 is on top: the unknown cell is at the lower right"
+    assert pixels[5, 7] == 255, "row 0 is at the top: the unknown cell is at the lower right"
     assert (pixels[:5, 1:] == 0).all()
     body = api.get(url, headers=JSON).json()
     assert body == {
@@ -134,7 +134,7 @@ def test_occupancy(api: Api, farm: str) -> None:
     api.problem("GET", url, 406, headers={"Accept": "text/html"})
 
 
-def test_a_cut_of_a_grid(api: Api, farm: str) -> None:
+def test_bbox_crops_a_grid(api: Api, farm: str) -> None:
     url = f"environments/{farm}/versions/3/layers/occupancy"
     body = api.get(url, headers=JSON, params={"crs": "local", "bbox": "-1,-2,-0.5,0"}).json()
     assert (body["width"], body["height"], body["origin"]) == (1, 4, [-1.0, -2.0, 0.0])
@@ -145,7 +145,7 @@ def test_a_cut_of_a_grid(api: Api, farm: str) -> None:
     api.problem("GET", url, 404, params={"crs": "local", "bbox": "100,100,101,101"})
 
 
-def test_several_grids(api: Api, farm: str, bare: str) -> None:
+def test_several_grids_need_a_name(api: Api, farm: str, bare: str) -> None:
     api.upload(farm, samples.grid("keepout"))
     url = f"environments/{farm}/versions/latest/layers/occupancy"
     assert api.get(url, headers=JSON).json()["name"] == "map"
@@ -160,19 +160,19 @@ def test_several_grids(api: Api, farm: str, bare: str) -> None:
     assert "keepout, speed" in problem["detail"]
 
 
-def test_what_is_not_there(api: Api, bare: str) -> None:
+def test_missing_parts_return_404(api: Api, bare: str) -> None:
     for layer in ("occupancy", "voxels", "imagery"):
         api.problem("GET", f"environments/{bare}/versions/0/layers/{layer}", 404)
 
 
-def test_a_layer_again_is_304(api: Api, farm: str) -> None:
+def test_repeated_layer_request_returns_304(api: Api, farm: str) -> None:
     for url in (f"environments/{farm}/versions/3/layers/topology", f"environments/{farm}/versions/3/layers/occupancy"):
         etag = api.get(url).headers["etag"]
         assert api.get(url, 304, headers={"If-None-Match": etag}).content == b""
         assert api.get(f"{url}?crs=local").headers["etag"] != etag
 
 
-def test_cut_of_a_turned_grid() -> None:
+def test_bbox_crops_a_rotated_grid() -> None:
     cells = np.arange(16, dtype=np.uint8).reshape(4, 4)
     turned = OccupancyGrid(cells, 1.0, (0.0, 0.0, math.pi / 2))
     # Turned by a quarter: cell (row r, column c) covers x in [-r-1, -r], y in [c, c+1].
@@ -187,7 +187,7 @@ OCTOMAP = Path(__file__).resolve().parents[1] / "samples" / "octomap"
 BYTES = {"Accept": "application/octet-stream"}
 
 
-def test_voxels(api: Api, bare: str) -> None:
+def test_voxels_are_json_or_octomap(api: Api, bare: str) -> None:
     shed = (OCTOMAP / "shed.bt").read_bytes()
     api.upload(bare, {"shed.bt": shed})
     url = f"environments/{bare}/versions/latest/layers/voxels"
@@ -218,7 +218,7 @@ def test_voxels(api: Api, bare: str) -> None:
     api.problem("GET", f"{url}?name=cut", 406, headers={"Accept": "image/png"})
 
 
-def test_voxels_as_a_bt_whatever_was_uploaded(api: Api, bare: str) -> None:
+def test_voxels_are_written_as_bt_from_any_upload(api: Api, bare: str) -> None:
     shelf = (OCTOMAP / "shelf.ot").read_bytes()
     api.upload(bare, {"map.ot": shelf})
     latest = f"environments/{bare}/versions/latest"
@@ -236,7 +236,7 @@ def test_voxels_as_a_bt_whatever_was_uploaded(api: Api, bare: str) -> None:
     api.problem("GET", f"{latest}/maps/octomap/lab.bt", 404)
 
 
-def test_an_octree_without_voxels_comes_back(api: Api, bare: str) -> None:
+def test_empty_octree_survives_a_round_trip(api: Api, bare: str) -> None:
     head = (OCTOMAP / "shelf.ot").read_bytes().partition(b"size ")[0].replace(b"ColorOcTree", b"OcTree")
     empty = head + b"size 0\nres 0.1\ndata\n"
     answer = api.upload(bare, {"map.ot": empty}).json()
@@ -262,7 +262,7 @@ def test_coordinates_are_rounded() -> None:
 # --- diff ---
 
 
-def test_diff(api: Api, farm: str) -> None:
+def test_diff_lists_changed_features(api: Api, farm: str) -> None:
     nodes = {"gate": (0.0, 0.0), "barn": (10.0, 1.0), "new": (3.0, 3.0)}
     api.upload(farm, {"network.tmap2.yaml": samples.tmap2(nodes, (("gate", "barn"), ("barn", "new")))})
     body = api.get(f"environments/{farm}/diff?from=3&to=4").json()
@@ -271,7 +271,7 @@ def test_diff(api: Api, farm: str) -> None:
     assert set(topology["added"]) >= {"new"}
     assert "barn" in {c["id"] for c in topology["changed"]}
     assert {"barn_gate"} <= set(topology["deleted"])
-    assert api.get(f"environments/{farm}/diff").json() == body, "by default: what the head changed"
+    assert api.get(f"environments/{farm}/diff").json() == body, "by default: the changes of the head"
     same = api.get(f"environments/{farm}/diff?from=4&to=latest").json()
     assert same["layers"] == {}
     api.problem("GET", f"environments/{farm}/diff?from=99", 404)
@@ -279,7 +279,7 @@ def test_diff(api: Api, farm: str) -> None:
     api.problem("GET", f"environments/{farm}/diff?to=0", 422)
 
 
-def test_diff_of_grids_and_its_picture(api: Api, farm: str) -> None:
+def test_diff_counts_cells_and_draws_an_image(api: Api, farm: str) -> None:
     ring = [[0.0, -2.0], [1.0, -2.0], [1.0, -1.0], [0.0, -1.0], [0.0, -2.0]]
     change = {"op": "cells", "polygon": {"type": "Polygon", "coordinates": [ring]}, "crs": "local", "value": 100}
     node = {"type": "Feature", "id": "new", "geometry": None, "place": {"type": "Point", "coordinates": [2.0, 0.0]}}
@@ -306,7 +306,7 @@ def test_diff_of_grids_and_its_picture(api: Api, farm: str) -> None:
 # --- transform ---
 
 
-def test_transform(api: Api, farm: str, bare: str, fresh: Callable[[], str]) -> None:
+def test_transform_converts_both_ways(api: Api, farm: str, bare: str, fresh: Callable[[], str]) -> None:
     url = f"environments/{farm}/transform"
     body = api.get(url, params={"xy": "100.5,-20.25"}).json()
     lat, lon = body["latlon"]

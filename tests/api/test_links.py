@@ -1,4 +1,4 @@
-"""Signed links: what they open, for how long, and what they do not open."""
+"""Signed links: scope, lifetime and refusals."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def signed(secret: bytes, path: str, expires: int, **parameters: str) -> links.S
 def test_signature_holds_for_parameters_in_any_order() -> None:
     query = links.sign(b"k", "e1", "/maps/farm/kml", {"b": "2 &é", "a": "1"}, int(NOW) + 9)
     pairs = parse_qsl(query)
-    for order in (pairs, pairs[::-1]):
-        parsed_link = links.parse("/maps/farm/kml", urlencode(order).encode())
+    for items in (pairs, pairs[::-1]):
+        parsed_link = links.parse("/maps/farm/kml", urlencode(items).encode())
         assert parsed_link is not None
         assert (parsed_link.query, parsed_link.expires, parsed_link.environment_id) == (
             b"a=1&b=2+%26%C3%A9",
@@ -71,7 +71,7 @@ def test_signature_covers_path_parameters_expiry_and_environment() -> None:
 
 
 def test_genuine_link_ends_at_its_expiry_and_stays_expired(tmp_path: Path) -> None:
-    """Also in another process, and where the clock is set back."""
+    """This includes other processes, and a clock that is set back."""
     secrets = LinkSecrets(tmp_path)
     link, later = (signed(secrets.newest(), "/maps/farm/kml", int(NOW) + life) for life in (9, 90))
     secrets.check(link, NOW + 8.9)
@@ -82,7 +82,9 @@ def test_genuine_link_ends_at_its_expiry_and_stays_expired(tmp_path: Path) -> No
 
 
 def test_links_made_after_the_clock_was_set_back_are_valid(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Also while they expire before links that were seen to be over: those end for good, with their secret."""
+    """This includes new links that expire before links that were seen to have expired, which end permanently, with
+    their secret.
+    """
     secrets = LinkSecrets(tmp_path)
     old, other = (signed(secrets.newest(), "/maps/farm/kml", int(NOW) + life) for life in (900, 1000))
     with pytest.raises(ExpiredLink):
@@ -104,7 +106,7 @@ def test_link_without_a_number_of_seconds_is_invalid(expires: str | None) -> Non
         links.parse("/maps/farm/kml", query.encode())
 
 
-def test_query_without_signature_is_no_link() -> None:
+def test_query_without_signature_is_not_a_link() -> None:
     assert links.parse("/maps/farm/kml", b"expires=1") is None
     assert links.parse("/maps/farm/kml", b"my_signature=1&expires=1") is None
     for bad in (b"signature=%ff", b"signature=a&expires=1&x=1&x=2", b"signature=a&signature=b&expires=1"):
@@ -131,10 +133,10 @@ def test_rotated_secret_stays_valid_until_its_links_have_ended(tmp_path: Path) -
     assert new != old
     assert two.valid(NOW + 59) == one.valid(NOW + 59) == [new, old]
     assert two.valid(NOW + 60) == [new]
-    assert one.valid(NOW) == [new], "its time is over, also where the clock is set back"
+    assert one.valid(NOW) == [new], "its lifetime has ended, even if the clock is set back"
     one.rotate(NOW + 61, 60)
     assert [s["until"] for s in json.loads((tmp_path / "links.json").read_text())] == [None, NOW + 121], (
-        "old is removed"
+        "the old secret is removed"
     )
     for k in range(40):
         one.rotate(NOW + 62 + k / 10, 60)
@@ -145,21 +147,21 @@ def test_rotated_secret_stays_valid_until_its_links_have_ended(tmp_path: Path) -
 
 
 def link(api: Api, env: str, version: int | str = "latest", **body: Any) -> dict[str, Any]:
-    """A new link, as the API returns it but for the server's own address before ``url``."""
+    """Create a link; return it as the API does, but ``url`` without the server's address."""
     signed_link: dict[str, Any] = api.post(f"environments/{env}/versions/{version}/links", body).json()
     assert signed_link["url"].startswith(f"{api.url}/api/v1/environments/{env}/versions/{signed_link['version']}/maps/")
     return signed_link | {"url": signed_link["url"].removeprefix(api.url)}
 
 
 def altered(url: str, **change: str | None) -> str:
-    """The link with other query parameters."""
+    """Change query parameters of a link."""
     parts = urlsplit(url)
     values = {k: v for k, v in (dict(parse_qsl(parts.query)) | change).items() if v is not None}
     return f"{parts.path}?{urlencode(values)}"
 
 
 def test_link_needs_no_token(api: Api, farm: str) -> None:
-    nobody = api.as_(None)
+    anonymous = api.as_(None)
     with_token = api.get(f"environments/{farm}/versions/3/maps/occupancy_grid/map.png?file_type=png&grid=map")
     signed_link = link(
         api, farm, format="occupancy_grid", file="map.png", parameters={"grid": "map", "file_type": "png"}
@@ -167,7 +169,7 @@ def test_link_needs_no_token(api: Api, farm: str) -> None:
     assert signed_link["url"].startswith(f"/api/v1/environments/{farm}/versions/3/maps/occupancy_grid/map.png?")
     assert (signed_link["version"], signed_link["name"]) == (3, "map.png")
     for _ in range(3):
-        answer = nobody.get(signed_link["url"])
+        answer = anonymous.get(signed_link["url"])
         assert answer.content == with_token.content
         assert (answer.headers["etag"], answer.headers["fleetmap-version"]) == (with_token.headers["etag"], "3")
         assert answer.headers["referrer-policy"] == "no-referrer"
@@ -177,16 +179,16 @@ def test_link_needs_no_token(api: Api, farm: str) -> None:
         signed_link["size"],
     )
     assert "referrer-policy" not in with_token.headers
-    unchanged = nobody.get(signed_link["url"], 304, headers={"If-None-Match": answer.headers["etag"]})
+    unchanged = anonymous.get(signed_link["url"], 304, headers={"If-None-Match": answer.headers["etag"]})
     assert unchanged.headers["referrer-policy"] == "no-referrer"
-    head = nobody("HEAD", signed_link["url"], 200)
+    head = anonymous("HEAD", signed_link["url"], 200)
     assert (head.content, head.headers["content-length"]) == (b"", str(signed_link["size"]))
-    part = nobody.get(signed_link["url"], 206, headers={"Range": "bytes=2-5"})
+    part = anonymous.get(signed_link["url"], 206, headers={"Range": "bytes=2-5"})
     assert part.content == answer.content[2:6]
     api.upload(farm, {"more.kml": samples.KML})
-    assert nobody.get(signed_link["url"]).content == answer.content, "it names the version by number"
+    assert anonymous.get(signed_link["url"]).content == answer.content, "the link names the version by number"
     zip_link = link(api, farm, "latest", format="occupancy_grid")
-    assert nobody.get(zip_link["url"]).headers["content-type"] == "application/zip"
+    assert anonymous.get(zip_link["url"]).headers["content-type"] == "application/zip"
 
 
 def test_short_address_can_be_signed(api: Api, farm: str) -> None:
@@ -201,11 +203,11 @@ def test_short_address_can_be_signed(api: Api, farm: str) -> None:
 
 @pytest.mark.parametrize("warm", [False, True])
 def test_altered_link_is_refused(api: Api, farm: str, warm: bool) -> None:
-    nobody = api.as_(None)
+    anonymous = api.as_(None)
     url = link(api, farm, format="geojson", parameters={"derive": False})["url"]
     assert "derive=false" in url
     if warm:
-        nobody.get(url)
+        anonymous.get(url)
         api.get(urlsplit(url).path)
     other = link(api, farm, format="tmap2")["url"]
     good = dict(parse_qsl(urlsplit(url).query))
@@ -214,41 +216,41 @@ def test_altered_link_is_refused(api: Api, farm: str, warm: bool) -> None:
             {"derive": None}, {"derive": "true"}, {"expires": str(int(good["expires"]) + 1)}, {"signature": "x"},
             {"signature": dict(parse_qsl(urlsplit(other).query))["signature"]}, {"crs": "local"},
         ):  # fmt: skip
-            body = nobody.problem("GET", altered(url, **change), 403)
+            body = anonymous.problem("GET", altered(url, **change), 403)
             assert (body["type"], body["title"]) == ("urn:fleetmap:problem:invalid-link", "Invalid link")
             assert "request a new one" in body["detail"]
         query = urlsplit(url).query
         for path in (f"environments/{farm}/versions/2/maps/geojson", f"/maps/{farm}/geojson",
                      f"environments/{farm}/versions/3/maps/tmap2"):  # fmt: skip
-            nobody.problem("GET", f"{path}?{query}", 403)
-        assert "valid 'expires'" in nobody.problem("GET", altered(url, expires=None), 403)["detail"]
-        nobody.problem("GET", altered(url, signature=None), 401)
-        api.problem("GET", altered(url, derive="true"), 403)  # a token beside a link counts for nothing
-        nobody.get(url)
+            anonymous.problem("GET", f"{path}?{query}", 403)
+        assert "valid 'expires'" in anonymous.problem("GET", altered(url, expires=None), 403)["detail"]
+        anonymous.problem("GET", altered(url, signature=None), 401)
+        api.problem("GET", altered(url, derive="true"), 403)  # a token beside a link is ignored
+        anonymous.get(url)
     finally:
         services = api.app.state.services
         services.access._sources.clear()
 
 
 def test_link_opens_nothing_else(api: Api, farm: str) -> None:
-    nobody = api.as_(None)
+    anonymous = api.as_(None)
     url = link(api, farm, format="geojson")["url"]
     query = urlsplit(url).query
     for path in (f"environments/{farm}", f"environments/{farm}/versions/3", f"environments/{farm}/versions/3/maps",
                  f"environments/{farm}/versions/3/reports/geojson", "formats", "/metrics",
                  f"environments/{farm}/versions/3/manifest"):  # fmt: skip
-        nobody.problem("GET", f"{path}?{query}", 401)
+        anonymous.problem("GET", f"{path}?{query}", 401)
     for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS"):
-        nobody.problem(method, url, 401)
+        anonymous.problem(method, url, 401)
     api.problem("GET", f"environments/{farm}/versions/3/maps/geojson?%73ignature=x&expires=1", 422)
 
 
 def test_link_ends(api: Api, farm: str) -> None:
-    nobody = api.as_(None)
+    anonymous = api.as_(None)
     signed_link = link(api, farm, format="geojson", seconds=2)
-    assert nobody.get(signed_link["url"]).content
+    assert anonymous.get(signed_link["url"]).content
     deadline = time.monotonic() + 30
-    while (answer := nobody.get(signed_link["url"], None)).status_code == 200:
+    while (answer := anonymous.get(signed_link["url"], None)).status_code == 200:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     assert datetime.now(UTC) >= datetime.fromisoformat(signed_link["expires"])
@@ -256,24 +258,24 @@ def test_link_ends(api: Api, farm: str) -> None:
     assert (answer.status_code, body["type"]) == (403, "urn:fleetmap:problem:expired-link")
     assert body["detail"] == "the link has expired: request a new one"
     for _ in range(40):
-        nobody.problem("GET", signed_link["url"], 403)  # an old link is no guess
+        anonymous.problem("GET", signed_link["url"], 403)  # an expired link is not a failure
 
 
 def test_link_ends_with_its_environment(api: Api, farm: str) -> None:
-    nobody = api.as_(None)
+    anonymous = api.as_(None)
     url = link(api, farm, format="datum")["url"]
-    nobody.get(url)
+    anonymous.get(url)
     api("DELETE", f"environments/{farm}", 204)
-    assert "deleted or renamed" in nobody.problem("GET", url, 403)["detail"]
+    assert "deleted or renamed" in anonymous.problem("GET", url, 403)["detail"]
     api("POST", f"environments/{farm}/restore", 200)
-    nobody.get(url)
+    anonymous.get(url)
     api("DELETE", f"environments/{farm}", 204)
     api("POST", f"environments/{farm}/purge")
     api.post("environments", {"name": farm})
     for k in range(3):
         api.upload(farm, {"datum.yaml": samples.DATUM.replace(b"53.", b"5%d." % k)})
     for _ in range(3):
-        nobody.problem("GET", url, 403)
+        anonymous.problem("GET", url, 403)
 
 
 def test_link_is_created_by_readers_of_its_environment(api: Api, farm: str, bare: str) -> None:
@@ -313,31 +315,33 @@ def strict(tmp_path: Path) -> Iterator[Api]:
 
 
 def test_repeated_wrong_signatures_return_429(strict: Api) -> None:
-    nobody = strict.as_(None)
+    anonymous = strict.as_(None)
     url = link(strict, "farm", format="geojson")["url"]
     wrong = strict.as_("wrong-token")
     for k in range(3):
-        nobody.problem("GET", altered(url, signature=f"x{k}"), 403)
+        anonymous.problem("GET", altered(url, signature=f"x{k}"), 403)
     for _ in range(2):
         wrong.problem("GET", "formats", 401)
-    assert int(nobody("GET", altered(url, signature="y"), 429).headers["retry-after"]) > 0
+    assert int(anonymous("GET", altered(url, signature="y"), 429).headers["retry-after"]) > 0
     wrong.problem("GET", "formats", 429)
-    assert nobody.get(url).content, "nobody guesses a genuine one"
+    assert anonymous.get(url).content, "valid links cannot be guessed"
 
 
-def test_links_of_before_a_rotation_stay_valid(strict: Api, tmp_path: Path) -> None:
-    nobody = strict.as_(None)
+def test_links_stay_valid_after_a_rotation(strict: Api, tmp_path: Path) -> None:
+    anonymous = strict.as_(None)
     old = link(strict, "farm", format="geojson")["url"]
-    nobody.get(old)
+    anonymous.get(old)
     strict.post("keys")
     new = link(strict, "farm", format="geojson")["url"]
-    assert nobody.get(old).content == nobody.get(new).content
+    assert anonymous.get(old).content == anonymous.get(new).content
     (tmp_path / "keys" / "links.json").unlink()
     deadline = time.monotonic() + 30
-    while 200 in [nobody.get(url, None).status_code for url in (old, new)]:  # what is in memory is good for a second
+    while 200 in [
+        anonymous.get(url, None).status_code for url in (old, new)
+    ]:  # cached responses are valid for a second
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    nobody.problem("GET", new, 403)
+    anonymous.problem("GET", new, 403)
 
 
 def test_link_shows_a_signature_in_no_log_job_or_metric(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -363,15 +367,15 @@ def test_slow_map_by_link_returns_503_and_keeps_no_signature(tmp_path: Path) -> 
         creator = services.access.authenticate(f"Bearer {api.token}".encode(), None)
         path = "/api/v1/environments/farm/versions/1/maps/geojson"
         grant = services.links.create(services.store.environments.get("farm"), path, {"derive": "false"}, 600, creator)
-        nobody = api.as_(None)
-        answer = nobody("GET", grant.url, 503)
+        anonymous = api.as_(None)
+        answer = anonymous("GET", grant.url, 503)
         assert int(answer.headers["retry-after"]) > 0
         assert "try again" in problem(answer)["detail"]
         deadline = time.monotonic() + 60
-        while nobody.get(grant.url, None).status_code == 503:
+        while anonymous.get(grant.url, None).status_code == 503:
             assert time.monotonic() < deadline
             time.sleep(0.1)
-        assert nobody.get(grant.url).content
+        assert anonymous.get(grant.url).content
         with closing(sqlite3.connect(tmp_path / "fleetmap.sqlite3")) as database:
             while None in (results := [row[0] for row in database.execute("select result from job")]):
                 assert time.monotonic() < deadline, "the job's end is stored a moment after the map"

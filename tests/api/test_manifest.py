@@ -1,4 +1,4 @@
-"""Signed manifests, and deltas of files."""
+"""Signed manifests, and file deltas."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def keys(api: Api) -> dict[str, Ed25519PublicKey]:
 
 
 def check(api: Api, answer: Any) -> dict[str, Any]:
-    """The manifest, its signature verified."""
+    """Fetch a manifest and verify its signature."""
     key, _, signature = answer.headers["fleetmap-signature"].partition(":")
     public_key = keys(api)[key]
     public_key.verify(base64.b64decode(signature), answer.content)
@@ -44,7 +44,7 @@ def manifest(api: Api, env: str, version: str, formats: str) -> dict[str, Any]:
     return check(api, api.get(f"environments/{env}/versions/{version}/manifest?formats={formats}"))
 
 
-def test_it_lists_what_is_served(api: Api, farm: str) -> None:
+def test_manifest_lists_served_files(api: Api, farm: str) -> None:
     body = manifest(api, farm, "latest", "tmap2,occupancy_grid,kml")
     assert (body["environment"], body["channel"], body["version"]) == (farm, "latest", 3)
     assert body["root"] == api.get(f"environments/{farm}").json()["root"]
@@ -55,20 +55,20 @@ def test_it_lists_what_is_served(api: Api, farm: str) -> None:
         assert (file["size"], file["sha256"]) == (len(got), hashlib.sha256(got).hexdigest())
 
 
-def test_all_grids_are_listed(api: Api, farm: str) -> None:
+def test_manifest_lists_all_grids(api: Api, farm: str) -> None:
     api.upload(farm, samples.grid(), grid="keepout")
     names = [f["name"] for f in manifest(api, farm, "latest", "occupancy_grid")["files"]]
     assert {"map.yaml", "map.pgm", "keepout.yaml", "keepout.pgm"} <= set(names)
 
 
-def test_it_says_what_the_place_is_called(api: Api, farm: str) -> None:
+def test_manifest_has_variables_of_the_site(api: Api, farm: str) -> None:
     assert "variables" not in manifest(api, farm, "latest", "tmap2")
     properties = b"export FIELD_ID=p1\nexport FARM_NAME='north farm'\nexport DATUM_FILE=/x\nexport PATH=/x\n"
     api.upload(farm, {"config/properties.sh": properties})
     assert manifest(api, farm, "latest", "tmap2")["variables"] == {"FARM_NAME": "north farm", "FIELD_ID": "p1"}
 
 
-def test_layers_differ_where_their_content_does(api: Api, farm: str) -> None:
+def test_layer_hashes_differ_with_content(api: Api, farm: str) -> None:
     def layers(version: str = "latest") -> dict[str, str]:
         hashes: dict[str, str] = manifest(api, farm, version, "tmap2")["layers"]
         return hashes
@@ -83,12 +83,12 @@ def test_layers_differ_where_their_content_does(api: Api, farm: str) -> None:
     assert changed(first) == {"occupancy"}
     second = layers()
     api("PATCH", f"environments/{farm}", 200, json={"datum": {"latitude": 53.2, "longitude": -0.5}})
-    assert changed(second) == {"location"}, "all that is anchored on earth lies elsewhere now"
+    assert changed(second) == {"location"}, "everything anchored in WGS 84 has moved"
     api.post(f"environments/{farm}/versions", {"revert_to": 3})
     assert layers() == first == layers("3")
 
 
-def test_the_sequence_is_that_of_the_channels_move(api: Api, farm: str) -> None:
+def test_sequence_is_that_of_the_channel_move(api: Api, farm: str) -> None:
     sequences = [manifest(api, farm, v, "tmap2")["sequence"] for v in ("2", "latest")]
     assert sequences == [3, 4]
     api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 3})
@@ -99,11 +99,11 @@ def test_the_sequence_is_that_of_the_channels_move(api: Api, farm: str) -> None:
     assert "channel" not in manifest(api, farm, "2", "tmap2")
 
 
-def test_asking_again_costs_nothing(api: Api, farm: str) -> None:
+def test_repeated_request_is_served_from_memory(api: Api, farm: str) -> None:
     path = f"environments/{farm}/versions/latest/manifest?formats=tmap2"
     first = api.get(path)
     again = api.get(path, expect=None, headers={"if-none-match": first.headers["etag"]})
-    assert again.status_code in (304, 200)  # 200 where the clock has just stepped
+    assert again.status_code in (304, 200)  # 200 if the clock has just stepped
     if again.status_code == 200:
         assert again.json()["expires"] > first.json()["expires"]
 
@@ -113,12 +113,12 @@ def test_unknown_formats_are_refused(api: Api, farm: str, formats: str) -> None:
     api.problem("GET", f"environments/{farm}/versions/latest/manifest?formats={formats}", 422)
 
 
-def test_what_cannot_be_made_says_what_to_supply(api: Api, bare: str) -> None:
+def test_unavailable_format_reports_missing_inputs(api: Api, bare: str) -> None:
     problem = api.problem("GET", f"environments/{bare}/versions/latest/manifest?formats=tmap2", 422)
     assert "supply" in problem["detail"]
 
 
-def test_a_rotated_key_is_vouched_for(api: Api, farm: str) -> None:
+def test_rotated_key_is_endorsed(api: Api, farm: str) -> None:
     before = keys(api)
     viewer = api.token_for("viewer")
     assert viewer("POST", "keys").status_code == 403
@@ -143,7 +143,7 @@ def unpack(dcz: bytes, before: bytes) -> bytes:
 
 
 def raw(api: Api, path: str, headers: dict[str, str]) -> tuple[Any, bytes]:
-    """An answer with its body as it was sent."""
+    """Return a response with its raw body."""
     with api.http.stream("GET", path, headers=headers) as answer:
         return answer, b"".join(answer.iter_raw())
 
@@ -153,15 +153,17 @@ def many(moved: float = 0.0) -> bytes:
     return samples.tmap2(nodes, tuple((f"n{k}", f"n{k + 1}") for k in range(599)))
 
 
-def test_a_delta_is_small_and_exact(api: Api, bare: str) -> None:
+def test_delta_is_small_and_exact(api: Api, bare: str) -> None:
     path = f"/maps/{bare}/tmap2/network.tmap2.yaml"
     api.upload(bare, {"n.tmap2.yaml": many()})
     first = api.get(path)
     assert first.headers["use-as-dictionary"] == f'match="{path}"'
     assert first.headers["vary"] == "accept-encoding, available-dictionary"
-    for _ in range(2):  # the long way, and from memory
+    for _ in range(2):  # on the slow path, and from memory
         same = api.get(path, 304, headers={"If-None-Match": first.headers["etag"]})
-        assert same.headers["vary"] == first.headers["vary"], "a cache between must know that it is one of several"
+        assert same.headers["vary"] == first.headers["vary"], (
+            "a shared cache must know that there are several representations"
+        )
     api.upload(bare, {"n.tmap2.yaml": many(0.25)})
     answer, body = raw(api, path, offered(first.content))
     assert answer.headers["content-encoding"] == "dcz"
@@ -175,7 +177,7 @@ def test_a_delta_is_small_and_exact(api: Api, bare: str) -> None:
     assert again.headers["etag"] == answer.headers["etag"]
 
 
-def test_a_file_too_small_for_a_dictionary_is_none(api: Api, bare: str) -> None:
+def test_delta_skips_dictionaries_below_minimum_size(api: Api, bare: str) -> None:
     mesh = "<geometry><mesh><uri>model://shelf/note.stl</uri></mesh></geometry>"
     model = (
         f'<sdf version="1.9"><model name="shelf"><link name="l"><visual name="v">{mesh}</visual></link></model></sdf>'
@@ -210,7 +212,7 @@ def test_a_file_too_small_for_a_dictionary_is_none(api: Api, bare: str) -> None:
         {"accept-encoding": "gzip"},
     ],
 )
-def test_without_a_known_dictionary_the_file_comes_whole(api: Api, farm: str, headers: dict[str, str]) -> None:
+def test_unknown_dictionary_gives_the_complete_file(api: Api, farm: str, headers: dict[str, str]) -> None:
     path = f"/maps/{farm}/tmap2/network.tmap2.yaml"
     content = api.get(path).content
     answer, body = raw(api, path, {**offered(content), **headers} if "available-dictionary" not in headers else headers)
@@ -219,8 +221,8 @@ def test_without_a_known_dictionary_the_file_comes_whole(api: Api, farm: str, he
     assert body == content
 
 
-def test_a_dictionary_that_comes_late_is_taken() -> None:
-    """A robot offers a file that this server has not made (again) yet; asked once more, it has."""
+def test_dictionary_is_used_once_converted() -> None:
+    """A robot offers a file that this server has not converted yet; the next request finds it."""
     old, new = many(), many(0.25)
     names = [hashlib.sha256(data).hexdigest() for data in (old, new)]
     shelf: dict[str, bytes] = {}
@@ -240,8 +242,8 @@ def test_a_dictionary_that_comes_late_is_taken() -> None:
     assert unpack(delta, old) == new
 
 
-def test_a_fleet_that_asks_for_a_new_map_costs_one_conversion(api: Api, bare: str) -> None:
-    """40 robots at once, each for the manifest and the file."""
+def test_fleet_requests_cause_one_conversion(api: Api, bare: str) -> None:
+    """40 robots request manifest and file at the same time."""
     api.upload(bare, {"n.tmap2.yaml": samples.tmap2({"here": (0.5, 1.0), "there": (2.5, 1.0)}, (("here", "there"),))})
 
     def conversion_count() -> float:
@@ -265,7 +267,7 @@ def test_a_fleet_that_asks_for_a_new_map_costs_one_conversion(api: Api, bare: st
     assert conversion_count() - before == 1
 
 
-def test_what_a_fleet_asks_for_at_once_comes_from_memory_and_is_never_old(api: Api, farm: str) -> None:
+def test_concurrent_manifests_come_from_memory_and_are_current(api: Api, farm: str) -> None:
     place = f"environments/{farm}"
     paths = (f"{place}/versions/latest/manifest?formats=tmap2", f"{place}/channels?robots=false")
     hot = api.app.state.services.response_cache
@@ -298,7 +300,7 @@ def test_what_a_fleet_asks_for_at_once_comes_from_memory_and_is_never_old(api: A
     assert "robots" in api.get(f"{place}/channels").json()[0]
 
 
-def test_a_cache_without_room_for_two_maps_still_gives_a_manifest_of_both(tmp_path: Path) -> None:
+def test_manifest_lists_more_maps_than_the_cache_holds(tmp_path: Path) -> None:
     with running(settings_for(tmp_path, cache_bytes=0)) as api:
         api.post("environments", {"name": "small"})
         api.upload("small", {"n.tmap2.yaml": many()})

@@ -1,4 +1,4 @@
-"""Maps as robots fetch them: whole, by file, by short address, conditionally, in parts; and what they are made of."""
+"""Map downloads: complete, by file, by short URL, conditional, partial; and reports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.api import samples
 from tests.api.conftest import Api, problem, running, settings_for
 
 
-def test_a_single_file_map(api: Api, farm: str) -> None:
+def test_map_with_one_file_is_served_as_file(api: Api, farm: str) -> None:
     answer = api.get(f"environments/{farm}/versions/3/maps/tmap2")
     assert {n["node"]["name"] for n in yaml.safe_load(answer.content)["nodes"]} == set(samples.NODES)
     headers = answer.headers
@@ -44,7 +44,7 @@ def test_a_single_file_map(api: Api, farm: str) -> None:
     assert "occupancy" in {line["what"] for line in report["dropped"]}
 
 
-def test_a_map_of_several_files(api: Api, farm: str) -> None:
+def test_map_with_several_files_is_served_as_zip(api: Api, farm: str) -> None:
     base = f"environments/{farm}/versions/latest/maps/occupancy_grid"
     answer = api.get(base)
     assert answer.headers["content-type"] == "application/zip"
@@ -60,7 +60,7 @@ def test_a_map_of_several_files(api: Api, farm: str) -> None:
     api.problem("GET", f"{base}/{quote('../map.yaml', safe='')}", 404)
 
 
-def test_the_same_again_is_304(api: Api, farm: str) -> None:
+def test_repeated_request_returns_304(api: Api, farm: str) -> None:
     for path in (
         f"environments/{farm}/versions/latest/maps/tmap2",
         f"/maps/{farm}/tmap2",
@@ -75,8 +75,8 @@ def test_the_same_again_is_304(api: Api, farm: str) -> None:
         assert api.get(path, headers={"If-None-Match": '"other"'}).content
 
 
-def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For a second neither database nor disk is asked; then the answer must be confirmed."""
+def test_repeated_requests_are_served_from_memory(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a second neither database nor disk is read; then the response must be confirmed."""
     from app.errors import Unavailable
     from app.store.channels import Channels
     from app.store.tokens import Tokens
@@ -93,7 +93,7 @@ def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeyp
     for _ in range(5):
         again = api.get(path)
         assert again.content == first.content
-        assert {*again.headers, "x-request-id"} == set(first.headers)  # only what the log may name has an id
+        assert {*again.headers, "x-request-id"} == set(first.headers)  # only ids that the log accepts are used
         api.get(path, 304, headers={"If-None-Match": first.headers["etag"]})
     time.sleep(1.1)
     api.problem("GET", path, 503)
@@ -101,8 +101,8 @@ def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeyp
     assert api.get(path).content == first.content
 
 
-def test_304_without_making(api: Api, farm: str) -> None:
-    """A robot that has the map already costs no conversion, also after a restart of the server."""
+def test_matching_etag_returns_304_without_conversion(api: Api, farm: str) -> None:
+    """A robot that has the map causes no conversion, not even after a restart of the server."""
     path = f"environments/{farm}/versions/3/maps/kml"
     etag = api.get(path).headers["etag"]
     hot = api.app.state.services.response_cache
@@ -112,7 +112,7 @@ def test_304_without_making(api: Api, farm: str) -> None:
     assert api.get(path).headers["etag"] == etag
 
 
-def test_head(api: Api, farm: str) -> None:
+def test_head_returns_headers_only(api: Api, farm: str) -> None:
     path = f"/maps/{farm}/tmap2"
     for _ in range(2):
         answer = api("HEAD", path, 200)
@@ -124,7 +124,7 @@ def test_head(api: Api, farm: str) -> None:
     assert api("HEAD", "environments/nowhere", 404).content == b""
 
 
-def test_ranges(api: Api, farm: str) -> None:
+def test_ranges_return_parts(api: Api, farm: str) -> None:
     path = f"/maps/{farm}/tmap2"
     response = api.get(path)
     etag, size = response.headers["etag"], len(response.content)
@@ -141,7 +141,7 @@ def test_ranges(api: Api, farm: str) -> None:
     api.get(path, 304, headers={"Range": "bytes=5-", "If-None-Match": etag})
 
 
-def test_the_short_address_follows_production(api: Api, farm: str) -> None:
+def test_short_url_follows_production(api: Api, farm: str) -> None:
     path = f"/maps/{farm}/tmap2"
     assert api.get(path).headers["fleetmap-version"] == "3"
     api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
@@ -156,7 +156,7 @@ def test_the_short_address_follows_production(api: Api, farm: str) -> None:
     assert api.get(f"environments/{farm}/versions/production/maps/tmap2").headers["fleetmap-version"] == "4"
 
 
-def test_an_acknowledged_change_is_seen_at_once(api: Api, farm: str) -> None:
+def test_commit_is_visible_at_once(api: Api, farm: str) -> None:
     path = f"/maps/{farm}/tmap2"
     for k in range(5):
         assert api.get(path).headers["fleetmap-version"] == str(3 + k)
@@ -170,8 +170,8 @@ def test_an_acknowledged_change_is_seen_at_once(api: Api, farm: str) -> None:
         assert places["field"] == 8.5 + k
 
 
-def test_other_layers_do_not_change_a_map(api: Api, farm: str) -> None:
-    """The ETag says what the bytes depend on, so a robot fetches nothing when only the grid has changed."""
+def test_other_layers_do_not_change_the_etag(api: Api, farm: str) -> None:
+    """The ETag depends only on the inputs, so a robot downloads nothing if only the grid has changed."""
     before = api.get(f"/maps/{farm}/tmap2")
     api.upload(farm, samples.grid(width=9))
     after = api.get(f"/maps/{farm}/tmap2")
@@ -180,7 +180,7 @@ def test_other_layers_do_not_change_a_map(api: Api, farm: str) -> None:
     assert after.headers["fleetmap-root"] != before.headers["fleetmap-root"]
 
 
-def test_parameters_of_a_format(api: Api, farm: str) -> None:
+def test_parameters_change_the_map(api: Api, farm: str) -> None:
     base = f"environments/{farm}/versions/3/maps/occupancy_grid"
     with zipfile.ZipFile(io.BytesIO(api.get(f"{base}?file_type=png").content)) as archive:
         assert sorted(archive.namelist()) == ["map.png", "map.yaml"]
@@ -195,7 +195,7 @@ def test_parameters_of_a_format(api: Api, farm: str) -> None:
     assert api.get(link).json()["format"] == "occupancy_grid"
 
 
-def test_what_cannot_be_made(api: Api, bare: str) -> None:
+def test_unavailable_maps_return_problems(api: Api, bare: str) -> None:
     base = f"environments/{bare}/versions/latest/maps"
     assert "supply" in api.problem("GET", f"{base}/tmap2", 422)["detail"]
     api.problem("GET", f"{base}/datum", 422)
@@ -206,7 +206,7 @@ def test_what_cannot_be_made(api: Api, bare: str) -> None:
     api.problem("GET", f"environments/{bare}/versions/9/maps/kml", 404)
 
 
-def test_derived_only_where_it_is_allowed(api: Api, bare: str) -> None:
+def test_derive_false_uses_stored_layers_only(api: Api, bare: str) -> None:
     api.upload(bare, {"drawing.kml": samples.KML})
     base = f"environments/{bare}/versions/1"
     coverage = {line["format"]: line for line in api.get(f"{base}/maps").json()}
@@ -222,7 +222,7 @@ def test_derived_only_where_it_is_allowed(api: Api, bare: str) -> None:
     api.problem("GET", f"{base}/reports/tmap2?derive=false", 422)
 
 
-def test_credits_stand_in_reports(api: Api, bare: str) -> None:
+def test_reports_contain_credits(api: Api, bare: str) -> None:
     api.upload(bare, {"area.osm": samples.OSM})
     credit = ["Some Mappers", "https://example.org/copyright"]
     for name in ("osm", "kml", "tmap2"):
@@ -238,7 +238,7 @@ def test_credits_stand_in_reports(api: Api, bare: str) -> None:
     assert summary["attribution"] == credit
 
 
-def test_merging_keeps_what_both_say_as_a_whole(api: Api, bare: str) -> None:
+def test_merge_keeps_documents_of_both_uploads(api: Api, bare: str) -> None:
     api.upload(bare, {"area.osm": samples.OSM})
     api.upload(bare, {"more.osm": samples.MORE_OSM}, mode="merge")
     root = etree.fromstring(api.get(f"/maps/{bare}/osm").content)
@@ -266,7 +266,7 @@ def test_merging_keeps_two_drawings_of_one_name(api: Api, bare: str) -> None:
     assert api.upload(bare, again, expect=None, mode="merge").status_code in (200, 201)
 
 
-def test_coverage(api: Api, farm: str) -> None:
+def test_coverage_lists_all_formats(api: Api, farm: str) -> None:
     lines = {line["format"]: line for line in api.get(f"environments/{farm}/versions/3/maps").json()}
     assert all(set(line) == {"format", "state", "chain", "missing"} for line in lines.values())
     assert lines["tmap2"]["state"] == "direct"
@@ -277,7 +277,7 @@ def test_coverage(api: Api, farm: str) -> None:
         assert bool(line["missing"]) == (line["state"] == "missing")
 
 
-def test_formats_through_each_other(api: Api, farm: str) -> None:
+def test_formats_survive_a_round_trip(api: Api, farm: str) -> None:
     geojson = json.loads(api.get(f"/maps/{farm}/geojson").content) if "geojson" in _formats(api) else None
     if geojson is not None:
         kinds = [f["properties"].get("kind") for f in geojson["features"]]
@@ -291,8 +291,8 @@ def _formats(api: Api) -> set[str]:
     return {f["id"] for f in api.get("formats").json()}
 
 
-def test_a_fleet_asks_at_once(api: Api, farm: str) -> None:
-    """One conversion, and everybody gets the same bytes."""
+def test_concurrent_requests_run_one_conversion(api: Api, farm: str) -> None:
+    """Concurrent requests cause one conversion, and all get the same bytes."""
     api.upload(farm, {"network.tmap2.yaml": samples.tmap2({**samples.NODES, "field": (77.0, 7.0)})})
     path = f"{api.url}/maps/{farm}/kml"
     count = api.app.state.services.metrics.conversions.labels("kml", "made")._value.get
@@ -311,7 +311,7 @@ def test_a_fleet_asks_at_once(api: Api, farm: str) -> None:
     assert count() - before == 1
 
 
-def test_a_large_file_is_streamed_from_disk(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_file_is_streamed_from_disk(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.api import maps
     from app.api.http import streams
 
@@ -334,7 +334,7 @@ def test_a_large_file_is_streamed_from_disk(api: Api, farm: str, monkeypatch: py
     api.app.state.services.response_cache._entries.clear()
 
 
-def test_memory_is_bounded(tmp_path: Path) -> None:
+def test_response_cache_is_bounded(tmp_path: Path) -> None:
     with running(settings_for(tmp_path, memory_cache_bytes=10_000)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2(), **samples.grid()})
@@ -345,7 +345,7 @@ def test_memory_is_bounded(tmp_path: Path) -> None:
                 assert hot._size <= 10_000 or len(hot._entries) == 1
 
 
-def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_conversion_becomes_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.convert.maps import Maps
 
     quick, gate = Maps.get_or_convert, threading.Event()
@@ -363,7 +363,7 @@ def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.
         job = answer.json()
         assert location == f"/api/v1/jobs/{job['id']}"
         assert job["state"] == "running"
-        assert api.get("/maps/farm/tmap2", 202).headers["location"] == location, "one job for one who asks again"
+        assert api.get("/maps/farm/tmap2", 202).headers["location"] == location, "repeated requests share one job"
         assert api.get(location).json()["state"] == "running"
         other = api.token_for("viewer")
         api_other = other.get("/maps/farm/tmap2", 202).headers["location"]
@@ -386,7 +386,7 @@ def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.
         api.problem("GET", location, 404)
 
 
-def test_a_job_is_cancelled_or_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_job_is_cancelled_or_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.convert.maps import Maps
     from app.errors import CannotConvert
 
@@ -420,13 +420,13 @@ def _linger(seconds: float) -> None:
     time.sleep(seconds)
 
 
-def test_cancelling_stops_the_work_unless_others_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cancel_stops_the_conversion_unless_others_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.pool import Pool
 
     quick, slow, begun = Pool.run, [60.0], []
 
     def run(self: Pool, function: Any, *args: Any, **more: Any) -> Any:
-        """The worker has something long to do first, in its process, where only killing it helps."""
+        """The worker is busy with a long task in its process, which only a kill can stop."""
         if "stop" in more and slow:
             begun.append(more["stop"])
             quick(self, _linger, slow[0], stop=more["stop"])
@@ -442,7 +442,7 @@ def test_cancelling_stops_the_work_unless_others_wait_for_it(tmp_path: Path, mon
         assert len(begun) == 1
         api("DELETE", location, 204)
         assert api.get(location).json()["state"] == "cancelled"
-        assert not begun[0].is_cancelled, "somebody else waits for it"
+        assert not begun[0].is_cancelled, "another request waits for it"
         assert other.get(theirs).json()["state"] == "running"
         again = api.get("/maps/farm/tmap2", 202).headers["location"]
         assert again != location
@@ -454,13 +454,13 @@ def test_cancelling_stops_the_work_unless_others_wait_for_it(tmp_path: Path, mon
         slow.clear()
         deadline = begin + 50
         while api.get("/maps/farm/tmap2", None).status_code == 202:
-            assert time.monotonic() < deadline, "the worker went on with what nobody wants"
+            assert time.monotonic() < deadline, "the worker continued an unwanted conversion"
             time.sleep(0.1)
         assert [api.get(url).json()["state"] for url in (location, theirs, again)] == ["cancelled"] * 3
         assert 'fleetmap_conversions_total{format="tmap2",result="cancelled"} 1.0' in api.get("/metrics").text
 
 
-def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.convert.maps import Maps
 
     stopped = threading.Event()
@@ -471,7 +471,7 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
                 stopped.set()
             stop.check()
             time.sleep(0.05)
-        raise AssertionError("nobody stopped it")
+        raise AssertionError("the conversion was not stopped")
 
     monkeypatch.setattr(Maps, "get_or_convert", endless)
     with running(settings_for(tmp_path, job_seconds=0.1)) as api:
@@ -486,7 +486,7 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
 
 
 def test_coverage_does_not_wait_for_busy_workers(api: Api, farm: str) -> None:
-    """The table of content that nobody has looked at, while the only worker is at work."""
+    """Coverage of unread content is requested while the only worker is busy."""
     services = api.app.state.services
     stop = CancelHandle()
     working = threading.Thread(target=_outlast, args=(services.pool, stop))
@@ -498,7 +498,7 @@ def test_coverage_does_not_wait_for_busy_workers(api: Api, farm: str) -> None:
             time.sleep(0.01)
         rows = api.get(f"environments/{farm}/versions/3/maps").json()
         assert any(row["state"] == "derivable" for row in rows)
-        assert services.pool.is_busy, "the worker's job ended before the table was told"
+        assert services.pool.is_busy, "the worker's task ended before the response"
     finally:
         stop()
         working.join(60)

@@ -1,4 +1,4 @@
-"""Pictures from a provider: against a server of our own that speaks its protocol, and one that misbehaves."""
+"""Imagery from a provider: a correct test server, and a misbehaving one."""
 
 from __future__ import annotations
 
@@ -46,7 +46,9 @@ SECRET = "pk.very-secret"
 
 
 def world(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """The colour of a place in Web Mercator metres: blocks of 16 m, so that every pixel tells where it lies."""
+    """Return the colour of a position in Web Mercator metres: blocks of 16 m, so that every pixel reveals its
+    position.
+    """
     return np.stack([(x // 16) % 256, (y // 16) % 256, (x // 16 + y // 16) % 256], axis=-1).astype(np.uint8)
 
 
@@ -59,17 +61,17 @@ def drawn(left: float, top: float, size: float, width: int, height: int) -> byte
 
 @dataclass
 class Misbehaving:
-    """A provider. mood: what it does; asked: the paths that came."""
+    """Imagery provider for tests. behaviour: kind of fault, or fine. paths: requested paths."""
 
     url: str = ""
-    mood: str = "fine"
-    asked: list[str] = field(default_factory=list)
+    behaviour: str = "fine"
+    paths: list[str] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
-    gone: threading.Event = field(default_factory=threading.Event)
+    closing: threading.Event = field(default_factory=threading.Event)
 
 
 def picture_for(path: str) -> bytes:
-    """What a good provider answers."""
+    """Build the response of a correct provider."""
     parts = urlsplit(path)
     query = {key.upper(): values[0] for key, values in parse_qs(parts.query).items()}
     tile = re.match(r"/tiles/(\d+)/(\d+)/(\d+)\.png", parts.path)
@@ -113,65 +115,69 @@ def provider() -> Iterator[Misbehaving]:
 
         def do_GET(self) -> None:
             with state.lock:
-                state.asked.append(self.path)
-                count = len(state.asked)
-            mood = state.mood
+                state.paths.append(self.path)
+                count = len(state.paths)
+            behaviour = state.behaviour
             try:
-                if mood == "fine" or (mood == "busy" and count > 2) or (mood == "led" and "moved" in self.path):
+                if (
+                    behaviour == "fine"
+                    or (behaviour == "busy" and count > 2)
+                    or (behaviour == "led" and "moved" in self.path)
+                ):
                     self.send(200, picture_for(self.path.replace("/moved", "")))
-                elif mood == "forbidden":
+                elif behaviour == "forbidden":
                     self.send(403, b"{}", "application/json")
-                elif mood == "failing":
+                elif behaviour == "failing":
                     self.send(500, b"oops", "text/plain")
-                elif mood in ("broken", "busy"):
+                elif behaviour in ("broken", "busy"):
                     self.send(503, b"", Retry_After="0")
-                elif mood == "html":
+                elif behaviour == "html":
                     self.send(200, b"<html>sign in</html>", "text/html; charset=utf-8")
-                elif mood == "disguised":
+                elif behaviour == "disguised":
                     self.send(200, b"<html>sign in</html>")
-                elif mood == "huge":
+                elif behaviour == "huge":
                     self.send(200, b"\x89PNG\r\n\x1a\n", length=str(10 * 2**30))
                     self.close_connection = True
-                elif mood == "endless":
+                elif behaviour == "endless":
                     self.send_response(200)
                     self.send_header("Content-Type", "image/png")
                     self.send_header("Connection", "close")
                     self.end_headers()
                     self.close_connection = True
-                    while not state.gone.is_set():
+                    while not state.closing.is_set():
                         self.wfile.write(b"\x89PNG\r\n\x1a\n" + bytes(2**16))
-                elif mood == "dripping":
+                elif behaviour == "dripping":
                     self.send_response(200)
                     self.send_header("Content-Length", "1000000")
                     self.end_headers()
                     self.close_connection = True
-                    while not state.gone.is_set():
+                    while not state.closing.is_set():
                         self.wfile.write(b"x")
                         time.sleep(0.05)
-                elif mood == "silent":
-                    state.gone.wait(20)
+                elif behaviour == "silent":
+                    state.closing.wait(20)
                     self.close_connection = True
-                elif mood == "elsewhere":
+                elif behaviour == "elsewhere":
                     self.send(302, b"", Location="http://169.254.169.254/latest/meta-data/")
-                elif mood == "led":
+                elif behaviour == "led":
                     self.send(302, b"", Location="/moved" + self.path)
-                elif mood == "circle":
+                elif behaviour == "circle":
                     self.send(302, b"", Location=self.path)
-                elif mood == "missing":
+                elif behaviour == "missing":
                     self.send(404, b"")
-                elif mood == "patchy":
+                elif behaviour == "patchy":
                     if count == 1:
                         self.send(404, b"")
                     else:
                         self.send(200, picture_for(self.path))
-                elif mood == "small":
+                elif behaviour == "small":
                     self.send(200, drawn(0, 0, 1, 64, 64))
-                elif mood == "torn":
+                elif behaviour == "torn":
                     self.send(200, picture_for(self.path)[:200])
-                elif mood == "bomb":
+                elif behaviour == "bomb":
                     self.send(200, BOMB)
                 else:
-                    raise AssertionError(mood)
+                    raise AssertionError(behaviour)
             except (BrokenPipeError, ConnectionResetError):
                 self.close_connection = True
 
@@ -183,7 +189,7 @@ def provider() -> Iterator[Misbehaving]:
     try:
         yield state
     finally:
-        state.gone.set()
+        state.closing.set()
         server.shutdown()
         server.server_close()
         thread.join(10)
@@ -201,7 +207,9 @@ def fetched(provider: Provider, resolution: float = 0.5) -> tuple[GeoImage, int]
 
 
 def check(picture: GeoImage) -> None:
-    """Every pixel shows the place that the transform says, and the box is covered with no more than a pixel around."""
+    """Check that every pixel is at the position of the transform, and that the image exceeds the box by at most a
+    pixel.
+    """
     height, width = picture.pixels.shape[:2]
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     at = pixel_positions(picture.transform, u.ravel(), v.ravel()).reshape(height, width, 2)
@@ -216,7 +224,7 @@ def check(picture: GeoImage) -> None:
 
 
 @pytest.mark.parametrize("kind", ["xyz", "wms", "mapbox"])
-def test_what_is_fetched_lies_where_it_is_said_to_lie(provider: Misbehaving, kind: Any) -> None:
+def test_fetched_image_is_at_its_position(provider: Misbehaving, kind: Any) -> None:
     url = {"xyz": "/tiles/{z}/{x}/{y}.png", "wms": "/wms?layers=ortho&format=image/png", "mapbox": "/styles/static"}
     tile_provider = Provider(provider.url + url[kind], kind, SECRET)
     picture, missing = fetched(tile_provider)
@@ -226,20 +234,20 @@ def test_what_is_fetched_lies_where_it_is_said_to_lie(provider: Misbehaving, kin
     assert 0.25 < ground <= 0.5001
     if kind == "wms":
         assert ground == pytest.approx(0.5, rel=1e-3)
-        assert all(SECRET not in path for path in provider.asked)
+        assert all(SECRET not in path for path in provider.paths)
     if kind == "mapbox":
-        assert all(f"access_token={SECRET}" in path for path in provider.asked)
+        assert all(f"access_token={SECRET}" in path for path in provider.paths)
 
 
-def test_large_pictures_come_in_parts(provider: Misbehaving) -> None:
+def test_large_images_are_fetched_in_parts(provider: Misbehaving) -> None:
     for kind, url in (("wms", "/wms?layers=ortho"), ("mapbox", "/styles/static")):
-        provider.asked.clear()
+        provider.paths.clear()
         picture, _ = fetched(Provider(provider.url + url, kind, max_zoom=22), resolution=0.03)  # type: ignore[arg-type]
         check(picture)
-        assert len(provider.asked) >= 2
+        assert len(provider.paths) >= 2
 
 
-def test_rows_from_below_and_wmts_names() -> None:
+def test_url_templates_support_tms_rows_and_wmts_names() -> None:
     box, size = (-0.5251, 53.2682, -0.5250, 53.2683), 0.5
     plain = plan_mosaic(Provider("https://a/{z}/{x}/{y}", "xyz"), box, size).blocks[0]
     below = plan_mosaic(Provider("https://a/{z}/{x}/{-y}", "xyz"), box, size).blocks[0]
@@ -247,7 +255,7 @@ def test_rows_from_below_and_wmts_names() -> None:
     z, x, y = (int(v) for v in plain.url.removeprefix("https://a/").split("/"))
     assert below.url == f"https://a/{z}/{x}/{2**z - 1 - y}"
     assert wmts.url == plain.url
-    # The tile that OpenStreetMap's wiki gives for this place by another formula.
+    # The wiki of OpenStreetMap gives this tile for the position, by another formula.
     n = 2**z
     lat = np.radians(53.2683)
     assert x == int((-0.5251 + 180) / 360 * n)
@@ -255,7 +263,7 @@ def test_rows_from_below_and_wmts_names() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mood", "error", "says"),
+    ("behaviour", "error", "message"),
     [
         ("forbidden", CannotDerive, r"refuses \(403\)"),
         ("broken", Unavailable, "answers 503"),
@@ -274,11 +282,13 @@ def test_rows_from_below_and_wmts_names() -> None:
         ("bomb", CannotDerive, "cannot be read"),
     ],
 )
-def test_a_provider_that_misbehaves(provider: Misbehaving, mood: str, error: type[Exception], says: str) -> None:
-    provider.mood = mood
+def test_misbehaving_provider_raises_error(
+    provider: Misbehaving, behaviour: str, error: type[Exception], message: str
+) -> None:
+    provider.behaviour = behaviour
     tile_provider = tiles(provider, max_bytes=2**20, seconds=1.5, tries=2)
     begun = time.monotonic()
-    with pytest.raises(error, match=says) as caught:
+    with pytest.raises(error, match=message) as caught:
         fetched(tile_provider)
     assert time.monotonic() - begun < 8.0
     assert SECRET not in str(caught.value)
@@ -286,16 +296,16 @@ def test_a_provider_that_misbehaves(provider: Misbehaving, mood: str, error: typ
     assert "169.254" not in str(caught.value)
 
 
-def test_nobody_there(provider: Misbehaving) -> None:
+def test_unreachable_provider_raises_unavailable(provider: Misbehaving) -> None:
     with pytest.raises(Unavailable, match="cannot be reached"):
         fetched(Provider("http://127.0.0.1:9/{z}/{x}/{y}", "xyz", tries=1))
 
 
-def test_a_busy_provider_is_asked_again(provider: Misbehaving) -> None:
-    provider.mood = "busy"
+def test_busy_provider_is_retried(provider: Misbehaving) -> None:
+    provider.behaviour = "busy"
     picture, _ = fetched(tiles(provider, tries=4))
     check(picture)
-    provider.mood, provider.asked[:] = "busy", []
+    provider.behaviour, provider.paths[:] = "busy", []
     waits: list[float] = []
     tile_provider = tiles(provider, tries=4)
     mosaic = plan_mosaic(tile_provider, BOX, 0.5)
@@ -304,47 +314,47 @@ def test_a_busy_provider_is_asked_again(provider: Misbehaving) -> None:
     assert max(waits) <= online.MAX_WAIT_SECONDS
 
 
-def test_a_redirect_on_the_host_is_followed(provider: Misbehaving) -> None:
-    provider.mood = "led"
+def test_redirect_to_the_same_host_is_followed(provider: Misbehaving) -> None:
+    provider.behaviour = "led"
     picture, _ = fetched(tiles(provider))
     check(picture)
 
 
-def test_parts_that_are_missing_are_transparent(provider: Misbehaving) -> None:
-    provider.mood = "patchy"
+def test_missing_parts_are_transparent(provider: Misbehaving) -> None:
+    provider.behaviour = "patchy"
     picture, missing = fetched(tiles(provider), resolution=0.2)
     assert missing == 1
     assert picture.pixels.shape[2] == 4
     assert 0 < (picture.pixels[..., 3] == 0).mean() < 1
 
 
-def test_what_was_fetched_is_kept_for_a_while(provider: Misbehaving, tmp_path: Path) -> None:
+def test_fetched_parts_are_cached(provider: Misbehaving, tmp_path: Path) -> None:
     tile_provider = tiles(provider, cache_dir=tmp_path / "c", cache_bytes=10**6)
     first, _ = fetched(tile_provider)
-    count = len(provider.asked)
-    provider.mood = "broken"
+    count = len(provider.paths)
+    provider.behaviour = "broken"
     again, _ = fetched(tile_provider)
-    assert len(provider.asked) == count
+    assert len(provider.paths) == count
     assert np.array_equal(first.pixels, again.pixels)
     files = list((tmp_path / "c").iterdir())
     assert files
     assert all(SECRET not in f.name and SECRET.encode() not in f.read_bytes() for f in files)
-    provider.mood = "fine"
+    provider.behaviour = "fine"
     size = max(f.stat().st_size for f in files)
     fetched(tiles(provider, cache_dir=tmp_path / "c", cache_bytes=3 * size), resolution=0.1)
     assert sum(f.stat().st_size for f in (tmp_path / "c").iterdir()) <= 3 * size
 
 
 @pytest.mark.parametrize(
-    ("box", "resolution", "says"),
+    ("box", "resolution", "message"),
     [
         ((-0.6, 53.0, -0.4, 53.2), 0.1, "coarser resolution"),
         ((179.9, 0.0, 180.1, 0.1), 1.0, "date line"),
         ((0.0, 86.0, 0.1, 86.1), 1.0, "pole"),
     ],
 )
-def test_what_is_not_even_asked_for(box: Any, resolution: float, says: str) -> None:
-    with pytest.raises(Invalid, match=says):
+def test_invalid_areas_cause_no_request(box: Any, resolution: float, message: str) -> None:
+    with pytest.raises(Invalid, match=message):
         plan_mosaic(Provider("https://a/{z}/{x}/{y}", "xyz"), box, resolution)
 
 
@@ -357,7 +367,7 @@ def test_what_is_not_even_asked_for(box: Any, resolution: float, says: str) -> N
         {"imagery_url": "https://a/wms?styles=", "imagery_kind": "wms"},
     ],
 )
-def test_addresses_that_cannot_be(tmp_path: Path, values: dict[str, Any]) -> None:
+def test_invalid_provider_urls_are_refused(tmp_path: Path, values: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="imagery_url"):
         settings_for(tmp_path, **values)
 
@@ -377,7 +387,7 @@ def serving(folder: Path, at: Misbehaving) -> Iterator[Api]:
         yield api
 
 
-def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
+def test_site_gets_its_image(provider: Misbehaving, tmp_path: Path) -> None:
     with serving(tmp_path, provider) as api:
         listed = {d["id"] for d in api.get("derivations").json()}
         assert "location_to_imagery" in listed
@@ -402,11 +412,11 @@ def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
         assert line["steps"][0]["parameters"]["provider"] == provider.url.removeprefix("http://")
         assert SECRET not in str(report) + str(version) + str(image)
         assert api.get("/maps/farm/satellite").content[:4] in (b"II*\0", b"MM\0*")
-        assert api.post(path, request, expect=200).json()["version"] == version["version"], "the same picture"
-        # Another storey has nothing to do with it.
+        assert api.post(path, request, expect=200).json()["version"] == version["version"], "the same image"
+        # A part on another level is independent.
         put = {"op": "put", "layer": "objects", "level": "1", "feature": FEATURE}
         assert api.post("environments/farm/edits", {"changes": [put]}).json()["stale"] == []
-        # The fence moves: the picture is stale, and stays served until it is fetched anew.
+        # The fence moves: the image becomes stale, and is still served until it is fetched again.
         (fence,) = api.get("environments/farm/versions/latest/layers/location").json()["features"]
         fence["geometry"]["coordinates"][0][1][0] = fence["geometry"]["coordinates"][0][2][0] = -0.5242
         put = {"op": "put", "layer": "location", "feature": fence}
@@ -416,31 +426,31 @@ def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
         report = api.get("environments/farm/versions/latest/reports/satellite").json()
         assert any("derive it anew" in w["problem"] for w in report["warnings"])
         assert api.post(path, request).json()["stale"] == []
-        # So does the datum; what comes is the same, and no longer stale.
+        # The datum moves, too; the new image is the same, and no longer stale.
         place = {"latitude": 53.2682, "longitude": -0.5251, "altitude": 20.0}
         api("PATCH", "environments/farm", 200, json={"datum": place})
         later = api.get("environments/farm/versions/latest").json()
         assert [s["changed"] for s in later["stale"]] == [["datum"]]
         again = api.post(path, request).json()
         assert (again["version"], again["root"], again["stale"]) == (later["version"] + 1, later["root"], [])
-        # What a provider does wrong makes no version.
-        for mood, status in (
+        # Errors of the provider create no version.
+        for behaviour, status in (
             *(("broken", 503), ("failing", 503), ("silent", 503), ("dripping", 503)),
             *(("html", 422), ("forbidden", 422), ("bomb", 422), ("huge", 422), ("endless", 422)),
         ):
-            provider.mood = mood
+            provider.behaviour = behaviour
             problem = api.problem("POST", path, status, json=request)
             assert SECRET not in str(problem)
             assert len(problem["detail"]) > 20
         before = api.get("environments/farm/versions/latest").json()["version"]
-        provider.mood = "fine"
+        provider.behaviour = "fine"
         api.problem("POST", path, 422, json={**request, "parameters": {"zoom": 3}})
         viewer = api.token_for("viewer")
         viewer.problem("POST", path, 403, json=request)
         assert api.get("environments/farm/versions/latest").json()["version"] == before
 
 
-def test_a_picture_around_the_datum_is_stale_when_there_is_a_fence(provider: Misbehaving, tmp_path: Path) -> None:
+def test_image_around_the_datum_is_stale_after_upload_of_a_fence(provider: Misbehaving, tmp_path: Path) -> None:
     with serving(tmp_path, provider) as api:
         api.post("environments", {"name": "farm", "datum": {"latitude": 53.2682, "longitude": -0.5251}})
         request = {"method": "location_to_imagery", "parameters": {"resolution": 0.5, "radius": 20}}
@@ -449,7 +459,7 @@ def test_a_picture_around_the_datum_is_stale_when_there_is_a_fence(provider: Mis
         assert [s["changed"] for s in later["stale"]] == [["location ground/site"]]
 
 
-def test_without_a_provider_nobody_is_asked(api: Api, fresh: Callable[[], str]) -> None:
+def test_missing_provider_causes_no_request(api: Api, fresh: Callable[[], str]) -> None:
     name = fresh()
     api.post("environments", {"name": name, "datum": {"latitude": 53.2682, "longitude": -0.5251}})
     request = {"method": "location_to_imagery", "parameters": {"radius": 50}}

@@ -1,4 +1,4 @@
-"""OpenAPI: complete, and every example in it works against a server."""
+"""OpenAPI document: complete, and all its examples work against a server."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tests.api import samples
 from tests.api.conftest import ADMIN, Api, parts, running, settings_for
 
 UPLOADED = {"datum.yaml": samples.DATUM}
-"""Files that the examples of uploads name."""
+"""Files that the upload examples name."""
 
 
 @pytest.fixture(scope="module")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
-    """A server that holds what the examples speak of: the demo, a robot's report."""
+    """Run a server with the objects that the examples name: the demo, a robot's report."""
     with running(settings_for(tmp_path_factory.mktemp("examples"), job_seconds=60)) as api:
         with Client(api.url, ADMIN) as client:
             demo.install(client)
@@ -69,13 +69,13 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
         "/api/v1/stored/{kind}/{sha256}": "get",
     }  # fmt: skip
-    by_format = {f"/maps/{{env}}/{known.name}" for known in all_formats().values() if known.write}
+    by_format = {f"/maps/{{env}}/{fmt.name}" for fmt in all_formats().values() if fmt.write}
     assert by_format < set(schema["paths"])
     assert {path: " ".join(sorted(item, key=["get", "post", "put", "patch", "delete"].index))
             for path, item in schema["paths"].items() if path not in by_format} == wanted  # fmt: skip
 
 
-def test_every_call_is_described(schema: dict[str, Any]) -> None:
+def test_openapi_describes_every_call(schema: dict[str, Any]) -> None:
     seen = set()
     for path, method, op in operations(schema):
         operation = f"{method} {path}"
@@ -91,7 +91,7 @@ def test_every_call_is_described(schema: dict[str, Any]) -> None:
         assert ("security" in op) == (path not in ("/healthz", "/readyz")), operation
 
 
-def test_every_problem_is_documented_in_its_shape(schema: dict[str, Any]) -> None:
+def test_openapi_documents_every_problem(schema: dict[str, Any]) -> None:
     for path, method, op in operations(schema):
         for status, response in op["responses"].items():
             if int(status) < 400:
@@ -105,14 +105,14 @@ def test_every_problem_is_documented_in_its_shape(schema: dict[str, Any]) -> Non
             assert {"400", "413", "415"} <= set(op["responses"]), (method, path)
 
 
-def test_references_resolve(schema: dict[str, Any]) -> None:
+def test_openapi_references_resolve(schema: dict[str, Any]) -> None:
     schemas = set(schema["components"]["schemas"])
     used = set(re.findall(r"#/components/schemas/([A-Za-z_0-9]+)", str(schema)))
     assert used <= schemas
     assert "HTTPValidationError" not in schemas
 
 
-def test_parameters_of_formats_are_listed(api: Api, schema: dict[str, Any]) -> None:
+def test_openapi_lists_parameters_of_formats(api: Api, schema: dict[str, Any]) -> None:
     op = schema["paths"]["/api/v1/environments/{env}/versions/{v}/maps/{format}"]["get"]
     listed = {p["name"] for p in op["parameters"] if p["in"] == "query"}
     declared = {o["name"] for f in api.get("formats").json() if f["write"] for o in f["options"] if o["for"] == "write"}
@@ -120,21 +120,21 @@ def test_parameters_of_formats_are_listed(api: Api, schema: dict[str, Any]) -> N
     assert listed == declared | steps | {"derive", "closures"}
 
 
-def test_each_format_has_its_own_parameters(schema: dict[str, Any]) -> None:
+def test_openapi_lists_parameters_by_format(schema: dict[str, Any]) -> None:
     op = schema["paths"]["/maps/{env}/octomap"]["get"]
     option_names = {o["name"] for o in describe(get_format("octomap").write_options)}
     assert option_names
     assert {p["name"] for p in op["parameters"] if p["in"] == "query"} == option_names | {"derive", "closures"}
 
 
-def test_the_page_needs_no_network(api: Api) -> None:
-    nobody = api.as_(None)
-    page = nobody.get("/docs").text
+def test_docs_page_needs_no_network(api: Api) -> None:
+    anonymous = api.as_(None)
+    page = anonymous.get("/docs").text
     links = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert len(links) >= 3
     for link in links:
         assert link.startswith("/docs/"), link
-        assert nobody.get(link).content
+        assert anonymous.get(link).content
     assert "//" not in page.replace("</", "").replace("<!--", "").replace("/*", "") or "http" not in page
 
 
@@ -159,7 +159,7 @@ LANE = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "prope
 
 
 def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]]:
-    """Ways to send the examples of a call, as arguments for the client."""
+    """Yield the requests of a call's examples, as arguments for the client."""
     content = op.get("requestBody", {}).get("content", {})
     out: list[dict[str, Any]] = []
     for media, media_object in content.items():
@@ -177,7 +177,7 @@ def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]
     return out or [{}]
 
 
-def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -> None:
+def test_openapi_examples_work(api: Api, schema: dict[str, Any], tmp_path: Path) -> None:
     resource_ids: dict[str, str] = {}
     job = api.app.state.services.store.jobs.create(owner="", detail="an example")
     resource_ids["/api/v1/jobs/{id}"] = job.id
@@ -213,12 +213,10 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
             elif parameter["in"] == "query" and value is not None:
                 query[parameter["name"]] = value
         if path == "/api/v1/events":
-            query["follow"] = "false"  # else it would not end
+            query["follow"] = "false"  # otherwise it would not end
         for body in bodies_of(schema, op):
             answer = api(method.upper(), target, None, params=query, **body)
-            missing = (
-                op["tags"] == ["maps by format"] and answer.status_code == 422
-            )  # what that format needs is not there
+            missing = op["tags"] == ["maps by format"] and answer.status_code == 422  # this format's inputs are missing
             assert answer.status_code < 400 or missing, (operation, answer.status_code, answer.text[:1000])
             assert str(answer.status_code) in op["responses"], (operation, answer.status_code)
             if path == "/api/v1/tokens" and method == "post":

@@ -1,4 +1,4 @@
-"""What robots report as blocked, and what editors make of it. ``test_closures.py``: how maps show it."""
+"""Reports of obstructions, and the decisions of editors. ``test_closures.py`` covers the maps."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def zones(api: Api, env: str) -> list[dict[str, Any]]:
 
 
 def told_of(api: Api, env: str) -> list[dict[str, Any]]:
-    """The events after the farm's own, as a client reads them."""
+    """Read the events after those of the farm, like a client."""
     lines = api.get(f"events?environment={env}&since=4&follow=false").text.splitlines()
     events = [json.loads(line[5:]) for line in lines if line.startswith("data:")]
     assert [e["sequence"] for e in events] == list(range(5, 5 + len(events)))
@@ -102,14 +102,14 @@ def test_end_is_given_as_a_time_or_as_seconds(api: Api, farm: str) -> None:
         (rfc3339(datetime.now(UTC) - timedelta(seconds=1)), {}, "in the past"),
         (rfc3339(soon + timedelta(days=400)), {}, "days ahead"),
         (soon.replace(tzinfo=None).isoformat(), {}, "time zone"),
-        (rfc3339(soon), {"ttl_seconds": 5}, "one of them"),
+        (rfc3339(soon), {"ttl_seconds": 5}, "exclude each other"),
     ):
         body = {"kind": "blocked", "edge": "gate_barn", "expires": expires, **more}
         assert text in api.problem("POST", url, 422, json=body)["detail"]
 
 
 def test_edge_that_only_a_channel_has_can_be_closed(api: Api, farm: str) -> None:
-    """The robot drives on production, and the newest version has another network."""
+    """The robot runs production, and the head has another network."""
     url = f"environments/{farm}/overlays"
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 3}).raise_for_status()
     deletion = {"op": "delete", "layer": "topology", "id": "gate_barn"}
@@ -126,7 +126,7 @@ def test_edge_that_only_a_channel_has_can_be_closed(api: Api, farm: str) -> None
 
 
 def test_piece_of_a_bent_edge_closes_the_edge(api: Api, farm: str) -> None:
-    """A robot reports the edge as its map calls it, and straight edges lead from bend to bend there."""
+    """The robot reports the edge by the id in its map, in which a bent edge is split into straight edges."""
     url = f"environments/{farm}/overlays"
     line = edge(api, farm, "gate_barn")
     (x, y, *_), (x2, y2, *_) = line["place"]["coordinates"]
@@ -145,7 +145,7 @@ def test_piece_of_a_bent_edge_closes_the_edge(api: Api, farm: str) -> None:
 
 
 @pytest.mark.parametrize("what", [{"edge": "gate_barn"}, {"polygon": SQUARE, "crs": "local"}])
-def test_kept_overlay_is_a_version_and_stays_in_force(api: Api, farm: str, what: dict[str, Any]) -> None:
+def test_kept_overlay_creates_a_version_and_stays_in_force(api: Api, farm: str, what: dict[str, Any]) -> None:
     url = f"environments/{farm}/overlays"
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 3}).raise_for_status()
     overlay = api.post(url, {"kind": "blocked", "detail": "a wall", **what}).json()
@@ -154,7 +154,9 @@ def test_kept_overlay_is_a_version_and_stays_in_force(api: Api, farm: str, what:
     result = api.post(f"{url}/{overlay['id']}/keep", expect=200).json()
     assert (result["state"], result["version"]) == ("accepted", 4)
     assert api.post(f"{url}/{overlay['id']}/keep", expect=200).json() == result
-    assert [o["id"] for o in api.get(f"{url}?state=accepted").json()] == [overlay["id"]], "production is not there yet"
+    assert [o["id"] for o in api.get(f"{url}?state=accepted").json()] == [overlay["id"]], (
+        "production does not exist yet"
+    )
     if "edge" in what:
         assert edge(api, farm, "gate_barn")["properties"]["blocked"] is True
         assert "gate_barn" not in api.get(f"environments/{farm}/versions/4/maps/tmap2").text
@@ -164,10 +166,10 @@ def test_kept_overlay_is_a_version_and_stays_in_force(api: Api, farm: str, what:
         assert zone["properties"] == {
             "kind": "keepout", "overlay": {"id": overlay["id"], "reporter": "administrator", "detail": "a wall"},
         }  # fmt: skip
-        # It is closed now, and it is a keepout for good.
+        # It is closed now, and a permanent keepout.
         assert f"overlay-{overlay['id']}" in api.get(f"environments/{farm}/versions/4/maps/geojson").text
     api.post(f"{url}/{overlay['id']}/end", expect=200)
-    assert "gate_barn" in api.get(f"/maps/{farm}/tmap2").text, "production was never moved"
+    assert "gate_barn" in api.get(f"/maps/{farm}/tmap2").text, "production did not move"
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 4}).raise_for_status()
     if "edge" in what:
         assert "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
@@ -176,8 +178,8 @@ def test_kept_overlay_is_a_version_and_stays_in_force(api: Api, farm: str, what:
 
 
 @pytest.mark.parametrize("what", [{"edge": "gate_barn"}, {"polygon": SQUARE, "crs": "local"}])
-def test_overlay_of_an_earlier_release_goes_on_as_a_closure(api: Api, farm: str, what: dict[str, Any]) -> None:
-    """It stands in version 4, which was promoted: it ends there as well."""
+def test_overlay_of_an_earlier_release_becomes_a_closure(api: Api, farm: str, what: dict[str, Any]) -> None:
+    """The overlay is in version 4, which is promoted: it ends there as well."""
     url = f"environments/{farm}/overlays"
     end = rfc3339(datetime.now(UTC) + timedelta(hours=1))
     overlay = api.post(url, {"kind": "blocked", "expires": end, "state": "accepted", **what}).json()
@@ -201,7 +203,7 @@ def test_overlay_of_an_earlier_release_goes_on_as_a_closure(api: Api, farm: str,
     assert api.get(f"/maps/{farm}/geojson").text.count(f'"overlay-{overlay["id"]}"') <= 1
     api.app.state.services.store.overlays.end_due(datetime.now(UTC) + timedelta(hours=2))
     assert api.get(f"{url}?state=ended").json()[0]["id"] == overlay["id"]
-    assert not blocked(), "production still stands on version 4"
+    assert not blocked(), "production still points to version 4"
     assert "blocked_until" not in api.get(f"/maps/{farm}/geojson").text
 
 
@@ -216,14 +218,14 @@ def test_overlay_of_an_earlier_release_goes_on_as_a_closure(api: Api, farm: str,
         ([[0, 0], [1, 1], [1, 0], [0, 1], [0, 0]], "local", "valid"),
     ],
 )
-def test_area_without_a_place_is_refused(api: Api, farm: str, ring: Any, crs: str, text: str) -> None:
+def test_area_that_cannot_be_placed_is_refused(api: Api, farm: str, ring: Any, crs: str, text: str) -> None:
     body = {"kind": "blocked", "crs": crs, "polygon": {"type": "Polygon", "coordinates": [ring]}}
     problem = api.problem("POST", f"environments/{farm}/overlays", 422, json=body)
     assert text in problem["detail"]
     api.get(f"/maps/{farm}/tmap2")
 
 
-def test_a_polygon_is_kept_without_what_came_along(api: Api, farm: str, bare: str) -> None:
+def test_polygon_is_stored_without_foreign_members(api: Api, farm: str, bare: str) -> None:
     url = f"environments/{farm}/overlays"
     report = {"kind": "blocked", "crs": "local", "polygon": {**SQUARE, "properties": {"x": "y" * 5000}, "crs": {}}}
     assert api.post(url, report).json()["polygon"] == SQUARE
@@ -239,7 +241,7 @@ def test_a_polygon_is_kept_without_what_came_along(api: Api, farm: str, bare: st
     )
 
 
-def test_one_that_goes_wild_leaves_room(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overlay_limit_applies_per_reporter(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.store.overlays.MAX_PENDING_PER_REPORTER", 3)
     url = f"environments/{farm}/overlays"
     wild, calm = (api.token_for("robot", robot=name) for name in ("wild", "calm"))
@@ -270,7 +272,7 @@ def test_undecided_overlays_expire(api: Api, farm: str) -> None:
     assert Event.from_json(json.dumps(told_of(api, farm)[1])).type == "overlay.expired"
 
 
-def test_refusals(api: Api, farm: str, bare: str) -> None:
+def test_invalid_reports_are_refused(api: Api, farm: str, bare: str) -> None:
     url = f"environments/{farm}/overlays"
     line = {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}
     for bad in (

@@ -1,4 +1,4 @@
-"""The same interface on PostgreSQL with PostGIS: one pass through everything that touches the database."""
+"""The same interface on PostgreSQL with PostGIS: one pass through all uses of the database."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.postgres
 
 @pytest.fixture
 def api(postgres_url: str, tmp_path: Path) -> Iterator[Api]:
-    """A server on a database that ``fleetmap migrate`` has prepared."""
+    """Run a server on a database that ``fleetmap migrate`` has prepared."""
     settings = settings_for(tmp_path, database_url=postgres_url)
     settings.blob_dir.mkdir(parents=True)
     store = Store(settings.database, settings.blob_dir)
@@ -32,12 +32,12 @@ def api(postgres_url: str, tmp_path: Path) -> Iterator[Api]:
         yield api
 
 
-def test_a_server_does_not_start_before_migrate(postgres_url: str, tmp_path: Path) -> None:
+def test_server_does_not_start_before_migrate(postgres_url: str, tmp_path: Path) -> None:
     with pytest.raises(Unavailable, match="fleetmap migrate"):
         open_services(settings_for(tmp_path, database_url=postgres_url))
 
 
-def test_the_whole_way(api: Api) -> None:
+def test_postgres_serves_the_whole_interface(api: Api) -> None:
     assert api.get("/readyz").json()["status"] == "ready"
     api.post("environments", {"name": "farm", "tags": ["wheat"]})
     api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()}, headers={"Idempotency-Key": "k"})
@@ -82,14 +82,14 @@ def test_the_whole_way(api: Api) -> None:
     assert api.get("/maps/copy/tmap2").content == first.content
 
 
-def test_writers_at_once(api: Api) -> None:
+def test_concurrent_writers_succeed_on_postgres(api: Api) -> None:
     api.post("environments", {"name": "farm"})
     api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
     races(api, "farm")
 
 
-def test_a_nul_is_never_a_mistake_of_the_server(api: Api) -> None:
-    """PostgreSQL refuses texts with NUL, also where they are only looked for."""
+def test_nul_returns_422(api: Api) -> None:
+    """PostgreSQL refuses texts with NUL, even in queries."""
     api.post("environments", {"name": "farm"})
     state = {"maps": [{"mapId": "\0", "mapVersion": "1", "mapStatus": "ENABLED"}]}
     for method, path, body in (

@@ -1,4 +1,4 @@
-"""The picture of which file made which map."""
+"""Provenance graph: files, layers and maps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.api.conftest import Api
 from tests.api.test_derivations import DATUM, lanes
 
 
-def test_files_lead_to_layers_and_layers_to_maps(api: Api, fresh: object) -> None:
+def test_graph_links_files_layers_and_maps(api: Api, fresh: object) -> None:
     api.post("environments", {"name": "traced", "datum": DATUM})
     api.upload("traced", lanes())
     api.post("environments/traced/derivations", {"method": "objects_to_topology"})
@@ -35,12 +35,12 @@ def test_files_lead_to_layers_and_layers_to_maps(api: Api, fresh: object) -> Non
     assert "tmap2" in texts
 
 
-def test_names_cannot_break_the_picture(api: Api, bare: str) -> None:
+def test_svg_escapes_names(api: Api, bare: str) -> None:
     api.upload(bare, {"a<b>&\"'.tmap2.yaml": samples.tmap2()})
     etree.fromstring(api.get(f"environments/{bare}/versions/1/provenance").content)
 
 
-def test_the_command_line_writes_it(api: Api, tmp_path: Path) -> None:
+def test_command_line_writes_the_graph(api: Api, tmp_path: Path) -> None:
     from app.cli import run
 
     api.post("environments", {"name": "drawn", "datum": DATUM})

@@ -1,4 +1,4 @@
-"""Robots over HTTP: who may tell what, who holds what, who lags."""
+"""Robots over HTTP: permissions, active maps, lag."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def root_of(api: Api, env: str, version: int) -> str:
     return str(api.get(f"environments/{env}/versions/{version}").json()["root"])
 
 
-def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
+def test_robot_reports_its_status(api: Api, farm: str) -> None:
     api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
     robot = api.token_for("robot", robot="mower-1", environments=farm)
     root = root_of(api, farm, 2)
@@ -45,14 +45,14 @@ def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
     assert api.get(f"robots/mower-1?environment={farm}").json()["lag"]["events"] == 0
 
 
-def test_many_reports_at_once_are_few_transactions(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_reports_share_transactions(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     robots, sizes = type(api.app.state.services.store.robots), []
-    quick = robots.note_reports
+    original = robots.note_reports
 
-    def counted(self: Any, heard: Any) -> Any:
-        sizes.append(len(heard))
+    def counted(self: Any, reports: Any) -> Any:
+        sizes.append(len(reports))
         time.sleep(0.2)
-        return quick(self, heard)
+        return original(self, reports)
 
     monkeypatch.setattr(robots, "note_reports", counted)
 
@@ -62,13 +62,13 @@ def test_many_reports_at_once_are_few_transactions(api: Api, farm: str, monkeypa
         return answer.status_code
 
     with ThreadPoolExecutor(24) as pool:
-        assert sorted(pool.map(report, range(24))) == [204] * 23 + [404], "each is told of his own"
+        assert sorted(pool.map(report, range(24))) == [204] * 23 + [404], "each caller gets its own robot"
     assert sum(sizes) == 24
     assert len(sizes) <= 12
     assert len([r for r in api.get(f"robots?environment={farm}").json() if r["robot"].startswith("many-")]) == 23
 
 
-def test_a_report_that_cannot_be_stored_is_told(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unstored_report_returns_503(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def away(*_: Any) -> Any:
         raise Unavailable("the database is away")
 
@@ -78,19 +78,19 @@ def test_a_report_that_cannot_be_stored_is_told(api: Api, farm: str, monkeypatch
     api("PUT", "robots/late/status", 200, json=status(farm, "a" * 64))
 
 
-def test_one_report_that_cannot_be_taken_harms_no_other(
+def test_failed_report_does_not_affect_others(
     api: Api, farm: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     robots = type(api.app.state.services.store.robots)
-    quick = robots.note_reports
+    original = robots.note_reports
 
-    def picky(self: Any, heard: Any) -> Any:
+    def failing(self: Any, reports: Any) -> Any:
         time.sleep(0.1)
-        if any(h.robot == "odd-3" for h in heard):
+        if any(report.robot == "odd-3" for report in reports):
             raise ValueError("a mistake")
-        return quick(self, heard)
+        return original(self, reports)
 
-    monkeypatch.setattr(robots, "note_reports", picky)
+    monkeypatch.setattr(robots, "note_reports", failing)
 
     def report(k: int) -> int:
         return api("PUT", f"robots/odd-{k}/status", None, json=status(farm, "a" * 64)).status_code
@@ -99,7 +99,7 @@ def test_one_report_that_cannot_be_taken_harms_no_other(
         assert list(pool.map(report, range(8))) == [200] * 3 + [503] + [200] * 4
 
 
-def test_the_list_comes_in_pages(api: Api, farm: str, bare: str) -> None:
+def test_list_is_paginated(api: Api, farm: str, bare: str) -> None:
     for env, names in ((farm, ("a", "B", "c", "d.1", "e")), (bare, ("a", "z"))):
         for name in names:
             api("PUT", f"robots/{name}/status", 200, json=status(env, "a" * 64))
@@ -126,19 +126,19 @@ def test_the_list_comes_in_pages(api: Api, farm: str, bare: str) -> None:
     api.problem("GET", "robots?limit=0", 422)
 
 
-def test_an_environment_that_goes_meanwhile_takes_its_robots_along(
+def test_robots_of_a_deleted_environment_are_skipped(
     api: Api, farm: str, bare: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = root_of(api, farm, 2)
     for env in (farm, bare):
         api("PUT", "robots/goer/status", 200, json=status(env, root))
     store = api.app.state.services.store
-    quick = store.channels.all
+    original = store.channels.all
 
     def delete_first(environment: str) -> Any:
         if environment == farm and store.environments.get(farm, deleted=True).deleted is None:
             store.environments.delete(farm)
-        return quick(environment)
+        return original(environment)
 
     monkeypatch.setattr(store.channels, "all", delete_first)
     assert farm not in {r["environment"] for r in api.get("robots?limit=1000").json()}
@@ -148,20 +148,20 @@ def test_an_environment_that_goes_meanwhile_takes_its_robots_along(
     assert api.get("robots/goer").json()["environment"] == bare
 
 
-def test_history_of_a_robot(api: Api, farm: str) -> None:
+def test_history_lists_changed_reports(api: Api, farm: str) -> None:
     for state in ("downloading", "downloading", "ready", "active"):
         api("PUT", "robots/digger/status", 200, json=status(farm, "a" * 64, state))
     body = api.get("robots/digger").json()
     assert [h["state"] for h in body["history"]] == ["active", "ready", "downloading"]
     assert body["environments"] == [farm]
-    assert body["lag"] is None, "the channel stands nowhere"
+    assert body["lag"] is None, "the channel has no version"
     assert len(api.get("robots/digger?limit=1").json()["history"]) == 1
     api("DELETE", f"robots/digger?environment={farm}", 204)
     api.problem("GET", "robots/digger", 404)
     api.problem("DELETE", f"robots/digger?environment={farm}", 404)
 
 
-def test_who_may_tell(api: Api, farm: str, bare: str) -> None:
+def test_report_needs_the_robots_token_or_an_editor(api: Api, farm: str, bare: str) -> None:
     report = status(farm, "a" * 64)
     robot_client = api.token_for("robot", robot="r-1", environments=farm)
     for caller in (robot_client, api.token_for("editor"), api):
@@ -191,7 +191,7 @@ def test_bad_statuses_are_refused(api: Api, farm: str) -> None:
     api.problem("GET", "robots?environment=nowhere", 404)
 
 
-def test_all_robots_hold_the_root(api: Api, farm: str) -> None:
+def test_since_is_set_if_all_robots_run_the_root(api: Api, farm: str) -> None:
     def stand() -> Any:
         channels = {c["channel"]: c for c in api.get(f"environments/{farm}/channels").json()}
         return channels["production"]["robots"]
@@ -211,7 +211,7 @@ def test_all_robots_hold_the_root(api: Api, farm: str) -> None:
     }  # fmt: skip
 
 
-def test_channel_counts_what_robots_hold(api: Api, farm: str) -> None:
+def test_channel_counts_active_maps(api: Api, farm: str) -> None:
     url = f"environments/{farm}/channels"
 
     def stand() -> tuple[int, int, int]:
@@ -226,7 +226,7 @@ def test_channel_counts_what_robots_hold(api: Api, farm: str) -> None:
     failed = {**status(farm, roots[3], "failed", holds=active_maps[2]), "version": 3}
     body = api("PUT", "robots/k/status", 200, json=failed).json()
     assert (body["version"], body["state"], body["holds"]["version"]) == (3, "failed", 2)
-    assert stand() == (1, 0, 0), "it holds what the channel points to, and refused what comes next"
+    assert stand() == (1, 0, 0), "it runs the channel's version, and refused the next one"
     api("PUT", "robots/k/status", 200, json={**failed, "holds": active_maps[1]})
     assert stand() == (0, 0, 1)
     api("PUT", "robots/k/status", 200, json={**failed, "holds": {"version": 0, "root": "0" * 64}})
@@ -235,7 +235,7 @@ def test_channel_counts_what_robots_hold(api: Api, farm: str) -> None:
         api.problem("PUT", "robots/k/status", 422, json={**failed, "holds": bad})
 
 
-def test_a_rollout(api: Api, farm: str) -> None:
+def test_rollout_moves_and_reverts_a_channel(api: Api, farm: str) -> None:
     url = f"environments/{farm}/channels/production"
 
     def channel() -> Any:
@@ -277,8 +277,8 @@ def test_a_rollout(api: Api, farm: str) -> None:
     api.token_for("robot", robot="two-1").problem("PUT", url, 403, json={"version": 3})
 
 
-def test_a_plan_of_somebody_whose_clock_is_slow(api: Api, farm: str) -> None:
-    """Planned for half a minute ahead by a clock that is a minute behind: no mistake, and it is due."""
+def test_planned_move_tolerates_a_slow_clock(api: Api, farm: str) -> None:
+    """The move is planned for 30 s ahead by a clock that is 60 s behind: it is accepted and due."""
     channel = f"environments/{farm}/channels/production"
     at = datetime.now(UTC) - timedelta(seconds=30)
     planned = api("PUT", channel, 200, json={"version": 2, "activate_at": at.isoformat()}).json()

@@ -1,4 +1,4 @@
-"""Channels, formats, conversion, tokens and roles, health and metrics, and the shape of every error."""
+"""Channels, formats, conversion, tokens and roles, health and metrics, and the shape of errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.api.conftest import ADMIN, API, Api, parts, problem, running, setting
 # --- channels ---
 
 
-def test_channels(api: Api, farm: str) -> None:
+def test_channel_moves_forward_and_back(api: Api, farm: str) -> None:
     url = f"environments/{farm}/channels"
     (latest,) = api.get(url).json()
     assert (latest["channel"], latest["version"]) == ("latest", 3)
@@ -42,7 +42,7 @@ def test_channels(api: Api, farm: str) -> None:
     api.problem("PUT", f"{url}/Bad", 422, json={"version": 1})
 
 
-def test_planned_moves(api: Api, farm: str) -> None:
+def test_planned_move_happens_or_is_cancelled(api: Api, farm: str) -> None:
     url = f"environments/{farm}/channels"
     api("PUT", f"{url}/production", 200, json={"version": 2})
     later = (datetime.now(UTC) + timedelta(hours=1)).isoformat()
@@ -65,7 +65,7 @@ def test_planned_moves(api: Api, farm: str) -> None:
 # --- formats and conversion ---
 
 
-def test_formats(api: Api) -> None:
+def test_formats_lists_options(api: Api) -> None:
     formats = {f["id"]: f for f in api.get("formats").json()}
     assert {"datum", "osm", "kml", "kmz", "occupancy_grid", "tmap2", "geojson"} <= set(formats)
     grid = formats["occupancy_grid"]
@@ -76,7 +76,7 @@ def test_formats(api: Api) -> None:
     assert grid["information"]["occupancy"] == "raw"
     assert grid["information"]["voxels"] == "derived"
     assert grid["information"]["location"] == "-"
-    assert formats["kml"]["information"]["occupancy"] == "derived", "a KML says where a grid lies, not what is in it"
+    assert formats["kml"]["information"]["occupancy"] == "derived", "a KML places a grid, but does not contain it"
     assert formats["kml"]["information"]["topology"] in ("raw", "derived")
     option = next(o for o in grid["options"] if o["name"] == "file_type")
     assert option["schema"]["enum"] == ["pgm", "png"]
@@ -85,11 +85,11 @@ def test_formats(api: Api) -> None:
     assert option["description"]
 
 
-def test_convert(api: Api) -> None:
+def test_convert_returns_the_format(api: Api) -> None:
     answer = api("POST", "convert", 200, files=parts({"n.kml": samples.KML}), data={"to": "tmap2"})
     assert len(yaml.safe_load(answer.content)["nodes"]) == 3
     assert answer.headers["content-disposition"] == 'attachment; filename="network.tmap2.yaml"'
-    assert int(answer.headers["fleetmap-warnings"]) >= 1, "no datum was given: told as a warning"
+    assert int(answer.headers["fleetmap-warnings"]) >= 1, "no datum was given: there is a warning"
     given = {"to": "datum", "datum": '{"latitude": 53.25, "longitude": -0.5}'}
     datum = yaml.safe_load(api("POST", "convert", 200, files=parts({"n.kml": samples.KML}), data=given).content)
     assert datum["datum_latitude"] == 53.25
@@ -120,11 +120,11 @@ def test_convert(api: Api) -> None:
         ({"to": "tmap2", "layer": "sky"}, 422),
     ],
 )
-def test_conversions_refused(api: Api, fields: dict[str, str], status: int) -> None:
+def test_invalid_conversions_are_refused(api: Api, fields: dict[str, str], status: int) -> None:
     api.problem("POST", "convert", status, files=parts({"n.kml": samples.KML}), data=fields)
 
 
-def test_conversions_without_files(api: Api) -> None:
+def test_conversion_without_files_is_refused(api: Api) -> None:
     api.problem("POST", "convert", 415, json={"to": "kml"})
     api.problem("POST", "convert", 422, files={"to": (None, "kml")})
     api.problem("POST", "convert", 422, files=parts({"../x": samples.KML}), data={"to": "tmap2"})
@@ -136,7 +136,7 @@ def test_conversions_without_files(api: Api) -> None:
 
 @pytest.fixture(scope="module")
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Api]]:
-    """A server with an environment and a client of every role."""
+    """Run a server with an environment and a client of every role."""
     with running(settings_for(tmp_path_factory.mktemp("guarded"))) as api:
         api.post("environments", {"name": "farm-1"})
         api.post("environments", {"name": "street"})
@@ -175,7 +175,7 @@ RULES = [
 
 
 @pytest.mark.parametrize("path", READS)
-def test_everybody_with_a_token_reads(guarded: dict[str, Api], path: str) -> None:
+def test_every_role_reads(guarded: dict[str, Api], path: str) -> None:
     for role in ("viewer", "robot", "editor", "admin"):
         guarded[role].get(path)
     answer = guarded["nobody"]("GET", path, 401)
@@ -184,7 +184,7 @@ def test_everybody_with_a_token_reads(guarded: dict[str, Api], path: str) -> Non
 
 
 @pytest.mark.parametrize(("method", "path", "more"), EDITS)
-def test_editors_change(guarded: dict[str, Api], method: str, path: str, more: dict[str, object]) -> None:
+def test_editors_change_content(guarded: dict[str, Api], method: str, path: str, more: dict[str, object]) -> None:
     for role in ("viewer", "robot"):
         guarded[role].problem(method, path, 403, **more)
     for role in ("editor", "admin"):
@@ -193,14 +193,16 @@ def test_editors_change(guarded: dict[str, Api], method: str, path: str, more: d
 
 
 @pytest.mark.parametrize(("method", "path", "more"), RULES)
-def test_administrators_rule(guarded: dict[str, Api], method: str, path: str, more: dict[str, object]) -> None:
+def test_administrators_manage_environments(
+    guarded: dict[str, Api], method: str, path: str, more: dict[str, object]
+) -> None:
     for role in ("viewer", "robot", "editor"):
         guarded[role].problem(method, path, 403, **more)
     assert guarded["admin"](method, path, None, **more).status_code not in (401, 403)
     guarded["nobody"].problem(method, path, 401, **more)
 
 
-def test_tokens_for_some_environments(guarded: dict[str, Api]) -> None:
+def test_limited_token_accesses_its_environments_only(guarded: dict[str, Api]) -> None:
     scoped, ruler = guarded["scoped"], guarded["scoped admin"]
     assert [e["name"] for e in scoped.get("environments").json()] == ["farm-1"]
     scoped.get(E)
@@ -217,8 +219,8 @@ def test_tokens_for_some_environments(guarded: dict[str, Api]) -> None:
     ruler.problem("PATCH", E, 403, json={"name": "street-2"})
 
 
-def test_a_token_over_a_warm_answer(guarded: dict[str, Api]) -> None:
-    """What is in memory is given to those only who may have it."""
+def test_cached_response_needs_access(guarded: dict[str, Api]) -> None:
+    """Cached responses are only for clients with access."""
     path = "/maps/farm-1/tmap2"
     for _ in range(3):
         guarded["admin"].get(path)
@@ -230,14 +232,14 @@ def test_a_token_over_a_warm_answer(guarded: dict[str, Api]) -> None:
     guarded["admin"].get(path)
 
 
-def test_open_addresses(guarded: dict[str, Api]) -> None:
+def test_open_addresses_need_no_token(guarded: dict[str, Api]) -> None:
     for path in ("/healthz", "/readyz", "/docs", "/openapi.json", "/docs/swagger-ui-bundle.js"):
         guarded["nobody"].get(path)
     for path in ("/nothing", "/api/v1", "/api/v1/nothing", "/metrics"):
         guarded["nobody"].problem("GET", path, 401)
 
 
-def test_tokens(guarded: dict[str, Api]) -> None:
+def test_tokens_are_created_listed_and_revoked(guarded: dict[str, Api]) -> None:
     api = guarded["first"]
     expires = (datetime.now(UTC) + timedelta(days=1)).isoformat()
     body = {"name": "mower", "role": "robot", "environments": "farm*", "robot": "mower-3", "expires": expires}
@@ -280,7 +282,7 @@ def test_robot_token_names_its_robot(guarded: dict[str, Api]) -> None:
 
 
 def test_robot_token_without_a_robot_still_reads(guarded: dict[str, Api]) -> None:
-    """Tokens of releases that did not ask for a robot's name."""
+    """Former releases created such tokens without a robot's name."""
     api = guarded["first"]
     old = api.token_for("robot", name="old-robot")
     store = api.app.state.services.store
@@ -293,7 +295,7 @@ def test_robot_token_without_a_robot_still_reads(guarded: dict[str, Api]) -> Non
     assert "names no robot" in old.problem("PUT", "robots/old-robot/status", 403, json=status)["detail"]
 
 
-def test_a_token_ends(guarded: dict[str, Api]) -> None:
+def test_expired_token_is_refused(guarded: dict[str, Api]) -> None:
     api = guarded["first"]
     expires = (datetime.now(UTC) + timedelta(seconds=1.5)).isoformat()
     short = api.token_for("viewer", expires=expires)
@@ -302,7 +304,7 @@ def test_a_token_ends(guarded: dict[str, Api]) -> None:
     short.problem("GET", "/maps/farm-1/tmap2", 401)
 
 
-def test_the_last_administrator_stays(tmp_path: Path) -> None:
+def test_last_administrator_token_cannot_be_revoked(tmp_path: Path) -> None:
     with running(settings_for(tmp_path)) as api:
         (only,) = api.get("tokens").json()
         api.problem("DELETE", f"tokens/{only['id']}", 409)
@@ -314,7 +316,7 @@ def test_the_last_administrator_stays(tmp_path: Path) -> None:
         api.problem("GET", "formats", 401)
 
 
-def test_guessing_is_answered_429(tmp_path: Path) -> None:
+def test_repeated_wrong_tokens_return_429(tmp_path: Path) -> None:
     with running(settings_for(tmp_path, token_failures=3)) as api:
         api.get("formats")
         wrong = api.as_("wrong")
@@ -331,7 +333,7 @@ def test_guessing_is_answered_429(tmp_path: Path) -> None:
         late("PUT", "robots/r1/status", 422, json={})
 
 
-def test_without_access_control(tmp_path: Path) -> None:
+def test_insecure_mode_accepts_local_requests_only(tmp_path: Path) -> None:
     with running(settings_for(tmp_path, insecure_no_auth=True, admin_token=None)) as api:
         open_ = api.as_(None)
         open_.post("environments", {"name": "farm"})
@@ -364,7 +366,7 @@ def test_health_and_metrics(api: Api, farm: str) -> None:
     assert farm not in "".join(line for line in text.splitlines() if line.startswith("fleetmap_requests"))
 
 
-def test_not_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readiness_without_database_returns_503(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.errors import Unavailable
     from app.store.store import Store
 
@@ -406,7 +408,7 @@ def test_errors_have_one_shape(api: Api, method: str, path: str, status: int, mo
         assert answer.headers["allow"]
 
 
-def test_a_bug_tells_nothing(
+def test_internal_error_reveals_no_data(
     api: Api, bare: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     from app.store.channels import Channels
@@ -422,7 +424,7 @@ def test_a_bug_tells_nothing(
     assert "/" not in next(r.getMessage() for r in caplog.records if "internal error" in r.getMessage())
 
 
-def test_damage_is_an_alarm(
+def test_damaged_data_logs_an_alarm(
     api: Api, farm: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     from app.errors import Damaged
@@ -436,7 +438,7 @@ def test_damage_is_an_alarm(
     assert [r for r in caplog.records if r.levelname == "CRITICAL"]
 
 
-def test_a_full_disk_is_told(api: Api, bare: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_returns_507(api: Api, bare: str, monkeypatch: pytest.MonkeyPatch) -> None:
     import errno
 
     from app.ingest import Ingest
@@ -461,7 +463,7 @@ def test_tokens_do_not_reach_the_log(api: Api, bare: str, caplog: pytest.LogCapt
 # --- the first start ---
 
 
-def test_the_first_start_prints_a_token_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_first_start_prints_a_token_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     settings = settings_for(tmp_path, admin_token=None)
     with running(settings) as api:
         (token,) = re.findall(r"only this once: (\S+)", capfd.readouterr().out)
@@ -475,7 +477,7 @@ def test_the_first_start_prints_a_token_once(tmp_path: Path, capfd: pytest.Captu
         api.as_(token).get("tokens")
 
 
-def test_stops_cleanly(tmp_path: Path) -> None:
+def test_server_stops_cleanly(tmp_path: Path) -> None:
     with running(settings_for(tmp_path)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
@@ -486,8 +488,8 @@ def test_stops_cleanly(tmp_path: Path) -> None:
         lines = listening.__enter__().iter_lines()
         while "version.created" not in next(lines):
             pass
-        api.others.clear()  # it listens on while the server stops
-    assert [line for line in lines if line.startswith("event")] == [], "and its stream comes to an end, not to a break"
+        api.others.clear()  # it still listens while the server stops
+    assert [line for line in lines if line.startswith("event")] == [], "its stream ends without a broken connection"
     listening.__exit__(None, None, None)
     assert not any(w.is_alive() for w in workers)
     assert not list((tmp_path / "spool").iterdir())
@@ -506,7 +508,7 @@ def test_settings_reach_the_pool(tmp_path: Path) -> None:
     assert API == "/api/v1"
 
 
-def test_a_browser_at_the_front_door_is_shown_the_documentation(api: Api) -> None:
+def test_root_redirects_to_the_documentation(api: Api) -> None:
     answer = api.as_(None).http.get("/")
     assert answer.status_code == 307
     assert answer.headers["location"] == "/docs"

@@ -1,4 +1,4 @@
-"""What formats ask for and no layer has: named sets, an environment's own values, and the versions they make."""
+"""Templates: named sets, values of an environment, and the versions that they create."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LANE = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>lanes</na
 
 @pytest.fixture
 def env(api: Api, request: pytest.FixtureRequest) -> str:
-    """A datum (version 1) and a drawn network (2), which says no action, tolerance or influence zone."""
+    """Create a datum (version 1) and a drawn network (2) without action, tolerances and influence zones."""
     name = f"t-{abs(hash(request.node.name)) % 10**9}"
     datum = {"latitude": samples.LATITUDE, "longitude": samples.LONGITUDE}
     api.post("environments", {"name": name, "datum": datum})
@@ -34,7 +34,7 @@ def put(api: Api, env: str, suffix: str = "", expect: int = 201, headers: Any = 
 
 
 def filled(api: Api, env: str, version: Any = "latest", query: str = "", format: str = "tmap2") -> dict[str, Any]:
-    """The report's template lines by parameter: (value, from)."""
+    """Return the report's template lines by parameter: (value, from)."""
     report = api.get(f"environments/{env}/versions/{version}/reports/{format}{query}").json()
     return {line["option"]: (line["value"], line["from"]) for line in report["template"] if "option" in line}
 
@@ -50,12 +50,12 @@ def etag(api: Api, env: str, format: str = "tmap2", version: Any = "latest", que
 
 
 def files(api: Api, env: str, version: Any = "latest") -> dict[str, str]:
-    """The hashes of a signed manifest, by format."""
+    """Return the hashes of a signed manifest, by format."""
     manifest = api.get(f"environments/{env}/versions/{version}/manifest?formats=tmap2,kml").json()
     return {file["format"]: file["sha256"] for file in manifest["files"]}
 
 
-def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, env: str) -> None:
+def test_template_values_create_a_version_and_change_maps(api: Api, env: str) -> None:
     assert filled(api, env)["xy_goal_tolerance"] == (0.3, "default")
     before, kml = etag(api, env), etag(api, env, "kml")
     listed = files(api, env)
@@ -64,7 +64,7 @@ def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, en
     )
     assert (version["version"], version["parent"], version["message"]) == (3, 2, "for ROS 2")
     old = api.get(f"environments/{env}/versions/2").json()
-    assert version["root"] != old["root"], "what robots get has changed, so has the root that they hold"
+    assert version["root"] != old["root"], "the maps changed, and so does the root"
     assert version["changes"] == {
         "templates": {
             "tmap2": {
@@ -77,12 +77,12 @@ def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, en
     assert tolerance(api, env) == 0.4
     assert api.get(f"/maps/{env}/tmap2").content.count(b"action: NavigateToPose") == 4
     assert etag(api, env) != before
-    assert etag(api, env, "kml") == kml, "other maps stay as they are"
+    assert etag(api, env, "kml") == kml, "other maps do not change"
     after = files(api, env)
     assert after["kml"] == listed["kml"]
-    assert after["tmap2"] != listed["tmap2"], "what robots verify is what they get"
+    assert after["tmap2"] != listed["tmap2"], "the manifest matches the downloads"
     assert files(api, env, 2) == listed
-    assert (tolerance(api, env, 2), etag(api, env, version=2)) == (0.3, before), "old versions, too"
+    assert (tolerance(api, env, 2), etag(api, env, version=2)) == (0.3, before), "old versions do not change"
     values = filled(api, env)
     assert values["xy_goal_tolerance"] == (0.4, "environment")
     assert values["action"] == ("NavigateToPose", "environment")
@@ -91,7 +91,7 @@ def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, en
     assert '"message":"for ROS 2"' in event.replace('": ', '":')
 
 
-def test_a_request_goes_before_the_environment_before_the_set_before_the_default(api: Api, env: str) -> None:
+def test_template_precedence(api: Api, env: str) -> None:
     assert put(api, env, set="outdoor")["message"] == "Templates: the set outdoor"
     assert filled(api, env)["xy_goal_tolerance"] == (0.5, "set outdoor")
     put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.4})
@@ -100,24 +100,24 @@ def test_a_request_goes_before_the_environment_before_the_set_before_the_default
     assert filled(api, env, query="?xy_goal_tolerance=0.2")["xy_goal_tolerance"] == (0.2, "request")
     assert tolerance(api, env, query="?xy_goal_tolerance=0.2") == 0.2
     assert filled(api, env, query="?xy_goal_tolerance=0.4")["xy_goal_tolerance"] == (0.4, "request")
-    assert filled(api, env)["xy_goal_tolerance"] == (0.4, "environment"), "the same bytes, told for each request"
+    assert filled(api, env)["xy_goal_tolerance"] == (0.4, "environment"), "the same bytes, with a report per request"
     assert filled(api, env)["action"] == ("move_base", "default")
     put(api, env, "/tmap2", set="ros2", values={"xy_goal_tolerance": 0.4})
     assert filled(api, env)["action"] == ("NavigateToPose", "set ros2"), "a format may have a set of its own"
     assert filled(api, env, format="tmap")["xy_goal_tolerance"] == (0.5, "set outdoor")
 
 
-def test_equal_values_have_equal_bytes_and_hashes(api: Api, env: str) -> None:
+def test_equal_template_values_give_equal_bytes_and_hashes(api: Api, env: str) -> None:
     query_etag = etag(api, env, query="?xy_goal_tolerance=0.4")
     before = etag(api, env)
     put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.4})
     assert etag(api, env) == query_etag
     put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.3})
-    assert etag(api, env) == before, "it is the format's own default, and said all the same"
+    assert etag(api, env) == before, "stated although it equals the format's default"
     assert filled(api, env)["xy_goal_tolerance"] == (0.3, "environment")
 
 
-def test_what_holds_can_be_read(api: Api, env: str) -> None:
+def test_effective_templates_are_listed_with_origin(api: Api, env: str) -> None:
     put(api, env, set="warehouse", formats={"tmap2": {"values": {"yaw_goal_tolerance": 0.2}}})
     answer = api.get(f"environments/{env}/templates")
     templates = answer.json()
@@ -142,13 +142,13 @@ def test_what_holds_can_be_read(api: Api, env: str) -> None:
     viewer.problem("DELETE", f"environments/{env}/templates/tmap2", 403)
 
 
-def test_they_are_taken_back_and_reverted_and_go_along(api: Api, env: str) -> None:
+def test_templates_are_reset_reverted_and_cloned(api: Api, env: str) -> None:
     first = api.get(f"environments/{env}/versions/2").json()
     version = put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.4})
     moved = LANE.replace(b"53.2687", b"53.2688")
     later = api.upload(env, {"lanes.kml": moved}, layer="topology").json()
     assert "templates" not in later["changes"]
-    assert tolerance(api, env) == 0.4, "another change leaves them as they are"
+    assert tolerance(api, env) == 0.4, "another change keeps them"
     api("PATCH", f"environments/{env}", 200, json={"datum": {"latitude": 53.0, "longitude": -0.5}})
     assert tolerance(api, env) == 0.4
     back = api.post(f"environments/{env}/versions", {"revert_to": 2}).json()
@@ -165,10 +165,10 @@ def test_they_are_taken_back_and_reverted_and_go_along(api: Api, env: str) -> No
     assert (deletion["message"], filled(api, env)["xy_goal_tolerance"]) == ("no more", (0.2, "set indoor"))
     assert api("DELETE", f"environments/{env}/templates/tmap2", 200).json()["version"] == deletion["version"]
     bare = api("DELETE", f"environments/{env}/templates", 201).json()
-    assert bare["root"] == first["root"], "an environment that says nothing has the root that it always had"
+    assert bare["root"] == first["root"], "without templates the root is as before"
 
 
-def test_conditions_keys_and_dry_runs(api: Api, env: str) -> None:
+def test_templates_honour_if_match_keys_and_dry_run(api: Api, env: str) -> None:
     values = {"xy_goal_tolerance": 0.4}
     dry = put(api, env, "/tmap2", 200, values=values, dry_run=True)
     assert (dry["version"], dry["parent"]) == (None, 2)
@@ -179,7 +179,7 @@ def test_conditions_keys_and_dry_runs(api: Api, env: str) -> None:
     assert version["root"] == dry["root"]
     assert put(api, env, "/tmap2", 201, {"idempotency-key": "k"}, values=values) == version
     put(api, env, "/tmap2", 409, {"idempotency-key": "k"}, values={})
-    assert put(api, env, "/tmap2", 200, values=values)["version"] == version["version"], "nothing new"
+    assert put(api, env, "/tmap2", 200, values=values)["version"] == version["version"], "no new version"
     dry = api("DELETE", f"environments/{env}/templates?dry_run=true", 200).json()
     assert dry["changes"]["templates"]["tmap2"] == {"xy_goal_tolerance": {"from": 0.4, "to": None}}
     assert put(api, env, "", 200)["version"] == version["version"]
@@ -203,14 +203,16 @@ def test_conditions_keys_and_dry_runs(api: Api, env: str) -> None:
         ("", {"formats": {"moon": {}}}, 404, None),
     ],
 )
-def test_what_is_wrong_is_named(api: Api, env: str, what: str, body: Any, status: int, where: str | None) -> None:
+def test_invalid_templates_name_the_member(
+    api: Api, env: str, what: str, body: Any, status: int, where: str | None
+) -> None:
     problem = api.problem("PUT", f"environments/{env}/templates{what}", status, json=body)
     if where is not None:
         assert [e["where"] for e in problem["errors"]] == [where]
     assert api.get(f"environments/{env}").json()["version"] == 2
 
 
-def test_a_package_holds_maps_by_the_environments_templates(api: Api, env: str) -> None:
+def test_environment_package_uses_templates(api: Api, env: str) -> None:
     before = etag(api, env, "environment")
     put(api, env, "/lif", values={"creator": "somebody"})
     other = etag(api, env, "environment")
@@ -225,7 +227,7 @@ def test_a_package_holds_maps_by_the_environments_templates(api: Api, env: str) 
     assert values["action"] == ("move_base", "default")
 
 
-def test_what_this_release_does_not_know_is_told_and_no_robot_stands_without_a_map(api: Api, env: str) -> None:
+def test_unknown_stored_templates_warn_and_are_ignored(api: Api, env: str) -> None:
     from app.store.changes import Changes
 
     store = api.app.state.services.store
@@ -243,7 +245,7 @@ def test_what_this_release_does_not_know_is_told_and_no_robot_stands_without_a_m
     assert "colour" not in line["effective"]
 
 
-def test_the_coverage_table_knows_them(api: Api, env: str) -> None:
+def test_coverage_uses_templates(api: Api, env: str) -> None:
     api.upload(env, samples.grid("north"))
     api.upload(env, samples.grid("south"))
     rows = {row["format"]: row for row in api.get(f"environments/{env}/versions/latest/maps").json()}
@@ -252,4 +254,4 @@ def test_the_coverage_table_knows_them(api: Api, env: str) -> None:
     rows = {row["format"]: row for row in api.get(f"environments/{env}/versions/latest/maps").json()}
     assert "choose" not in rows["occupancy_grid"]
     assert api.get(f"/maps/{env}/occupancy_grid/south.yaml").content
-    assert api.get(f"/maps/{env}/occupancy_grid/north.yaml").content, "a file's name goes before them"
+    assert api.get(f"/maps/{env}/occupancy_grid/north.yaml").content, "the name of a file takes precedence"

@@ -1,4 +1,4 @@
-"""The form of an upload: bounds, names, broken bodies; nothing half stored, nothing left behind."""
+"""Multipart uploads: limits, names, malformed bodies; nothing is stored partially or left behind."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BOUNDARY = "frontier"
 
 @pytest.fixture(scope="module")
 def tight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
-    """A server with small limits."""
+    """Run a server with small limits."""
     settings = settings_for(
         tmp_path_factory.mktemp("tight"),
         max_upload_bytes=200_000,
@@ -48,12 +48,12 @@ FILE = part('form-data; name="files"; filename="n.tmap2.yaml"', samples.tmap2())
 
 
 def spool_is_empty(api: Api) -> bool:
-    """No upload of this process is left on disk."""
+    """Test that no upload of this process is left on disk."""
     spool: Path = api.app.state.services.options.spool_dir
     return [p.name for p in spool.rglob("*") if p.is_file()] == ["alive"]
 
 
-def test_plain(tight: Api) -> None:
+def test_upload_leaves_an_empty_spool(tight: Api) -> None:
     answer = raw(tight, FILE + part('form-data; name="dry_run"', b"true") + END)
     assert answer.status_code == 200, answer.text  # type: ignore[attr-defined]
     assert spool_is_empty(tight)
@@ -94,7 +94,7 @@ def test_plain(tight: Api) -> None:
         (part('form-data; name="files"; filename="big"', b"x" * 300_000) + END, 413),
     ],
 )
-def test_forms_that_are_refused(tight: Api, body: bytes, status: int) -> None:
+def test_invalid_forms_are_refused(tight: Api, body: bytes, status: int) -> None:
     answer = raw(tight, body)
     assert answer.status_code == status, answer.text  # type: ignore[attr-defined]
     problem(answer)  # type: ignore[arg-type]
@@ -106,11 +106,11 @@ def test_forms_that_are_refused(tight: Api, body: bytes, status: int) -> None:
     "content_type",
     ["multipart/form-data", "multipart/form-data; boundary=", "multipart/form-data; boundary=" + "x" * 999],
 )
-def test_without_a_boundary(tight: Api, content_type: str) -> None:
+def test_missing_boundary_returns_400(tight: Api, content_type: str) -> None:
     assert raw(tight, FILE + END, content_type).status_code == 400  # type: ignore[attr-defined]
 
 
-def test_other_media_types(tight: Api) -> None:
+def test_other_media_types_return_415(tight: Api) -> None:
     for content_type in ("text/plain", "application/x-www-form-urlencoded", "application/octet-stream"):
         answer = raw(tight, b"x", content_type)
         assert answer.status_code == 415  # type: ignore[attr-defined]
@@ -119,7 +119,7 @@ def test_other_media_types(tight: Api) -> None:
     tight.problem("POST", "environments", 415, files=parts({"a": b"b"}))
 
 
-def test_compressed_bodies(tight: Api) -> None:
+def test_compressed_bodies_return_415(tight: Api) -> None:
     for coding in ("gzip", "zstd", "br", "gzip, identity"):
         headers = {"Content-Encoding": coding, "Content-Type": f"multipart/form-data; boundary={BOUNDARY}"}
         tight.problem("POST", "environments/farm/versions", 415, content=FILE + END, headers=headers)
@@ -127,7 +127,7 @@ def test_compressed_bodies(tight: Api) -> None:
     tight("POST", "environments/farm/versions?dry_run=true", 200, content=FILE + END, headers=headers)
 
 
-def test_a_declared_length_is_enough_to_refuse(tight: Api) -> None:
+def test_declared_length_is_enough_to_refuse(tight: Api) -> None:
     place = urlsplit(tight.url)
     connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=10)
     connection.putrequest("POST", "/api/v1/environments/farm/versions")
@@ -143,7 +143,7 @@ def test_a_declared_length_is_enough_to_refuse(tight: Api) -> None:
     connection.close()
 
 
-def test_json_bodies_are_bounded(tight: Api) -> None:
+def test_json_body_size_is_limited(tight: Api) -> None:
     body = {"name": "x", "description": "y" * 5000}
     tight.problem("POST", "environments", 413, json=body)
     chunks = (b"x" * 500 for _ in range(10))
@@ -157,7 +157,7 @@ def _request(api: Api, head: str) -> socket.socket:
     return line
 
 
-def test_a_body_that_stops_coming(tight: Api) -> None:
+def test_stalled_body_returns_408(tight: Api) -> None:
     with _request(
         tight,
         "POST /api/v1/environments/farm/versions HTTP/1.1\r\nHost: x\r\n"
@@ -171,13 +171,13 @@ def test_a_body_that_stops_coming(tight: Api) -> None:
     assert spool_is_empty(tight)
 
 
-def test_a_head_that_stops_coming(tight: Api) -> None:
+def test_stalled_head_closes_the_connection(tight: Api) -> None:
     for head in ("", "GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: "):
         with _request(tight, head) as line:
-            assert line.recv(65536) == b"", "the connection is closed without an answer"
+            assert line.recv(65536) == b"", "the connection is closed without a response"
 
 
-def test_a_head_without_end(tight: Api) -> None:
+def test_endless_head_returns_431(tight: Api) -> None:
     with _request(tight, "GET /healthz HTTP/1.1\r\nHost: x\r\nX: " + "y" * 100_000 + "\r\n\r\n") as line:
         assert line.recv(65536).startswith(b"HTTP/1.1 431 ")
     with _request(tight, "no http at all\r\n\r\n") as line:
@@ -186,7 +186,7 @@ def test_a_head_without_end(tight: Api) -> None:
         assert b"application/problem+json" in answer
 
 
-def test_a_client_that_goes_away(tight: Api) -> None:
+def test_disconnected_client_leaves_an_empty_spool(tight: Api) -> None:
     line = _request(
         tight,
         "POST /api/v1/environments/farm/versions HTTP/1.1\r\nHost: x\r\n"
@@ -196,13 +196,13 @@ def test_a_client_that_goes_away(tight: Api) -> None:
     line.close()
     deadline = time.monotonic() + 10
     while (status := raw(tight, FILE + part('form-data; name="dry_run"', b"true") + END).status_code) != 200:  # type: ignore[attr-defined]
-        assert status == 503, "its place is taken until the server has noticed"
+        assert status == 503, "its place is in use until the server notices"
         assert time.monotonic() < deadline
         time.sleep(0.05)
     assert spool_is_empty(tight)
 
 
-def test_more_uploads_than_places(tight: Api) -> None:
+def test_too_many_uploads_return_503(tight: Api) -> None:
     with _request(
         tight,
         "POST /api/v1/environments/farm/versions HTTP/1.1\r\nHost: x\r\n"
@@ -223,7 +223,7 @@ def _active(api: Api) -> bool:
     return bool(api.app.state.services.intake._active)
 
 
-def test_what_a_killed_server_left_is_removed(tmp_path: Path) -> None:
+def test_start_removes_files_of_a_killed_server(tmp_path: Path) -> None:
     left = tmp_path / "spool" / "dead" / "upload"
     left.mkdir(parents=True)
     (left / "0").write_bytes(b"half a file")
@@ -247,7 +247,7 @@ def test_what_a_killed_server_left_is_removed(tmp_path: Path) -> None:
         ("datum.yaml", b"datum_latitude: 99\ndatum_longitude: .nan\n"),
     ],
 )  # fmt: skip
-def test_damaged_files(api: Api, bare: str, name: str, data: bytes) -> None:
+def test_damaged_files_return_422(api: Api, bare: str, name: str, data: bytes) -> None:
     answer = api.upload(bare, {name: data}, expect=413 if "bomb" in name else 422)
     body = problem(answer)
     assert body["errors"], body
@@ -255,20 +255,20 @@ def test_damaged_files(api: Api, bare: str, name: str, data: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", ["a/b", "../../x", "..", ".hidden", "C:\\x", "C:x", "a\nb", "x" * 101])
-def test_a_grid_is_called_as_a_file_can_be(api: Api, bare: str, name: str) -> None:
+def test_grid_names_that_no_file_can_have_are_refused(api: Api, bare: str, name: str) -> None:
     body = problem(api.upload(bare, samples.grid(), expect=422, grid=name))
     assert body["errors"][0]["where"] == "grid"
     files = [("files", (n, data)) for n, data in samples.grid().items()]
     api.problem("POST", "convert", 422, files=files, data={"to": "occupancy_grid", "grid": name})
 
 
-def test_a_grid_in_a_file_of_an_odd_name_is_served(api: Api, bare: str) -> None:
+def test_grid_in_a_file_with_a_special_name_is_served(api: Api, bare: str) -> None:
     files = {f"maps/C:{n}" if n.endswith("yaml") else f"maps/{n}": data for n, data in samples.grid().items()}
     api.upload(bare, files)
     assert api.get(f"/maps/{bare}/occupancy_grid").status_code == 200
 
 
-def test_what_was_said_in_vain_is_told(api: Api, bare: str) -> None:
+def test_unused_form_fields_add_warnings(api: Api, bare: str) -> None:
     body = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, layer="zones", grid="keepout").json()
     assert {w["where"] for w in body["warnings"]} == {"layer", "grid"}
     assert api.upload(bare, samples.grid(), grid="keepout").json()["warnings"] == []
@@ -280,11 +280,11 @@ FAR_KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><n
 
 
 @pytest.mark.parametrize(("lon", "lat", "far"), [(-0.5, 53.2, False), (0.6, 53.2, False), (53.2, -0.5, True)])
-def test_what_lies_far_from_the_datum_is_doubted(api: Api, lon: float, lat: float, far: bool) -> None:
+def test_content_far_from_the_datum_adds_warnings(api: Api, lon: float, lat: float, far: bool) -> None:
     env = f"far-{abs(int(lon * 10))}"
     api.post("environments", {"name": env, "datum": {"latitude": 53.2, "longitude": -0.5}})
     version = api.upload(env, {"a.kml": FAR_KML.format(lon, lat).encode()}).json()
     warnings = [w["problem"] for w in version["warnings"] if "km from the datum" in w["problem"]]
     assert bool(warnings) == far
     if far:
-        assert "7746 km" in warnings[0], "by the spherical law of cosines, worked out apart"
+        assert "7746 km" in warnings[0], "by the spherical law of cosines, computed independently"

@@ -1,4 +1,4 @@
-"""VDA 5050: instant actions of a version, and state messages as status."""
+"""VDA 5050: instant actions for a version, and state messages as robot status."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def maps(env: str, *versions: tuple[Any, str], **more: Any) -> dict[str, Any]:
     return {"headerId": 1, "maps": listed, "actionStates": None, **more}
 
 
-def test_actions_name_the_very_bytes(api: Api, farm: str) -> None:
+def test_actions_contain_link_and_hash_of_the_file(api: Api, farm: str) -> None:
     body = api.get(f"environments/{farm}/versions/latest/vda5050/actions?mapId=hall&grid=map&file_type=png").json()
     assert (body["mapId"], body["mapVersion"], body["version"]) == ("hall", "3", 3)
     actions = [body[k] for k in ("downloadMap", "enableMap", "deleteMap")]
@@ -56,15 +56,15 @@ def test_actions_name_the_very_bytes(api: Api, farm: str) -> None:
 
 @pytest.fixture
 def tower(api: Api, farm: str) -> str:
-    """The farm with a grid on the level L2 (version 4) and another level without one (version 5)."""
+    """Extend the farm with a grid on the level L2 (version 4) and another level without one (version 5)."""
     api.upload(farm, samples.grid(), level="L2")
     api.upload(farm, {"n.tmap2.yaml": samples.tmap2()}, level="roof")
     return farm
 
 
-def test_actions_come_for_each_level(api: Api, tower: str) -> None:
+def test_actions_cover_each_level(api: Api, tower: str) -> None:
     url = f"environments/{tower}/versions/latest/vda5050/actions"
-    nobody = api.as_(None)
+    anonymous = api.as_(None)
     every = api.get(f"{url}?level=*&grid=map&derive=false").json()
     assert [(m["mapId"], m["level"], m["mapVersion"]) for m in every["maps"]] == [
         (tower, "ground", "5"), (f"{tower}/L2", "L2", "5"),
@@ -75,7 +75,7 @@ def test_actions_come_for_each_level(api: Api, tower: str) -> None:
     for one, name in zip(links, ("ground", "L2"), strict=True):
         assert f"level={name}" in one["mapDownloadLink"]
         assert (
-            hashlib.sha256(nobody.get(one["mapDownloadLink"].removeprefix(api.url)).content).hexdigest()
+            hashlib.sha256(anonymous.get(one["mapDownloadLink"].removeprefix(api.url)).content).hexdigest()
             == one["mapHash"]
         )
     upstairs = api.get(f"{url}?level=L2&grid=map").json()
@@ -88,17 +88,17 @@ def test_actions_come_for_each_level(api: Api, tower: str) -> None:
     assert "ground, L2, roof" in api.problem("GET", f"{url}?level=L9", 404)["detail"]
     assert "no level has this map" in api.problem("GET", f"{url}?level=*&grid=other&derive=false", 422)["detail"]
     problem = api.problem("GET", f"{url}?level=*&format=nav2_route", 422)
-    assert "holds all levels" in problem["detail"]
+    assert "contains all levels" in problem["detail"]
     assert "occupancy_grid" in problem["detail"]
 
 
 def test_lif_is_not_offered_to_vehicles(api: Api, farm: str) -> None:
     problem = api.problem("GET", f"environments/{farm}/versions/3/vda5050/actions?format=lif", 422)
-    assert "for the fleet manager, never for vehicles" in problem["detail"]
+    assert "for fleet managers, not for vehicles" in problem["detail"]
     api.get(f"environments/{farm}/versions/3/maps/lif")
 
 
-def test_links_of_actions_are_signed_unless_asked_otherwise(api: Api, farm: str) -> None:
+def test_action_links_are_signed_by_default(api: Api, farm: str) -> None:
     url = f"environments/{farm}/versions/3/vda5050/actions?format=geojson"
     body = api.get(f"{url}&seconds=60").json()
     left = datetime.fromisoformat(body["expires"]) - datetime.now(UTC)
@@ -113,7 +113,7 @@ def test_links_of_actions_are_signed_unless_asked_otherwise(api: Api, farm: str)
     api.problem("GET", f"{url}&seconds=86401", 422)
 
 
-def test_floors_count_together(api: Api, tower: str) -> None:
+def test_levels_of_a_site_count_together(api: Api, tower: str) -> None:
     api("PUT", f"environments/{tower}/channels/production", 200, json={"version": 4})
     vehicle = api.token_for("robot", robot="agv-9")
 
@@ -127,9 +127,9 @@ def test_floors_count_together(api: Api, tower: str) -> None:
     on, off = "ENABLED", "DISABLED"
     assert floors([("4", on)], [("4", on)]) == ("active", 4, 4)
     api("PUT", f"environments/{tower}/channels/production", 200, json={"version": 5, "rollout": {"ready": 1}})
-    assert floors([("4", on), ("5", off)], [("4", on)]) == ("active", 4, 4), "the upper floor is not there yet"
+    assert floors([("4", on), ("5", off)], [("4", on)]) == ("active", 4, 4), "the upper level does not have it yet"
     assert floors([("4", on), ("5", off)], [("4", on), ("5", off)]) == ("ready", 5, 4)
-    assert floors([("5", on)], [("4", on), ("5", off)])[2] == 4, "one floor still runs the old version"
+    assert floors([("5", on)], [("4", on), ("5", off)])[2] == 4, "one level still runs the old version"
     assert floors([("5", on)], [("5", on)]) == ("active", 5, 5)
     body = maps(f"{tower}/L2", ("5", on))
     body["maps"] += maps("other/L2", ("5", on))["maps"]
@@ -138,14 +138,14 @@ def test_floors_count_together(api: Api, tower: str) -> None:
     assert [i["mapId"] for i in result["ignored"]] == ["other/L2"]
 
 
-def test_whole_site_of_floors() -> None:
+def test_merge_levels_combines_a_site() -> None:
     floors = (VehicleMaps("a", ("9",), ("10",), ()), VehicleMaps("a/L2", ("10",), ("9", "x"), (("11", "no room"),)))
     assert merge_levels(floors) == VehicleMaps("a", ("9",), ("10",), (("11", "no room"),))
     assert merge_levels(floors[1:]) == floors[1]
     assert merge_levels((VehicleMaps("a", ("x",), (), ()), VehicleMaps("a/b", ("2",), (), ()))).enabled == ("2",)
 
 
-def test_a_state_is_a_status(api: Api, farm: str) -> None:
+def test_vehicle_state_becomes_a_status(api: Api, farm: str) -> None:
     api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
     vehicle = api.token_for("robot", robot="agv-1")
     url = "robots/agv-1/vda5050/state"
@@ -172,7 +172,7 @@ def test_a_state_is_a_status(api: Api, farm: str) -> None:
     assert say(other, f"?environment={farm}&channel=latest")["robots"][0]["channel"] == "latest"
 
 
-def test_what_is_not_known_is_told(api: Api, farm: str, bare: str) -> None:
+def test_unknown_maps_are_listed_as_ignored(api: Api, farm: str, bare: str) -> None:
     editor = api.token_for("editor", environments=farm)
     body = maps(farm, ("99", "ENABLED"))
     body["maps"] += maps("nowhere", ("1", "ENABLED"))["maps"] + maps(bare, ("0", "ENABLED"))["maps"]
@@ -180,7 +180,7 @@ def test_what_is_not_known_is_told(api: Api, farm: str, bare: str) -> None:
     assert result["robots"] == []
     assert [i["mapId"] for i in result["ignored"]] == sorted([farm, "nowhere", bare])
     result = editor.post("robots/agv-2/vda5050/state", maps(farm, ("a-b", "ENABLED")), 200).json()
-    assert "no version's number" in result["ignored"][0]["why"]
+    assert "must be the number of a version" in result["ignored"][0]["why"]
     editor.problem("POST", f"robots/agv-2/vda5050/state?environment={farm}", 422, json=body)
     api.token_for("robot", robot="agv-1").problem("POST", "robots/agv-2/vda5050/state", 403, json=body)
     api.token_for("viewer").problem("POST", "robots/agv-2/vda5050/state", 403, json=body)
@@ -204,7 +204,7 @@ def test_bad_states_are_refused(bad: Any) -> None:
         read_state(bad)
 
 
-def test_a_state_with_nulls() -> None:
+def test_state_with_nulls_is_read() -> None:
     states = [
         {"actionId": "a", "actionStatus": "FAILED"},
         {"actionId": None, "actionStatus": None},
@@ -217,8 +217,8 @@ def test_a_state_with_nulls() -> None:
     )
 
 
-def test_a_state_of_3_0() -> None:
-    """Instant actions have a list of their own, stay in it, and may wait for another try; reasons are among errors."""
+def test_state_of_version_3_0_is_read() -> None:
+    """Version 3.0 lists instant actions separately, retains them, and may retry them; reasons are in errors."""
     states = [
         {"actionId": "downloadMap:a:3:1", "actionType": "downloadMap", "actionStatus": "FAILED"},
         {"actionId": "downloadMap:a:4:1", "actionStatus": "FAILED", "actionResult": "no room"},
@@ -243,7 +243,7 @@ def test_a_state_of_3_0() -> None:
 
 @pytest.mark.skipif(not REAL, reason="the real samples are not here")
 @pytest.mark.parametrize("path", REAL, ids=lambda p: p.name)
-def test_real_states(path: Path) -> None:
+def test_real_states_are_read(path: Path) -> None:
     message = json.loads(path.read_text())
     assert read_state(message) == ()
     message["maps"] = maps("a", ("1", "ENABLED"))["maps"]

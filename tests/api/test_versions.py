@@ -14,7 +14,7 @@ from tests.api import samples
 from tests.api.conftest import Api, problem
 
 
-def test_an_upload_is_a_version(api: Api, bare: str) -> None:
+def test_upload_creates_a_version(api: Api, bare: str) -> None:
     answer = api.upload(bare, {"network.tmap2.yaml": samples.tmap2()}, message="driven today")
     body = answer.json()
     assert answer.headers["location"] == f"/api/v1/environments/{bare}/versions/1"
@@ -38,7 +38,7 @@ def test_an_upload_is_a_version(api: Api, bare: str) -> None:
     assert api.get(answer.headers["location"]).json() == body
 
 
-def test_nothing_changed(api: Api, bare: str) -> None:
+def test_reupload_of_same_content_returns_head(api: Api, bare: str) -> None:
     api.upload(bare, {"a.tmap2.yaml": samples.tmap2()})
     again = api.upload(bare, {"b.tmap2.yaml": samples.tmap2()}, expect=200)
     assert again.json()["version"] == 1
@@ -46,7 +46,7 @@ def test_nothing_changed(api: Api, bare: str) -> None:
     assert len(api.get(f"environments/{bare}/versions").json()) == 2
 
 
-def test_several_files_and_folders_are_one_version(api: Api, bare: str) -> None:
+def test_upload_of_several_files_creates_one_version(api: Api, bare: str) -> None:
     files = {
         "config/location/datum.yaml": samples.DATUM,
         "config/topological/network.tmap2.yaml": samples.tmap2(),
@@ -70,7 +70,7 @@ def lanes(ids: tuple[str, str]) -> bytes:
     return json.dumps({"type": "FeatureCollection", "features": rows}).encode()
 
 
-def test_a_drawing_sent_again_with_other_ids_is_the_same(api: Api, bare: str) -> None:
+def test_drawing_with_other_ids_creates_no_version(api: Api, bare: str) -> None:
     first = api.upload(bare, {"lanes.geojson": lanes(("a", "b"))}, layer="topology").json()
     again = api.upload(bare, {"lanes.geojson": lanes(("x", "y"))}, layer="topology").json()
     assert again["changes"].get("objects") is None, again["changes"]
@@ -83,7 +83,7 @@ def test_a_drawing_sent_again_with_other_ids_is_the_same(api: Api, bare: str) ->
 
 
 def test_osm_ids_are_never_changed(api: Api, bare: str) -> None:
-    """They are the world's: what comes with other ids is other things, though it lies in the same places."""
+    """OSM ids are global: other ids are other features, even with equal geometry."""
     api.upload(bare, {"a.osm": samples.OSM})
     other = samples.OSM.replace(b'id="1"', b'id="11"').replace(b'id="2"', b'id="12"').replace(b'id="3"', b'id="13"')
     other = other.replace(b'ref="1"', b'ref="11"').replace(b'ref="2"', b'ref="12"')
@@ -93,7 +93,7 @@ def test_osm_ids_are_never_changed(api: Api, bare: str) -> None:
     assert [way.get("id") for way in root.iter("way")] == ["13"]
 
 
-def test_a_zip_is_the_same_as_its_files(api: Api, bare: str) -> None:
+def test_zip_equals_its_files(api: Api, bare: str) -> None:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for name, data in samples.grid().items():
@@ -103,7 +103,7 @@ def test_a_zip_is_the_same_as_its_files(api: Api, bare: str) -> None:
     assert api.get(f"environments/{bare}/versions/1/sources/grids/map.yaml").content == samples.grid()["map.yaml"]
 
 
-def test_a_dry_run_stores_nothing(api: Api, bare: str) -> None:
+def test_dry_run_stores_nothing(api: Api, bare: str) -> None:
     body = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, expect=200, dry_run="true").json()
     assert body["version"] is None
     assert body["changes"]["topology"]["added"] == 6
@@ -114,18 +114,18 @@ def test_a_dry_run_stores_nothing(api: Api, bare: str) -> None:
 
 
 @pytest.mark.parametrize("tag", ['"0"', '"7", "0"', "*"])
-def test_if_match_that_holds(api: Api, bare: str, tag: str) -> None:
+def test_if_match_accepts_the_head_only(api: Api, bare: str, tag: str) -> None:
     api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, headers={"If-Match": tag})
 
 
-def test_if_match_by_root(api: Api, bare: str) -> None:
+def test_if_match_accepts_a_root(api: Api, bare: str) -> None:
     root = api.get(f"environments/{bare}").json()["root"]
     api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, headers={"If-Match": f'"{root}"'})
     answer = api.upload(bare, {"datum.yaml": samples.DATUM}, expect=412, headers={"If-Match": f'"{root}"'})
     assert "version 1" in problem(answer)["detail"]
 
 
-def test_an_answer_that_got_lost(api: Api, bare: str) -> None:
+def test_idempotency_key_returns_the_first_response(api: Api, bare: str) -> None:
     headers = {"Idempotency-Key": "k-1"}
     first = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, headers=headers, message="m")
     api.upload(bare, {"datum.yaml": samples.DATUM})
@@ -136,7 +136,7 @@ def test_an_answer_that_got_lost(api: Api, bare: str) -> None:
     assert api.get(f"environments/{bare}").json()["version"] == 2
 
 
-def test_a_request_that_changed_nothing_undoes_nothing_when_sent_again(api: Api, bare: str) -> None:
+def test_idempotency_key_covers_unchanged_uploads(api: Api, bare: str) -> None:
     api.upload(bare, {"n.tmap2.yaml": samples.tmap2()})
     headers = {"Idempotency-Key": "k"}
     api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, expect=200, headers=headers)
@@ -152,7 +152,7 @@ def test_a_request_that_changed_nothing_undoes_nothing_when_sent_again(api: Api,
     assert api.get(f"environments/{bare}").json()["version"] == 2
 
 
-def test_a_revert_is_a_version(api: Api, farm: str) -> None:
+def test_revert_creates_a_version(api: Api, farm: str) -> None:
     body = {"revert_to": 1, "message": "the gate was open"}
     answer = api.post(f"environments/{farm}/versions", body, headers={"If-Match": '"3"', "Idempotency-Key": "r"})
     version = answer.json()
@@ -167,7 +167,7 @@ def test_a_revert_is_a_version(api: Api, farm: str) -> None:
         api.problem("POST", f"environments/{farm}/versions", 422, json=bad)
 
 
-def test_history_newest_first_in_pages(api: Api, farm: str) -> None:
+def test_history_is_paginated_newest_first(api: Api, farm: str) -> None:
     first = api.get(f"environments/{farm}/versions?limit=3")
     assert [v["version"] for v in first.json()] == [3, 2, 1]
     second = api.get(first.links["next"]["url"])
@@ -177,7 +177,7 @@ def test_history_newest_first_in_pages(api: Api, farm: str) -> None:
     api.problem("GET", f"environments/{farm}/versions?cursor=x", 422)
 
 
-def test_versions_by_number_and_channel(api: Api, farm: str) -> None:
+def test_versions_are_found_by_number_and_channel(api: Api, farm: str) -> None:
     answer = api.get(f"environments/{farm}/versions/latest")
     assert answer.json()["version"] == 3
     assert answer.headers["fleetmap-root"] == answer.json()["root"]
@@ -225,7 +225,7 @@ def put(item: str, x: float, y: float, **more: object) -> dict[str, object]:
     return {"op": "put", "layer": "topology", "feature": feature, **more}
 
 
-def test_a_node_is_moved_and_its_edges_follow(api: Api, farm: str) -> None:
+def test_edges_follow_a_moved_node(api: Api, farm: str) -> None:
     answer = api.post(f"environments/{farm}/edits", {"message": "moved", "changes": [put("barn", 12.0, 1.0)]})
     body = answer.json()
     assert (body["version"], body["message"]) == (4, "moved")
@@ -240,7 +240,7 @@ def test_a_node_is_moved_and_its_edges_follow(api: Api, farm: str) -> None:
     assert {f["id"]: f["place"]["coordinates"] for f in before["features"]}["barn"] == [10.0, 0.0]
 
 
-def test_a_dangling_edge_is_refused(api: Api, farm: str) -> None:
+def test_dangling_edge_is_refused(api: Api, farm: str) -> None:
     answer = api.problem(
         "POST",
         f"environments/{farm}/edits",
@@ -256,7 +256,7 @@ def test_a_dangling_edge_is_refused(api: Api, farm: str) -> None:
     assert body["changes"]["topology"]["deleted"] == 4
 
 
-def test_cells_in_a_polygon(api: Api, farm: str) -> None:
+def test_cells_in_a_polygon_are_set(api: Api, farm: str) -> None:
     ring = [[-0.5, -2.0], [0.5, -2.0], [0.5, -1.0], [-0.5, -1.0], [-0.5, -2.0]]
     change = {
         "op": "cells",
@@ -290,12 +290,12 @@ def test_cells_in_a_polygon(api: Api, farm: str) -> None:
          "coordinates": ["x", None]}, "properties": {"kind": "node"}}},
     ],
 )  # fmt: skip
-def test_edits_refused(api: Api, farm: str, change: object) -> None:
+def test_invalid_edits_are_refused(api: Api, farm: str, change: object) -> None:
     api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": [change]})
     assert api.get(f"environments/{farm}").json()["version"] == 3
 
 
-def test_edits_on_top_of_a_version(api: Api, farm: str) -> None:
+def test_edits_honour_if_match_and_idempotency_key(api: Api, farm: str) -> None:
     body = {"changes": [put("new", 1.0, 1.0)]}
     api.problem("POST", f"environments/{farm}/edits", 412, json=body, headers={"If-Match": '"2"'})
     first = api.post(f"environments/{farm}/edits", body, headers={"If-Match": '"3"', "Idempotency-Key": "e"})
@@ -318,6 +318,6 @@ def test_edits_on_top_of_a_version(api: Api, farm: str) -> None:
         '{"message": 1e999, "changes": []}',
     ],
 )
-def test_json_that_is_none(api: Api, farm: str, text: str | bytes) -> None:
+def test_invalid_json_returns_400(api: Api, farm: str, text: str | bytes) -> None:
     headers = {"Content-Type": "application/json"}
     api.problem("POST", f"environments/{farm}/edits", 400, content=text, headers=headers)

@@ -1,4 +1,4 @@
-"""Every level, every named part and every drawn mask of a format: over HTTP, and in manifests."""
+"""All levels, named parts and drawn masks of a format: over HTTP, and in manifests."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def names_of(body: dict[str, Any], fmt: str = "occupancy_grid") -> list[str]:
 
 
 def check_files(api: Api, env: str, body: dict[str, Any], query: str = "") -> None:
-    """Each file of a manifest is had by its name, with these bytes."""
+    """Check that each file of a manifest can be downloaded by its name, with the signed hash."""
     for file in body["files"]:
         path = f"environments/{env}/versions/{body['version']}/maps/{file['format']}/{quote(file['name'])}{query}"
         got = api.get(path).content
@@ -68,7 +68,7 @@ def unzipped(content: bytes) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def office(api: Api) -> str:
-    """A made-up office with two levels and zones on both."""
+    """Generate an office with two levels and zones on both."""
     api.post("environments", {"name": "office-7"})
     api.post("environments/office-7/generations", {"generator": "office", "seed": 7})
     return "office-7"
@@ -76,7 +76,7 @@ def office(api: Api) -> str:
 
 @pytest.fixture(scope="module")
 def polytunnels(api: Api) -> str:
-    """A made-up farm with keepouts and speed limits drawn as zones."""
+    """Generate a farm with keepouts and speed limits drawn as zones."""
     api.post("environments", {"name": "polytunnels-7"})
     api.post("environments/polytunnels-7/generations", {"generator": "polytunnels", "seed": 7})
     return "polytunnels-7"
@@ -84,7 +84,7 @@ def polytunnels(api: Api) -> str:
 
 @pytest.fixture
 def house(api: Api, fresh: Callable[[], str]) -> str:
-    """Grids on two levels: map and nav on the ground, map on L2."""
+    """Create grids on two levels: map and nav on the ground, map on L2."""
     name = fresh()
     api.post("environments", {"name": name})
     api.upload(name, samples.grid())
@@ -107,7 +107,7 @@ def test_manifest_lists_both_levels_and_masks_of_office(api: Api, office: str) -
     check_files(api, office, body)
 
 
-def test_an_environment_uploaded_again_as_its_package_has_the_same_root(
+def test_reupload_of_a_package_keeps_the_root(
     api: Api, office: str, polytunnels: str, fresh: Callable[[], str], shared: Path
 ) -> None:
     template = shared / "data" / "environment_template" / "riseholme_park_farm_vineyard"
@@ -125,7 +125,7 @@ def test_an_environment_uploaded_again_as_its_package_has_the_same_root(
         for env in (name, copy):
             network = yaml.safe_load(api.get(f"/maps/{env}/tmap2/network.tmap2.yaml").content)
             names = {network[key] for key in ("name", "metric_map", "pointset")}
-            assert names == {env} if name != real else "riseholme" in network["name"], "an uploaded one keeps its own"
+            assert names == {env} if name != real else "riseholme" in network["name"], "an uploaded mask keeps its own"
 
 
 def test_manifest_lists_drawn_masks_of_polytunnels(api: Api, polytunnels: str) -> None:
@@ -139,7 +139,7 @@ def test_manifest_lists_drawn_masks_of_polytunnels(api: Api, polytunnels: str) -
     assert (grey == 0).any(), "keepouts are drawn"
 
 
-def test_zip_of_all_has_the_files_of_the_manifest(api: Api, office: str) -> None:
+def test_zip_has_the_files_of_the_manifest(api: Api, office: str) -> None:
     files = unzipped(api.get(f"/maps/{office}/occupancy_grid?level=*&grid=*").content)
     body = listed(api, office, "occupancy_grid")
     hashes = {f["name"]: f["sha256"] for f in body["files"]}
@@ -171,7 +171,7 @@ def test_stars_select_levels_and_grids(api: Api, house: str, query: str, expecte
     assert {name.rpartition(".")[2] for name in files} == {"yaml", "png" if "png" in query else "pgm"}
 
 
-def test_address_without_parameters_gives_the_one_map(api: Api, house: str) -> None:
+def test_url_without_parameters_gives_the_default_map(api: Api, house: str) -> None:
     files = unzipped(api.get(f"/maps/{house}/occupancy_grid").content)
     assert set(files) == {"map.yaml", "map.pgm"}
     assert unzipped(api.get(f"/maps/{house}/occupancy_grid?level=L2").content)["map.pgm"][:7] == b"P5\n12 6"
@@ -231,7 +231,7 @@ def test_mask_that_cannot_be_drawn_fails_the_whole_format(api: Api, house: str) 
     api.get(f"/maps/{house}/occupancy_grid/map.yaml")
 
 
-def test_lowest_level_is_at_the_top_where_no_ground_is(api: Api, bare: str) -> None:
+def test_lowest_level_is_the_default_without_ground(api: Api, bare: str) -> None:
     api.upload(bare, samples.grid(width=9), level="L1")
     assert names_of(listed(api, bare, "occupancy_grid")) == ["map.pgm", "map.yaml"]
     api.upload(bare, samples.grid(width=12), level="B1")
@@ -260,7 +260,7 @@ def test_level_folders_never_collide() -> None:
     assert len(set(folders)) == len(folders)
 
 
-def test_levels_with_odd_names_are_served(api: Api, bare: str) -> None:
+def test_levels_with_special_names_are_served(api: Api, bare: str) -> None:
     api.upload(bare, samples.grid())
     levels = ("map.yaml", "a/b", "..", "Étage 2", "x?y#z*")
     for place, level in enumerate(levels):
@@ -312,24 +312,24 @@ def test_entries_carry_parameters(api: Api, house: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("query", "said"),
+    ("query", "message"),
     [
-        ("formats=occupancy_grid,occupancy_grid", "named twice"),
-        ("formats=occupancy_grid&optional=occupancy_grid%3Flevel=L2", "named twice"),
+        ("formats=occupancy_grid,occupancy_grid", "duplicate format"),
+        ("formats=occupancy_grid&optional=occupancy_grid%3Flevel=L2", "duplicate format"),
         ("formats=occupancy_grid%3Fcolour=red", "colour"),
-        ("formats=occupancy_grid%3Flevel=a%26level=b", "given twice"),
+        ("formats=occupancy_grid%3Flevel=a%26level=b", "duplicate parameter"),
         ("formats=occupancy_grid&optional=nothing", "no format"),
-        ("formats=&optional=occupancy_grid", "name 1 to"),
+        ("formats=&optional=occupancy_grid", "list 1 to"),
         ("formats=occupancy_grid%3Flevel=L9", "occupancy_grid: "),
     ],
 )
-def test_bad_entries_are_refused(api: Api, house: str, query: str, said: str) -> None:
+def test_bad_entries_are_refused(api: Api, house: str, query: str, message: str) -> None:
     answer = api.get(f"environments/{house}/versions/latest/manifest?{query}", expect=None)
     assert answer.status_code in (404, 422)
-    assert said in answer.json()["detail"]
+    assert message in answer.json()["detail"]
 
 
-def test_optional_formats_that_cannot_be_given_are_listed(api: Api, house: str) -> None:
+def test_unavailable_optional_formats_are_listed(api: Api, house: str) -> None:
     body = listed(api, house, "occupancy_grid", optional="kml,datum")
     assert {line["format"] for line in body["missing"]} == {"kml", "datum"}
     assert all("upload" in line["detail"] for line in body["missing"])
@@ -338,9 +338,7 @@ def test_optional_formats_that_cannot_be_given_are_listed(api: Api, house: str) 
     assert "kml" in problem["detail"]
 
 
-def test_optional_format_whose_making_fails_is_not_tried_again_at_once(
-    api: Api, house: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_optional_format_is_not_retried_at_once(api: Api, house: str, monkeypatch: pytest.MonkeyPatch) -> None:
     draw(api, house, zone("a", "speed", 0.5), zone("b", "speed", "50%", x=1.0))
     api.upload(house, {"network.tmap2.yaml": samples.tmap2()})
     maps = api.app.state.services.maps
@@ -361,7 +359,7 @@ def test_optional_format_whose_making_fails_is_not_tried_again_at_once(
     assert tried.count("occupancy_grid") <= 4, "each stored grid once, and the masks once"
 
 
-def test_whole_site_is_made_where_the_cache_holds_one_map_only(tmp_path: Path) -> None:
+def test_whole_site_is_converted_with_a_cache_for_one_map(tmp_path: Path) -> None:
     with running(settings_for(tmp_path, cache_bytes=1)) as api:
         api.post("environments", {"name": "small"})
         for level in ("ground", "L2", "L3"):
@@ -371,7 +369,7 @@ def test_whole_site_is_made_where_the_cache_holds_one_map_only(tmp_path: Path) -
         assert len(unzipped(api.get("/maps/small/occupancy_grid?level=*&grid=*").content)) == 6
 
 
-def test_masks_are_made_once_for_manifest_and_files(api: Api, house: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masks_are_converted_once_for_manifest_and_files(api: Api, house: str, monkeypatch: pytest.MonkeyPatch) -> None:
     draw(api, house, zone("low", "keepout"), zone("slow", "speed", 0.5, x=1.0))
     maps = api.app.state.services.maps
     steps = []

@@ -1,4 +1,4 @@
-"""Writers at the same moment: with ``If-Match`` one of them wins, without it all come in, one after the other."""
+"""Concurrent writers: with ``If-Match`` one of them succeeds, without it all do, one after the other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WRITERS = 6
 
 
 def at_once(api: Api, env: str, headers: dict[str, str]) -> list[tuple[int, Any]]:
-    """Each puts a zone of its own, all in the same moment: the answers' statuses and bodies."""
+    """Put one zone per writer at the same time; return the statuses and bodies."""
     start = threading.Barrier(WRITERS)
 
     def write(k: int) -> tuple[int, Any]:
@@ -38,14 +38,14 @@ def at_once(api: Api, env: str, headers: dict[str, str]) -> list[tuple[int, Any]
 
 
 def races(api: Api, env: str) -> None:
-    """Both races, and what must be true after them."""
+    """Run both races, and check the result."""
     head = api.get(f"environments/{env}").json()["version"]
     answers = at_once(api, env, {"If-Match": f'"{head}"'})
     assert sorted(status for status, _ in answers) == [201] + [412] * (WRITERS - 1)
     assert api.get(f"environments/{env}").json()["version"] == head + 1
     answers = at_once(api, env, {})
     won = {body["version"] for status, body in answers if status == 201}
-    same = [body["version"] for status, body in answers if status == 200]  # the zone that the first race has put
+    same = [body["version"] for status, body in answers if status == 200]  # the zone of the first race
     assert len(won) == WRITERS - 1
     assert len(same) == 1
     last = head + WRITERS
@@ -57,19 +57,19 @@ def races(api: Api, env: str) -> None:
     for k, (status, body) in enumerate(answers):
         assert status == 200 or messages[body["version"]] == f"by writer {k}"
     zones = api.get(f"environments/{env}/versions/latest/layers/zones?crs=local").json()["features"]
-    assert {z["id"] for z in zones} == {f"z{k}" for k in range(WRITERS)}, "nobody has overwritten another"
+    assert {z["id"] for z in zones} == {f"z{k}" for k in range(WRITERS)}, "no writer has overwritten another"
     lines = api.get(f"events?environment={env}&since=0&follow=false").text.splitlines()
     events = [json.loads(line[5:]) for line in lines if line.startswith("data:")]
     assert [e["sequence"] for e in events] == list(range(1, len(events) + 1))
     assert [e["version"] for e in events if e["type"] == "version.created"] == list(range(1, last + 1))
 
 
-def test_writers_at_once(api: Api, farm: str) -> None:
+def test_concurrent_writers_lose_no_update(api: Api, farm: str) -> None:
     races(api, farm)
 
 
-def test_order_does_not_depend_on_clocks(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The server's clock goes back by a minute between commits, and forth by two."""
+def test_version_order_is_independent_of_clocks(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server's clock goes back by a minute between commits, and forward by two."""
     database = api.app.state.services.store._database
     for shift in (60, -60, 0):
         monkeypatch.setattr(database, "now", lambda s=shift: datetime.now(UTC) + timedelta(seconds=s))

@@ -158,7 +158,7 @@ def test_a_job_that_fails_tells_its_problem(talk: Talk) -> None:
 
 
 def test_a_missing_token_gets_a_hint(talk: Talk) -> None:
-    client, script = talk(reply(401, {"title": "Token needed", "detail": "give a token"}, "application/problem+json"))
+    client, script = talk(reply(401, {"title": "Token required", "detail": "give a token"}, "application/problem+json"))
     with pytest.raises(RequestFailed) as caught:
         client.get("/formats")
     assert "FLEETMAP_TOKEN" in caught.value.hint

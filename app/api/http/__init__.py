@@ -1,1 +1,1 @@
-"""Below the nouns: how a request comes in and an answer goes out, whatever it is about."""
+"""Request and response handling that all resources share."""

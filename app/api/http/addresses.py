@@ -1,4 +1,4 @@
-"""What the address of a map asks for, and the version and recipe that it means."""
+"""Parsing of map URLs, and their resolution to a version and a recipe."""
 
 from __future__ import annotations
 
@@ -23,8 +23,14 @@ PRODUCTION = "production"
 
 @dataclass(frozen=True, slots=True)
 class MapRequest:
-    """What an address asks for, checked. version: None on a short address. file: None for the whole map. values: the
-    map's own parameters. derive: whether derived information is allowed. closures: None for the default of the address.
+    """Parsed URL of a map.
+
+    Attributes:
+        version: None in a short URL.
+        file: None for the complete map.
+        values: parameters of the map.
+        derive: allow derived information.
+        closures: None for the default of the URL.
     """
 
     environment: str
@@ -37,7 +43,7 @@ class MapRequest:
 
 
 def parse_map_request(request: Request) -> MapRequest:
-    """What the address of a map asks for. Raises Invalid for a query that cannot be read."""
+    """Parse the URL of a map. Raises NotFound for another path, Invalid for an unreadable query."""
     link = signed_link(request)
     options = parse_query(request.scope["query_string"] if link is None else link.query)
     match = MAP_PATH.fullmatch(request.scope["path"])
@@ -47,36 +53,37 @@ def parse_map_request(request: Request) -> MapRequest:
 
 
 def signed_link(request: Request) -> SignedAddress | None:
-    """The signed link, already checked, that a request was made by."""
+    """Return the verified signed link of a request, or None."""
     link: SignedAddress | None = request.scope["state"].get(LINK)
     return link
 
 
 def request_address(request: Request) -> str:
-    """The request's own address, to be asked for again; without the signature of a link."""
+    """Return the request's URL for later requests, without the signature of a link."""
     link = signed_link(request)
     query = request.url.query if link is None else link.query.decode()
     return quote(request.scope["path"], safe="/") + (f"?{quote(query, safe='&=%,.:+-_~/')}" if query else "")
 
 
 def parse_query(query: bytes) -> tuple[dict[str, str], bool, ClosureMode | None]:
-    """``parse_options`` of the bytes in an address."""
+    """Decode a query and apply ``parse_options``. Raises Invalid."""
     try:
         text = query.decode("ascii")
     except UnicodeDecodeError:
-        raise Invalid("the query cannot be read: it must be percent-encoded UTF-8") from None
+        raise Invalid("unreadable query: it must be percent-encoded UTF-8") from None
     return parse_options(text)
 
 
 def resolve_recipe(services: Services, wanted: MapRequest) -> Recipe:
-    """The recipe that an address means at this moment. Blocks. Raises what ``Maps.recipe`` raises."""
+    """Resolve a URL to its current recipe. Blocks. Raises the errors of ``Maps.recipe``."""
     version = resolve_version(services, wanted)
     return services.maps.recipe(version, wanted.format, wanted.values, derive=wanted.derive, file=wanted.file)
 
 
 def resolve_version(services: Services, wanted: MapRequest) -> Version:
-    """The version that an address means, with the closures that its maps show: on a short one production where there is
-    one, else the head.
+    """Resolve a URL to a version, with the closures that its maps show.
+
+    A short URL means the channel ``production`` if it exists, else the head.
     """
     target = partial(services.store.channels.target, wanted.environment)
     if wanted.version is not None:

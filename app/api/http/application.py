@@ -1,4 +1,4 @@
-"""The application: answers in memory before everything else, and its own OpenAPI document."""
+"""FastAPI application that serves cached responses first and builds its own OpenAPI document."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from app.api.http.response_cache import ResponseCache
 
 
 class FleetMapApp(FastAPI):
-    """FastAPI with a shortcut. response_cache: None until the services are open."""
+    """FastAPI with a response cache in front. response_cache: None until the services are open."""
 
     response_cache: ResponseCache | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a repeated request for a map from memory, or go the long way."""
+        """Serve a repeated request for a map from memory; pass all others on."""
         if self.response_cache is not None and scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
             reply = self.response_cache.reply(scope)
             if reply is not None:
@@ -27,7 +27,7 @@ class FleetMapApp(FastAPI):
         await super().__call__(scope, receive, send)
 
     def openapi(self) -> dict[str, Any]:
-        """The OpenAPI document, made when first asked for."""
+        """Return the OpenAPI document, built on first use."""
         if self.openapi_schema is None:
             self.openapi_schema = openapi.build(self)
         return self.openapi_schema

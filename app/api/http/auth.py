@@ -1,7 +1,7 @@
-"""Who may do what: bearer tokens, roles, environments by name pattern, and a brake on guessing.
+"""Authentication and authorization: bearer tokens, roles, environment name patterns, throttling of failures.
 
-Default is no: the guard in front of all routes asks for a token at every address that is not listed as open, and for
-the environment that stands in the address; each route declares the role it takes.
+Access is denied by default: the middleware requires a token for every path that is not listed as open, and access to
+the environment in the path. Each route declares the role that it requires.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _CAN: dict[RequiredRole, frozenset[Role]] = {
 }
 
 FRESH_SECONDS = 1.0
-"""How long a token is believed without asking the store: one revoked by another process lives that much longer."""
+"""Seconds for which a checked token is cached; a token revoked by another process stays valid that much longer."""
 
 WINDOW_SECONDS = 60.0
 MAX_CACHED_TOKENS = 4096
@@ -44,10 +44,10 @@ MAX_SOURCES = 10_000
 MAX_TOKEN = 512
 
 OPEN = frozenset({"/", "/healthz", "/readyz", "/docs", "/openapi.json"})
-"""Addresses that need no token; also all below /docs/ (the pages' own files)."""
+"""Paths that need no token, besides all below /docs/ (files of the documentation page)."""
 
 PROVE = "prove"
-"""In the ``state`` of a request's scope: what to call once the request has shown a valid token or link."""
+"""Key in a request scope's ``state``: callback for the first valid token or link of a connection."""
 
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps)/([^/]+)(?:/.*)?", re.DOTALL)
@@ -55,7 +55,7 @@ _ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps)/([^/]+)(?:/.*)?", re.D
 
 @dataclass(frozen=True, slots=True)
 class Principal:
-    """Who asks. environments: a name pattern, None for all."""
+    """Authenticated caller. environments: name pattern, None for all."""
 
     id: str
     name: str
@@ -66,42 +66,42 @@ class Principal:
 
     @classmethod
     def from_token(cls, token: Token) -> Principal:
-        """Who holds this token."""
+        """Create the principal of a token."""
         return cls(token.id, token.name, token.role, token.environments, token.robot, token.expires)
 
     def has_expired(self) -> bool:
-        """Whether the token or link is over."""
+        """Test if the token or link has expired."""
         return self.expires is not None and self.expires <= datetime.now(UTC)
 
     def has_role(self, need: RequiredRole) -> bool:
-        """Whether the role allows it."""
+        """Test if the role includes ``need``."""
         return self.role in _CAN[need]
 
     def can_access(self, environment: str) -> bool:
-        """Whether the token reaches this environment."""
+        """Test if the token can access this environment."""
         return self.environments is None or fnmatchcase(environment, self.environments)
 
     def require_role(self, need: RequiredRole) -> None:
-        """Denied unless the role allows it."""
+        """Raise Denied unless the role includes ``need``."""
         if not self.has_role(need):
             takes = " or ".join(sorted(_CAN[need]))
-            raise Denied(f"this call takes a token with the role {takes}; yours is {self.role}")
+            raise Denied(f"this call requires the role {takes}; your token has the role {self.role}")
 
     def require_environment(self, environment: str) -> None:
-        """Denied unless the token reaches this environment."""
+        """Raise Denied unless the token can access this environment."""
         if not self.can_access(environment):
-            raise Denied(f"your token is limited to the environments {self.environments}")
+            raise Denied(f"your token is limited to the environments {self.environments}: use another token")
 
     def require_all_environments(self) -> None:
-        """Denied for tokens that are limited to some environments."""
+        """Raise Denied if the token is limited to some environments."""
         if self.environments is not None:
-            raise Denied(f"this call takes a token for all environments; yours is limited to {self.environments}")
+            raise Denied(f"this call requires a token for all environments; yours is limited to {self.environments}")
 
 
 def authorise(scope: Scope, principal: Principal, environment: str | None) -> None:
-    """Let a caller in whose token or link is valid: to the environment of the address, if it speaks of one.
+    """Check that an authenticated caller may access the environment of the path, if there is one.
 
-    Raises Denied. The connection counts as proven all the same. What role a call takes is for its route to say.
+    Raises Denied, but the connection counts as proven anyway. The route checks the role.
     """
     prove = scope["state"].get(PROVE)
     if prove is not None:
@@ -111,22 +111,22 @@ def authorise(scope: Scope, principal: Principal, environment: str | None) -> No
 
 
 ANONYMOUS_ADMIN = Principal("", "anonymous", "admin")
-"""Everybody, where access control is switched off."""
+"""Principal of every request if access control is disabled."""
 
 
 def is_open(path: str) -> bool:
-    """Whether an address needs no token."""
+    """Test if a path needs no token."""
     return path in OPEN or path.startswith("/docs/")
 
 
 def environment_in_path(path: str) -> str | None:
-    """The environment that an address speaks of."""
+    """Return the environment in a path, or None."""
     match = _ENVIRONMENT.fullmatch(path)
     return match[1] if match else None
 
 
 class Authenticator:
-    """Tokens, looked up in the store and believed for a second. is_invalidated: how often one was revoked here."""
+    """Token check with a cache of FRESH_SECONDS. is_invalidated: number of revocations in this process."""
 
     def __init__(
         self,
@@ -144,9 +144,9 @@ class Authenticator:
         self.is_invalidated = 0
 
     def check_origin(self, headers: Iterable[tuple[bytes, bytes]]) -> None:
-        """Denied without access control, unless a request names this machine and comes from no other site's page.
+        """If access control is disabled, raise Denied unless the request is local and not from another site's page.
 
-        Without tokens a browser must not be led here by a foreign page (DNS rebinding, cross-site requests).
+        Otherwise another page could make the browser call this server (DNS rebinding, cross-site requests).
         """
         if not self.insecure:
             return
@@ -157,12 +157,12 @@ class Authenticator:
             origin is not None and urlsplit(origin.decode("latin-1")).hostname not in _LOOPBACK
         ):
             raise Denied(
-                "without access control the server answers only to a loopback name (localhost, 127.0.0.1), and no "
-                "pages of other sites"
+                "access control is disabled, so requests must use a loopback name (localhost, 127.0.0.1) and "
+                "must not come from pages of other sites"
             )
 
     def cached_principal(self, header: bytes | None) -> Principal | None:
-        """Who sent this Authorization header, if it was checked less than a second ago. Never blocks."""
+        """Return the cached principal of an Authorization header, or None. Never blocks."""
         if self.insecure:
             return ANONYMOUS_ADMIN
         if header is None:
@@ -171,38 +171,39 @@ class Authenticator:
         return entry[0] if entry is not None and self._clock() < entry[1] else None
 
     def authenticate(self, header: bytes | None, client: str | None) -> Principal:
-        """Who sent this header. Asks the store, so call it from a thread.
+        """Authenticate an Authorization header. Reads the store, so call it from a thread.
 
-        A valid token is accepted also from an address that sent too many wrong ones: many robots share an address.
+        A valid token is accepted even from an address with too many failures, because many robots may share an
+        address.
 
-        Raises Unauthenticated; Throttled for a wrong token after too many from the client's address.
+        Raises Unauthenticated; Throttled for a wrong token after too many failures from the client's address.
         """
         cached = self.cached_principal(header)
         if cached is not None:
             return cached
         if header is None:
-            raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
+            raise Unauthenticated("missing token: send 'Authorization: Bearer <token>'")
         forgotten = self.is_invalidated
         token = self._find_token(_token(header)) if _token(header) else None
         principal = None if token is None else Principal.from_token(token)
         if principal is None or principal.has_expired():
             self.note_failure(client)
-            raise Unauthenticated("the token is unknown or has expired: ask an administrator for a new one")
+            raise Unauthenticated("unknown or expired token: ask an administrator for a new one")
         with self._lock:
-            if forgotten == self.is_invalidated:  # else it may have been revoked while it was looked up
+            if forgotten == self.is_invalidated:  # otherwise it may have been revoked during the lookup
                 self._cache[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)
             while len(self._cache) > MAX_CACHED_TOKENS:
                 self._cache.popitem(last=False)
         return principal
 
     def invalidate(self) -> None:
-        """Ask the store again for every token: one was revoked."""
+        """Clear the cache of tokens, because one was revoked."""
         with self._lock:
             self.is_invalidated += 1
             self._cache.clear()
 
     def note_failure(self, client: str | None) -> None:
-        """Count a wrong token or signature; Throttled after too many from this address within a minute."""
+        """Count a wrong token or signature. Raises Throttled after too many from this address within a minute."""
         source = client_source(client)
         with self._lock:
             now = self._clock()
@@ -211,8 +212,8 @@ class Authenticator:
                 times.popleft()
             if len(times) >= self._failures:
                 raise Throttled(
-                    "too many wrong tokens or signatures came from your address: wait a minute, or send a valid token, "
-                    "which is accepted at any time"
+                    "too many wrong tokens or signatures from your address: wait a minute, or send a valid "
+                    "token, which is always accepted"
                 )
             times.append(now)
             self._sources.move_to_end(source)
@@ -221,7 +222,7 @@ class Authenticator:
 
 
 def _token(header: bytes) -> str:
-    """The token of ``Bearer <token>``; empty where it is none."""
+    """Extract the token of ``Bearer <token>``; empty if the header is malformed."""
     scheme, _, text = header.partition(b" ")
     text = text.strip()
     if scheme.lower() != b"bearer" or not text or len(text) > MAX_TOKEN:
@@ -233,7 +234,7 @@ def _token(header: bytes) -> str:
 
 
 def client_source(client: str | None) -> str:
-    """What counts as one source: an IPv4 address (also one mapped into IPv6), the /64 of an IPv6 one."""
+    """Reduce a client address to the unit of throttling: an IPv4 address (also mapped into IPv6), or an IPv6 /64."""
     try:
         address = ipaddress.ip_address(client or "")
     except ValueError:
@@ -247,22 +248,22 @@ def client_source(client: str | None) -> str:
 
 
 def is_loopback(source: str) -> bool:
-    """Whether a source is this machine itself."""
+    """Test if a source is this machine."""
     return source == "::1" or (source.startswith("127.") and "/" not in source)
 
 
 @dataclass(frozen=True, slots=True)
 class RequireRole:
-    """A route's dependency: the caller, who must have at least this role; everywhere: in all environments."""
+    """Dependency of a route: the caller, with at least this role. everywhere: for all environments."""
 
     need: RequiredRole
     everywhere: bool = False
 
     async def __call__(self, request: Request) -> Principal:
-        """The caller; Denied where the role does not suffice."""
+        """Return the caller. Raises Denied if the role is not sufficient."""
         principal: Any = request.scope.get("state", {}).get("principal")
         if not isinstance(principal, Principal):
-            raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
+            raise Unauthenticated("missing token: send 'Authorization: Bearer <token>'")
         principal.require_role(self.need)
         if self.everywhere:
             principal.require_all_environments()
@@ -277,4 +278,4 @@ Editor = Annotated[Principal, Depends(editor)]
 Admin = Annotated[Principal, Depends(admin)]
 ServerViewer = Annotated[Principal, Depends(RequireRole("viewer", everywhere=True))]
 ServerAdmin = Annotated[Principal, Depends(RequireRole("admin", everywhere=True))]
-"""For what concerns the server itself or all environments: tokens, keys, metrics."""
+"""Roles for calls about the server or all environments: tokens, keys, metrics."""

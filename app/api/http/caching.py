@@ -12,7 +12,7 @@ _ONE_RANGE = re.compile(r"\s*(\d{0,18})\s*-\s*(\d{0,18})\s*")
 
 
 def none_match(header: str | None, etag: str) -> bool:
-    """Whether If-None-Match names this ETag (weak comparison), so that the answer is 304."""
+    """Test if If-None-Match contains this ETag (weak comparison), so that the response is 304."""
     if header is None:
         return False
     if header == etag or header.strip() == "*":
@@ -21,14 +21,14 @@ def none_match(header: str | None, etag: str) -> bool:
 
 
 def match(header: str | None, *etags: str) -> bool:
-    """Whether If-Match names one of these ETags (strong comparison), or is absent."""
+    """Test if If-Match is absent or contains one of these ETags (strong comparison)."""
     if header is None or header.strip() == "*":
         return True
     return any(not weak and tag in etags for weak, tag in _tags(header))
 
 
 def _tags(header: str) -> list[tuple[bool, str]]:
-    """The entity tags of a list; what is not one ends it."""
+    """Parse a list of entity tags up to the first malformed one."""
     out, at = [], 0
     while at < len(header) and (tag := _TAG.match(header, at)):
         out.append((bool(tag[1]), tag[2]))
@@ -38,16 +38,16 @@ def _tags(header: str) -> list[tuple[bool, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Unsatisfiable:
-    """A range that lies outside the content: 416."""
+    """Range outside the content, which returns 416."""
 
 
 def byte_range(
     range_: str | None, if_range: str | None, etag: str, size: int
 ) -> tuple[int, int] | Unsatisfiable | None:
-    """The half-open range [start, end) that a client asks for; None means the whole.
+    """Return the requested half-open range [start, end), or None for the complete content.
 
-    Only a single range is honoured: several, another unit or a malformed one give the whole, as RFC 9110 allows.
-    If-Range holds only with the strong ETag of the present content.
+    Only a single range is supported: several ranges, other units and malformed ranges return the complete content, as
+    RFC 9110 allows. If-Range must be the strong ETag of the current content.
     """
     if range_ is None or (if_range is not None and if_range.strip() != etag):
         return None
@@ -66,7 +66,7 @@ def byte_range(
 
 
 def content_disposition(name: str) -> str:
-    """``attachment`` with a file name that any client understands (RFC 6266): ASCII, and UTF-8 where it differs."""
+    """Format ``attachment`` with a file name for all clients (RFC 6266): ASCII, plus UTF-8 if it differs."""
     base = name.rsplit("/", 1)[-1]
     plain = "".join(c if " " <= c <= "~" and c not in '"\\%' else "_" for c in base) or "file"
     if plain == base:

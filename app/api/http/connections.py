@@ -1,8 +1,9 @@
-"""Open connections of one process: how many there may be, and which of them give way.
+"""Limits on the open connections of one process, and the choice of connections to close.
 
-A connection is *proven* once one of its requests had a valid token or link. All others are bounded for each address,
-and a quarter of the places is not for those of strangers. The oldest one gives way to a new one: a client sends its
-token within milliseconds, so that a flood of silent connections displaces only itself.
+A connection is *proven* once one of its requests had a valid token or link. Unproven connections are limited per
+address, and those from untrusted addresses cannot use a quarter of the total. If a limit is reached, the oldest
+unproven connection is closed: clients send their token within milliseconds, so a flood of silent connections
+displaces only itself.
 """
 
 from __future__ import annotations
@@ -22,30 +23,30 @@ from app.api.http.auth import client_source, is_loopback
 log = logging.getLogger(__name__)
 
 TRUST_SECONDS = 600.0
-"""How long an address counts as trusted after a valid token came from it."""
+"""Seconds for which an address is trusted after a valid token from it."""
 
 MAX_TRUSTED = 10_000
 RESERVED_SHARE = 4
-"""One place in so many is not for connections of strangers."""
+"""Reserved share of connections, as 1/N of the total, that untrusted addresses cannot use."""
 
 WARN_SECONDS = 60.0
 OTHER_FILES = 512
-"""Descriptors for all else: database, cache, workers, the router."""
+"""File descriptors for everything else: database, cache, workers, router."""
 
 FILES_PER_CONNECTION = 2
-"""Its socket, and the file that it may be streamed."""
+"""File descriptors per connection: its socket, and a file that is streamed."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConnectionLimits:
-    """What a client may take up. Times in seconds.
+    """Limits for clients. Times in seconds.
 
     Attributes:
-        total: open connections.
-        per_address: open connections of one address that have not been proven; loopback addresses have no such limit.
-        head_seconds: time in which a request's head must have come.
-        stall_seconds: time after which a client that reads an answer at less than ``pace`` is given up.
-        pace: bytes per second.
+        total: maximum number of open connections.
+        per_address: maximum number of unproven connections of one address; loopback addresses are not limited.
+        head_seconds: maximum time to receive the head of a request.
+        stall_seconds: time after which a client that reads slower than ``pace`` is disconnected.
+        pace: minimum reading speed in bytes per second.
     """
 
     total: int = 4096
@@ -56,23 +57,23 @@ class ConnectionLimits:
 
 
 class Connection(Protocol):
-    """What the registry needs of a connection."""
+    """Interface of a connection for the registry."""
 
     @property
     def is_idle(self) -> bool:
-        """Whether no request is under way."""
+        """Whether no request is in progress."""
 
     def close_idle(self) -> None:
-        """Close at once."""
+        """Close immediately."""
 
 
 class Connections:
-    """The open connections of a process. For the thread of its event loop alone."""
+    """Registry of a process's open connections. Not thread-safe: use it in the event loop's thread only."""
 
     def __init__(self, limits: ConnectionLimits, clock: Callable[[], float] = time.monotonic) -> None:
         self.limits = limits
         self._clock = clock
-        # Each in order of age: not proven yet, of strangers and of trusted addresses; proven.
+        # Each ordered by age: unproven of untrusted addresses, unproven of trusted addresses, proven.
         self._strangers: dict[Connection, str] = {}
         self._expected: dict[Connection, str] = {}
         self._proven: dict[Connection, str] = {}
@@ -84,7 +85,7 @@ class Connections:
         return len(self._strangers) + len(self._expected) + len(self._proven)
 
     def open(self, connection: Connection, address: str | None) -> bool:
-        """Register a new connection; others give way where need be. False: there is no place for it."""
+        """Register a new connection, closing others if necessary. Returns False if there is no room."""
         source = client_source(address)
         connections = self._unproven_of.get(source, {})
         if len(connections) >= self.limits.per_address and not is_loopback(source):
@@ -96,7 +97,7 @@ class Connections:
             idle = (proven for proven in self._proven if proven.is_idle)
             victim = next(itertools.chain(self._strangers, self._expected, idle), None)
             if victim is None:
-                self._warn("refused a connection, for all places are taken by clients with a token")
+                self._warn("connection refused: all connections are in use by clients with a token")
                 return False
             self._displace(victim)
         (self._expected if trusted else self._strangers)[connection] = source
@@ -104,10 +105,10 @@ class Connections:
         return True
 
     def prove(self, connection: Connection) -> None:
-        """A request of it had a valid token: it gives way to no stranger, and its address is trusted for a while."""
+        """Mark a connection as proven: it is not closed for unproven ones, and its address is trusted for a while."""
         source = self._remove(connection)
         if source is None:
-            return  # it has given way meanwhile
+            return  # closed meanwhile
         self._proven[connection] = source
         self._trusted[source] = self._clock() + TRUST_SECONDS
         self._trusted.move_to_end(source)
@@ -115,11 +116,11 @@ class Connections:
             self._trusted.popitem(last=False)
 
     def close(self, connection: Connection) -> None:
-        """A connection has ended."""
+        """Unregister a closed connection."""
         self._remove(connection)
 
     def _remove(self, connection: Connection) -> str | None:
-        """Its address; None for one that is not registered."""
+        """Unregister a connection and return its address; None if it is not registered."""
         if connection in self._proven:
             return self._proven.pop(connection)
         source = self._strangers.pop(connection, None)
@@ -135,7 +136,7 @@ class Connections:
     def _displace(self, connection: Connection) -> None:
         self._remove(connection)
         connection.close_idle()
-        self._warn("the oldest connections without a token give way: there are too many")
+        self._warn("limit reached, closing the oldest connections without a token")
 
     def _warn(self, event: str) -> None:
         if self._clock() - self._warned >= WARN_SECONDS:
@@ -145,7 +146,7 @@ class Connections:
 
 
 def fit_open_files(total: int) -> int:
-    """Raise this process' limit of open files for so many connections; how many of them it allows."""
+    """Raise the process's limit of open files for ``total`` connections; return how many connections it allows."""
     required_files = total * FILES_PER_CONNECTION + OTHER_FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < required_files:
@@ -155,8 +156,8 @@ def fit_open_files(total: int) -> int:
         return total
     fitting = max(soft - OTHER_FILES, soft // 2) // FILES_PER_CONNECTION
     log.warning(
-        "connections: the limit of open files (%d) allows %d of %d: raise it (ulimit -Hn, LimitNOFILE) or lower "
-        "FLEETMAP_MAX_CONNECTIONS",
+        "connections: limit of open files (%d) allows %d of %d connections: raise it (ulimit -Hn, "
+        "LimitNOFILE) or lower FLEETMAP_MAX_CONNECTIONS",
         soft,
         fitting,
         total,

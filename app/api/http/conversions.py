@@ -1,4 +1,4 @@
-"""Work that may take long: asked for by many, done once, and after a while followed as a job."""
+"""Running conversions: shared by concurrent requests, and continued as jobs if they take long."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ MAX_CONCURRENT_CONVERSIONS = 32
 MAX_QUEUED_CONVERSIONS = 256
 HEARTBEAT_SECONDS = 5.0
 LOST_AFTER = timedelta(seconds=60)
-"""A job that nobody has touched for this long belonged to a process that is no more."""
+"""Age of the last heartbeat after which a job counts as lost, because its process has ended."""
 
 
 @dataclass(frozen=True, slots=True)
 class JobStarted:
-    """The map takes longer than an answer may: follow this job."""
+    """Outcome of a conversion that outlives its request: the job to follow."""
 
     job: Job
 
 
 @dataclass(slots=True)
 class _RunningConversion:
-    """A map in the making. waiters: requests that wait for it. jobs: principal's id -> job id."""
+    """Conversion in progress. waiters: number of waiting requests. jobs: principal id -> job id."""
 
     future: asyncio.Future[tuple[Recipe, CachedMap]]
     stop: CancelHandle
@@ -52,7 +52,7 @@ class _RunningConversion:
 
 
 class ConversionJobs:
-    """Maps being made in this process, by recipe."""
+    """Running conversions of this process by recipe, and their jobs."""
 
     def __init__(self, store: Store, maps: Maps, seconds: float, count: Callable[[str, str], None]) -> None:
         self._store, self._maps, self._seconds, self._count = store, maps, seconds, count
@@ -64,17 +64,17 @@ class ConversionJobs:
     async def get_or_start(
         self, recipe: Recipe, principal: Principal, address: str
     ) -> tuple[Recipe, CachedMap] | JobStarted:
-        """The map with the recipe that worked, or after ``seconds`` the job that will end with it.
+        """Return the map with the recipe that was used, or, after the time limit, the job that converts it.
 
-        address: where the finished map is available.
+        address: URL of the finished map.
 
-        Raises what making raises; Unavailable where too much is being made.
+        Raises the errors of the conversion; Unavailable if too many conversions are queued.
         """
-        with self._lock:  # held for a moment only: whoever comes to a map keeps it from being stopped
+        with self._lock:  # short critical section: a new waiter prevents cancellation
             running = self._running.get(recipe.key)
             if running is None:
                 if len(self._running) >= MAX_CONCURRENT_CONVERSIONS + MAX_QUEUED_CONVERSIONS:
-                    raise Unavailable("too many maps are being made: try again in a few seconds")
+                    raise Unavailable("too many conversions are queued: try again in a few seconds")
                 running = self._start(recipe)
             running.waiters += 1
         try:
@@ -86,7 +86,7 @@ class ConversionJobs:
                 return JobStarted(await run_in_threadpool(self._store.jobs.get, job_id))
             try:
                 return JobStarted(await self._as_job(recipe, running, principal, address))
-            except NoRoom:  # nowhere to note a job: the answer waits for the map
+            except NoRoom:  # a job cannot be stored: wait for the map
                 return await asyncio.shield(running.future)
         finally:
             with self._lock:
@@ -95,7 +95,7 @@ class ConversionJobs:
     async def convert(
         self, plan: Callable[[], Recipe], principal: Principal, address: str
     ) -> tuple[Recipe, CachedMap] | JobStarted:
-        """The map of a plan, made where need be; the job that makes it for ``address`` if it takes long."""
+        """Return a planned map from the cache or a conversion, or the job that converts it for ``address``."""
         recipe = await run_in_threadpool(plan)
         cached_map = await run_in_threadpool(self._maps.get_cached, recipe)
         if cached_map is not None:
@@ -103,7 +103,7 @@ class ConversionJobs:
         return await self.get_or_start(recipe, principal, address)
 
     def cancel(self, job: str) -> bool:
-        """Stop the making that a job waits for, unless others wait for it too: whether it was of this process."""
+        """Stop the conversion of a job unless others wait for it. Returns False if it runs in another process."""
         with self._lock:
             for key, running in self._running.items():
                 owner = next((principal_id for principal_id, job_id in running.jobs.items() if job_id == job), None)
@@ -112,7 +112,7 @@ class ConversionJobs:
                 del running.jobs[owner]
                 if not running.jobs and not running.waiters:
                     running.stop()
-                    del self._running[key]  # who asks from now on begins anew
+                    del self._running[key]  # later requests start a new conversion
                 return True
         return False
 
@@ -124,21 +124,21 @@ class ConversionJobs:
         return running
 
     def send_heartbeats(self) -> None:
-        """Show that the jobs of this process are alive, and stop those that were cancelled elsewhere. Blocks."""
+        """Update the heartbeats of this process's jobs, and stop those cancelled by other processes. Blocks."""
         with self._lock:
             jobs = [job for running in self._running.values() for job in running.jobs.values()]
         for job in jobs:
             self._touch(job)
 
     def close(self) -> None:
-        """Let threads end; what is being made ends with the pool."""
+        """Release the threads; running conversions end with the pool."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _as_job(self, recipe: Recipe, running: _RunningConversion, principal: Principal, address: str) -> Job:
         label = f"{recipe.format.name} of {recipe.version.environment}, version {recipe.version.number}"
 
         def begin() -> Job:
-            job = self._store.jobs.create(principal.id, f"making {label}")
+            job = self._store.jobs.create(principal.id, f"converting {label}")
             return self._store.jobs.update(job.id, state="running")
 
         job = await run_in_threadpool(begin)
@@ -159,22 +159,24 @@ class ConversionJobs:
             if self._store.jobs.get(job).state == "cancelled":
                 return
             if error is None:
-                detail = f"made {label}"
+                detail = f"converted {label}"
                 self._store.jobs.update(job, state="done", progress=1.0, detail=detail, result={"location": address})
             else:
-                self._store.jobs.update(job, state="failed", detail=f"could not make {label}", problem=_problem(error))
+                self._store.jobs.update(
+                    job, state="failed", detail=f"could not convert {label}", problem=_problem(error)
+                )
         except FleetMapError as other:
-            log.warning("a job's end could not be noted: %s", other.detail)
+            log.warning("conversions: storing the outcome of a job failed: %s", other.detail)
 
     def _touch(self, job: str) -> None:
         try:
             state = self._store.jobs.get(job).state
             if state == "running":
                 self._store.jobs.update(job, state="running")
-            elif state == "cancelled":  # in another process of the server
+            elif state == "cancelled":  # by another process of the server
                 self.cancel(job)
         except FleetMapError as error:
-            log.warning("a job could not be kept alive: %s", error.detail)
+            log.warning("conversions: updating the heartbeat of a job failed: %s", error.detail)
 
     def _on_done(self, recipe: Recipe, running: _RunningConversion) -> None:
         with self._lock:
@@ -185,23 +187,23 @@ class ConversionJobs:
             self._count(recipe.format.name, "cancelled")
         elif done.exception() is not None:
             self._count(recipe.format.name, "failed")
-        elif done.result()[1].fresh:  # else another request or process had just made it
+        elif done.result()[1].fresh:  # otherwise another request or process converted it meanwhile
             self._count(recipe.format.name, "made")
 
 
 def _problem(error: BaseException) -> dict[str, Any]:
     if isinstance(error, FleetMapError):
         return problems.as_document(error)
-    log.error("internal error in a job: %s", problems.describe(error))
-    return problems.document(500, "internal error; the server's log has the details", title="Internal error")
+    log.error("conversions: internal error in a job: %s", problems.describe(error))
+    return problems.document(500, "internal server error; details are in the server log", title="Internal error")
 
 
 def job_as_json(job: Job) -> dict[str, Any]:
-    """The job as JSON; one whose process is gone has failed."""
+    """Convert a job to JSON. A job whose process has ended counts as failed."""
     state, problem, detail = job.state, job.problem, job.detail
     if state in ("queued", "running") and datetime.now(UTC) - job.updated > LOST_AFTER:
         state, detail = "failed", "the server was restarted"
-        problem = problems.document(503, "the server was restarted while it worked on this: ask for it again")
+        problem = problems.document(503, "the server restarted during the conversion: repeat the request")
     out: dict[str, Any] = {"id": job.id, "state": state, "progress": job.progress, "detail": detail}
     if job.result is not None:
         out["result"] = dict(job.result)
@@ -211,5 +213,5 @@ def job_as_json(job: Job) -> dict[str, Any]:
 
 
 def job_started_response(job: Job) -> Response:
-    """The answer 202 of a call that became a job."""
+    """Build the 202 response for a request that became a job."""
     return json_response(job_as_json(job), 202, {"location": api_path("jobs", job.id), "retry-after": "2"})

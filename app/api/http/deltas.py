@@ -1,6 +1,6 @@
-"""Deltas of files (RFC 9842): a file compressed with the one that the client has as its dictionary, ``dcz``.
+"""File deltas (RFC 9842): a file compressed with ``dcz``, with a file that the client has as the dictionary.
 
-Exact bytes of any format for the price of what changed: one moved node of a 400 kB network is some hundred bytes.
+Exact bytes of any format at the cost of the changes: one moved node of a 400 kB network takes some hundred bytes.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ else:
 
 MAGIC = bytes.fromhex("5e2a4d1820000000")
 MAX_BYTES = 64 * 2**20
-"""Larger files go whole: a window of that size is the most that a client has to keep."""
+"""Maximum size of a file for deltas; a client needs a window of that size."""
 
 MIN_BYTES = 8
-"""Zstandard takes no smaller file as a dictionary."""
+"""Minimum size of a dictionary for Zstandard."""
 
 LEVEL = 3
 
 
 class Deltas:
-    """Deltas made and remembered: a fleet that asks for one at once costs one compression."""
+    """Cache of deltas; concurrent requests for one delta share one compression."""
 
     def __init__(self, cache: Cache, room: int = 64 * 2**20) -> None:
         self._cache, self._room, self._size = cache, room, 0
@@ -40,8 +40,10 @@ class Deltas:
         self._lock = threading.Lock()
 
     async def between(self, old: str, new: str, body: bytes | CachedFile) -> bytes | None:
-        """``dcz`` of the new file (by its SHA-256) against an old one; None where the old one is not known, or the
-        delta is not smaller than the file."""
+        """Return ``dcz`` of the new file (by SHA-256) against an old one.
+
+        None if the old one is not cached or the delta is not smaller than the file.
+        """
         key = (old, new)
         with self._lock:
             if key in self._cached:
@@ -52,7 +54,7 @@ class Deltas:
     def _between(self, key: tuple[str, str], body: bytes | CachedFile) -> bytes | None:
         before = self._cache.find_by_hash(key[0], MAX_BYTES)
         if before is None:
-            return None  # not remembered: it may be made (again) at any moment, and anybody can ask for any hash
+            return None  # not cached: the old file may appear at any time, and clients can send any hash
         delta = _smaller(before, body if isinstance(body, bytes) else body.read(), bytes.fromhex(key[0]))
         with self._lock:
             self._cached[key] = delta
@@ -71,7 +73,7 @@ def _smaller(before: bytes, after: bytes, digest: bytes) -> bytes | None:
 
 
 def compress(before: bytes, after: bytes, digest: bytes) -> bytes:
-    """RFC 9842's dictionary-compressed Zstandard. digest: SHA-256 of ``before``, which has 8 bytes or more."""
+    """Compress with a dictionary (RFC 9842). digest: SHA-256 of ``before``, which needs at least 8 bytes."""
     window = max(10, min(27, max(len(before), len(after), 1).bit_length()))
     options: dict[int, int] = {
         zstd.CompressionParameter.compression_level: LEVEL,
@@ -84,7 +86,7 @@ def compress(before: bytes, after: bytes, digest: bytes) -> bytes:
 
 
 def offered_dictionary(headers: Mapping[str, str]) -> str | None:
-    """The SHA-256 (hex) of the file that a client offers as dictionary, if it takes ``dcz``."""
+    """Return the SHA-256 (hex) of the dictionary that a client offers, if it accepts ``dcz``."""
     header = headers.get("available-dictionary")
     if header is None:
         return None

@@ -1,4 +1,4 @@
-"""What routes work with: one object at ``app.state.services``, made when the server starts."""
+"""Services that routes use: one object at ``app.state.services``, created when the server starts."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from app.signing import Keys
 from app.store.store import Store
 
 WRITABLE_SECONDS = 2.0
-"""How long it is remembered whether something can be stored."""
+"""Seconds for which the result of a write check is cached."""
 
 PROBE_SECONDS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class ApiOptions:
-    """What an operator can set of the API. Times in seconds, sizes in bytes; see ``app.config``."""
+    """Settings of the API. Times in seconds, sizes in bytes; see ``app.config``."""
 
     limits: Limits
     spool_dir: Path
@@ -53,7 +53,10 @@ class ApiOptions:
 
 
 class Writability:
-    """Whether something can be stored. Thread-safe; ``checks`` run at most every WRITABLE_SECONDS, once at a time."""
+    """Cached check for whether data can be stored.
+
+    Thread-safe; ``checks`` run at most every WRITABLE_SECONDS, never concurrently.
+    """
 
     def __init__(self, *checks: Callable[[], None]) -> None:
         self._checks = checks
@@ -62,11 +65,11 @@ class Writability:
         self._refusal: str | None = None
 
     def refusal(self) -> str | None:
-        """Why nothing can be stored at the moment, None where it can."""
+        """Return why nothing can be stored at the moment, or None."""
         if time.monotonic() < self._until:
             return self._refusal
         if not self._lock.acquire(timeout=PROBE_SECONDS):
-            return f"the disk did not answer within {PROBE_SECONDS:g} seconds"
+            return f"the disk did not respond within {PROBE_SECONDS:g} seconds"
         try:
             if time.monotonic() >= self._until:
                 self._refusal = self._check()
@@ -84,13 +87,13 @@ class Writability:
         return None
 
     def forget(self) -> None:
-        """Check again at the next request."""
+        """Discard the cached result."""
         self._until = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """The parts of the server that routes use. spare: a worker for what should not wait for ``pool``."""
+    """Services that routes use. spare: worker for tasks that should not wait for ``pool``."""
 
     options: ApiOptions
     store: Store
@@ -109,11 +112,11 @@ class Services:
     fleet: FleetIntake
     writability: Writability
     prepared: threading.Event = field(default_factory=threading.Event)
-    """Set once the first map and the first coverage table need not wait for anything to be loaded."""
+    """Event that is set once the first map and coverage table need not wait for modules to load."""
 
 
 async def services(request: Request) -> Services:
-    """The services of the application that answers this request."""
+    """Return the services of the application."""
     instance: Services = request.app.state.services
     return instance
 

@@ -1,4 +1,4 @@
-"""Forms with files: each field is taken and checked once; what is left over are options of a format."""
+"""Form fields of uploads: each field is taken and checked once; the rest are options of a format."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ _TRUTH = {"": False, "false": False, "0": False, "no": False, "true": True, "1":
 
 
 class FormFields:
-    """The fields of a form, and of a query beside it, that are not taken yet. An empty field counts as left out."""
+    """Fields of a form and its query that are not taken yet. Empty fields count as missing."""
 
     def __init__(self, form: UploadForm, query: Iterable[tuple[str, str]] = ()) -> None:
         self._fields = dict(form.fields)
         for name, value in query:
             if name in self._fields:
-                raise Invalid(f"{name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
+                raise Invalid(f"duplicate field {name[:80]!r}: give it once", [Problem("duplicate", where=name[:80])])
             self._fields[name] = value
 
     def take(self, name: str) -> str:
-        """A field's text; empty if it is left out."""
+        """Take the text of a field; empty if it is missing."""
         return self._fields.pop(name, "")
 
     def take_flag(self, name: str) -> bool:
-        """A yes or no; left out is no."""
+        """Take a boolean field; False if it is missing."""
         text = self.take(name)
         if text.lower() not in _TRUTH:
             raise Invalid(f"{name} must be true or false, got {text[:80]!r}", [Problem("true or false", where=name)])
         return _TRUTH[text.lower()]
 
     def take_format(self, name: str) -> str | None:
-        """A format's id. Invalid, with those there are, for an unknown one."""
+        """Take the id of a format. Raises Invalid with the existing ids for an unknown one."""
         text = self.take(name)
         return require_format(text, name).name if text else None
 
     def take_hints(self) -> UploadHints:
-        """Layer, level, format and grid of the files, without options."""
+        """Take layer, level, format and grid of the files, without options."""
         layer = parse_drawn_layer(self.take("layer") or None)
         level = self.take("level") or GROUND
         Level(level)
         return UploadHints(self.take_format("format"), layer, level, self.take("grid") or None)
 
     def take_rest(self) -> dict[str, str]:
-        """All fields that were not taken."""
+        """Take all remaining fields."""
         fields, self._fields = self._fields, {}
         return fields

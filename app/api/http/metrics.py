@@ -1,7 +1,7 @@
-"""Prometheus: requests, conversions, cache hits, heads.
+"""Prometheus metrics: requests, conversions, cache hits, heads.
 
 With several worker processes prometheus_client keeps the counters in files (``PROMETHEUS_MULTIPROC_DIR``, set by
-``app.main.serve``), and any worker answers for all of them.
+``app.main.serve``), and any worker returns those of all.
 """
 
 from __future__ import annotations
@@ -23,42 +23,49 @@ MAX_HEADS = 10_000
 
 
 class Metrics:
-    """The counters of one application."""
+    """Counters of one application."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
-            "fleetmap_requests", "Requests answered.", ["method", "route", "status"], registry=self.registry
+            "fleetmap_requests", "Number of requests.", ["method", "route", "status"], registry=self.registry
         )
         self.seconds = Histogram(
             "fleetmap_request_seconds",
-            "Time to the end of an answer, without those from memory.",
+            "Seconds until the end of a response, without responses from memory.",
             ["route"],
             registry=self.registry,
             buckets=(0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100),
         )
-        self.conversions = Counter("fleetmap_conversions", "Maps made.", ["format", "result"], registry=self.registry)
-        hits = Counter("fleetmap_cache_hits", "Maps answered without making them.", ["cache"], registry=self.registry)
+        self.conversions = Counter(
+            "fleetmap_conversions", "Number of conversions.", ["format", "result"], registry=self.registry
+        )
+        hits = Counter("fleetmap_cache_hits", "Number of maps served from a cache.", ["cache"], registry=self.registry)
         self.memory_hits = hits.labels("memory")
         self.disk_hits = hits.labels("disk")
         self.cache_damaged = Counter(
-            "fleetmap_cache_damaged", "Cached maps found damaged, and made again.", registry=self.registry
+            "fleetmap_cache_damaged",
+            "Number of damaged maps in the cache, which were converted again.",
+            registry=self.registry,
         )
-        self.uploads = Counter("fleetmap_uploads", "Uploads and edits.", ["result"], registry=self.registry)
+        self.uploads = Counter("fleetmap_uploads", "Number of uploads and edits.", ["result"], registry=self.registry)
 
         self._reserve()
 
     def _reserve(self) -> None:
-        """Take the room of this process's shared counters now: touching a hole on a full disk would kill it."""
+        """Allocate disk space for this process's shared counters.
+
+        A write to a sparse file on a full disk would kill the process.
+        """
         folder = os.environ.get("PROMETHEUS_MULTIPROC_DIR")
         if folder:
-            self.seconds.labels("other")  # makes the histograms' file
+            self.seconds.labels("other")  # creates the file of the histograms
             for path in Path(folder).glob(f"*_{os.getpid()}.db"):
                 with contextlib.suppress(OSError), path.open("r+b") as file:
                     os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
 
     def render(self, store: Store) -> bytes:
-        """The text that Prometheus reads."""
+        """Write all metrics in the text format of Prometheus."""
         registry = self.registry
         if os.environ.get("PROMETHEUS_MULTIPROC_DIR"):
             registry = CollectorRegistry()
@@ -70,7 +77,7 @@ class Metrics:
 
 
 class _HeadVersionCollector(Collector):
-    """Every environment's newest version, and how many environments there are."""
+    """Head version of every environment, and the number of environments."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -90,18 +97,20 @@ class _HeadVersionCollector(Collector):
 
 
 class _Scrubs(Collector):
-    """When stored data was last hashed as a whole, and what of it was damaged."""
+    """Age and findings of the last complete check of stored data."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def collect(self) -> Iterable[Metric]:
         state = figures(read_state(self._store.blob_dir))
-        age = "Seconds since the last complete check of all stored data; +Inf where there was none yet."
+        age = "Seconds since the last complete check of all stored data; +Inf before the first one."
         yield GaugeMetricFamily("fleetmap_scrub_age_seconds", age, value=state["age"])
-        yield GaugeMetricFamily("fleetmap_scrub_running", "Whether such a check is under way.", value=state["running"])
+        yield GaugeMetricFamily(
+            "fleetmap_scrub_running", "Whether a check of all stored data is running.", value=state["running"]
+        )
         findings = GaugeMetricFamily(
-            "fleetmap_scrub_findings", "Damaged items found by the check, by kind.", labels=["kind"]
+            "fleetmap_scrub_findings", "Number of damaged items found by the check, by kind.", labels=["kind"]
         )
         for kind, count in state["findings"].items():
             findings.add_metric([kind], count)

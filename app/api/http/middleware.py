@@ -1,4 +1,4 @@
-"""In front of all routes: the token, the size and pace of bodies, and every error in one shape.
+"""Middleware in front of all routes: token check, limits on size and pace of bodies, uniform errors.
 
 Plain ASGI: it costs a few microseconds and lets bodies stream.
 """
@@ -29,7 +29,7 @@ from app.store.audit import CALLER, Caller
 log = logging.getLogger("app.requests")
 
 MULTIPART_OVERHEAD = 2**20
-"""Bytes that a multipart body may have beside its files: field values, plus the parts' heads."""
+"""Maximum size of a multipart body beside its files: field values and the headers of parts, in bytes."""
 
 PART_OVERHEAD = 1024
 _BODY = frozenset({"POST", "PUT", "PATCH"})
@@ -37,31 +37,31 @@ _METHODS = frozenset({"GET", "DELETE", "OPTIONS", *_BODY})
 
 _REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 _REPORT = re.compile(r"/api/v1/robots/[^/]+/(?:status|vda5050/state)")
-"""A robot's report: no change of a map or of who may do what, and too frequent for the audit log."""
+"""Reports of robots: they change neither maps nor access, and are too frequent for the audit log."""
 
 MAX_LOGGED_PATH = 300
-"""Characters of an address that a log line has."""
+"""Maximum number of characters of a path in the log."""
 
 MAX_LOGGED_REJECTIONS = 20
-"""Refusals of one source a minute that are logged; further ones with level debug."""
+"""Maximum number of logged refusals per source and minute; further ones have level DEBUG."""
 
 SLOW_SECONDS = 1.0
-"""A request that takes longer is logged like a change."""
+"""Minimum duration of requests that are logged like changes, in seconds."""
 
 
 class _Disconnected(Exception):
-    """The client went away in the middle of its body."""
+    """The client disconnected before the end of its body."""
 
 
 class Guard:
-    """ASGI middleware; ``app.state.services`` is looked up with each request."""
+    """ASGI middleware; looks up ``app.state.services`` for each request."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
         self._checks: SingleFlight[tuple[bytes | None, str | None, int], Principal] = SingleFlight()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or pass it on."""
+        """Handle a request, or pass it on."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -70,7 +70,7 @@ class Guard:
         head_only = scope["method"] == "HEAD"
         scope.setdefault("state", {})
         if head_only:
-            # A HEAD is a GET whose body stays here; routes that answer HEAD themselves are told by the state.
+            # Handle HEAD as GET without a body; routes that treat HEAD specially read it from the state.
             scope = {**scope, "method": "GET", "state": {**scope["state"], "head": True}}
         given = _headers(scope).get(b"x-request-id", b"")
         request_id = given.decode() if _REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
@@ -104,7 +104,7 @@ class Guard:
         headers = _headers(scope)
         services.access.check_origin(scope["headers"])
         if is_open(scope["path"]):
-            # Anybody can send a body: it is not read before it is known who takes it.
+            # Do not read the body: anyone can send one, and open routes take none.
             await self._app(scope, body, answer)
             return
         principal = await self._principal(scope, headers, services)
@@ -117,7 +117,7 @@ class Guard:
         await self._app(scope, body, answer)
 
     async def _principal(self, scope: Scope, headers: dict[bytes, bytes], services: Services) -> Principal:
-        """The caller: by the link that the address is, else by the token. A token beside a link counts for nothing."""
+        """Authenticate by signed link, else by token. A token beside a link is ignored."""
         client = scope["client"][0] if scope.get("client") else None
         link = request_link(scope)
         if link is not None:
@@ -132,8 +132,8 @@ class Guard:
 
     async def _reject(self, response: Response, scope: Scope, body: _RequestBody, answer: _ResponseSender) -> None:
         if answer.started:
-            # Half an answer is out: the only honest end is a broken connection.
-            raise ConnectionAbortedError("the answer could not be finished")
+            # The response has started: the only correct end is a broken connection.
+            raise ConnectionAbortedError("internal error after the start of the response")
         await response(scope, body, answer)
 
 
@@ -143,7 +143,7 @@ def _template(scope: Scope) -> str:
 
 
 def _caller(scope: Scope, principal: Principal, environment: str | None) -> Caller | None:
-    """Who stands in the audit log for what this request changes; None where it is not for there."""
+    """Build the author of a change for the audit log; None for requests that are not logged there."""
     path = scope["path"]
     if scope["method"] in ("GET", "OPTIONS") or _REPORT.fullmatch(path):
         return None
@@ -165,14 +165,14 @@ def _address(scope: Scope) -> str:
 
 
 class _Quota:
-    """How many refusals of one source a minute are worth a warning: strangers must not fill the log."""
+    """Limit on warnings per source and minute, so that unauthenticated clients cannot fill the log."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}
         self._minute = 0
 
     def allow(self, source: str) -> bool:
-        """Count one, and tell whether it is among the first of this minute."""
+        """Count one refusal; return whether it is within the limit of this minute."""
         minute = int(time.monotonic() // 60)
         if minute != self._minute or len(self._counts) > MAX_SOURCES:
             self._counts, self._minute = {}, minute
@@ -184,9 +184,9 @@ _rejections = _Quota()
 
 
 def _log(scope: Scope, status: int, seconds: float, reason: str) -> None:
-    """A request: refusals and failures always, changes and slow ones from level info on, the others with debug."""
+    """Log a request: refusals and failures as WARNING, changes and slow requests as INFO, others as DEBUG."""
     changes = scope["method"] not in ("GET", "OPTIONS") and not _REPORT.fullmatch(scope["path"])
-    starting = status == 503 and scope["path"] == "/readyz"  # what is wrong later is logged where it goes wrong
+    starting = status == 503 and scope["path"] == "/readyz"  # later failures are logged by their cause
     if (status >= 500 and not starting) or (
         status in (401, 403, 429) and _rejections.allow(client_source(_address(scope)))
     ):
@@ -217,7 +217,7 @@ def _headers(scope: Scope) -> dict[bytes, bytes]:
 
 
 class _ResponseSender:
-    """Sends, and remembers the status; adds ``nosniff``; leaves out the body of a HEAD."""
+    """Wrapper of ``send``: records the status, adds headers, and drops the body of a HEAD."""
 
     __slots__ = ("_head_only", "_request_id", "_send", "started", "status")
 
@@ -244,7 +244,7 @@ class _ResponseSender:
 
 
 class _RequestBody:
-    """Receives, counts, and keeps the time."""
+    """Wrapper of ``receive``: counts bytes and enforces the pace."""
 
     __slots__ = (
         "_complete",
@@ -267,7 +267,7 @@ class _RequestBody:
         self.content = "request body"
 
     def check_headers(self, scope: Scope, headers: dict[bytes, bytes]) -> bool:
-        """Look at what is announced (coding, media type, length): whether the body is one to be read as a whole."""
+        """Check the declared coding, media type and length; return whether to read the body at once."""
         coding = headers.get(b"content-encoding", b"identity").strip().lower()
         length = headers.get(b"content-length")
         self._declared = int(length) if length is not None and length.isdigit() else None
@@ -275,8 +275,8 @@ class _RequestBody:
             self._declared = 0
         if coding not in (b"", b"identity"):
             raise UnsupportedMedia(
-                f"bodies are taken as they are, not with Content-Encoding {coding.decode('latin-1')[:40]}: "
-                "send the plain bytes (an archive may be sent as a .zip file)"
+                f"unsupported Content-Encoding {coding.decode('latin-1')[:40]}: send the plain bytes (an "
+                "archive may be sent as a .zip file)"
             )
         if self._declared == 0:
             return False
@@ -285,18 +285,20 @@ class _RequestBody:
         if media == "multipart/form-data" and upload:
             limits = self._services.options.limits
             self.content = "upload"
-            # Heads of parts are counted where they are read; this bound only has to be safe.
+            # The size of part headers is limited by the parser; this is only an upper bound.
             parts = min(limits.files, 100_000)
             self._limit = limits.upload_bytes + MULTIPART_OVERHEAD + parts * PART_OVERHEAD
         elif not (media == "application/json" or (media.startswith("application/") and media.endswith("+json"))):
             takes = "multipart/form-data or application/json" if upload else "application/json"
-            raise UnsupportedMedia(f"this call takes {takes}, not {media[:80] or 'a body without Content-Type'}")
+            raise UnsupportedMedia(
+                f"unsupported media type {media[:80] or 'none (Content-Type is missing)'}: send {takes}"
+            )
         if self._declared is not None and self._declared > self._limit:
             raise self._too_large()
         return self.content != "upload"
 
     async def preload(self) -> None:
-        """Read the whole body now: its errors are told from here, before any route parses half of it."""
+        """Read the complete body, so that errors occur before a route parses half of it."""
         chunks = []
         while not self._complete:
             chunks.append((await self()).get("body", b""))
@@ -315,7 +317,7 @@ class _RequestBody:
                 message = await self._receive()
         except TimeoutError:
             raise SlowBody(
-                f"the {self.content} stopped coming, or comes at less than {pace} bytes a second: send it again"
+                f"the {self.content} stopped arriving, or is slower than {pace} bytes per second: send it again"
             ) from None
         if message["type"] == "http.disconnect":
             raise _Disconnected
@@ -326,11 +328,13 @@ class _RequestBody:
         return message
 
     def _too_large(self) -> TooLarge:
-        return TooLarge(f"the {self.content} is larger than {self._limit} bytes, the most that this server takes")
+        return TooLarge(
+            f"the {self.content} is larger than {self._limit} bytes: send less, or ask the operator to raise the limit"
+        )
 
 
 def accepts_files(path: str) -> bool:
-    """Whether files can be uploaded at this address."""
+    """Test if this path accepts file uploads."""
     parts = path.split("/")
     if path == "/api/v1/convert":
         return True

@@ -1,7 +1,8 @@
-"""OpenAPI: what FastAPI cannot know by itself, the maps' plain routes, and the pages at /docs without a network."""
+"""OpenAPI document with the plain routes of maps and common responses, and the offline documentation at /docs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
@@ -21,19 +22,19 @@ from app.errors import NotFound
 from app.model.closures import CLOSURE_MODES
 
 SESSION_SCRIPT = """\
-// The token stays until the tab is closed, and no longer: the page's own memory would outlive the browser.
+// Keep the token until the tab is closed; the storage of Swagger UI would outlive the browser.
 const key = "fleetmap-token";
 let restored = false;
 ui.getStore().subscribe(() => {
   if (!ui.specSelectors.specJson().size) return;
   if (!restored) {
     restored = true;
-    const kept = sessionStorage.getItem(key);
-    if (kept) ui.preauthorizeApiKey("token", kept);
+    const stored = sessionStorage.getItem(key);
+    if (stored) ui.preauthorizeApiKey("token", stored);
     return;
   }
-  const given = ui.authSelectors.authorized().getIn(["token", "value"]);
-  if (given) sessionStorage.setItem(key, given);
+  const token = ui.authSelectors.authorized().getIn(["token", "value"]);
+  if (token) sessionStorage.setItem(key, token);
   else sessionStorage.removeItem(key);
 });
 """
@@ -46,47 +47,47 @@ ASSETS = {
 _PACKAGE = "fastapi_offline"
 
 DESCRIPTION = """\
-Every environment's maps, versioned in canonical layers, for every robot in its own format.
+Stores the maps of environments, versioned in canonical layers, and exports them in the format that each robot needs.
 
-All errors are `application/problem+json` (RFC 9457). Lists come in pages: the `Link` header names the next one.
-Versions are named by number, by channel (`production`), or `latest`. Coordinates are `longitude, latitude` in GeoJSON
-and `latitude, longitude` in query parameters, as their names say.
-
-Access: `Authorization: Bearer <token>`; maps also by a signed link (`POST …/links`). Roles: `viewer` and `robot` read,
-`robot` also tells the status of the robot that its token names and what is blocked; `editor` also uploads, edits,
-converts, moves channels and sets datums; `admin` does all.
+- **Errors** are `application/problem+json` (RFC 9457).
+- **Lists** are paginated: follow the `Link` header with `rel="next"`.
+- **Versions** are given by number, by channel (`production`), or as `latest`.
+- **Coordinates** are `longitude, latitude` in GeoJSON, and `latitude, longitude` in query parameters (`LAT,LON`).
+- **Access** requires `Authorization: Bearer <token>`; maps can also be read with a signed link (`POST …/links`).
+- **Roles**: `viewer` reads; `robot` also reports the status of the token's robot, and obstructions; `editor` also
+  uploads, edits, converts, moves channels and sets datums; `admin` may do everything.
 """
 
 
 TAGS = {
-    "environments": "Mapped places.",
-    "versions": "Immutable states: upload, edit, revert, compare.",
-    "sources": "The uploaded files, byte for byte.",
-    "layers": "Canonical content.",
+    "environments": "Mapped places, each with its own history of versions.",
+    "versions": "Immutable states of an environment: upload, edit, revert, compare.",
+    "sources": "Uploaded files, byte for byte.",
+    "layers": "Canonical content of a version.",
     "maps": "Maps in a format, converted on demand.",
-    "maps by format": "The short address of each format, with the parameters of that format.",
-    "channels": "Which version robots drive on.",
-    "robots": "Who holds what, who lags.",
-    "overlays": "What robots report as blocked.",
-    "vda5050": "Maps for fleet managers that speak VDA 5050.",
-    "events": "Every change as it happens.",
-    "manifest": "What a robot verifies.",
-    "transform": "Between earth and local frame.",
-    "derivations": "What is computed from what, and committing it.",
-    "alignments": "Laying a map of another frame onto what is stored.",
-    "generations": "Sites made up from parameters and a seed.",
-    "templates": "What is filled in where a format asks for more than the layers have.",
-    "formats": "What can be read, served and converted.",
-    "jobs": "Work that takes long.",
-    "stored data": "Healing from another server.",
-    "tokens": "Access.",
-    "audit": "Who changed what, from where.",
-    "health": "Operation.",
+    "maps by format": "Short URL of each format, with the parameters of that format.",
+    "channels": "Names that point to the version that robots run.",
+    "robots": "Status and lag of robots.",
+    "overlays": "Obstructions that robots report, and closures in force.",
+    "vda5050": "Maps for fleet managers that use VDA 5050.",
+    "events": "Stream of all changes.",
+    "manifest": "Signed list of files that a robot verifies.",
+    "transform": "Conversion between WGS 84 and the local frame.",
+    "derivations": "Layers computed from other layers.",
+    "alignments": "Alignment of grids with other maps.",
+    "generations": "Synthetic sites, generated from parameters and a seed.",
+    "templates": "Values that are filled in if a format needs more than the layers contain.",
+    "formats": "File formats that can be read, exported and converted.",
+    "jobs": "Conversions that outlive their request.",
+    "stored data": "Stored bytes, for the repair of another server.",
+    "tokens": "Access tokens.",
+    "audit": "Log of changes with author and address.",
+    "health": "Liveness, readiness and metrics.",
 }
 
 
 def add_pages(app: FastAPI) -> None:
-    """``/openapi.json`` and ``/docs``, with all that the page loads from this server."""
+    """Add ``/openapi.json`` and ``/docs``; this server provides all files of the page."""
 
     async def schema(_: Request) -> Response:
         return Response(orjson.dumps(app.openapi()), media_type="application/json")
@@ -105,12 +106,12 @@ def add_pages(app: FastAPI) -> None:
     async def asset(request: Request) -> Response:
         name = request.path_params["name"]
         if name not in ASSETS:
-            raise NotFound("the documentation has no such file")
+            raise NotFound("no such file of the documentation: see /docs")
         data = resources.files(_PACKAGE).joinpath("static", name).read_bytes()
         return Response(data, headers={"cache-control": "public, max-age=86400"}, media_type=ASSETS[name])
 
     async def front(_: Request) -> Response:
-        return RedirectResponse("/docs", 307)  # until there is a page for operators
+        return RedirectResponse("/docs", 307)  # the server has no other page
 
     app.router.add_route("/", front, methods=["GET"], include_in_schema=False)
     app.router.add_route("/openapi.json", schema, methods=["GET"], include_in_schema=False)
@@ -119,7 +120,7 @@ def add_pages(app: FastAPI) -> None:
 
 
 def build(app: FastAPI) -> dict[str, Any]:
-    """The whole description."""
+    """Build the OpenAPI document."""
     schema = get_openapi(
         title=app.title,
         version=app.version,
@@ -136,14 +137,14 @@ def build(app: FastAPI) -> dict[str, Any]:
     schemas["Problem"] = problem
     for operations in schema["paths"].values():
         for operation in operations.values():
-            schemas.update(operation.pop("x-schemas", {}))  # of bodies that a route reads itself
+            schemas.update(operation.pop("x-schemas", {}))  # of bodies that a route parses itself
     components["securitySchemes"] = {
-        "token": {"type": "http", "scheme": "bearer", "description": "A token; see `/api/v1/tokens`."},
+        "token": {"type": "http", "scheme": "bearer", "description": "Bearer token; see `/api/v1/tokens`."},
         "link": {
             "type": "apiKey",
             "in": "query",
             "name": "signature",
-            "description": "A signed link, used as it was given (with its `expires`); see `POST …/links`.",
+            "description": "Signed link, used unchanged (with its `expires`); see `POST …/links`.",
         },
     }
     _map_paths(schema["paths"])
@@ -155,7 +156,7 @@ def build(app: FastAPI) -> dict[str, Any]:
 
 
 def _finish(path: str, method: str, operation: dict[str, Any]) -> None:
-    """The problems that every call can meet, and the token."""
+    """Add the problems that every call can return, and its security schemes."""
     operation.pop("x-free-query", None)
     problem = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     responses = operation["responses"]
@@ -163,23 +164,23 @@ def _finish(path: str, method: str, operation: dict[str, Any]) -> None:
     if not is_open(path):
         operation["security"] = [{"token": []}, *([{"link": []}] if _is_map(path) else [])]
         common |= {
-            "401": "A token is needed, or it is unknown or has expired.",
-            "403": "The token's role or its environments do not allow it."
-            + (" Or the signed link was altered, or has expired." if _is_map(path) else ""),
+            "401": "The token is missing, unknown or expired.",
+            "403": "The role or the environments of the token do not allow the call."
+            + (" Or the signed link is invalid or expired." if _is_map(path) else ""),
             "429": "Too many wrong tokens from this address.",
         }
-        common["422"] = "A parameter, the body or a file cannot be used; `errors` says where."
-        common["503"] = "Too busy, or a part of the server does not answer: try again after `Retry-After` seconds."
+        common["422"] = "A parameter, the body or a file is invalid; `errors` has the details."
+        common["503"] = "Overloaded, or a part of the server does not respond: try again after `Retry-After` seconds."
         if method != "get":
             common["507"] = (
-                "The server's disk is full, and nothing was stored: try again after its operator has freed space."
+                "The server's disk is full, and nothing was stored: try again when its operator has freed space."
             )
     if "requestBody" in operation:
         common |= {
             "400": "The body is malformed.",
-            "408": "The body stopped coming.",
-            "413": "The body is larger than the server takes.",
-            "415": "A media type or content coding that is not taken.",
+            "408": "The body stopped arriving.",
+            "413": "The body is too large.",
+            "415": "Unsupported media type or content coding.",
         }
     for status, text in common.items():
         response = responses.get(status)
@@ -192,35 +193,35 @@ def _is_map(path: str) -> bool:
 
 
 def _map_paths(paths: dict[str, Any]) -> None:
-    """The plain routes, as ``app.api.maps`` serves them; the formats' parameters from their declarations."""
+    """Add the plain routes of ``app.api.maps``, with the declared parameters of the formats."""
     long = f"{API}/environments/{{env}}/versions/{{v}}/maps/{{format}}"
     for path, summary, extra in (
-        (long, "A map in a format", ()),
-        (long + "/{file}", "One file of a map", ("file",)),
-        ("/maps/{env}/{format}", "A map, by the short address for robots", ()),
-        ("/maps/{env}/{format}/{file}", "One file of a map, by the short address", ("file",)),
+        (long, "Download a map", ()),
+        (long + "/{file}", "Download one file of a map", ("file",)),
+        ("/maps/{env}/{format}", "Download a map by its short URL", ()),
+        ("/maps/{env}/{format}/{file}", "Download one file of a map by its short URL", ("file",)),
     ):
         names = [n for n in ("env", "v", "format") if "{" + n + "}" in path] + list(extra)
         content: dict[str, Any] = {"application/octet-stream": {}, "application/zip": {}}
-        describing = "The file itself where the format is one file, else a zip of all." if not extra else "The file."
-        short = " From the channel `production` where there is one, else `latest`." if path.startswith("/maps") else ""
+        describing = "The file if the map is a single file, else a zip." if not extra else "The file."
+        short = " Uses the channel `production` if it exists, else `latest`." if path.startswith("/maps") else ""
         operation = {
             "tags": ["maps"],
             "summary": summary,
             "operationId": "get_" + "_".join(["map", *(["file"] if extra else []), *(["short"] if short else [])]),
-            "description": f"{describing}{short} Derives what is missing. Ask again with `If-None-Match`: it costs "
-            "nothing. `Link` names the report on what was raw, derived, filled in or dropped. Where a format has parts "
-            "by level and name, `*` gives all of them: `?level=*&grid=*`; files of other levels than the default one "
-            "are below a folder of the level's name (`L2/map.yaml`).",
+            "description": f"{describing}{short} Missing layers are derived. Send `If-None-Match` with repeated "
+            "requests. `Link` refers to the report on raw, derived, filled-in and dropped information. If a format has "
+            "parameters for level and name, `*` selects all: `?level=*&grid=*`. Files of other levels than the default "
+            "one are below a folder named like the level (`L2/map.yaml`).",
             "parameters": [_path_parameter(name) for name in names] + _query_parameters() + _header_parameters(),
             "responses": {
                 "200": {"description": describing, "headers": _HEADERS, "content": content},
                 "202": {
-                    "description": "It takes long: follow the job at `Location`, then ask again.",
+                    "description": "The conversion takes long: follow the job at `Location`, then repeat the request.",
                     "content": {"application/json": {"schema": {"$ref": "#/components/schemas/JobOut"}}},
                 },
-                "206": {"description": "A part of the file"},
-                "304": {"description": "The client has it"},
+                "206": {"description": "Part of the file"},
+                "304": {"description": "Not modified: the client has this map"},
                 **{str(k): v for k, v in problem_responses(None, 404, 409, 416, 422, 503).items()},
             },
         }
@@ -243,34 +244,46 @@ def _map_paths(paths: dict[str, Any]) -> None:
 
 
 def _writer_parameters(fmt: formats.Format) -> list[dict[str, Any]]:
-    """The parameters of one format's writer."""
+    """List the parameters of a format's writer."""
     return [
         {
             "name": option["name"],
             "in": "query",
-            "description": f"{option['description']} Default: {option['default']!r}.",
+            "description": _option_text(option),
             "schema": dict(option["schema"]),
         }
         for option in parameters.describe(fmt.write_options)
     ]
 
 
+def _option_text(option: Mapping[str, Any]) -> str:
+    """Describe an option, with its default as written in a URL."""
+    text, default = option["description"].rstrip("."), option["default"]
+    if default is None:
+        return f"{text}."
+    if isinstance(default, bool):
+        default = str(default).lower()
+    elif isinstance(default, tuple):
+        default = ",".join(map(str, default))
+    return f"{text}. Default: {f'`{default}`' if default != '' else 'empty'}."
+
+
 _HEADERS: dict[str, Any] = {
-    "ETag": {"schema": {"type": "string"}, "description": "Strong: equal tags mean equal bytes."},
+    "ETag": {"schema": {"type": "string"}, "description": "Strong ETag: equal tags mean equal bytes."},
     "Fleetmap-Version": {"schema": {"type": "integer"}},
     "Fleetmap-Root": {"schema": {"type": "string"}},
     "Fleetmap-Overlays": {
         "schema": {"type": "string"},
         "description": "Digest of the closures in force that the map shows; absent with `closures=ignore`.",
     },
-    "Link": {"schema": {"type": "string"}, "description": 'The report, `rel="describedby"`.'},
+    "Link": {"schema": {"type": "string"}, "description": 'Report of the map, `rel="describedby"`.'},
 }
 
 _EXAMPLES = {
-    "env": ("An environment's name.", "orchard"),
-    "v": ("Number, channel, or `latest`.", "latest"),
-    "format": ("A format's id.", "geojson"),
-    "file": ("A file's name; it may have folders.", "map.geojson"),
+    "env": ("Name of the environment.", "orchard"),
+    "v": ("Version: number, channel, or `latest`.", "latest"),
+    "format": ("Id of the format.", "geojson"),
+    "file": ("Name of the file, with its folders.", "map.geojson"),
 }
 
 
@@ -290,16 +303,16 @@ def _path_parameter(name: str) -> dict[str, Any]:
 
 
 def _query_parameters() -> list[dict[str, Any]]:
-    """``derive``, ``closures``, the options of all formats, and the parameters of the derivations on the way to them.
+    """List ``derive``, ``closures``, the options of all formats and the parameters of all derivations.
 
-    One that several have is told once, with what it means for each.
+    A name that occurs several times is listed once, with its meaning for each format or derivation.
     """
     out: dict[str, dict[str, Any]] = {}
     declared = [(fmt.name, fmt.write_options) for fmt in formats.all_formats().values() if fmt.write]
     declared += [(step.name, step.parameters) for step in all_derivations().values()]
     for name, options in declared:
         for option in parameters.describe(options):
-            text = f"`{name}`: {option['description']} Default: {option['default']!r}."
+            text = f"`{name}`: {_option_text(option)}"
             entry = out.setdefault(
                 option["name"],
                 {"name": option["name"], "in": "query", "description": "", "schema": dict(option["schema"])},
@@ -310,14 +323,14 @@ def _query_parameters() -> list[dict[str, Any]]:
     derive = {
         "name": "derive",
         "in": "query",
-        "description": "`false`: only from information that is stored as it is.",
+        "description": "Derive missing layers. `false`: use only stored layers.",
         "schema": {"type": "boolean", "default": True},
     }
     closures = {
         "name": "closures",
         "in": "query",
-        "description": "How the closures in force are shown: `apply` (closed edges are left out of formats that "
-        "cannot express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` at a version's number.",
+        "description": "How the map shows the closures in force: `apply` (closed edges are omitted from formats that "
+        "cannot express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` for a version number.",
         "schema": {"type": "string", "enum": list(CLOSURE_MODES)},
     }
     return [derive, closures, *(out[name] for name in sorted(out))]
@@ -325,11 +338,11 @@ def _query_parameters() -> list[dict[str, Any]]:
 
 def _header_parameters() -> list[dict[str, Any]]:
     texts = {
-        "If-None-Match": "ETags that the client has.",
-        "Range": "One range of bytes.",
-        "If-Range": "The range holds only for this ETag.",
+        "If-None-Match": "ETags of the client's copies.",
+        "Range": "Single range of bytes.",
+        "If-Range": "Apply the range only if the ETag matches.",
         "Available-Dictionary": "`:<base64 of the SHA-256>:` of a file that the client has (RFC 9842); with "
-        "`Accept-Encoding: dcz` the answer is a delta to it.",
+        "`Accept-Encoding: dcz` the response is a delta to it.",
     }
     return [
         {"name": name, "in": "header", "description": text, "schema": {"type": "string"}}

@@ -1,4 +1,4 @@
-"""Values in addresses and forms, as text: numbers, positions, boxes, versions, and the parameters of a map."""
+"""Parsing of values in URLs and forms: numbers, positions, boxes, versions, parameters of maps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.store.values import Box
 
 
 def numbers(text: str, parameter: str, names: str) -> tuple[float, ...]:
-    """Numbers separated by commas; Invalid unless there is one for each of ``names`` (``LAT,LON``)."""
+    """Parse comma-separated numbers. Raises Invalid unless there is one per name in ``names`` (``LAT,LON``)."""
     count = names.count(",") + 1
     try:
         values = tuple(float(part) for part in text.split(","))
@@ -20,13 +20,13 @@ def numbers(text: str, parameter: str, names: str) -> tuple[float, ...]:
         values = ()
     if len(values) != count or not all(abs(v) <= 1e9 for v in values):
         raise Invalid(
-            f"{parameter} must be {names}: {count} numbers separated by commas", [Problem(names, where=parameter)]
+            f"{parameter} must be {names}: {count} comma-separated numbers", [Problem(names, where=parameter)]
         )
     return values
 
 
 def parse_box(text: str, parameter: str = "bbox") -> Box:
-    """West, south, east, north in degrees; west > east crosses the antimeridian."""
+    """Parse west, south, east, north in degrees; west > east crosses the antimeridian. Raises Invalid."""
     west, south, east, north = numbers(text, parameter, "W,S,E,N")
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
         raise Invalid(
@@ -37,7 +37,7 @@ def parse_box(text: str, parameter: str = "bbox") -> Box:
 
 
 def parse_position(text: str, parameter: str = "contains") -> tuple[float, float]:
-    """Latitude and longitude in degrees."""
+    """Parse latitude and longitude in degrees. Raises Invalid."""
     latitude, longitude = numbers(text, parameter, "LAT,LON")
     if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
         raise Invalid(
@@ -48,31 +48,31 @@ def parse_position(text: str, parameter: str = "contains") -> tuple[float, float
 
 
 def require_format(name: str, parameter: str) -> Format:
-    """A format by its id. Invalid, with those there are, for an unknown one."""
+    """Return a format by id. Raises Invalid with the existing ids for an unknown one."""
     try:
         return formats.get_format(name)
     except NotFound as error:
-        raise Invalid(error.detail, [Problem("no such format", where=parameter)]) from None
+        raise Invalid(error.detail, [Problem("unknown format", where=parameter)]) from None
 
 
 def parse_version_ref(ref: str) -> str | int:
-    """A version as an address names it: a number, or a channel."""
+    """Parse a version in a URL: a number, or the name of a channel."""
     return int(ref) if ref.isascii() and ref.isdigit() and len(ref) <= 18 else ref
 
 
 def parse_options(query: str) -> tuple[dict[str, str], bool, ClosureMode | None]:
-    """A map's query: the format's options, whether derived information is allowed, and how closures are shown.
+    """Parse a map's query: options, whether derived information is allowed, and how closures are shown.
 
-    Raises Invalid; also for what is given twice.
+    Raises Invalid, also for duplicates.
     """
     try:
         pairs = parse_qsl(query, keep_blank_values=True, max_num_fields=100, errors="strict")
     except ValueError:
-        raise Invalid("the query cannot be read: it must be percent-encoded UTF-8 with at most 100 members") from None
+        raise Invalid("unreadable query: it must be percent-encoded UTF-8 with at most 100 parameters") from None
     values: dict[str, str] = {}
     for name, value in pairs:
         if name in values:
-            raise Invalid(f"the parameter {name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
+            raise Invalid(f"duplicate parameter {name[:80]!r}: give it once", [Problem("duplicate", where=name[:80])])
         values[name] = value
     derive = values.pop("derive", "true")
     if derive not in ("true", "false"):
@@ -81,7 +81,7 @@ def parse_options(query: str) -> tuple[dict[str, str], bool, ClosureMode | None]
 
 
 def closure_mode(text: str | None) -> ClosureMode | None:
-    """The parameter ``closures`` of a map; None for the default of the address. Raises Invalid."""
+    """Parse the parameter ``closures`` of a map; None for the default of the URL. Raises Invalid."""
     if text is None:
         return None
     for mode in CLOSURE_MODES:

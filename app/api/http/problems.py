@@ -1,7 +1,7 @@
-"""RFC 9457: every error of the server in one wire shape, ``application/problem+json``.
+"""Error responses: every error as ``application/problem+json`` (RFC 9457).
 
-``{type, title, status, detail, errors?: [{file?, line?, where?, problem}]}``. The table below is the only place that
-knows which class of error has which status.
+``{type, title, status, detail, errors?: [{file?, line?, where?, problem}]}``. The table below is the only mapping
+from error classes to status codes.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ MEDIA_TYPE = "application/problem+json"
 
 
 class MalformedBody(errors.Invalid):
-    """A request body that is not what its media type says (JSON that does not parse, a broken multipart)."""
+    """The request body is malformed (invalid JSON, a broken multipart)."""
 
 
 class UnsupportedMedia(errors.Invalid):
-    """A media type or content coding that the call does not take."""
+    """The call does not support the media type or content coding."""
 
 
 class NotAcceptable(errors.Invalid):
-    """None of the media types that the client accepts can be served."""
+    """None of the media types that the client accepts is available."""
 
 
 class SlowBody(errors.FleetMapError):
-    """The client stopped sending its body."""
+    """The client stopped sending its body, or sends it too slowly."""
 
 
 class Throttled(errors.Denied):
-    """Too many wrong tokens from this address; ``retry_after`` in seconds."""
+    """Too many wrong tokens from this address. ``retry_after``: seconds."""
 
     retry_after = 60
 
@@ -74,28 +74,28 @@ STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
     errors.StaleParent: (412, "The head has moved"),
     Throttled: (429, "Too many failures"),
     errors.Denied: (403, "Denied"),
-    errors.Unauthenticated: (401, "Token needed"),
+    errors.Unauthenticated: (401, "Token required"),
     errors.InvalidLink: (403, "Invalid link"),
     errors.ExpiredLink: (403, "Expired link"),
-    errors.NoRoom: (507, "No room left"),
+    errors.NoRoom: (507, "Disk full"),
     errors.DatabaseDamaged: (503, "Database damaged"),
     errors.Unavailable: (503, "Unavailable"),
     errors.Damaged: (500, "Damaged data"),
-    errors.Untrusted: (500, "Not to be trusted"),
+    errors.Untrusted: (500, "Untrusted data"),
 }
-"""Class -> status and title; a class that is not listed takes its nearest base's."""
+"""Mapping of error classes to status and title; other classes use their nearest base class."""
 
 RETRY_SECONDS = 5
 DISK_FULL_RETRY_SECONDS = 60
 ALARM_SECONDS = 3600.0
-"""How often the same alarm is logged, however many requests meet it."""
+"""Minimum seconds between two logs of the same alarm."""
 
 MAX_ERRORS = 100
 MAX_ALARMS = 1000
 
 
 def problem_status(error: errors.FleetMapError) -> tuple[int, str, str]:
-    """Status, title and the problem's type of an error."""
+    """Return status, title and problem type of an error."""
     for cls in type(error).__mro__:
         if cls in STATUS:
             status, title = STATUS[cls]
@@ -112,7 +112,7 @@ def document(
     type_: str = "about:blank",
     problems: Sequence[errors.Problem] = (),
 ) -> dict[str, Any]:
-    """The JSON of a problem."""
+    """Build the JSON of a problem."""
     out: dict[str, Any] = {
         "type": type_,
         "title": title or HTTPStatus(status).phrase,
@@ -125,7 +125,7 @@ def document(
 
 
 def clean(text: str) -> str:
-    """A text that JSON can carry: lone surrogates shown as escapes, and not longer than a page."""
+    """Make a text safe for JSON: escape lone surrogates, and shorten it to 4000 characters."""
     if len(text) > 4000:
         text = text[:4000] + " …"
     return text.encode("utf-8", "backslashreplace").decode()
@@ -140,20 +140,20 @@ def problem(
     problems: Sequence[errors.Problem] = (),
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """The answer for a problem."""
+    """Build the response for a problem."""
     body = document(status, detail, title=title, type_=type_, problems=problems)
     extra = {"cache-control": "no-store", **(headers or {})}
     return Response(orjson.dumps(body), status, extra, MEDIA_TYPE)
 
 
 def as_document(error: errors.FleetMapError) -> dict[str, Any]:
-    """The JSON of an error, for a job that failed."""
+    """Build the JSON of an error, for a failed job."""
     status, title, type_ = problem_status(error)
     return document(status, error.detail, title=title, type_=type_, problems=error.problems)
 
 
 def error_response(error: errors.FleetMapError) -> Response:
-    """The answer for one of our own errors."""
+    """Build the response for an error of this server."""
     status, title, type_ = problem_status(error)
     headers = {}
     if isinstance(error, errors.Unauthenticated):
@@ -165,8 +165,8 @@ def error_response(error: errors.FleetMapError) -> Response:
     elif status == 507:
         headers["retry-after"] = str(DISK_FULL_RETRY_SECONDS)
     if isinstance(error, errors.Damaged | errors.NoRoom) and _is_news(error.detail):
-        # The operator's alarm; the client learns only that it was not its fault.
-        alarm = "stored data is damaged" if isinstance(error, errors.Damaged) else "no room left on the server's disk"
+        # An alarm for the operator; the client only learns that the request was not at fault.
+        alarm = "stored data is damaged" if isinstance(error, errors.Damaged) else "the server's disk is full"
         log.critical("%s: %s", alarm, error.detail)
     return problem(status, error.detail, title=title, type_=type_, problems=error.problems, headers=headers)
 
@@ -176,7 +176,7 @@ _alarms_lock = threading.Lock()
 
 
 def _is_news(detail: str) -> bool:
-    """Whether an alarm was not logged within the last hour."""
+    """Return whether an alarm was not logged within the last hour, and remember it."""
     now = time.monotonic()
     with _alarms_lock:
         for text in [text for text, since in _alarms.items() if now - since > ALARM_SECONDS]:
@@ -188,19 +188,19 @@ def _is_news(detail: str) -> bool:
 
 
 def problem_body(error: Exception) -> bytes:
-    """The JSON of any error, for who asks otherwise than over HTTP."""
+    """Build the JSON of any error, for queries that do not use HTTP."""
     return bytes(
         (error_response(error) if isinstance(error, errors.FleetMapError) else internal_error_response(error)).body
     )
 
 
 def http_error_response(error: HTTPException) -> Response:
-    """The answer for Starlette's and FastAPI's own errors (no route, wrong method …)."""
+    """Build the response for an error of Starlette or FastAPI (no route, wrong method …)."""
     if error.status_code in (204, 304):
         return Response(status_code=error.status_code, headers=error.headers)
     details = {
-        404: "there is nothing at this address; /docs lists what there is",
-        405: "this address does not take this method",
+        404: "no such address: see /docs for the list",
+        405: "this address does not support the method: see /docs",
     }
     phrase = HTTPStatus(error.status_code).phrase
     detail = str(error.detail)
@@ -210,16 +210,16 @@ def http_error_response(error: HTTPException) -> Response:
 
 
 def validation_error_response(error: RequestValidationError) -> Response:
-    """The answer for a request that does not fit its schema; 400 where the body is not even JSON."""
+    """Build the response for a request that does not match its schema; 400 if the body is not JSON."""
     problems = []
     for item in error.errors():
         location = ".".join(str(part) for part in item.get("loc", ()))
         if item.get("type") == "json_invalid":
             reason = str(item.get("ctx", {}).get("error", item["msg"]))
-            parse_problem = errors.Problem(f"not JSON: {reason}", where=f"character {item['loc'][-1]}")
+            parse_problem = errors.Problem(f"invalid JSON: {reason}", where=f"character {item['loc'][-1]}")
             return problem(
                 400,
-                "the request body is not JSON",
+                "the request body is not valid JSON",
                 title="Malformed body",
                 type_="urn:fleetmap:problem:malformed-body",
                 problems=[parse_problem],
@@ -230,20 +230,24 @@ def validation_error_response(error: RequestValidationError) -> Response:
 
 
 def internal_error_response(error: BaseException) -> Response:
-    """The answer for anything else. The log gets the class and our own lines, no data, paths or tokens."""
+    """Build the response for any other error. Logs the class and our own lines, no data, paths or tokens."""
     if isinstance(error, OSError) and error.errno in errors.DISK_FULL_ERRNOS:
-        detail = "the server has no room left; nothing was stored. Try again after its operator has freed space"
+        detail = "the server's disk is full, and nothing was stored: try again when its operator has freed space"
         return error_response(errors.NoRoom(detail))
     if isinstance(error, OSError) and error.errno == errno.EROFS:
-        return error_response(errors.Unavailable("the server's disk is read-only; nothing was stored. Try again later"))
+        return error_response(
+            errors.Unavailable("the server's disk is read-only, and nothing was stored: try again later")
+        )
     log.error("internal error: %s", describe(error))
-    return problem(500, "internal error; the server's log has the details. Nothing was stored", title="Internal error")
+    return problem(
+        500, "internal server error, and nothing was stored; details are in the server log", title="Internal error"
+    )
 
 
 def describe(error: BaseException) -> str:
-    """Class and places of an exception in one line: ``ValueError at store.versions:120 < api.maps:33``.
+    """Describe an exception in one line, as in ``ValueError at store.versions:120 < api.maps:33``.
 
-    Neither its text (it may hold data or names of files) nor whole paths.
+    Omits the text (it may contain data or file names) and full paths.
     """
     frames = traceback.extract_tb(error.__traceback__)
     ours = [f"{PurePath(f.filename).parent.name}.{PurePath(f.filename).stem}:{f.lineno}" for f in frames]
@@ -251,18 +255,18 @@ def describe(error: BaseException) -> str:
 
 
 async def handle_error(_: Request, error: Exception) -> Response:
-    """FastAPI's handler for our own errors."""
+    """Handle errors of this server for FastAPI."""
     assert isinstance(error, errors.FleetMapError)
     return error_response(error)
 
 
 async def handle_http(_: Request, error: Exception) -> Response:
-    """FastAPI's handler for HTTP errors."""
+    """Handle HTTP errors for FastAPI."""
     assert isinstance(error, HTTPException)
     return http_error_response(error)
 
 
 async def handle_validation(_: Request, error: Exception) -> Response:
-    """FastAPI's handler for requests that do not fit their schema."""
+    """Handle requests that do not match their schema for FastAPI."""
     assert isinstance(error, RequestValidationError)
     return validation_error_response(error)

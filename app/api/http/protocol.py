@@ -1,7 +1,7 @@
-"""uvicorn's HTTP protocol with bounds that it lacks, and errors in one shape.
+"""HTTP protocol of uvicorn with additional limits, and uniform errors.
 
-Bounds: connections, time and size of a request's head, pace of a client that reads an answer. A connection is
-closed where its request is answered before the body has come completely.
+Limits: connections, time and size of a request's head, reading pace of a client. A connection is closed if the
+response starts before the request body is complete.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from app.api.http.connections import Connections
 from app.api.http.problems import MEDIA_TYPE, RETRY_SECONDS, document
 
 MAX_HEAD = 64 * 2**10
-"""Bytes of a request line and headers."""
+"""Maximum size of a request line with headers, in bytes."""
 
 LINGER_SECONDS = 0.7
 LINGER_BYTES = 64 * 2**20
-"""How long, and how much of a refused body, a connection still takes in, so that the client reads the answer."""
+"""Maximum time and size for which a connection accepts a refused body, so that the client reads the response."""
 
 ON_STOP = "on_stop"
-"""In the ``state`` of a request's scope: what to call where the server stops before its answer has ended."""
+"""Key in a request scope's ``state``: callback that ends a response when the server stops."""
 
 
 def _feed(protocol: Any, data: bytearray) -> None:
-    """Hand bytes to a protocol that reads into buffers of its own, as those of TLS do."""
+    """Pass bytes to a protocol with its own read buffers, like those of TLS."""
     while data:
         buffer = protocol.get_buffer(len(data))
         size = min(len(buffer), len(data))
@@ -45,14 +45,14 @@ def _feed(protocol: Any, data: bytearray) -> None:
 
 @cache
 def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """Create what HTTPS is served with (TLS 1.2 and newer) from PEM files; OSError where they cannot be used."""
+    """Create the TLS context of the server (TLS 1.2 and newer) from PEM files. Raises OSError if they are unusable."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
     return context
 
 
 class BoundedProtocol(HttpToolsProtocol):
-    """A connection that cannot take up more of the server than its share."""
+    """HTTP connection with limits on the resources that it can use."""
 
     def __init__(
         self, connections: Connections, tls: tuple[Path, Path] | None, /, config: Config, *args: Any, **kwargs: Any
@@ -74,31 +74,31 @@ class BoundedProtocol(HttpToolsProtocol):
 
     @property
     def is_idle(self) -> bool:
-        """Whether no request is under way."""
+        """Whether no request is in progress."""
         return self.cycle is None or self.cycle.response_complete
 
     @property
     def lingers(self) -> bool:
-        """Whether all has been said, and what still comes in is dropped."""
+        """Whether the response is complete and further input is discarded."""
         return self._linger_timer is not None
 
     @property
     def is_broken(self) -> bool:
-        """Whether something that is no request came after the last one, whose answer is still due."""
+        """Whether invalid data followed the last request, whose response is still pending."""
         return self._broken
 
     def close_idle(self) -> None:
-        """Close at once."""
+        """Close immediately."""
         self.transport.abort()
 
     def prove(self) -> None:
-        """A request has shown a valid token or link."""
+        """Mark the connection as proven after a valid token or link."""
         if not self._proven:
             self._proven = True
             self._connections.prove(self)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """A connection opens: there must be a place for it, and its first request must come soon."""
+        """Register the connection and start the timer for its first request."""
         peer = get_remote_addr(transport)
         accepted = self._connections.open(self, peer[0] if peer else None)
         if self._tls is None:
@@ -108,13 +108,13 @@ class BoundedProtocol(HttpToolsProtocol):
             return
         self.transport = transport
         if not accepted:
-            transport.abort()  # nothing can be said before the handshake
+            transport.abort()  # no response is possible before the handshake
             return
         self._pending = bytearray()
         self._handshake = self.loop.create_task(self._start_tls(transport, self._tls))
 
     async def _start_tls(self, transport: asyncio.Transport, tls: tuple[Path, Path]) -> None:
-        """Agree on TLS. The event loop's own way to do so counts no connection before its handshake is over."""
+        """Run the TLS handshake here: the event loop's own TLS would not count connections during the handshake."""
         secured = None
         handshake = asyncio.ensure_future(
             self.loop.start_tls(
@@ -126,7 +126,7 @@ class BoundedProtocol(HttpToolsProtocol):
                 ssl_shutdown_timeout=LINGER_SECONDS,
             )
         )
-        await asyncio.sleep(0)  # from here on TLS reads; what came before is handed to it
+        await asyncio.sleep(0)  # TLS reads from now on; pass it what arrived before
         hello, self._pending = self._pending, bytearray()
         if hello:
             self.loop.call_soon(_feed, transport.get_protocol(), hello)
@@ -147,7 +147,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._await_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It is over."""
+        """Cancel the timers and unregister the connection."""
         self._connections.close(self)
         for timer in (self._head_timer, self._stall_timer, self._linger_timer):
             if timer is not None:
@@ -155,55 +155,55 @@ class BoundedProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def on_message_begin(self) -> None:
-        """A further request starts on the connection."""
+        """Start a further request on the connection."""
         self._head_size = 0
         self._await_head()
         super().on_message_begin()
         self.scope["state"][PROVE] = self.prove
 
     def on_url(self, url: bytes) -> None:
-        """A piece of the request line."""
+        """Count a piece of the request line."""
         self._grow(len(url))
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """One header."""
+        """Count a header."""
         self._grow(len(name) + len(value) + 4)
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
-        """The head is whole."""
+        """Stop the timer for the head."""
         self._head_came()
         super().on_headers_complete()
-        # Until its body has come, whatever is answered says that the connection closes.
+        # Until the body is complete, every response closes the connection.
         self._keep_alive, self.cycle.keep_alive = self.cycle.keep_alive, False
         self.cycle.transport = self._closing
 
     def on_message_complete(self) -> None:
-        """The body is whole."""
+        """Allow keep-alive again, since the body is complete."""
         if not self.cycle.response_started:
             self.cycle.keep_alive = self._keep_alive
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        """An answer is complete: the next request may come, unless the connection closes."""
+        """Continue with the next request, unless the connection closes."""
         if not self.lingers:
             super().on_response_complete()
 
     def pause_writing(self) -> None:
-        """The client reads more slowly than the answer is made: it must go on reading."""
+        """Start to check the client's pace, since it reads more slowly than the response is produced."""
         super().pause_writing()
         self._await_reader()
 
     def resume_writing(self) -> None:
-        """The client has caught up."""
+        """Stop the check of the client's pace."""
         super().resume_writing()
         if self._stall_timer is not None:
             self._stall_timer.cancel()
             self._stall_timer = None
 
     def shutdown(self) -> None:
-        """The server stops: an answer that has no end of its own is told to come to one."""
+        """End endless responses, since the server stops."""
         if self.cycle is not None and not self.cycle.response_complete:
             ending = self.cycle.scope["state"].get(ON_STOP)
             if ending is not None:
@@ -211,8 +211,8 @@ class BoundedProtocol(HttpToolsProtocol):
         super().shutdown()
 
     def data_received(self, data: bytes) -> None:
-        """Bytes came in."""
-        if self._pending is not None:  # TLS has not begun to read, or its handshake is just over
+        """Parse received bytes, or discard them if the connection is closing."""
+        if self._pending is not None:  # TLS does not read yet, or its handshake has just ended
             if self.transport.get_protocol() is self:
                 self.transport.pause_reading()
             self._pending += data
@@ -225,20 +225,20 @@ class BoundedProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self.is_idle:
-            self._await_head()  # also for what the parser skips, like empty lines
+            self._await_head()  # also for data that the parser skips, like empty lines
         super().data_received(data)
 
     def send_400_response(self, msg: str) -> None:  # noqa: ARG002  uvicorn's text is plain
-        """Not HTTP: told in the shape of all other errors, unless another answer is due before."""
+        """Reject invalid HTTP with a problem, unless another response is pending."""
         if self.pipeline or not (self.is_idle or (self.cycle.more_body and not self.cycle.response_started)):
             self._end_after_answers()
         elif self._head_size > MAX_HEAD:
-            self._reject(431, "the request's head is too large")
+            self._reject(431, "the request head is too large: shorten the address or the headers")
         else:
-            self._reject(400, "this is not a valid HTTP request")
+            self._reject(400, "invalid HTTP request")
 
     def linger(self) -> None:
-        """Close, but first let the client read the answer: bytes that nobody takes in would reset the connection."""
+        """Close after the client had time to read the response: unread input would reset the connection."""
         self._head_came()
         self._linger_timer = self.loop.call_later(LINGER_SECONDS, self.transport.abort)
         self.flow.resume_reading()
@@ -246,8 +246,8 @@ class BoundedProtocol(HttpToolsProtocol):
             self.transport.write_eof()
 
     def _end_after_answers(self) -> None:
-        """Close once the requests that came completely are answered; nothing after them can be understood."""
-        if self.cycle.more_body:  # half of a request, whose answer has begun or comes after others
+        """Close after the responses to complete requests; data after them cannot be parsed."""
+        if self.cycle.more_body:  # incomplete request, whose response has started or is queued
             self.transport.abort()
             return
         self._head_came()
@@ -292,23 +292,23 @@ class BoundedProtocol(HttpToolsProtocol):
 
 
 class _Closing(asyncio.Transport):
-    """The transport as an answer sees it: closing it lingers where the request has not come completely."""
+    """Transport for responses: closing it lingers if the request is incomplete."""
 
     def __init__(self, connection: BoundedProtocol) -> None:
         super().__init__()
         self._connection = connection
 
     def write(self, data: bytes | bytearray | memoryview[Any]) -> None:
-        """Send, unless the connection is closed: the answer to a pipelined request is not told of it."""
+        """Send, unless the connection is closed: responses to pipelined requests are not notified of that."""
         if not self._connection.transport.is_closing():
             self._connection.transport.write(data)
 
     def is_closing(self) -> bool:
-        """Whether nothing more can be said."""
+        """Test if nothing more can be sent."""
         return self._connection.lingers or self._connection.transport.is_closing()
 
     def close(self) -> None:
-        """The answer is complete."""
+        """Close after a complete response."""
         if self._connection.cycle.more_body or self._connection.is_broken:
             self._connection.linger()
         else:

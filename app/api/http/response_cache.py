@@ -1,7 +1,7 @@
-"""Answers in memory, so that a fleet that asks again costs microseconds.
+"""Response cache in memory: repeated requests of a fleet take microseconds.
 
-An answer is believed while ``Store.generation()`` stays the same and for a second at most, the caller's token likewise.
-All else goes the long way: guard, route, recipe (the ETag), cache on disk, conversion.
+A response is valid while ``Store.generation()`` is unchanged, for at most a second, and so is the caller's token.
+Other requests take the slow path: middleware, route, recipe (the ETag), disk cache, conversion.
 """
 
 from __future__ import annotations
@@ -30,14 +30,17 @@ FRESH_SECONDS = 1.0
 T = TypeVar("T")
 P = ParamSpec("P")
 Key = tuple[bytes, bytes]
-"""Raw path and raw query."""
+"""Key of the cache: raw path and raw query."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CachedResponse:
-    """What stands at an address. recipe: None where it is no map. body: None while it is not made, or too large for
-    memory; file: then the one on disk. link: the caller with the signed link that the address is; None where a token is
-    needed.
+    """Cached response of an address.
+
+    Attributes:
+        recipe: None if the address is not a map.
+        body: None before the conversion, or if too large for memory; ``file`` is then the one on disk.
+        link: principal of the signed link, if the address is one; None if a token is required.
     """
 
     environment: str
@@ -57,7 +60,7 @@ class CachedResponse:
 
 
 class ResponseCache:
-    """Answers in memory, by address; the least recently stored go first."""
+    """LRU cache of responses by address, and single flight for their creation. Thread-safe."""
 
     def __init__(self, max_bytes: int, access: Authenticator, metrics: Metrics, generation: Callable[[], int]) -> None:
         self._limit, self._size = max_bytes, 0
@@ -68,39 +71,39 @@ class ResponseCache:
         self._tallies: dict[str, list[int]] = {}
 
     def get_fresh(self, key: Key) -> CachedResponse | None:
-        """What is known to stand there at this moment."""
+        """Return the response of an address if it is still valid."""
         entry = self._entries.get(key)
         if entry is None or entry.fresh_until < time.monotonic() or entry.generation != self.generation():
             return None
         return entry
 
     def get(self, key: Key) -> CachedResponse | None:
-        """What stood there when it was last looked up."""
+        """Return the last response of an address, valid or not."""
         return self._entries.get(key)
 
     async def join(self, key: tuple[Any, ...], function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """What ``function`` finds, called in a thread: one call for all who come with this key meanwhile."""
+        """Run ``function`` in a thread and return its result; concurrent calls with the same key share one run."""
         result: T = await self._flights.run(key, function, *args, **kwargs)
         return result
 
     async def run_shared(self, request: Request, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """What ``function`` finds, called in a thread: one look for all who ask for this address at the same moment.
+        """Run ``function`` in a thread and return its result; concurrent requests for the same address share one run.
 
-        Nobody joins a look that began before the last commit. So what it finds must depend on what commits tell of
-        alone (robots' reports are not), and on nothing that was found before it, nor on who asks.
+        Requests after a commit do not join a run that began before it. So the result may depend only on data that
+        changes by commits (not on robot reports), and neither on earlier reads nor on the caller.
         """
         return await self.join((request_key(request), self.generation(), function), function, *args, **kwargs)
 
     def tally(self, route: str) -> list[int]:
-        """The counters of a route's answers from memory: status 200, and 304."""
+        """Return the counters of a route's responses from memory: status 200, and 304."""
         return self._tallies.setdefault(route, [0, 0])
 
     def store_response(
         self, request: Request, environment: str, headers: Mapping[str, str], body: bytes, generation: int
     ) -> None:
-        """Another answer (200, with an ``etag``) that a whole fleet asks for at once; good until the next commit.
+        """Cache another response (200, with an ``etag``) that a whole fleet requests; valid until the next commit.
 
-        generation: as it was before the store was asked. Whoever may enter the environment gets it.
+        generation: value from before the store was read. All callers with access to the environment get the response.
         """
         bare = [(name.encode(), value.encode()) for name, value in headers.items()]
         full = [*bare, (b"content-length", str(len(body)).encode()), (b"content-type", b"application/json")]
@@ -123,13 +126,13 @@ class ResponseCache:
         self.insert(request_key(request), response)
 
     def evict(self, request: Request) -> None:
-        """Drop what is remembered of an address."""
+        """Remove the response of an address."""
         with self._lock:
             old = self._entries.pop(request_key(request), None)
             self._size -= _entry_bytes(old) if old else 0
 
     def flush_counters(self) -> None:
-        """Add what was answered from memory since the last call to the metrics."""
+        """Add the responses served from memory since the last call to the metrics."""
         for route, tally in list(self._tallies.items()):
             for place, status in enumerate(("200", "304")):
                 new, tally[place] = tally[place], 0
@@ -138,7 +141,7 @@ class ResponseCache:
                     self._metrics.memory_hits.inc(new)
 
     def insert(self, key: Key, response: CachedResponse) -> None:
-        """Remember an answer; others go where there is no room for it."""
+        """Cache a response, evicting the oldest ones if necessary."""
         with self._lock:
             old = self._entries.pop(key, None)
             self._size += _entry_bytes(response) - (_entry_bytes(old) if old else 0)
@@ -147,7 +150,7 @@ class ResponseCache:
                 self._size -= _entry_bytes(self._entries.popitem(last=False)[1])
 
     def reply(self, scope: Scope) -> tuple[dict[str, Any], dict[str, Any]] | None:
-        """The two messages of an answer to a request, or None where it takes the long way."""
+        """Return the two ASGI messages of a cached response, or None for the slow path."""
         entry = self.get_fresh((scope.get("raw_path") or b"", scope["query_string"]))
         if entry is None:
             return None
@@ -161,7 +164,7 @@ class ResponseCache:
                 condition = value
             elif name in (b"range", b"if-match", b"available-dictionary"):
                 return None
-        # The signature of a link is part of the key: it was checked with the first request.
+        # The signature of a link is part of the key: the first request checked it.
         principal = entry.link or self.access.cached_principal(authorization)
         if principal is None or (entry.link is not None and principal.has_expired()):
             return None
@@ -188,7 +191,7 @@ _EMPTY = {"type": "http.response.body", "body": b""}
 
 
 def request_key(request: Request) -> Key:
-    """Where the answer to a request is remembered."""
+    """Return the cache key of a request."""
     scope = request.scope
     return (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
 

@@ -1,4 +1,4 @@
-"""Answers and requests as this API speaks them: exact JSON in and out, pages with a link to the next one."""
+"""Conventions of this API for requests and responses: strict JSON, and pages with a link to the next one."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ API = "/api/v1"
 
 
 def api_path(*parts: object) -> str:
-    """An address below the API from its parts, each quoted whole."""
+    """Build a path below the API from its parts, each quoted completely."""
     return API + "".join("/" + quote(str(part), safe="") for part in parts)
 
 
 def json_bytes(value: Any) -> bytes:
-    """Compact UTF-8 JSON."""
+    """Write compact UTF-8 JSON."""
     return orjson.dumps(value, option=orjson.OPT_NON_STR_KEYS)
 
 
 def json_response(value: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
-    """A JSON answer."""
+    """Build a JSON response."""
     return Response(json_bytes(value), status, headers, "application/json")
 
 
 def page_response(request: Request, items: list[Any], cursor: str | None) -> Response:
-    """One page of a list; ``Link: <…>; rel="next"`` where there is more."""
+    """Build a page of a list, with ``Link: <…>; rel="next"`` if there are more items."""
     headers = {}
     if cursor is not None:
         query = [(k, v) for k, v in request.query_params.multi_items() if k != "cursor"]
@@ -47,13 +47,13 @@ def page_response(request: Request, items: list[Any], cursor: str | None) -> Res
 
 
 def version_headers(version: Version) -> dict[str, str]:
-    """``ETag`` for ``If-Match``, and which version it is."""
+    """Build the headers of a version: ``ETag`` for ``If-Match``, number and root."""
     number = str(version.number)
     return {"etag": f'"{number}"', "fleetmap-version": number, "fleetmap-root": version.root}
 
 
 def commit_response(outcome: CommitResult) -> Response:
-    """The answer for what became of a change: 201 where there is a new version, also when it is told again."""
+    """Build the response of a commit: 201 for a new version, also if the request is repeated; else 200."""
     version = outcome.version
     if version is None:
         return json_response(outcome.body)
@@ -66,10 +66,10 @@ def commit_response(outcome: CommitResult) -> Response:
 
 class _StrictRequest(Request):
     async def json(self) -> Any:
-        """The body as JSON: no NaN, no infinity, no lone surrogates, no integer beyond 64 bits, bounded nesting."""
+        """Parse the body as JSON: no NaN, infinity or lone surrogates, integers up to 64 bits, limited nesting."""
         data = await self.body()
         value = orjson.loads(data)
-        if _LONG.search(data):  # orjson would take a larger integer as a float
+        if _LONG.search(data):  # orjson would parse a larger integer as a float
             json.loads(data, parse_int=_int64)
         return value
 
@@ -79,15 +79,15 @@ _LONG = re.compile(rb"\d{19}")
 
 def _int64(text: str) -> int:
     if len(text) > 20 or not -(2**63) <= int(text) < 2**63:
-        raise json.JSONDecodeError(f"the integer {text[:40]} does not fit into 64 bits", text, 0)
+        raise json.JSONDecodeError(f"the integer {text[:40]} exceeds 64 bits", text, 0)
     return int(text)
 
 
 class StrictRoute(APIRoute):
-    """A route that reads exact JSON and refuses query parameters it does not know: a misspelt one is told."""
+    """Route with strict JSON that refuses unknown query parameters, so that misspelt ones are reported."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """FastAPI's hook."""
+        """Wrap FastAPI's handler with the checks."""
         handler = super().get_route_handler()
         allowed_names = {field.alias for field in _query_fields(self.dependant)}
         free = bool((self.openapi_extra or {}).get("x-free-query"))

@@ -1,7 +1,6 @@
-"""The edge's shapes that several nouns share: names, parameters, problems, versions.
+"""Schemas that several resources share: names, parameters, problems, versions.
 
-The shapes of one noun stand in its module. The examples fit each other: a test runs every one of them against a server
-that holds the demo.
+The schemas of one resource are in its module. A test runs all examples against a server with the demo environment.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ MAX_TEXT = 20_000
 
 
 class RequestModel(BaseModel):
-    """A request body: unknown members and numbers that are not finite are refused."""
+    """Request body: unknown members and numbers that are not finite are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 def _representable(moment: datetime) -> datetime:
-    """Times near the years 1 and 9999 leave the calendar in another zone, UTC for instance."""
+    """Check that a time can be converted to UTC: near the years 1 and 9999 it may leave the calendar."""
     try:
         moment.astimezone(UTC)
     except OverflowError:
-        raise ValueError("this time is outside the calendar: give one between the years 2 and 9998") from None
+        raise ValueError("time out of range: give one between the years 2 and 9998") from None
     return moment
 
 
@@ -40,7 +39,7 @@ ApiTime = Annotated[datetime, AfterValidator(_representable)]
 
 
 class DatumBody(RequestModel):
-    """Where the local frame's origin is (WGS 84), and where its +y axis points."""
+    """Origin of the local frame (WGS 84) and heading of its +y axis."""
 
     latitude: float = Field(ge=-MAX_DATUM_LATITUDE, le=MAX_DATUM_LATITUDE, description="Degrees north.")
     longitude: float = Field(ge=-180, le=180, description="Degrees east.")
@@ -49,7 +48,7 @@ class DatumBody(RequestModel):
 
 
 class DatumOut(BaseModel):
-    """The local origin."""
+    """Origin of the local frame (WGS 84) and heading of its +y axis."""
 
     latitude: float
     longitude: float
@@ -58,7 +57,7 @@ class DatumOut(BaseModel):
 
 
 class ProblemItem(BaseModel):
-    """One thing that is wrong or doubtful, and where."""
+    """Error or warning, with its place."""
 
     problem: str
     file: str | None = None
@@ -66,12 +65,12 @@ class ProblemItem(BaseModel):
     where: str | None = None
     level: Literal["error", "warning"] | None = Field(
         default=None,
-        description="Of a finding about a served map: error where its consumer would refuse it, else warning.",
+        description="Severity of a finding in a served map: `error` if its consumer would refuse it, else `warning`.",
     )
 
 
 class ProblemOut(BaseModel):
-    """RFC 9457."""
+    """Error response (RFC 9457)."""
 
     type: str
     title: str
@@ -81,7 +80,7 @@ class ProblemOut(BaseModel):
 
 
 class SourceOut(BaseModel):
-    """An uploaded file. ``used``: whether the version was made from it."""
+    """Uploaded file. `used`: whether the version uses it."""
 
     name: str
     size: int
@@ -91,7 +90,7 @@ class SourceOut(BaseModel):
 
 
 class VersionOut(BaseModel):
-    """An immutable state. A dry run has ``version: null``."""
+    """Immutable version of an environment. `version` is null in a dry run."""
 
     environment: str
     version: int | None
@@ -105,31 +104,32 @@ class VersionOut(BaseModel):
     warnings: list[ProblemItem]
     information: dict[str, str]
     stale: list[dict[str, Any]] = Field(
-        description="Derived parts whose inputs have changed since, with what has: maps are made from them anew."
+        description="Derived parts whose inputs have changed since, with the changed inputs. Maps derive them again."
     )
 
 
 EnvironmentPath = Annotated[
-    str, Path(pattern=NAME, description="An environment's name.", examples=["orchard"], max_length=63)
+    str, Path(pattern=NAME, description="Name of the environment.", examples=["orchard"], max_length=63)
 ]
 VersionPath = Annotated[
     str,
     Path(
         pattern=VERSION,
-        description="Number, channel, or `latest`.",
+        description="Version: number, channel, or `latest`.",
         examples=["latest"],
     ),
 ]
-Limit = Annotated[int, Query(ge=1, le=1000, description="Items on a page.")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Maximum number of items per page.")]
 Cursor = Annotated[
-    str | None, Query(max_length=500, description="Where the page starts: taken from the last page's `Link` header.")
+    str | None, Query(max_length=500, description="Start of the page, from the `Link` header of the previous page.")
 ]
 IfMatch = Annotated[
     str | None,
     Header(
         alias="If-Match",
         max_length=2000,
-        description='The version that the change builds on, as `"3"`, `"<root>"` or `*`; 412 where the head has moved.',
+        description='Version on which the change is based, as `"3"`, `"<root>"` or `*`. Returns 412 if the head has '
+        "moved.",
     ),
 ]
 IdempotencyKey = Annotated[
@@ -137,8 +137,8 @@ IdempotencyKey = Annotated[
     Header(
         alias="Idempotency-Key",
         max_length=255,
-        description="A text of your choice; the same request sent again with it gets the same answer, and never makes "
-        "a second version.",
+        description="Any text. A repeated request with the same key returns the same response and creates no second "
+        "version.",
     ),
 ]
 
@@ -146,18 +146,18 @@ IdempotencyKey = Annotated[
 def problem_responses(
     model: Any, *statuses: int, ok: int = 200, description: str = "OK"
 ) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's responses: the good one by its shape, and which problems this call can meet besides the usual ones."""
+    """Build the OpenAPI responses: success with its schema, and the problems besides those of every call."""
     reasons = {
         400: "The body is malformed.",
-        404: "There is no such thing.",
-        406: "None of the accepted media types can be served.",
-        409: "It does not fit the present state, or several things fit and none was named.",
-        412: "The head has moved.",
-        413: "Larger than the server takes.",
-        415: "A media type or content coding that is not taken.",
-        416: "The range lies outside of the file.",
-        422: "The request, a file, or what is stored does not allow it; `errors` says where.",
-        503: "Too busy, or a part of the server does not answer: try again after `Retry-After` seconds.",
+        404: "Not found.",
+        406: "None of the accepted media types is available.",
+        409: "Conflict with the present state, or several items match and none is named.",
+        412: "The head has moved since the version on which the change is based.",
+        413: "Too large.",
+        415: "Unsupported media type or content coding.",
+        416: "The range is outside the file.",
+        422: "The request, a file or stored data is not suitable; `errors` has the details.",
+        503: "Overloaded, or a part of the server does not respond: try again after `Retry-After` seconds.",
     }
     out: dict[int | str, dict[str, Any]] = {}
     if model is not None:

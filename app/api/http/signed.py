@@ -1,4 +1,4 @@
-"""Signed links at the door: which requests are by a link, whether it is genuine, and making links."""
+"""Signed links: detection in requests, verification and creation."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ MAP_PATH = re.compile(
     r"/(?P<format>[^/]+)(?:/(?P<file>.+))?",
     re.DOTALL,
 )
-"""The two addresses of a map."""
+"""Pattern of the two URLs of a map."""
 
 LINK = "link"
-"""Id and name of the principal of a request by link, and the member of a request's state that has the link."""
+"""Id and name of the principal of a signed link, and the key of the link in a request's state."""
 
 
 def request_link(scope: Scope) -> SignedAddress | None:
-    """The link that a request was made by; None for all other requests. Only maps are given by link, and only read.
+    """Return the signed link of a request, or None. Links are valid for maps only, and for reading only.
 
-    Raises InvalidLink where the query has a signature but is no link.
+    Raises InvalidLink if the query has a signature but is malformed.
     """
     query: bytes = scope["query_string"]
     if b"signature=" not in query or scope["method"] != "GET" or MAP_PATH.fullmatch(scope["path"]) is None:
@@ -42,16 +42,16 @@ def request_link(scope: Scope) -> SignedAddress | None:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A link that was made. url: without scheme and host."""
+    """Created link. url: without scheme and host."""
 
     url: str
     expires: datetime
 
 
 class SignedLinks:
-    """Makes links and checks them.
+    """Creation and verification of signed links.
 
-    max_seconds: maximum life of a link. find: an environment by name; raises NotFound.
+    max_seconds: maximum lifetime of a link. find: returns an environment by name; raises NotFound.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class SignedLinks:
         self.max_seconds = max_seconds
 
     def check_life(self, seconds: int | None) -> None:
-        """Invalid for a link that should live longer than the maximum."""
+        """Raise Invalid if a lifetime exceeds the maximum."""
         if seconds is not None and seconds > self.max_seconds:
             limit = f"at most {self.max_seconds} (FLEETMAP_LINK_SECONDS)"
             raise Invalid(f"seconds must be {limit}, got {seconds}", [Problem(f"must be {limit}", where="seconds")])
@@ -74,7 +74,7 @@ class SignedLinks:
     def create(
         self, environment: Environment, path: str, parameters: Mapping[str, str], seconds: int, creator: Principal
     ) -> Grant:
-        """Make a link to a map's path (percent-decoded). It does not outlive the token of its creator."""
+        """Create a link to a map's path (percent-decoded). It expires with its creator's token at the latest."""
         now = self._clock()
         expires = int(now) + min(seconds, self.max_seconds)
         if creator.expires is not None:
@@ -83,14 +83,16 @@ class SignedLinks:
         return Grant(f"{quote(path, safe='/')}?{query}", datetime.fromtimestamp(expires, UTC))
 
     def check(self, address: SignedAddress, client: str | None) -> Principal:
-        """The caller with this link, who may read what it names. Asks the store, so call it from a thread.
+        """Verify a link; return its principal, which may read the linked map.
 
-        A genuine link is accepted also from an address that sent too many wrong tokens: nobody guesses one.
+        Reads the store, so call it from a thread.
+
+        A valid link is accepted even from an address with too many failures, because links cannot be guessed.
 
         Raises:
-            InvalidLink: the signature is wrong, which counts as a wrong token, or the environment was deleted.
-            ExpiredLink: its time is over.
-            Throttled: the signature is wrong, and so were too many before it.
+            InvalidLink: the signature is wrong (counted like a wrong token), or the environment was deleted.
+            ExpiredLink: the link has expired.
+            Throttled: the signature is wrong, after too many failures from this address.
         """
         now = self._clock()
         try:
@@ -110,5 +112,5 @@ class SignedLinks:
         return Principal(LINK, LINK, "viewer", name, None, datetime.fromtimestamp(address.expires, UTC))
 
     def rotate(self) -> None:
-        """Sign links with a new secret; those made before stay valid until they expire."""
+        """Sign links with a new secret; existing links stay valid until they expire."""
         self._secrets.rotate(self._clock(), self.max_seconds)

@@ -1,4 +1,4 @@
-"""Work that is done once for all who want it at the same moment: a fleet that asks at once costs one look."""
+"""Single flight: coalesce concurrent calls with the same key into one."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ P = ParamSpec("P")
 
 
 class SingleFlight(Generic[K, T]):
-    """Calls under way, by key, on one event loop.
+    """Running calls by key, on one event loop.
 
-    What a key stands for must not change while its call runs: where a commit changes the answer, the store's generation
-    belongs into the key, for who comes after the commit may have been told of it.
+    The meaning of a key must not change during a call. If a commit changes the result, the key must contain the
+    store's generation, because a client that knows of the commit must not get an older result.
     """
 
     def __init__(self) -> None:
         self._running: dict[K, asyncio.Future[T]] = {}
 
     async def run(self, key: K, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """The result of ``function``, called in a thread by the first who asks; what it raises goes to all.
+        """Run ``function`` in a thread, or join the call with the same key; errors go to all callers.
 
-        It goes on where the one who began it goes away.
+        The call continues if the caller that started it is cancelled.
         """
         running = self._running.get(key)
         if running is None:
@@ -38,4 +38,4 @@ class SingleFlight(Generic[K, T]):
     def _done(self, key: K, done: asyncio.Future[Any]) -> None:
         self._running.pop(key, None)
         if not done.cancelled():
-            done.exception()  # looked at by whoever waits; nobody may be left
+            done.exception()  # mark the exception as retrieved: there may be no caller left

@@ -1,4 +1,4 @@
-"""Files as answers: whole or one range, from memory or in chunks from disk."""
+"""Responses with files: complete or one range, from memory or in chunks from disk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from starlette.responses import Response, StreamingResponse
 from app.api.http.caching import Unsatisfiable, byte_range
 
 IN_MEMORY = 8 * 2**20
-"""Files up to this many bytes are answered from memory; larger ones are streamed from disk."""
+"""Maximum size of files that are served from memory; larger ones are streamed from disk."""
 
 CHUNK = 256 * 2**10
 
@@ -22,22 +22,24 @@ Headers = list[tuple[bytes, bytes]]
 
 
 def raw_response(status: int, headers: Headers, body: bytes = b"") -> Response:
-    """An answer with exactly these headers."""
+    """Build a response with exactly these headers."""
     response = Response(body, status)
     response.raw_headers = list(headers)
     return response
 
 
 def requested_range(request: Request, etag: str, size: int) -> tuple[int, int] | None:
-    """The half-open range [start, end) that a client asks for, None for the whole. Status 416 if it lies outside."""
+    """Return the requested half-open range [start, end), None for the complete file. Raises 416 if it is outside."""
     part = byte_range(request.headers.get("range"), request.headers.get("if-range"), etag, size)
     if isinstance(part, Unsatisfiable):
-        raise HTTPException(416, f"the file has {size} bytes", {"content-range": f"bytes */{size}"})
+        raise HTTPException(
+            416, f"the range is outside the file, which has {size} bytes", {"content-range": f"bytes */{size}"}
+        )
     return part
 
 
 def range_headers(part: tuple[int, int] | None, size: int) -> Headers:
-    """Length of an answer, and which range it has."""
+    """Build the headers with the length of a response and its range."""
     start, end = part or (0, size)
     length = (b"content-length", str(end - start).encode())
     return [length] if part is None else [length, (b"content-range", f"bytes {start}-{end - 1}/{size}".encode())]
@@ -46,10 +48,10 @@ def range_headers(part: tuple[int, int] | None, size: int) -> Headers:
 def stream_file(
     file: BinaryIO, start: int, end: int, status: int, headers: Headers, check: Callable[[str], None] | None = None
 ) -> Response:
-    """The bytes [start, end) of an open file, which is closed at the end.
+    """Stream the bytes [start, end) of an open file, which is closed at the end.
 
-    check: called with the hash of all of it before the last bytes are sent; what it raises breaks the connection, so
-    that nobody takes damaged content for whole.
+    check: called with the hash of the streamed bytes before the last chunk is sent; an exception breaks the
+    connection, so that the client does not accept damaged content.
     """
     digest = hashlib.sha256()
 
@@ -66,7 +68,7 @@ def stream_file(
             while left > 0:
                 chunk = await run_in_threadpool(read, min(CHUNK, left))
                 if not chunk:
-                    raise OSError("a file that is being sent became shorter")
+                    raise OSError("a file became shorter while it was sent")
                 left -= len(chunk)
                 if check is not None and not left:
                     check(digest.hexdigest())

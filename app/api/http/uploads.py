@@ -1,8 +1,8 @@
-"""Multipart uploads, streamed to disk while they arrive: counted, hashed, bounded.
+"""Multipart uploads, streamed to disk while they arrive: counted, hashed, limited.
 
-A file's name may be a relative path and is kept as it was given; on disk it never names anything. Files lie in a
-folder of their own below the spool, which goes with the request; what a killed server left is removed at the next
-start (``UploadSpool``).
+The name of a file may be a relative path and is stored as sent; it is never used as a name on disk. The files of a
+request are in a directory of the spool, which is removed with the request. The next start removes leftovers of a
+killed server (``UploadSpool``).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from app.limits import Limits
 from app.store.database import check_room
 
 BATCH = 2**20
-"""Bytes gathered before a thread parses, hashes and writes them."""
+"""Size of a batch that a thread parses, hashes and writes, in bytes."""
 
 MAX_FIELD = 64 * 2**10
 MAX_FIELDS = 100
@@ -43,14 +43,14 @@ FILES = "files"
 
 @dataclass(slots=True)
 class UploadForm:
-    """What was sent: files in order, and the other fields."""
+    """Content of an upload: files in order, and the other fields."""
 
     files: list[SpooledFile] = field(default_factory=list)
     fields: dict[str, str] = field(default_factory=dict)
 
 
 class UploadSpool:
-    """Where uploads arrive: so many at once, and nothing of a dead process stays."""
+    """Spool directory for uploads: limits concurrent uploads, and removes leftovers of ended processes."""
 
     def __init__(self, spool: Path, limits: Limits, *, at_once: int) -> None:
         self._limits, self._at_once = limits, at_once
@@ -60,43 +60,43 @@ class UploadSpool:
         self._alive: IO[str] | None = None
         if spool.is_dir():
             _remove_abandoned(spool)
-        with contextlib.suppress(OSError):  # a full disk keeps uploads away, not the server from starting
+        with contextlib.suppress(OSError):  # a full disk must not prevent the server's start
             self._open()
 
     def _open(self) -> None:
-        """Make the folder of this process."""
+        """Create the directory of this process."""
         with self._lock:
             if self._alive is None:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                # Held as long as this process lives: how the next start knows what is left over.
+                # Locked while this process lives: a later start removes unlocked directories.
                 alive = (self._folder / "alive").open("w")
                 fcntl.flock(alive, fcntl.LOCK_EX)
                 self._alive = alive
 
     def check(self) -> None:
-        """NoRoom or Unavailable unless an upload could be spooled."""
+        """Raise NoRoom or Unavailable if an upload could not be spooled."""
         try:
             self._open()
             check_room(self._folder)
         except OSError as error:
             kind = NoRoom if error.errno in DISK_FULL_ERRNOS else Unavailable
-            raise kind(f"the folder for uploads cannot be written: {error.strerror}") from error
+            raise kind(f"the upload directory cannot be written: {error.strerror}") from error
 
     def close(self) -> None:
-        """Remove the spool of this process."""
+        """Remove the directory of this process."""
         if self._alive is not None:
             self._alive.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     @contextlib.asynccontextmanager
     async def receive(self, request: Request) -> AsyncIterator[UploadForm]:
-        """The form of a multipart request; its files last as long as the block.
+        """Receive the form of a multipart request; its files exist until the end of the block.
 
-        Raises Unavailable (too many uploads at once), MalformedBody, Invalid, TooLarge.
+        Raises Unavailable (too many concurrent uploads), MalformedBody, Invalid, TooLarge.
         """
         with self._lock:
             if self._active >= self._at_once:
-                raise Unavailable("too many uploads arrive at the moment: try again in a few seconds")
+                raise Unavailable("too many concurrent uploads: try again in a few seconds")
             self._active += 1
         folder = self._folder / uuid4().hex
         try:
@@ -116,11 +116,11 @@ class UploadSpool:
 
 
 def _boundary(content_type: str) -> bytes:
-    """The boundary of a multipart body; MalformedBody where there is none."""
+    """Return the boundary of a multipart body. Raises MalformedBody if there is none."""
     _, options = parse_options_header(content_type)
     boundary = options.get(b"boundary", b"")
     if not 1 <= len(boundary) <= 200:
-        raise MalformedBody("the multipart body's Content-Type has no usable boundary")
+        raise MalformedBody("missing or invalid boundary in the Content-Type of the multipart body")
     return boundary
 
 
@@ -137,7 +137,7 @@ async def _feed(request: Request, receiver: _MultipartReceiver) -> None:
 
 
 def _remove_abandoned(spool: Path) -> None:
-    """Remove the folders of processes that are no more: nobody holds their lock."""
+    """Remove the directories of ended processes, which are not locked."""
     for folder in spool.iterdir():
         try:
             with (folder / "alive").open("r+") as handle:
@@ -146,14 +146,14 @@ def _remove_abandoned(spool: Path) -> None:
         except BlockingIOError:
             continue
         except OSError:
-            # No lock file: it died while it started, or another start is just removing it.
+            # No lock file: its process died during its start, or another process is removing it.
             if folder.is_dir() and not any(folder.iterdir()):
                 with contextlib.suppress(OSError):
                     folder.rmdir()
 
 
 class _MultipartReceiver:
-    """The parts of one body: files to disk, fields to memory."""
+    """Parser of one body: files to disk, fields to memory."""
 
     def __init__(self, boundary: bytes, folder: Path, limits: Limits) -> None:
         self.form = UploadForm()
@@ -186,20 +186,20 @@ class _MultipartReceiver:
         )
 
     def write(self, data: bytes) -> None:
-        """The next bytes of the body."""
+        """Parse the next bytes of the body."""
         try:
             self._parser.write(data)
         except FormParserError as error:
-            raise MalformedBody(f"the multipart body cannot be read: {error}") from error
+            raise MalformedBody(f"malformed multipart body: {error}") from error
 
     def finish(self, data: bytes) -> None:
-        """The last bytes of the body: it must be complete."""
+        """Parse the last bytes of the body, which must be complete."""
         self.write(data)
         if not self._ended:
-            raise MalformedBody("the multipart body ends before its closing boundary: it was cut off on its way")
+            raise MalformedBody("the multipart body ends before its closing boundary: send it again")
 
     def close(self) -> None:
-        """Let go of a file that was not finished."""
+        """Close an incomplete file."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -215,31 +215,35 @@ class _MultipartReceiver:
             self._disposition = value
         plain = value.strip().lower() in (b"binary", b"8bit", b"7bit")
         if name == b"content-transfer-encoding" and not plain:
-            raise MalformedBody("parts are taken as they are: send them without Content-Transfer-Encoding")
+            raise MalformedBody("unsupported Content-Transfer-Encoding: send parts without it")
         self._header_name.clear()
         self._header_value.clear()
 
     def _part_starts(self) -> None:
         kind, options = parse_options_header(self._disposition.decode("latin-1"))
         if kind != b"form-data" or b"name" not in options:
-            raise MalformedBody("each part needs Content-Disposition: form-data; name=…")
+            raise MalformedBody("a part has no field name: send Content-Disposition: form-data; name=…")
         name = _text(options[b"name"], "field name")
         file_name = options.get(b"filename")
         if file_name is None and name != FILES:
             if len(self.form.fields) >= MAX_FIELDS:
                 raise TooLarge(f"the form has more than {MAX_FIELDS} fields")
             if name in self.form.fields:
-                raise Invalid(f"the field {name!r} is given twice", [Problem("given twice", where=name)])
+                raise Invalid(f"duplicate field {name!r}: give it once", [Problem("duplicate", where=name)])
             self._field, self._value = name, bytearray()
             return
         if name != FILES:
             raise Invalid(
-                f"files are sent in the field '{FILES}', not {name[:80]!r}", [Problem("not a file field", where=name)]
+                f"unexpected file field {name[:80]!r}: send files in the field '{FILES}'",
+                [Problem("not a file field", where=name)],
             )
         if not file_name:
-            raise Invalid("a file needs a name: filename=… in its Content-Disposition")
+            raise Invalid("a file has no name: send filename=… in its Content-Disposition")
         if len(self.form.files) >= self._limits.files:
-            raise TooLarge(f"the upload has more than {self._limits.files} files, the most that this server takes")
+            raise TooLarge(
+                f"the upload has more than {self._limits.files} files: send fewer, or ask the operator to raise "
+                "the limit"
+            )
         self._file_name = _text(file_name, "file name")
         self._file_size, self._hash = 0, hashlib.sha256()
         self._file = (self._folder / str(len(self.form.files))).open("wb")
@@ -249,7 +253,8 @@ class _MultipartReceiver:
             self._total += end - start
             if self._total > self._limits.upload_bytes:
                 raise TooLarge(
-                    f"the files are larger than {self._limits.upload_bytes} bytes, the most that this server takes"
+                    f"the files are larger than {self._limits.upload_bytes} bytes: send less, or ask the "
+                    "operator to raise the limit"
                 )
             chunk = memoryview(data)[start:end]
             self._file.write(chunk)
@@ -275,7 +280,7 @@ class _MultipartReceiver:
 
 
 def _text(data: bytes, label: str) -> str:
-    """UTF-8 without a NUL; Invalid says which part of the form is not."""
+    """Decode UTF-8 without NUL. Raises Invalid with the label of the part."""
     try:
         text = data.decode()
     except UnicodeDecodeError:

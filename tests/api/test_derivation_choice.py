@@ -1,4 +1,4 @@
-"""Parameters of derivations come from the request, and a derivation that finds nothing to use gives way to another."""
+"""Choice of derivations: parameters come from the request, and a derivation that fails is replaced by another one."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ SQUARE = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "pro
 
 @dataclass(frozen=True, slots=True)
 class Blank:
-    """Of a made-up derivation."""
+    """Parameters of a test derivation."""
 
     side: int = parameter(4, "cells a side", minimum=1, maximum=100)
 
 
 @dataclass(frozen=True, slots=True)
 class Nothing:
-    """No parameters."""
+    """Empty parameters."""
 
 
 @pytest.fixture
 def blank(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two more ways to a grid, of which the cheaper one never works."""
+    """Add two derivations of a grid, of which the cheaper one always fails."""
     derivations = dict(derive.all_derivations())
     monkeypatch.setattr(derive._registry, "entries", {k: d for k, d in derivations.items() if d.gives != "occupancy"})
 
     @derives(gives="occupancy", needs={"objects"}, parameters=Blank, cost=5.0)
     def blank_grid(layers: Layers, parameters: Blank, notes: DerivationNotes) -> Layers:
-        """A free square."""
+        """Return a free square."""
         notes.warn("it is blank")
         notes.drop("objects", 1, "a blank grid shows none")
         cells = np.full((parameters.side, parameters.side), FREE, np.uint8)
@@ -53,11 +53,11 @@ def blank(monkeypatch: pytest.MonkeyPatch) -> None:
 
     @derives(gives="occupancy", needs={"objects"}, parameters=Nothing, cost=1.0)
     def never(layers: Layers, parameters: Nothing, notes: DerivationNotes) -> Layers:
-        """A derivation that finds nothing."""
+        """Fail, like a derivation that finds nothing."""
         raise CannotConvert("there is nothing red among the objects")
 
 
-def test_the_next_way_is_taken_and_notes_are_told(blank: None) -> None:
+def test_failed_derivation_falls_back_with_warnings(blank: None) -> None:
     converted = offline({"a.geojson": SQUARE}, "occupancy_grid", options={"side": "7"})
     assert b"7 7" in converted.files["map.pgm"][:20]
     line = next(line for line in converted.report.as_dict()["layers"] if line["layer"] == "occupancy")
@@ -68,14 +68,14 @@ def test_the_next_way_is_taken_and_notes_are_told(blank: None) -> None:
     assert {"what": "objects", "count": 1, "why": "a blank grid shows none"} in converted.report.as_dict()["dropped"]
 
 
-def test_when_nothing_is_left_every_reason_is_told(blank: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failure_of_all_derivations_lists_every_reason(blank: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(derive._registry.entries, "blank_grid")
     with pytest.raises(MissingLayer, match="nothing red") as caught:
         offline({"a.geojson": SQUARE}, "occupancy_grid")
     assert "supply an occupancy grid" in caught.value.detail
 
 
-def test_a_parameter_makes_a_stored_layer_anew(blank: None) -> None:
+def test_parameter_derives_a_stored_layer_again(blank: None) -> None:
     yaml = b"image: map.pgm\nresolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     files = {"map.yaml": yaml, "map.pgm": b"P5 2 1 255\n\0\xfe", "a.geojson": SQUARE}
     stored = offline(files, "occupancy_grid")
@@ -91,17 +91,17 @@ def test_a_parameter_makes_a_stored_layer_anew(blank: None) -> None:
         offline(files, "occupancy_grid", options={"side": "3"}, derived=False)
 
 
-def test_wrong_parameters_are_named(blank: None) -> None:
+def test_invalid_parameters_are_named(blank: None) -> None:
     with pytest.raises(Invalid, match="at least 1"):
         offline({"a.geojson": SQUARE}, "occupancy_grid", options={"side": "0"})
     with pytest.raises(Invalid, match="colour") as caught:
         offline({"a.geojson": SQUARE}, "occupancy_grid", options={"colour": "red"})
     assert [p.where for p in caught.value.problems] == ["colour"]
-    with pytest.raises(Invalid, match="outlines"):  # a derivation's, but not one on the way to this format
+    with pytest.raises(Invalid, match="outlines"):  # a parameter of a derivation, but of none in this chain
         offline({"a.geojson": SQUARE}, "datum", options={"outlines": "true"}, hints=UploadHints(layer="location"))
 
 
-def test_a_failing_step_is_named() -> None:
+def test_failing_step_is_named() -> None:
     step = derive.plan(frozenset({"objects"}), frozenset({"topology"}))
     assert step is not None
     with pytest.raises(CannotDerive) as caught:
@@ -109,14 +109,14 @@ def test_a_failing_step_is_named() -> None:
     assert caught.value.step == "objects_to_topology"
 
 
-def test_over_http(api: Api) -> None:
+def test_derivation_parameters_are_read_from_the_query(api: Api) -> None:
     api.post("environments", {"name": "beds"})
     api.upload("beds", {"a.geojson": SQUARE})
     refused: Any = api.get("/maps/beds/tmap2?join=0.5", expect=None)
     assert refused.status_code == 422
     assert "outlines=true" in refused.json()["detail"]
     again: Any = api.get("/maps/beds/tmap2?join=0.5", expect=None)
-    assert again.status_code == 422, "what was tried is remembered"
+    assert again.status_code == 422, "the failed attempt is cached"
     got = api.get("/maps/beds/tmap2?outlines=true")
     assert got.content.count(b"- meta:") == 4
     report = api.get("environments/beds/versions/1/reports/tmap2?outlines=true").json()
@@ -126,8 +126,10 @@ def test_over_http(api: Api) -> None:
     report = api.get("environments/beds/versions/1/reports/kml").json()
     assert "topology" not in {line["layer"] for line in report["layers"]}
     report = api.get("environments/beds/versions/1/reports/kml?outlines=true").json()
-    assert {"objects", "topology"} <= {line["layer"] for line in report["layers"]}, "a network was asked for"
-    assert api.get("/maps/beds/datum?outlines=true", expect=None).status_code == 422, "no step on the way takes it"
+    assert {"objects", "topology"} <= {line["layer"] for line in report["layers"]}, "the request was for a network"
+    assert api.get("/maps/beds/datum?outlines=true", expect=None).status_code == 422, (
+        "no step of the chain has the parameter"
+    )
     table = {row["format"]: row for row in api.get("environments/beds/versions/1/maps").json()}
     assert table["tmap2"]["state"] in ("missing", "derivable")
 
@@ -137,7 +139,7 @@ ROOM = b"P5\n40 40\n255\n" + b"".join(
 )
 
 
-def test_of_several_grids_one_has_to_be_named(api: Api) -> None:
+def test_several_grids_require_a_name(api: Api) -> None:
     api.post("environments", {"name": "two-grids"})
     for name in ("coarse", "fine"):
         size = b"0.2" if name == "coarse" else b"0.1"
@@ -153,8 +155,8 @@ def test_of_several_grids_one_has_to_be_named(api: Api) -> None:
     assert b"- meta:" in api.get("/maps/two-grids/tmap2?grid=fine").content
 
 
-def test_a_grid_alone_becomes_a_world_of_objects_where_their_context_is_told(api: Api) -> None:
-    """Its cells are walls by default, which needs no derivation; a parameter of one asks for it."""
+def test_grid_becomes_a_world_of_objects_with_context(api: Api) -> None:
+    """Its cells become walls by default, without a derivation; a parameter of a derivation requests that one."""
     cells = np.full((60, 80), 254, np.uint8)
     y, x = np.mgrid[:60, :80]
     for cx, cy in ((20, 20), (60, 30)):
@@ -169,7 +171,7 @@ def test_a_grid_alone_becomes_a_world_of_objects_where_their_context_is_told(api
     world = api.get("environments/copse/versions/1/maps/gazebo/world.sdf?context=forest").content
     assert world.count(b"<model name='tree") + world.count(b'<model name="tree') == 2, world.decode()[:2000]
     assert b"<cylinder>" in world
-    assert b"<mesh>" not in world, "the cells' walls would stand there twice"
+    assert b"<mesh>" not in world, "otherwise the walls of the cells would be duplicated"
     report = api.get("environments/copse/versions/1/reports/gazebo?context=forest").json()
     (line,) = [entry for entry in report["layers"] if entry["layer"] == "objects"]
     assert line["steps"][0]["step"] == "occupancy_to_objects"
@@ -177,4 +179,4 @@ def test_a_grid_alone_becomes_a_world_of_objects_where_their_context_is_told(api
     wrong = api.problem("GET", "environments/copse/versions/1/maps/gazebo?context=moon", 422)
     assert "forest" in wrong["detail"]
     wrong = api.problem("GET", "environments/copse/versions/1/maps/gazebo?contexts=forest", 422)
-    assert "context" in wrong["detail"], "what is accepted is told"
+    assert "context" in wrong["detail"], "the accepted values are listed"
