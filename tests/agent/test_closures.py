@@ -143,7 +143,7 @@ def test_closures_that_never_agree_are_an_error(fake: Fake, robot: Robot, monkey
     fake.instead = change
     one = robot()
     assert not one.once()
-    assert "other closures than the manifest" in one.detail
+    assert "other closures than its manifest" in one.detail
     assert request_count <= 2 * (agent.MAX_CLOSURE_CHANGES + 1)
     assert whole(one.into)["version"] == 1
     fake.instead = lambda _: False
@@ -213,7 +213,7 @@ def test_invalid_closures_are_refused(fake: Fake, robot: Robot, members: dict[st
     fake.more = members
     one = robot()
     assert not one.once()
-    assert "cannot be read" in one.detail
+    assert "invalid manifest" in one.detail
     assert whole(one.into)["version"] == 1
 
 
@@ -228,11 +228,11 @@ def test_status_carries_the_digest() -> None:
 @pytest.mark.parametrize(
     ("members", "text"),
     [
-        ({"closures": "ignore"}, "closures=ignore instead of apply"),
-        ({"closures": "mark"}, "closures=mark instead of apply"),
+        ({"closures": "ignore"}, "closures=ignore instead of closures=apply"),
+        ({"closures": "mark"}, "closures=mark instead of closures=apply"),
         ({"parameters": {"kml": {"level": "L2"}}}, "'level': 'L2'"),
         ({"parameters": {}}, "'crs': 'local'"),
-        ({"missing": []}, "without the optional osm"),
+        ({"missing": []}, "optional formats osm are missing without a reason"),
         ({"closures": 7}, "cannot be read"),
     ],
 )
@@ -276,7 +276,7 @@ def test_other_closures_under_one_sequence_are_refused(fake: Fake, robot: Robot)
     fake.closures = []
     one = robot()
     assert not one.once()
-    assert "under the same number" in one.detail
+    assert "under the same sequence" in one.detail
     assert map_and_closures(one)[0].endswith(b"ae7")
     fake.close_edges()
     assert robot().once()

@@ -187,21 +187,21 @@ def other_environment(fake: Fake, _: Path) -> None:
     ("attack", "word"),
     [
         (replay_old_manifest, "possible rollback"),
-        (replay_old_file, "other bytes than the manifest"),
-        (foreign_sequence, "which the server does not tell"),
+        (replay_old_file, "differs from the manifest"),
+        (foreign_sequence, "which the server does not list"),
         (trusted_sequence, "more than 1000000000 ahead"),
         (trusted_epoch, "ahead of 0"),
-        (unsigned, "not signed"),
-        (unknown_key, "which the server does not tell"),
-        (expired, "has expired"),
-        (endless_file, "other bytes than the manifest"),
-        (endless_manifest, "more than"),
+        (unsigned, "no valid signature"),
+        (unknown_key, "which the server does not list"),
+        (expired, "manifest expired"),
+        (endless_file, "differs from the manifest"),
+        (endless_manifest, "exceeds"),
         (one_byte_a_second, "bytes in"),
-        (hundred_bytes_a_second, "less than 4096 a second"),
-        (cut_off, "no answer"),
-        (one_bit, "other bytes than the manifest"),
-        (hostile_name, "cannot be"),
-        (other_environment, "of the environment 'elsewhere'"),
+        (hundred_bytes_a_second, "less than 4096 bytes per second"),
+        (cut_off, "no response"),
+        (one_bit, "differs from the manifest"),
+        (hostile_name, "invalid or duplicate file path"),
+        (other_environment, "belongs to environment 'elsewhere'"),
     ],
 )
 def test_attack_is_refused_reported_and_healed(
@@ -262,7 +262,7 @@ def test_frozen_server_is_reported(fake: Fake, robot: Robot, monkeypatch: pytest
 
         fake.instead = frozen
         fake.put(B)
-        eventually(lambda: "no fresh signed answer since" in fake.statuses[-1].get("detail", ""))
+        eventually(lambda: "no new signed response since" in fake.statuses[-1].get("detail", ""))
         assert fake.statuses[-1]["state"] == "failed"
         assert whole(one.into)["version"] == 1
         fake.instead = lambda _: False
@@ -277,7 +277,7 @@ def test_server_that_gives_less_than_the_bus_announced_is_reported(
     with run(one):
         eventually(lambda: one.saw("active", version=1))
         one.agent._on_event(event(2))
-        eventually(lambda: "the bus announced sequence 2" in fake.statuses[-1].get("detail", ""))
+        eventually(lambda: "sequence 2 was announced" in fake.statuses[-1].get("detail", ""))
         assert fake.statuses[-1]["state"] == "active", "events are not signed: they make no robot fail"
         fake.put(B)
         eventually(lambda: fake.statuses[-1]["version"] == 2 and "detail" not in fake.statuses[-1])
@@ -298,7 +298,7 @@ def test_expired_map_is_refused_with_the_clock_set_back(fake: Fake, robot: Robot
     fake.more = {"expires": old, "time": (datetime.now(timezone.utc) - timedelta(days=1, hours=1)).isoformat()}
     one = robot(clock=lambda: time.time() - 2 * 86400)
     assert not one.once()
-    assert "has expired" in one.detail
+    assert "manifest expired" in one.detail
     assert whole(one.into)["version"] == 1
     fake.more = {}
     assert robot(clock=lambda: time.time() - 2 * 86400).once()
@@ -308,7 +308,7 @@ def test_clock_set_forward_heals_when_it_is_put_right(fake: Fake, robot: Robot) 
     year = 365 * 86400
     one = robot(clock=lambda: time.time() + year)
     assert not one.once()
-    assert "has expired" in one.detail
+    assert "manifest expired" in one.detail
     assert robot().once()
 
 
@@ -331,7 +331,7 @@ def test_unset_clock_is_replaced_by_signed_time(fake: Fake, robot: Robot) -> Non
     fake.more = {"expires": (datetime.now(timezone.utc) - timedelta(hours=1)).isoformat()}
     one = robot(clock=lambda: 1000.0)
     assert not one.once()
-    assert "has expired" in one.detail
+    assert "manifest expired" in one.detail
 
 
 # --- order ---
@@ -412,7 +412,7 @@ def test_hook_that_is_killed_is_taken_back(fake: Fake, robot: Robot) -> None:
     fake.put(B)
     one = robot("test $FLEETMAP_VERSION = 1 || kill -9 $$")
     assert not one.once()
-    assert "ended with -9" in one.detail
+    assert "exited with status -9" in one.detail
     assert whole(one.into)["version"] == 1
 
 
@@ -431,7 +431,7 @@ def test_second_agent_of_a_directory_is_refused(fake: Fake, robot: Robot) -> Non
     one = robot(poll_seconds=3600.0)
     with run(one):
         eventually(lambda: one.saw("active", version=1))
-        with pytest.raises(Conflict, match="another agent keeps"):
+        with pytest.raises(Conflict, match="another agent uses"):
             robot().once()
         fake.put(B)
         one.agent._on_event(event(2))

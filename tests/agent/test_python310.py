@@ -78,7 +78,7 @@ def test_commands_of_the_server_name_the_python_they_need(python310: Path, argum
     ended = fleetmap(python310, *arguments)
     assert ended.returncode == 1
     assert f"fleetmap {arguments[0]}" in ended.stderr
-    assert "needs Python 3.11 or newer, and this is 3.10." in ended.stderr
+    assert "requires Python 3.11 or newer, this is 3.10." in ended.stderr
     assert "Traceback" not in ended.stderr
 
 

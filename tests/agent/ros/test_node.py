@@ -137,7 +137,7 @@ def test_a_failure_to_load_fails_the_hook(graph: Graph, folder: Path) -> None:
 @pytest.mark.parametrize(
     ("service", "reason"),
     [
-        (lambda request: None, "gave no answer within 0.2 seconds"),
+        (lambda request: None, "no response from /map_server/load_map within 0.2 seconds"),
         (lambda request: 1 / 0, "/map_server/load_map failed: division by zero"),
     ],
 )
@@ -191,7 +191,7 @@ def test_an_agent_that_ends_is_started_again(graph: Graph, folder: Path) -> None
     calls = folder.parent / "calls"
     calls.touch()  # the first process may not have written yet
     eventually(lambda: len(calls.read_text().splitlines()) == 2)
-    assert any("the agent ended with 3" in text for _, text in graph.log)
+    assert any("the agent exited with status 3" in text for _, text in graph.log)
     eventually(lambda: len(graph.latched["/fleetmap_agent/status"]) == 2)
     node._agent._process.send_signal(signal.SIGKILL)
     eventually(lambda: len(calls.read_text().splitlines()) == 3)
@@ -202,8 +202,8 @@ def test_an_agent_that_ends_is_started_again(graph: Graph, folder: Path) -> None
 @pytest.mark.parametrize(
     ("parameters", "reason"),
     [
-        ({"environment": " "}, "the parameter environment is empty"),
-        ({"formats": [""]}, "the parameter formats is empty"),
+        ({"environment": " "}, "parameter environment is empty"),
+        ({"formats": [""]}, "parameter formats is empty"),
         ({"call_seconds": 0.0}, "call_seconds must be above 0"),
     ],
 )
@@ -220,8 +220,8 @@ def test_parameters_are_checked(graph: Graph, folder: Path, parameters: dict[str
 @pytest.mark.parametrize(
     ("parameters", "reason"),
     [
-        ({"token_file": "/nowhere/token"}, "the token_file /nowhere/token cannot be read"),
-        ({"fleetmap": "/nowhere/fleetmap"}, "/nowhere/fleetmap cannot be run"),
+        ({"token_file": "/nowhere/token"}, "could not read token_file /nowhere/token"),
+        ({"fleetmap": "/nowhere/fleetmap"}, "could not run /nowhere/fleetmap"),
     ],
 )
 def test_an_agent_that_cannot_start(graph: Graph, folder: Path, parameters: dict[str, Any], reason: str) -> None:
@@ -249,14 +249,14 @@ def test_the_topological_map_is_read_back(graph: Graph, folder: Path) -> None:
     graph.latched["/topological_map_2"] = [Message(data="{}")]
     ok, lines = node._loader(variables)
     assert not ok
-    assert "reported success, but /topological_map_2 does not hold" in lines[0]
+    assert "reported success, but /topological_map_2 does not publish" in lines[0]
     node.stop()
 
 
 def test_a_ros_without_a_service_says_what_to_install(graph: Graph, folder: Path) -> None:
     from app.agent.ros.fleetmap_ros.node import service_type
 
-    with pytest.raises(loading.LoadError, match="has no nav2_msgs/srv/SetRouteGraph: install nav2_msgs"):
+    with pytest.raises(loading.LoadError, match="nav2_msgs/srv/SetRouteGraph not found: install nav2_msgs"):
         service_type("nav2_msgs/srv/SetRouteGraph")
     with pytest.raises(loading.LoadError, match="install absent_msgs"):
         service_type("absent_msgs/srv/X")
@@ -266,7 +266,7 @@ def test_the_hook_without_a_node_fails(tmp_path: Path) -> None:
     command = [sys.executable, control.HOOK, tmp_path / "none"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
-    assert "the node fleetmap_agent does not answer" in ended.stdout
+    assert "no response from the node fleetmap_agent" in ended.stdout
 
 
 def test_the_socket_is_closed_to_others_and_goes_with_the_node(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_it_is_copied_out_and_replaced(tmp_path: Path) -> None:
 def test_what_is_no_copy_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "fleetmap_ros").mkdir()
     (tmp_path / "fleetmap_ros" / "mine").touch()
-    with pytest.raises(Conflict, match="is no copy of fleetmap_ros"):
+    with pytest.raises(Conflict, match="is not a copy of fleetmap_ros"):
         ros.copy_package(tmp_path)
     assert (tmp_path / "fleetmap_ros" / "mine").exists()
 
