@@ -25,7 +25,7 @@ def test_a_good_map_passes(offline: Fleetmap, tmp_path: Path) -> None:
     a_map(tmp_path)
     result = offline("check", tmp_path)
     assert result.status == 0, result.err
-    assert "map.yaml (occupancy_grid): nothing to complain of" in result.out
+    assert "map.yaml (occupancy_grid): no problems" in result.out
 
 
 def test_doubts_are_told_and_pass(offline: Fleetmap, tmp_path: Path) -> None:
@@ -39,7 +39,7 @@ def test_a_map_that_nav2_would_refuse_fails(offline: Fleetmap, tmp_path: Path) -
     path = a_map(tmp_path, image="other.pgm")
     result = offline("check", path, tmp_path / "map.pgm")
     assert result.status == 1
-    assert "map.yaml (occupancy_grid): would be refused" in result.out
+    assert "map.yaml (occupancy_grid): would be rejected" in result.out
     assert "error: map.yaml: image: " in result.out
     answer = offline("check", path, tmp_path / "map.pgm", "--json")
     assert answer.status == 1
@@ -68,7 +68,7 @@ def test_what_is_no_map_is_said(offline: Fleetmap, tmp_path: Path) -> None:
     assert "none of the files is a map" in result.err
     named = offline("check", tmp_path / "note.txt", "--format", "nav2_route")
     assert named.status == 1
-    assert "would be refused" in named.out
+    assert "would be rejected" in named.out
 
 
 def test_the_picture_beside_a_named_file_is_read(offline: Fleetmap, tmp_path: Path) -> None:
@@ -131,5 +131,5 @@ def test_companions_are_those_that_each_format_names(shared: Path, tmp_path: Pat
 def test_a_wrong_option_of_a_generator_lists_its_own(offline: Fleetmap, tmp_path: Path) -> None:
     result = offline("generate", "orchard", "--to", "tmap2", "-o", tmp_path / "n.yaml", "-O", "typo=1")
     assert result.status == 1
-    assert "typo: no such parameter of orchard; accepted: crown_diameter," in result.err
+    assert "typo: unknown parameter of orchard: use one of crown_diameter," in result.err
     assert "tmap2 accepts action," in result.err

@@ -110,7 +110,7 @@ def test_an_upload_whose_answer_is_lost_is_sent_again_under_the_same_key(talk: T
 
 def test_a_lost_answer_is_told_in_the_end(talk: Talk, tmp_path: Path) -> None:
     client, script = talk(None)
-    with pytest.raises(RequestFailed, match="no answer from"):
+    with pytest.raises(RequestFailed, match="no response from"):
         client.upload("/environments/e/versions", [local(tmp_path, "a", b"1")], {})
     assert len(script.asked) == clients.MAX_ATTEMPTS
 
@@ -174,7 +174,7 @@ def test_a_missing_environment_gets_a_hint(talk: Talk) -> None:
     client, _ = talk(reply(404, problem, "application/problem+json"), reply(200, [{"name": "other"}]))
     with pytest.raises(RequestFailed) as caught:
         client.get("/environments/x")
-    assert caught.value.hint == "`fleetmap environment list` lists all."
+    assert caught.value.hint == "List all with `fleetmap environment list`."
 
 
 def test_missing_environment_proposes_the_nearest_one_the_token_sees(talk: Talk) -> None:
@@ -194,7 +194,7 @@ def test_another_kind_of_server_is_recognised(talk: Talk) -> None:
     with pytest.raises(RequestFailed, match="no JSON"):
         client.get("/formats")
     client, _ = talk(reply(404, b"<html>", "text/html"))
-    with pytest.raises(RequestFailed, match="answered 404"):
+    with pytest.raises(RequestFailed, match="returned status 404"):
         client.get("/formats")
 
 

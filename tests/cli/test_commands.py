@@ -131,11 +131,13 @@ def test_a_promotion_in_two_stages(fleetmap: Fleetmap, network: Path) -> None:
     result = fleetmap(
         "promote", "staged", "1", "--ready", "0.9", "--failed", "0.2", "--deadline", "2099-01-31T06:00:00Z"
     )
-    assert result.out.strip() == "staged: production will point to version 1 when 0.9 of its online robots have it"
+    assert (
+        result.out.strip() == "staged: production will point to version 1 when 0.9 of its online robots have fetched it"
+    )
     body = fleetmap("promote", "staged", "1", "--ready", "0.9", "--window", "60", "--json").json
     assert body["version"] is None
     assert (body["rollout"]["state"], body["rollout"]["ready"], body["rollout"]["window"]) == ("waiting", 0.9, 60.0)
-    assert "nothing is planned" in fleetmap("promote", "staged", "--cancel").out
+    assert "cancelled the planned move" in fleetmap("promote", "staged", "--cancel").out
     assert fleetmap("promote", "staged", "--cancel").status == 1, "there is nothing to cancel any more"
     assert fleetmap("promote", "staged", "--cancel", "--ready", "0.5").status == 2
     assert fleetmap("promote", "staged", "1").out.strip() == "staged: production points to version 1"
@@ -293,7 +295,7 @@ def test_link_gives_a_map_without_a_token(fleetmap: Fleetmap, network: Path) -> 
 def test_robot_token_names_its_robot(fleetmap: Fleetmap) -> None:
     assert fleetmap("token", "create", "mower-9", "--role", "robot", "--json").json["robot"] == "mower-9"
     result = fleetmap("token", "create", "the red one", "--role", "robot", "--robot", "mower-9")
-    assert (result.status, "sets the status of the robot mower-9" in result.err) == (0, True)
+    assert (result.status, "reports the status of robot mower-9" in result.err) == (0, True)
     for wrong in (("the red one", "--role", "robot"), ("x", "--role", "robot", "--robot", "a b")):
         refused = fleetmap("token", "create", *wrong)
         assert (refused.status, refused.out) == (1, "")
@@ -308,7 +310,7 @@ def test_usage_errors_have_their_own_status(fleetmap: Fleetmap, network: Path, t
     assert "absent does not exist" in fleetmap("import", tmp_path / "absent", "-e", "x").err
     missing = fleetmap("versions", "no-such-place")
     assert missing.status == 1
-    assert "lists all" in missing.err
+    assert "List all with" in missing.err
     named = fleetmap("import", network, "-e", "My Farm")
     assert named.status == 1
     assert "try my-farm" in named.err

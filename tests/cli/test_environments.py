@@ -89,7 +89,7 @@ def test_a_folder_imports_with_one_command_and_its_maps_come_back(
         assert same(expected.format, originals(folder, expected), read(out)) == []
     again = fleetmap("import", folder)
     assert again.status == 0, again.err
-    assert f"{name}: nothing changed, version 1 stays" in again.out
+    assert f"{name}: no changes, still version 1" in again.out
 
 
 @pytest.mark.parametrize("name", FOLDERS)

@@ -45,7 +45,7 @@ def test_environment_life(fleetmap: Fleetmap) -> None:
     assert "newest version" in shown
     assert "53.3, -0.5, heading 12.5°" in fleetmap("environment", "datum", "life", "53.3,-0.5,12.5").out
     assert fleetmap("environment", "datum", "life", "--json").json["heading"] == 12.5
-    assert "now called life-2" in fleetmap("environment", "rename", "life", "life-2").out
+    assert "renamed to life-2" in fleetmap("environment", "rename", "life", "life-2").out
     assert fleetmap("environment", "rename", "life-2").status == 2
     assert (
         fleetmap("environment", "create", "life-3", "--clone", "life-2@1", "--json").json["datum"]["latitude"] == 53.25
@@ -74,7 +74,7 @@ def test_channels_and_robots(fleetmap: Fleetmap, server: str, network: Path) -> 
     assert "version" in fleetmap("channels", "show", "manned", "production").out
     assert fleetmap("promote", "manned", "1", "--at", "2099-01-31T06:00:00Z", "-c", "staging").status == 0
     assert "2099-01-31 06:00" in fleetmap("channels", "manned").out
-    assert "nothing is planned" in fleetmap("channels", "cancel", "manned", "staging").out
+    assert "cancelled the planned move" in fleetmap("channels", "cancel", "manned", "staging").out
     assert [row["robot"] for row in fleetmap("robots", "-e", "manned", "--json").json] == ["mower-3"]
     assert "mower-3" in fleetmap("robots").out
     shown = fleetmap("robots", "show", "mower-3")

@@ -70,14 +70,14 @@ def test_unknown_names_get_a_proposal(fleetmap: Fleetmap, network: Path) -> None
         assert result.status == 1, arguments
         assert proposal in result.err, (arguments, result.err)
     for arguments, proposal in (
-        (("frmats",), "there is no command frmats (did you mean formats?)"),
-        (("convrt",), "there is no command convrt (did you mean convert?)"),
-        (("zzz",), "there is no command zzz"),
-        (("overlays", "acept", "proposals", "1"), "there is no command acept (did you mean accept?)"),
-        (("formats", "--jsn"), "there is no option --jsn (did you mean --json?)"),
-        (("check", "--jsn=1", "x"), "there is no option --jsn (did you mean --json?)"),
-        (("--versoin",), "there is no option --versoin (did you mean --version?)"),
-        (("formats", "-z"), "there is no option -z"),
+        (("frmats",), "unknown command frmats (did you mean formats?)"),
+        (("convrt",), "unknown command convrt (did you mean convert?)"),
+        (("zzz",), "unknown command zzz"),
+        (("overlays", "acept", "proposals", "1"), "unknown command acept (did you mean accept?)"),
+        (("formats", "--jsn"), "unknown option --jsn (did you mean --json?)"),
+        (("check", "--jsn=1", "x"), "unknown option --jsn (did you mean --json?)"),
+        (("--versoin",), "unknown option --versoin (did you mean --version?)"),
+        (("formats", "-z"), "unknown option -z"),
         (("overlays", "list", "proposals", "--state", "pendng"), "did you mean pending?"),
         (("jobs", "list", "--state", "rnning"), "did you mean running?"),
         (("token", "create", "x", "--role", "edtor"), "did you mean editor?"),
@@ -119,4 +119,4 @@ def test_failed_work_takes_a_new_datum_back(fleetmap: Fleetmap, network: Path, t
     assert fleetmap("import", bad, "-e", "moved", "--datum", "53.2,-0.5").status == 1
     after = fleetmap("environment", "show", "moved", "--json").json
     assert (after["datum"], after["root"]) == (before["datum"], before["root"])
-    assert "take back the datum" in fleetmap("versions", "moved").out
+    assert "reset the datum" in fleetmap("versions", "moved").out
