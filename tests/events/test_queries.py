@@ -70,7 +70,7 @@ def test_maps_over_zenoh_are_the_bytes_of_http(api: Api, session: zenoh.Session)
         assert str(refused.encoding) == "application/problem+json"
     for key in ("fleetmap/*/*/version", "fleetmap/asked/latest/maps/**", "**"):
         problem = json.loads(bytes(get(key).payload))
-        assert (problem["status"], "without wildcards" in problem["detail"]) == (422, True)
+        assert (problem["status"], "wildcards are unsupported" in problem["detail"]) == (422, True)
 
 
 def test_environments_by_position_are_those_of_http(api: Api, session: zenoh.Session) -> None:

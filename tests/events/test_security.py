@@ -344,12 +344,12 @@ def test_why_a_robot_is_not_let_in_is_told(authority: Authority, tmp_path: Path)
     error = zenoh.ZError("Unable to connect! at /somewhere/else.rs:1")
     try:
         for login, reason in (
-            (ZenohCredentials(authority.pem), "it refuses: tlsv13 alert certificate required"),
+            (ZenohCredentials(authority.pem), "TLS error: tlsv13 alert certificate required"),
             (
                 ZenohCredentials(authority.pem, *authority.sign("late", -1)),
-                "it refuses: sslv3 alert certificate expired",
+                "TLS error: sslv3 alert certificate expired",
             ),
-            (ZenohCredentials(authority.pem, *Authority(tmp_path, "x").sign("r")), "it refuses: "),
+            (ZenohCredentials(authority.pem, *Authority(tmp_path, "x").sign("r")), "TLS error: "),
             (ZenohCredentials(authority.pem, *authority.sign("r1")), "Unable to connect!"),
         ):
             assert describe_connection_failure(f"{endpoint}, tcp/x:1", error, login).startswith(
@@ -373,9 +373,9 @@ def test_a_file_of_users(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "told"),
-    [(b"", "no user"), (b"# x\n", "no user"), (b"r1\n", "line 1: not NAME"), (b"r1:\n", "line 1: not NAME"),
-     (b"a:b\nr/1:x\n", "line 2: a name"), (b"*:x", "a name"), (b"server:x", "the server's own"),
-     (b"a:b\na:c", "line 2: this name"), (b"a:\xff", "UTF-8"), (b"a:b\x00c", "not NAME"),
+    [(b"", "no user"), (b"# x\n", "no user"), (b"r1\n", "line 1: must be NAME"), (b"r1:\n", "line 1: must be NAME"),
+     (b"a:b\nr/1:x\n", "line 2: invalid name"), (b"*:x", "a name"), (b"server:x", "the server's own"),
+     (b"a:b\na:c", "line 2: duplicate name"), (b"a:\xff", "UTF-8"), (b"a:b\x00c", "not NAME"),
      (b"a:b\n" * 300_000, "bytes")],
 )  # fmt: skip
 def test_what_is_no_file_of_users(text: bytes, told: str, tmp_path: Path) -> None:
@@ -395,7 +395,7 @@ def test_a_missing_file_is_told_before_the_start(tmp_path: Path) -> None:
         RouterSecurity(ZenohCredentials(certificate=existing_file, key=missing_file)),
         RouterSecurity(users=missing_file, folder=tmp_path),
     ):
-        with pytest.raises(Invalid, match=r"gone\.pem cannot be read"):
+        with pytest.raises(Invalid, match=r"could not read .*gone\.pem"):
             check_bus(BusOptions(security=security))
     for login in (
         ZenohCredentials(certificate=existing_file),
@@ -408,11 +408,11 @@ def test_a_missing_file_is_told_before_the_start(tmp_path: Path) -> None:
     with pytest.raises(Unavailable, match="FLEETMAP_ZENOH_CONFIG"):
         check_bus(BusOptions(config=missing_file))
     existing_file.write_text("no PEM")
-    with pytest.raises(Invalid, match="holds no certificate of a certification authority"):
+    with pytest.raises(Invalid, match="is not a certificate of a certification authority"):
         check_bus(BusOptions(security=RouterSecurity(ZenohCredentials(ca=existing_file))))
     one, other = Authority(tmp_path / "ca").sign("one"), Authority(tmp_path / "ca").sign("other")
     for certificate, key in ((one[0], other[1]), (existing_file, one[1]), (one[0], existing_file)):
-        with pytest.raises(Invalid, match="are no certificate and its unencrypted key"):
+        with pytest.raises(Invalid, match="are not a certificate and its unencrypted key"):
             check_bus(BusOptions(security=RouterSecurity(ZenohCredentials(certificate=certificate, key=key))))
     assert "secret" not in repr(ZenohCredentials(user="a", password="secret"))
 
@@ -420,12 +420,12 @@ def test_a_missing_file_is_told_before_the_start(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        ({"zenoh_certificate": "a"}, "go together"), ({"tls_key": "a"}, "go together"),
-        ({"zenoh_listen": "tls/0.0.0.0:7447"}, "needs zenoh_certificate"),
-        ({"zenoh_certificate": "a", "zenoh_key": "b"}, "encrypted endpoints"),
-        ({"zenoh_user": "a"}, "go together"), ({"zenoh_mtls": True}, "zenoh_mtls needs"),
-        ({"zenoh_mode": "client", "zenoh_connect": "tcp/x:1", "zenoh_users": "u"}, "its own users"),
-        ({"zenoh_connect": "tcp/x:1", "zenoh_users": "u"}, "what other routers may say"),
+        ({"zenoh_certificate": "a"}, "must be set together"), ({"tls_key": "a"}, "must be set together"),
+        ({"zenoh_listen": "tls/0.0.0.0:7447"}, "requires zenoh_certificate"),
+        ({"zenoh_certificate": "a", "zenoh_key": "b"}, "encrypted endpoint"),
+        ({"zenoh_user": "a"}, "must be set together"), ({"zenoh_mtls": True}, "zenoh_mtls requires"),
+        ({"zenoh_mode": "client", "zenoh_connect": "tcp/x:1", "zenoh_users": "u"}, "users of other routers"),
+        ({"zenoh_connect": "tcp/x:1", "zenoh_users": "u"}, "rights of other routers"),
     ],
 )  # fmt: skip
 def test_settings_that_do_not_fit(more: dict[str, Any], told: str, tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ def test_trouble_is_told_once_and_ends(
     try:
         eventually(lambda: one.rounds)
         assert caplog.text.count("IT STOPPED: the database is away") == 1
-        assert caplog.text.count("fleetmap-some stumbled") == 1
+        assert caplog.text.count("fleetmap-some: unexpected error") == 1
         assert one.stumbles == 1
         eventually(lambda: read_state(tmp_path, "some") == {"state": "connected"})
     finally:
@@ -124,6 +124,6 @@ def test_a_full_disk_stops_nothing(
     one.start()
     try:
         eventually(lambda: one.rounds > 3)
-        assert "some.json cannot be written: No space left on device" in caplog.text
+        assert "could not write some.json: No space left on device" in caplog.text
     finally:
         one.close()
