@@ -205,7 +205,7 @@ def test_agent_level_refuses_what_it_cannot_load(fake: Fake, robot: Robot, tmp_p
     (tmp_path / "bad").unlink()
     fake.instead = lambda h: h.send_error(503) or True
     robot(f"test ! -e {tmp_path}/bad").once()
-    with pytest.raises(NotFound, match="no map in .* yet"):
+    with pytest.raises(NotFound, match=r"no map in .* yet"):
         load(one.into, "L2")
 
 
