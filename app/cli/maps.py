@@ -64,7 +64,7 @@ def import_maps(
     extra = options.pairs(option)
     if environment is not None:
         folders.check_name(environment)
-    files, suggested, notes = _collect(paths)
+    files, suggested, notes = _collect(paths, for_environment=environment is None)
     name = environment or suggested
     if name is None:
         raise typer.BadParameter("missing --environment NAME: it is optional only for a single folder")
@@ -410,11 +410,19 @@ def show_report(report: Mapping[str, Any]) -> None:
     output.show_warnings(report.get("warnings") or ())
 
 
-def _collect(paths: Sequence[Path]) -> tuple[list[LocalFile], str | None, tuple[str, ...]]:
-    """Collect the files to upload. Also return an environment name if it is a single folder, and skipped files."""
+def _collect(
+    paths: Sequence[Path], *, for_environment: bool = False
+) -> tuple[list[LocalFile], str | None, tuple[str, ...]]:
+    """Collect the files to upload. Also return an environment name if it is a single folder, and skipped files.
+
+    Args:
+        for_environment: propose --environment for a missing path that may be the name of an environment.
+    """
     for path in paths:
         if not path.exists():
-            raise NotFound(f"{path} does not exist")
+            is_name = for_environment and len(paths) > 1 and folders.NAME.fullmatch(str(path)) is not None
+            hint = f": set an environment with --environment {path}" if is_name else ""
+            raise NotFound(f"no file or folder {str(path)!r}{hint}")
     if len(paths) == 1 and paths[0].is_dir():
         upload_folder = folders.collect(paths[0])
         inner = upload_folder.root if upload_folder.is_template else paths[0].resolve()

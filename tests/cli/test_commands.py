@@ -306,14 +306,23 @@ def test_usage_errors_have_their_own_status(fleetmap: Fleetmap, network: Path, t
     assert fleetmap("import", network).status == 2
     assert fleetmap("export", "story", "kml", "-o", "-", "--json").status == 2
     assert fleetmap("nonsense").status == 2
-    assert fleetmap("import", tmp_path / "absent", "-e", "x").status == 1
-    assert "absent does not exist" in fleetmap("import", tmp_path / "absent", "-e", "x").err
+    absent = fleetmap("import", tmp_path / "absent", "-e", "x")
+    assert absent.status == 1
+    assert f"no file or folder '{tmp_path}/absent'" in absent.err
+    assert "--environment" not in absent.err
     missing = fleetmap("versions", "no-such-place")
     assert missing.status == 1
     assert "List all with" in missing.err
     named = fleetmap("import", network, "-e", "My Farm")
     assert named.status == 1
     assert "try my-farm" in named.err
+
+
+def test_import_with_environment_as_argument_proposes_its_option(fleetmap: Fleetmap, network: Path) -> None:
+    assert fleetmap("environment", "create", "strawberry").status == 0
+    mistaken = fleetmap("import", "strawberry", network)
+    assert mistaken.status == 1
+    assert "no file or folder 'strawberry': set an environment with --environment strawberry" in mistaken.err
 
 
 def test_an_option_that_nobody_knows_is_refused(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
